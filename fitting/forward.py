@@ -511,7 +511,8 @@ def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
         impact = impact.free
     speeds = jax.vmap(impact.speeds)(coordinate)
     just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
-    return Free(speeds, impact.hertz_time(speeds.approach), impact.lowest, just_above, impact.length)
+    hertz = impact.hertz_contact
+    return Free(speeds, hertz.time(speeds.approach), impact.lowest, just_above, hertz.length_nm)
 
 
 @jax.jit

@@ -80,7 +80,7 @@ def _predicted(impact: TabulatedImpact, quality_factor, frequency_khz, free_nm, 
         u = state.speeds.approach
         turn = (lag - read[1] + 180.0) % 360.0 - 180.0
         error = jnp.where(orbits.steady[slot], size - read[0], jnp.nan)
-        return Forward(error, turn, read[0], u / impact.lowest, middle.acceleration * impact.hertz_time(u) / u)
+        return Forward(error, turn, read[0], u / impact.lowest, middle.acceleration * impact.hertz_contact.time(u) / u)
 
     return jax.vmap(one)(frequency_khz, free_nm, offset_nm, read)
 

@@ -60,7 +60,7 @@ def predicted(impact: TabulatedImpact, ratio: jax.Array, free_nm: jax.Array, off
     size, lag = detected(amplitude, phase, free_nm, ratio, cantilever.quality_factor, base=False)
     middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * state.speeds.delay)
     u = state.speeds.approach
-    return Read(size, lag, u / impact.lowest, middle.acceleration * impact.hertz_time(u) / u)
+    return Read(size, lag, u / impact.lowest, middle.acceleration * impact.hertz_contact.time(u) / u)
 
 
 ROWS = [(100.0, 1.1, 80.0), (20.0, 1.1, 80.0)]

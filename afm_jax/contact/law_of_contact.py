@@ -34,7 +34,7 @@ from afm_jax.contact.driven import free_tip
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
-from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, ImpactLaw, TabulatedLaw
+from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, HertzContact, ImpactLaw, TabulatedLaw
 from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import Result, public_result
 from afm_jax.solve.derivatives import largest
@@ -521,16 +521,13 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
         end=far[-1],
         inner_nm=contact.bridge_forms_nm,
         outer_nm=outer,
-        hertz=delay * u[-1] ** 0.2,
-        early_nm=jnp.zeros(()),
-        raised_nm=jnp.zeros(()),
-        length_nm=contact.bridge_breaks_nm,
+        closest=HertzContact(delay * u[-1] ** 0.2, jnp.zeros(()), jnp.zeros(()), contact.bridge_breaks_nm),
         loss_error=_tail(loss),
         speed_error=largest(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
         time_error=_tail(time_terms) + largest(jnp.abs(finer.time - time[_COMPARED])),
     )
-    early, raised = _lead_and_height(table)
-    return replace(table, early_nm=early, raised_nm=raised)
+    lead, raised = _lead_and_height(table)
+    return replace(table, closest=table.closest._replace(lead_nm=lead, raised_nm=raised))
 
 
 def _traced_back(
@@ -582,7 +579,7 @@ def _lead_and_height(table: TabulatedImpact) -> tuple[Float[Array, ""], Float[Ar
     scale = jnp.sqrt(jnp.sum(terms**2, axis=0))
     terms = terms / scale
     lead = jnp.linalg.solve(terms.T @ terms, terms.T @ delay)[1] / scale[1]
-    early = table.hertz_time(u) - delay - lead * (1.0 / w - 1.0 / u)
+    early = table.closest.time(u) - delay - lead * (1.0 / w - 1.0 / u)
     return lead, 0.5 * (u * early)[-1]
 
 

@@ -39,7 +39,7 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
-from afm_jax.impact.law import Impact, Law, Speeds, TabulatedLaw
+from afm_jax.impact.law import HertzContact, Impact, Law, Speeds, TabulatedLaw
 
 PASSES = 4
 """Passes from the delay to mid contact and back."""
@@ -128,14 +128,15 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
     u, w = free.approach, free.rebound
     if isinstance(impact, PulledImpact):
         return impact.during(u, middle, cantilever).speeds
-    pull, raised = middle.acceleration, impact.raised
+    pull, hertz = middle.acceleration, impact.hertz_contact
+    raised, length = hertz.raised_nm, hertz.length_nm
     at_surface = speed_over(u, raised, pull)
-    tau = impact.hertz_time(at_surface)
+    tau = hertz.time(at_surface)
     gained, longer = gained_and_longer(at_surface, tau, middle, cantilever)
     rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
-    longer = longer + tau - impact.hertz_time(u) - _lag(u, raised, pull) - _lag(w, raised, pull)
-    later = _lag(w, impact.length, pull) - _lag(u, impact.length, pull)
-    fraction = jnp.maximum(impact.lead, 0.0) / (USUAL_LEAD * impact.length)
+    longer = longer + tau - hertz.time(u) - _lag(u, raised, pull) - _lag(w, raised, pull)
+    later = _lag(w, length, pull) - _lag(u, length, pull)
+    fraction = jnp.maximum(hertz.lead_nm, 0.0) / (USUAL_LEAD * length)
     return Speeds(u, rebound, free.delay + longer - fraction * later)
 
 
@@ -234,13 +235,15 @@ def depth_of_impact(
         cantilever: its spring stiffens the contact.
         nu: angular frequency of the lock-in in rad/us.
     """
-    at_surface = speed_over(approach_speed, impact.raised, middle.acceleration)
-    tau = impact.hertz_time(at_surface)
+    hertz = impact.hertz_contact
+    raised = hertz.raised_nm
+    at_surface = speed_over(approach_speed, raised, middle.acceleration)
+    tau = hertz.time(at_surface)
     lasts, _ = hertz_under_pull(middle.acceleration * tau / at_surface)
     # the parabolas between the surface and gap 0 are of the flight
-    beside = 2.0 * impact.raised / (at_surface + approach_speed)
+    beside = 2.0 * raised / (at_surface + approach_speed)
     flown = beside**2 * (at_surface + 2.0 * approach_speed) / 3.0
-    return indentation(at_surface, tau, middle, cantilever, nu) - impact.raised * lasts * tau + flown
+    return indentation(at_surface, tau, middle, cantilever, nu) - raised * lasts * tau + flown
 
 
 def _lag(speed: Float[Array, ""], length: Float[Array, ""], acceleration: Float[Array, ""]) -> Float[Array, ""]:
@@ -314,7 +317,7 @@ def crawls(impact: Impact, speeds: Speeds, cantilever: Cantilever) -> Bool[Array
         speeds: of the free tip on a sample at rest; the tip leaves.
         cantilever: for its period.
     """
-    early = jnp.maximum(impact.lead, 0.0) * (speeds.approach - speeds.rebound)
+    early = jnp.maximum(impact.hertz_contact.lead_nm, 0.0) * (speeds.approach - speeds.rebound)
     return early > 0.5 * jnp.pi / cantilever.angular_frequency * speeds.approach * speeds.rebound
 
 
@@ -405,10 +408,9 @@ class TabulatedImpact(Impact):
         end: asinh(v/scale) where the table ends; beyond, loss and delay are held.
         inner_nm: gap at which contact begins.
         outer_nm: gap at which contact ends.
-        hertz: Hertz time at 1 nm/us, in us (nm/us)^0.2: that of the table's end, where nothing else is left.
-        early_nm: lead b in nm of the delay formula that is closest to the delay.
-        raised_nm: half the offset d in nm that is left then.
-        length_nm: gap in nm at which the bridge breaks.
+        closest: the Hertz contact as stiff as the table's end, where nothing else is left, with the lead b of the delay
+            formula that is closest to the delay, half the offset d that is left then, and the gap at which the bridge
+            breaks.
         loss_error: estimated error of the series for the loss, in nm^2/us^2.
         speed_error: estimated error of the approach speeds that it goes through, as a share.
         time_error: estimated error of the time in us.
@@ -421,10 +423,7 @@ class TabulatedImpact(Impact):
     end: Float[Array, ""]
     inner_nm: Float[Array, ""]
     outer_nm: Float[Array, ""]
-    hertz: Float[Array, ""]
-    early_nm: Float[Array, ""]
-    raised_nm: Float[Array, ""]
-    length_nm: Float[Array, ""]
+    closest: HertzContact
     loss_error: Float[Array, ""]
     speed_error: Float[Array, ""]
     time_error: Float[Array, ""]
@@ -435,28 +434,14 @@ class TabulatedImpact(Impact):
         return self.capture
 
     @property
-    def lead(self) -> Float[Array, ""]:
-        """Length b in nm of the lead b (1/u_out - 1/u_in) of the delay formula closest to the delay."""
-        return self.early_nm
-
-    @property
-    def raised(self) -> Float[Array, ""]:
-        """Height in nm of the solid's surface over gap 0: half the offset of the delay formula closest to the delay."""
-        return self.raised_nm
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """Gap in nm at which the bridge breaks: over this length a leaving tip keeps its energy."""
-        return self.length_nm
+    def hertz_contact(self) -> HertzContact:
+        """The closest Hertz contact."""
+        return self.closest
 
     @property
     def highest(self) -> Float[Array, ""]:
         """Approach speed in nm/us where the table ends."""
         return jnp.sqrt(self.lowest**2 + (self.scale * jnp.sinh(self.end)) ** 2)
-
-    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the time in us that a Hertz contact as stiff as the table's end takes at a speed in nm/us."""
-        return self.hertz * approach_speed**-0.2
 
     def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
         """Return approach and rebound speed in nm/us and the delay in us at the coordinate, the approach speed."""
@@ -613,23 +598,10 @@ class PulledImpact(Impact):
         return self.free.lowest
 
     @property
-    def lead(self) -> Float[Array, ""]:
-        """Lead in nm that the delay contains: 0, because the time counts the way through the bridge."""
-        return jnp.zeros_like(self.plane_nm)
-
-    @property
-    def raised(self) -> Float[Array, ""]:
-        """Height in nm of the solid over the plane that the delay tells: 0, because the depth below it is tabulated."""
-        return jnp.zeros_like(self.plane_nm)
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """Gap in nm at which the bridge of a free tip breaks."""
-        return self.free.length
-
-    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the time in us that a Hertz contact of a free tip takes at a speed in nm/us."""
-        return self.free.hertz_time(approach_speed)
+    def hertz_contact(self) -> HertzContact:
+        """That of a free tip, without lead and height: the time counts the bridge, the depth is tabulated."""
+        none = jnp.zeros_like(self.plane_nm)
+        return self.free.hertz_contact._replace(lead_nm=none, raised_nm=none)
 
     def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
         """Return speeds and time of a tap under a middling pull, or of the next that there is."""

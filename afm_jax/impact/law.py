@@ -85,11 +85,32 @@ class CollisionDelay(eqx.Module):
         return hertz + self.lead_nm * (rebound_slope / w**2 - 1.0 / u**2) + self.offset_nm / u**2
 
 
-class Impact(eqx.Module):
-    """What an impact does to the tip, as functions of one coordinate that grows with the approach speed.
+class HertzContact(NamedTuple):
+    """What lasts of an impact: a Hertz contact on a surface near gap 0, with straight paths to it and from it.
 
-    A `Law`, or a resolved contact as series (`afm_jax.impact.lasting_impact`): of a free tip on a sample at rest. Where
-    an impact lasts, platform, spring and air change it (`afm_jax.impact.lasting_impact`).
+    On it platform, spring and air act (`afm_jax.impact.lasting_impact`).
+    """
+
+    hertz: Float[Array, ""]
+    """a, the contact time at 1 nm/us, in us (nm/us)^(1/5)."""
+    lead_nm: Float[Array, ""]
+    """b of the lead b (1/u_out - 1/u_in) that the delay contains."""
+    raised_nm: Float[Array, ""]
+    """Height of the solid's surface over gap 0, as the delay tells it: half its offset."""
+    length_nm: Float[Array, ""]
+    """Length over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
+
+    def time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the contact time tau = a u^(-1/5) in us for a speed in nm/us."""
+        return self.hertz * approach_speed**-0.2
+
+
+class Impact(eqx.Module):
+    """What an impact does to a free tip on a sample at rest, as functions of one coordinate.
+
+    The coordinate grows with the approach speed. An impact is a `Law`, or a resolved contact as series
+    (`TabulatedImpact`, `PulledImpact`). What platform, spring and air change while it lasts is in
+    `afm_jax.impact.lasting_impact`.
     """
 
     @property
@@ -99,18 +120,12 @@ class Impact(eqx.Module):
 
     @property
     @abstractmethod
-    def lead(self) -> Float[Array, ""]:
-        """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
+    def hertz_contact(self) -> HertzContact:
+        """The Hertz contact on which platform, spring and air act while the impact lasts."""
 
-    @property
     @abstractmethod
-    def raised(self) -> Float[Array, ""]:
-        """Height in nm of the solid's surface over gap 0, as the delay tells it: half its offset."""
-
-    @property
-    @abstractmethod
-    def length(self) -> Float[Array, ""]:
-        """Length in nm over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
+        """Return approach and rebound speed in nm/us and the delay in us at a coordinate above `lowest`."""
 
     @property
     def delayed(self) -> bool:
@@ -127,14 +142,6 @@ class Impact(eqx.Module):
         """Distance in nm/us from the lowest coordinate over which adhesion counts: up to twice the capture speed."""
         return self.lowest
 
-    @abstractmethod
-    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the time tau in us that a Hertz contact of the same stiffness takes at a speed in nm/us."""
-
-    @abstractmethod
-    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
-        """Return approach and rebound speed in nm/us and the delay in us at a coordinate above `lowest`."""
-
     def at_approach(self, approach_speed: Float[Array, "..."]) -> Speeds:
         """Return the speeds in nm/us and the delay in us at an approach speed, which is a contact's coordinate."""
         return self.speeds(approach_speed)
@@ -143,9 +150,8 @@ class Impact(eqx.Module):
 class Law(Impact):
     """What the tip does at an impact, as functions of the approach speed: of a free tip on a sample at rest.
 
-    Either a formula (`ImpactLaw`) or a table (`TabulatedLaw`). A delay with corrections adds what happens while the
-    impact lasts (`afm_jax.impact.lasting_impact`). Near capture speeds are singular functions of each other; orbits use
-    a coordinate Y in which both are smooth.
+    A formula (`ImpactLaw`) or a table (`TabulatedLaw`). A law of another kind says what is abstract here. Near capture
+    speeds are singular functions of each other; orbits use a coordinate Y in which both are smooth.
     """
 
     @property
@@ -157,16 +163,6 @@ class Law(Impact):
     @abstractmethod
     def capture_speed_nm_per_us(self) -> Float[Array, "..."]:
         """Approach speed up to which the tip is captured."""
-
-    @property
-    def delayed(self) -> bool:
-        """Whether the next flight begins at another time than the last one ends."""
-        return self.delay is not None
-
-    @property
-    def lasts(self) -> bool:
-        """Whether platform, spring and air act during the contact: a delay, with its corrections."""
-        return self.delay is not None and self.delay.corrections
 
     @property
     @abstractmethod
@@ -183,25 +179,6 @@ class Law(Impact):
     def slow_restitution(self) -> Float[Array, "..."]:
         """Coefficient of restitution of the slowest impacts of a law without adhesion: what chatter dies out with."""
 
-    @property
-    def lead(self) -> Float[Array, ""]:
-        """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
-        return jnp.zeros_like(self.lowest) if self.delay is None else self.delay.lead_nm
-
-    @property
-    def raised(self) -> Float[Array, ""]:
-        """Height in nm of the solid's surface over gap 0, as the delay tells it: half its offset."""
-        return jnp.zeros_like(self.lowest) if self.delay is None else 0.5 * self.delay.offset_nm
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """Length in nm over which a leaving tip keeps its energy: that of the paper's bridge."""
-        return jnp.full_like(self.lowest, BRIDGE_NM)
-
-    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the time in us that a Hertz contact of the same stiffness takes at a speed in nm/us: a u^(-1/5)."""
-        return jnp.zeros_like(approach_speed) if self.delay is None else self.delay.hertz * approach_speed**-0.2
-
     @abstractmethod
     def coordinate(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the coordinate Y in nm/us of an impact that comes at a speed in nm/us above capture."""
@@ -211,36 +188,56 @@ class Law(Impact):
         """Say whether the tip stays at an approach speed in nm/us."""
 
     @abstractmethod
-    def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return u_out in nm/us for u_in in nm/us; 0 where the tip is captured."""
-
-    @abstractmethod
-    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d u_out/d u_in, a number; 0 where the tip is captured."""
+    def at_approach(self, approach_speed: ArrayLike) -> Speeds:
+        """Return the speeds in nm/us and the delay in us at an approach speed; 0 where the tip is captured."""
 
     @abstractmethod
     def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
         """Return the u_in in nm/us that leaves at u_out in nm/us: the law read backwards."""
 
     @abstractmethod
-    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return the delay tau in us at an approach speed in nm/us; 0 without a delay or where captured."""
-
-    @abstractmethod
-    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
-
-    @abstractmethod
     def without_delay(self) -> "Law":
         """Return the law of instantaneous impacts with the same rebound speeds."""
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the next flight begins at another time than the last one ends."""
+        return self.delay is not None
+
+    @property
+    def lasts(self) -> bool:
+        """Whether platform, spring and air act during the contact: a delay, with its corrections."""
+        return self.delay is not None and self.delay.corrections
+
+    @property
+    def hertz_contact(self) -> HertzContact:
+        """The Hertz contact of the delay's formula, with the length of the paper's bridge."""
+        length, none = jnp.full_like(self.lowest, BRIDGE_NM), jnp.zeros_like(self.lowest)
+        if self.delay is None:
+            return HertzContact(none, none, none, length)
+        return HertzContact(self.delay.hertz, self.delay.lead_nm, 0.5 * self.delay.offset_nm, length)
+
+    def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return u_out in nm/us for u_in in nm/us; 0 where the tip is captured."""
+        return self.at_approach(approach_speed).rebound
+
+    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return the delay tau in us at an approach speed in nm/us; 0 without a delay or where captured."""
+        return self.at_approach(approach_speed).delay
+
+    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d u_out/d u_in, a number; 0 where the tip is captured."""
+        u = as_argument(approach_speed)
+        return jax.jvp(self.rebound_speed, (u,), (jnp.ones_like(u),))[1]
+
+    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
+        u = as_argument(approach_speed)
+        return jax.jvp(self.collision_delay, (u,), (jnp.ones_like(u),))[1]
 
     def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether an approach speed in nm/us is outside those that the law is known for: a formula's never is."""
         return jnp.zeros(jnp.shape(approach_speed), bool)
-
-    def at_approach(self, approach_speed: Float[Array, "..."]) -> Speeds:
-        """Return the speeds in nm/us and the delay in us at an approach speed; a captured tip has neither."""
-        return Speeds(approach_speed, self.rebound_speed(approach_speed), self.collision_delay(approach_speed))
 
     def energy_lost(self, approach_speed: ArrayLike, mass_ng: ArrayLike = 1.0) -> Float[Array, "..."]:
         """Return the energy an impact takes in aJ, m (u_in^2 - u_out^2)/2; all of it where the tip is captured."""
@@ -317,11 +314,16 @@ class ImpactLaw(Law):
         """Approach speed up to which the tip is captured: (c + sqrt(c^2 + 4 r^2 epsilon)) / 2 r^2, or infinite."""
         return self.approach_speed(jnp.zeros_like(self.r))
 
-    def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return u_out in nm/us for u_in in nm/us (eq. 6); 0 where the tip is captured."""
-        square = squared_rebound_speed(approach_speed, self.r, self.epsilon, self.viscous_loss)
+    def at_approach(self, approach_speed: ArrayLike) -> Speeds:
+        """Return speeds in nm/us (eq. 6) and delay in us at an approach speed; 0 where the tip is captured."""
+        u = as_argument(approach_speed)
+        square = squared_rebound_speed(u, self.r, self.epsilon, self.viscous_loss)
         free = square > 0.0
-        return jnp.where(free, jnp.sqrt(jnp.where(free, square, 1.0)), 0.0)
+        safe = jnp.sqrt(jnp.where(free, square, 1.0))
+        rebound = jnp.where(free, safe, 0.0)
+        if self.delay is None:
+            return Speeds(u, rebound, jnp.zeros_like(u))
+        return Speeds(u, rebound, jnp.where(free, self.delay(jnp.where(free, u, 1.0), safe), 0.0))
 
     def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return d u_out/d u_in = (2 r^2 u_in - c)/(2 u_out); 0 where the tip is captured."""
@@ -341,17 +343,8 @@ class ImpactLaw(Law):
         leaves = self.r > 0.0
         return jnp.where(leaves, (self.viscous_loss + root) / (2.0 * jnp.where(leaves, self.r, 1.0) ** 2), jnp.inf)
 
-    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return the delay tau in us at an approach speed in nm/us; 0 without a delay or where captured."""
-        u = as_argument(approach_speed)
-        if self.delay is None:
-            return jnp.zeros_like(u)
-        rebound = self.rebound_speed(u)
-        free = rebound > 0.0
-        return jnp.where(free, self.delay(jnp.where(free, u, 1.0), jnp.where(free, rebound, 1.0)), 0.0)
-
     def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
+        """Return d tau/d u_in in us^2/nm (`CollisionDelay.slope`); 0 without a delay or where captured."""
         u = as_argument(approach_speed)
         if self.delay is None:
             return jnp.zeros_like(u)
@@ -449,8 +442,7 @@ class TabulatedLaw(Law):
         origin: str = "",
     ):
         """Make a law of columns: see the class."""
-        columns = _columns(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        held, u, w, late = _free_rows(*columns)
+        u, w, late, _, held = _free_rows(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
         check_parameter("mass_ng", mass_ng, "positive", optional=True)
         check_kind("delay", delay, CollisionDelay | None)
         if delay is not None and late is None:
@@ -515,14 +507,13 @@ class TabulatedLaw(Law):
             ValueError: as of a law, or if shapes do not fit.
         """
         law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
-        columns = _columns(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        _, u, w, late = _free_rows(*columns)
-        free = slice(columns[0].shape[0] - u.shape[0], None)
+        u, w, late, captured, _ = _free_rows(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
         by_rebound = jnp.asarray(rebound_changes, float)
-        if by_rebound.ndim != 2 or by_rebound.shape[1] != columns[0].shape[0]:
+        if by_rebound.ndim != 2 or by_rebound.shape[1] != captured + len(u):
             raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
-        by_rebound, count = by_rebound[:, free], by_rebound.shape[0]
-        by_delay = jnp.zeros_like(by_rebound) if delay_changes is None else jnp.asarray(delay_changes, float)[:, free]
+        by_rebound, count = by_rebound[:, captured:], by_rebound.shape[0]
+        late_changes = None if delay_changes is None else jnp.asarray(delay_changes, float)[:, captured:]
+        by_delay = jnp.zeros_like(by_rebound) if late_changes is None else late_changes
         by_capture = jnp.zeros(count) if capture_changes is None else jnp.asarray(capture_changes, float)
         known = options.get("capture_speed_nm_per_us")
 
@@ -683,30 +674,12 @@ class TabulatedLaw(Law):
         return as_argument(approach_speed) <= self.capture
 
     def at_approach(self, approach_speed: ArrayLike) -> Speeds:
-        """Return the speeds in nm/us and the delay in us at an approach speed; a captured tip has neither."""
+        """Return the speeds in nm/us and the delay in us at an approach speed; 0 where the tip is captured."""
         u = as_argument(approach_speed)
         free = u > self.capture
         safe = jnp.where(free, u, self.capture + self.scale_nm_per_us)
-        found = self.beyond_capture(safe, self._beyond(safe))
-        return Speeds(u, jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0))
-
-    def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return u_out in nm/us for u_in in nm/us; 0 where the tip is captured."""
-        return self.at_approach(approach_speed).rebound
-
-    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d u_out/d u_in, a number; 0 where the tip is captured."""
-        u = as_argument(approach_speed)
-        return jax.jvp(self.rebound_speed, (u,), (jnp.ones_like(u),))[1]
-
-    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return the delay in us at an approach speed in nm/us; 0 without a delay or where captured."""
-        return self.at_approach(approach_speed).delay
-
-    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
-        u = as_argument(approach_speed)
-        return jax.jvp(self.collision_delay, (u,), (jnp.ones_like(u),))[1]
+        speeds = self.beyond_capture(safe, self._beyond(safe))
+        return Speeds(u, jnp.where(free, speeds.rebound, 0.0), jnp.where(free, speeds.delay, 0.0))
 
     def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
         """Return the u_in in nm/us that leaves at u_out in nm/us, by Newton's method; differentiable."""
@@ -880,60 +853,65 @@ class Origin:
         return hash(Origin)
 
 
-def _columns(approach: Any, rebound: Any, delay: Any) -> tuple[Any, Any, Any]:
-    """Return a table's columns as arrays of one length, checked.
+class _FreeRows(NamedTuple):
+    """The rows of a table whose tips leave: approach and rebound speed in nm/us, delay in us; and those before them."""
+
+    u: Array
+    w: Array
+    delay: Array | None
+    captured: int
+    """How many slower rows are captured."""
+    held: float
+    """The fastest approach speed that is captured, 0 if none is."""
+
+
+def _free_rows(approach: Any, rebound: Any, delay: Any) -> _FreeRows:
+    """Return the rows of a table whose tips leave, its columns checked as far as their numbers are known.
 
     Raises:
         ValueError: as `TabulatedLaw`.
     """
-    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
-    given = _column(approach), _column(rebound), None if delay is None else _column(delay)
-    for name, column in zip(names, given, strict=True):
-        if column is None or is_traced(column):
-            continue
-        known = as_real(name, column)
-        if known.ndim != 1:
-            raise ValueError(f"`{name}` must be a column of numbers, but has shape {known.shape}")
-        bad = np.flatnonzero(~np.isfinite(known))
-        if bad.size:
-            raise ValueError(f"`{name}` must be finite numbers, but is {known[bad[0]]} in row {bad[0] + 1}")
-    rows = given[0].shape[0]
-    for name, column in zip(names[1:], given[1:], strict=True):
-        if column is not None and column.shape != (rows,):
-            raise ValueError(f"`{name}` must have a number for each of the {rows} speeds, but has {column.shape[0]}")
-    return given
-
-
-def _column(values: Any) -> Any:
-    return as_parameter(jnp.asarray(values) if isinstance(values, list | tuple) else values)
-
-
-def _free_rows(u: Any, w: Any, delay: Any) -> tuple[float, Array, Array, Array | None]:
-    """Return the fastest approach speed that is captured, 0 if none is, and the rows of tips that leave, checked."""
-    held = 0.0
-    if u.shape[0] < _LEAST_ROWS:
-        raise ValueError(f"a table of a law needs at least four speeds, but has {u.shape[0]}")
+    u = _column("approach_speed_nm_per_us", approach)
+    w = _column("rebound_speed_nm_per_us", rebound, len(u))
+    late = None if delay is None else _column("collision_delay_us", delay, len(u))
+    if len(u) < _LEAST_ROWS:
+        raise ValueError(f"a table of a law needs at least four speeds, but has {len(u)}")
     if is_traced(u):
-        return held, u, w, delay
-    known = np.asarray(u)
-    fall = np.flatnonzero(np.diff(known) <= 0.0)
+        return _FreeRows(u, w, late, 0, 0.0)
+    speeds = np.asarray(u)
+    fall = np.flatnonzero(np.diff(speeds) <= 0.0)
     if fall.size:
-        first, second = known[fall[0]], known[fall[0] + 1]
+        first, second = speeds[fall[0]], speeds[fall[0] + 1]
         raise ValueError(
             f"`approach_speed_nm_per_us` must increase from row to row, but {second:g} follows {first:g} in row "
             f"{fall[0] + 2}"
         )
-    if known[0] <= 0.0:
-        raise ValueError(f"`approach_speed_nm_per_us` must be positive, but is {known[0]:g} in row 1")
-    if is_traced(w):
-        return held, u, w, delay
-    captured = _captured_rows(known, np.asarray(w))
-    if captured:
-        held = float(known[captured - 1])
-        u, w, delay = u[captured:], w[captured:], None if delay is None else delay[captured:]
-        if u.shape[0] < _LEAST_ROWS:
-            raise ValueError(f"a table of a law needs at least four speeds that leave, but has {u.shape[0]}")
-    return held, u, w, delay
+    if speeds[0] <= 0.0:
+        raise ValueError(f"`approach_speed_nm_per_us` must be positive, but is {speeds[0]:g} in row 1")
+    captured = 0 if is_traced(w) else _captured_rows(speeds, np.asarray(w))
+    if len(u) - captured < _LEAST_ROWS:
+        raise ValueError(f"a table of a law needs at least four speeds that leave, but has {len(u) - captured}")
+    late = None if late is None else late[captured:]
+    return _FreeRows(u[captured:], w[captured:], late, captured, float(speeds[captured - 1]) if captured else 0.0)
+
+
+def _column(name: str, values: Any, rows: int | None = None) -> Any:
+    """Return a column of a table as an array, checked: finite numbers, and as many as there are speeds.
+
+    Raises:
+        ValueError: if they are something else.
+    """
+    column = as_parameter(jnp.asarray(values) if isinstance(values, list | tuple) else values)
+    if not is_traced(column):
+        numbers = as_real(name, column)
+        if numbers.ndim != 1:
+            raise ValueError(f"`{name}` must be a column of numbers, but has shape {numbers.shape}")
+        bad = np.flatnonzero(~np.isfinite(numbers))
+        if bad.size:
+            raise ValueError(f"`{name}` must be finite numbers, but is {numbers[bad[0]]} in row {bad[0] + 1}")
+    if rows is not None and column.shape != (rows,):
+        raise ValueError(f"`{name}` must have a number for each of the {rows} speeds, but has {column.shape[0]}")
+    return column
 
 
 def _captured_rows(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> int:

@@ -318,7 +318,9 @@ def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, "
     speeds = problem.impact.speeds(coordinate)
     if not problem.impact.lasts:
         return jnp.abs(speeds.delay) < period
-    return (jnp.abs(speeds.delay) < 0.5 * period) & (problem.impact.length / speeds.rebound < _LEAVING * period)
+    return (jnp.abs(speeds.delay) < 0.5 * period) & (
+        problem.impact.hertz_contact.length_nm / speeds.rebound < _LEAVING * period
+    )
 
 
 class _Brackets(NamedTuple):
