@@ -214,6 +214,20 @@ def test_packages_start_without_jax():
     assert python(code).split() == ["False", "True"]
 
 
+def test_public_signatures_are_short_words():
+    code = (
+        "import inspect, afm_jax, fitting\nfor package in (afm_jax, fitting):\n    for name in dir(package):\n"
+        "        public = getattr(package, name)\n        if callable(public) and not isinstance(public, type):\n"
+        "            print(name, inspect.signature(public))\n"
+        "print(inspect.signature(afm_jax.Cantilever))\nprint(inspect.signature(afm_jax.Cantilever.propagator))"
+    )
+    lines = python(code).splitlines()
+    assert not [line for line in lines if "Union[" in line or "afm_jax." in line or "collections" in line]
+    constructor = "(frequency_khz: ArrayLike, quality_factor: ArrayLike | None = None, mass_ng: ArrayLike | None = None"
+    assert lines[-2].startswith(constructor)
+    assert lines[-1] == "(self, duration_us: ArrayLike) -> Propagator"
+
+
 def test_fits_load_no_scipy_and_pictures_no_pyplot():
     # its statistics alone take as long as JAX: they are for posteriors, which import them when they need them
     code = (

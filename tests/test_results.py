@@ -77,7 +77,7 @@ def public_results() -> dict[str, Any]:
             public = getattr(package, name)
             kinds = [public]
             if inspect.isfunction(public):
-                kinds = [inspect.signature(public).return_annotation]
+                kinds: list[Any] = [inspect.get_annotations(public).get("return")]
             for kind in kinds:
                 record = inspect.isclass(kind) and (dataclasses.is_dataclass(kind) or hasattr(kind, "_fields"))
                 if record and kind.__name__ not in PARAMETERS:
