@@ -7,8 +7,8 @@ options by their names, and returns an `Output`, which the runner writes (None: 
 
     def basins(session: Session, scene: NamedScene, *, grid, speeds, draws, picture) -> Output:
         with session.working("following starts", "starts") as report:
-            found = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
-        return Output({"share": found.share}, ["..."], tables={"basins.csv": found.columns()})
+            result = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
+        return Output(payload={"share": result.share}, text=["..."], tables={"basins.csv": columns_of(result)})
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -107,7 +107,7 @@ def _effect(report: EffectReport, full: Cost, left_out: tuple[str, ...]) -> dict
         "change": report.change._asdict(),
         "reason": report.reason,
         **cost,
-        **{f"saved_{name}": _difference(whole[name], cost[name]) for name in COSTS},
+        **{f"saved_{name}": _saved(whole[name], cost[name]) for name in COSTS},
     }
 
 
@@ -117,8 +117,8 @@ def _cost(cost: Cost | None) -> dict[str, float | None]:
     return dict(zip(COSTS, (cost.time_us, *cost.program), strict=True))
 
 
-def _difference(one: float | None, other: float | None) -> float | None:
-    return None if one is None or other is None else one - other
+def _saved(whole: float | None, cost: float | None) -> float | None:
+    return None if whole is None or cost is None else whole - cost
 
 
 def _reduction(reduction: Reduction | None, written: Path | None) -> dict[str, Any]:

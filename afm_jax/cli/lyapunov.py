@@ -17,6 +17,18 @@ from afm_jax.words import with_error
 
 draw_exponents = later("afm_jax.plots.dynamics:draw_exponents")
 
+_TOLD = (
+    "exponents_per_us",
+    "exponents_per_impact",
+    "exponents_per_us_error",
+    "exponents_per_impact_error",
+    "mean_log_determinant",
+    "impacts",
+    "near_grazing",
+    "rested",
+)
+"""What is told of a motion: attributes of `Lyapunov`."""
+
 
 def lyapunov(
     session: Session,
@@ -68,61 +80,56 @@ def lyapunov(
     )
 
 
-def _why_none(found: Lyapunov, verdicts: list[str]) -> str | None:
+def _why_none(spectrum: Lyapunov, verdicts: list[str]) -> str | None:
     """Return why there are no exponents at all; None where there are some."""
-    if not np.isnan(found.exponents_per_impact[:, 0]).all():
+    if not np.isnan(spectrum.exponents_per_impact[:, 0]).all():
         return None
     words = "; ".join(dict.fromkeys(verdicts))
     most = "at most " if len(verdicts) > 1 else ""
-    return f"{words}; there were {most}{int(found.impacts.max())} impacts to average over"
+    return f"{words}; there were {most}{int(spectrum.impacts.max())} impacts to average over"
 
 
-def _payload(found: Lyapunov, verdict: Any) -> dict[str, Any]:
+def _payload(spectrum: Lyapunov, verdict: Any) -> dict[str, Any]:
     return {
-        "exponents_per_us": found.exponents_per_us,
-        "exponents_per_impact": found.exponents_per_impact,
-        "exponents_per_us_error": found.exponents_per_us_error,
-        "exponents_per_impact_error": found.exponents_per_impact_error,
-        "mean_log_determinant": found.mean_log_determinant,
-        "impacts": found.impacts,
-        "near_grazing": found.near_grazing,
-        "rested": found.rested,
-        "orbit": {"impacts": found.verdicts.impacts, "periods": found.verdicts.periods},
+        **{name: getattr(spectrum, name) for name in _TOLD},
+        "orbit": {"impacts": spectrum.verdicts.impacts, "periods": spectrum.verdicts.periods},
         "verdict": verdict,
     }
 
 
-def _columns(found: Lyapunov, verdicts: list[str]) -> dict[str, Any]:
+def _columns(spectrum: Lyapunov, verdicts: list[str]) -> dict[str, Any]:
     return {
-        "exponent_per_impact": found.exponents_per_impact[:, 0],
-        "second_exponent_per_impact": found.exponents_per_impact[:, 1],
-        "exponent_per_impact_error": found.exponents_per_impact_error[:, 0],
-        "exponent_per_us": found.exponents_per_us[:, 0],
-        "second_exponent_per_us": found.exponents_per_us[:, 1],
-        "impacts": found.impacts,
-        "near_grazing": found.near_grazing,
-        "rested": found.rested,
+        "exponent_per_impact": spectrum.exponents_per_impact[:, 0],
+        "second_exponent_per_impact": spectrum.exponents_per_impact[:, 1],
+        "exponent_per_impact_error": spectrum.exponents_per_impact_error[:, 0],
+        "exponent_per_us": spectrum.exponents_per_us[:, 0],
+        "second_exponent_per_us": spectrum.exponents_per_us[:, 1],
+        "impacts": spectrum.impacts,
+        "near_grazing": spectrum.near_grazing,
+        "rested": spectrum.rested,
         "verdict": verdicts,
     }
 
 
-def _text(found: Lyapunov, verdict: str) -> list[str]:
+def _text(spectrum: Lyapunov, verdict: str) -> list[str]:
     def pair(values: np.ndarray, errors: np.ndarray) -> str:
-        found = zip(values, errors, strict=True)
-        return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in found)
+        pairs = zip(values, errors, strict=True)
+        return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in pairs)
 
     lines = [
-        f"Lyapunov exponents per impact: {pair(found.exponents_per_impact, found.exponents_per_impact_error)}",
-        f"                       per us: {pair(found.exponents_per_us, found.exponents_per_us_error)}",
-        f"{int(found.impacts)} impacts; {verdict}",
+        f"Lyapunov exponents per impact: {pair(spectrum.exponents_per_impact, spectrum.exponents_per_impact_error)}",
+        f"                       per us: {pair(spectrum.exponents_per_us, spectrum.exponents_per_us_error)}",
+        f"{int(spectrum.impacts)} impacts; {verdict}",
     ]
-    if found.near_grazing:
-        lines.append(f"{int(found.near_grazing)} impacts are near grazing, where the map's slopes grow without bound")
+    if spectrum.near_grazing:
+        lines.append(
+            f"{int(spectrum.near_grazing)} impacts are near grazing, where the map's slopes grow without bound"
+        )
     return lines
 
 
-def _summary(found: Lyapunov, what: str) -> str:
-    larger, error = found.exponents_per_impact[:, 0], found.exponents_per_impact_error[:, 0]
+def _summary(spectrum: Lyapunov, what: str) -> str:
+    larger, error = spectrum.exponents_per_impact[:, 0], spectrum.exponents_per_impact_error[:, 0]
     positive = int(np.sum(np.isfinite(larger) & (larger > CHAOTIC_ERRORS * error)))
     return (
         f"{what}: the larger exponent is positive at {positive} values, negative or undecided at "

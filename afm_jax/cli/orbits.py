@@ -172,8 +172,8 @@ def _resting_words(rests: Mapping[str, Any]) -> str:
 def impact_rows(reading: LoopReading, index: int | None = None) -> list[dict[str, float]]:
     """Return what is told of each impact of an orbit; of one of many, or of the only one."""
     columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
-    own = {name: (part if index is None else part[index]).tolist() for name, part in columns.items()}
-    return [dict(zip(own, values, strict=True)) for values in zip(*own.values(), strict=True)]
+    lists = {name: (values if index is None else values[index]).tolist() for name, values in columns.items()}
+    return [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
 
 
 def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
@@ -188,22 +188,22 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
         "peak_amplitude_nm": float(reading.peak_amplitude_nm[index]),
         "trace": trace,
         "determinant": determinant,
-        "multipliers": [[float(one.real), float(one.imag)] for one in multipliers],
+        "multipliers": [[float(each.real), float(each.imag)] for each in multipliers],
         "stable": bool(is_stable(multipliers)),
         "admissible": bool(reading.admissible[index]),
         "impacts": impacts,
     }
 
 
-def names_of(found: SingleImpactOrbits) -> tuple[str, ...]:
+def names_of(result: SingleImpactOrbits) -> tuple[str, ...]:
     """Return what is told of orbits: what their scene has."""
-    return (*COLUMNS, *(name for name in (*DRIVEN_COLUMNS, "extrapolated") if getattr(found, name) is not None))
+    return (*COLUMNS, *(name for name in (*DRIVEN_COLUMNS, "extrapolated") if getattr(result, name) is not None))
 
 
-def orbit_rows(found: SingleImpactOrbits) -> list[dict[str, Any]]:
+def orbit_rows(result: SingleImpactOrbits) -> list[dict[str, Any]]:
     """Return the orbits that exist as one dict of plain numbers each, by rising approach speed."""
-    columns = {name: getattr(found, name).tolist() for name in names_of(found)}
-    slots = [slot for slot, exists in enumerate(found.exists.tolist()) if exists]
+    columns = {name: getattr(result, name).tolist() for name in names_of(result)}
+    slots = [slot for slot, exists in enumerate(result.exists.tolist()) if exists]
     return [{name: values[slot] for name, values in columns.items()} for slot in slots]
 
 

@@ -336,11 +336,11 @@ def _write_trace(session: Session, scene: Scene, run: LongRun, window: Window) -
 def _trace_comments(scene: Scene, drive: DrivePeriod) -> list[str]:
     """Return what a trace says of its measurement, a setting each."""
     cantilever, platform = scene.cantilever, scene.platform
-    known = {"drive_frequency_khz": drive.angular_frequency / RAD_PER_US_PER_KHZ}
+    settings = {"drive_frequency_khz": drive.angular_frequency / RAD_PER_US_PER_KHZ}
     if scene.base is None and scene.force is None and drive.aperiodic is None and platform.second is None:
-        known |= {"drive_amplitude_nm": platform.amplitude_nm, "offset_nm": platform.offset_nm}
-    known |= {"free_frequency_khz": cantilever.frequency_khz, "mass_ng": cantilever.mass_ng}
+        settings |= {"drive_amplitude_nm": platform.amplitude_nm, "offset_nm": platform.offset_nm}
+    settings |= {"free_frequency_khz": cantilever.frequency_khz, "mass_ng": cantilever.mass_ng}
     if cantilever.quality_factor is not None:
-        known["quality_factor"] = cantilever.quality_factor
+        settings["quality_factor"] = cantilever.quality_factor
     damping = ["quality_factor = none"] if cantilever.quality_factor is None else []
-    return [*(f"{name} = {float(value)!r}" for name, value in known.items()), *damping]
+    return [*(f"{name} = {float(value)!r}" for name, value in settings.items()), *damping]

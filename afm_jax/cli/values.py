@@ -370,5 +370,5 @@ def tables_with(
     if quality_factor is None:
         return read
     value, error = quality_factor
-    own = None if math.isinf(value) else value
-    return [replace(table, quality_factor=own, quality_factor_error=error) for table in read]
+    quality = None if math.isinf(value) else value
+    return [replace(table, quality_factor=quality, quality_factor_error=error) for table in read]
