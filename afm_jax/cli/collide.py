@@ -38,7 +38,7 @@ _PRINTED = (
     Column("outcome", "outcome_name", "", left=True),
 )
 _MOST_PRINTED = 40
-"""Tips."""
+"""Tips in the printed table at most."""
 
 
 def collide(

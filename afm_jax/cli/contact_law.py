@@ -40,6 +40,7 @@ DELAY_COLUMNS = (
 )
 """What is told of the delay at a speed: attributes of `ContactDelay`."""
 _SHOWN = 9
+"""Speeds at which the delay is told in JSON and text."""
 
 
 def make_law(

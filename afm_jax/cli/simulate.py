@@ -28,16 +28,17 @@ stretch_drawn = later("afm_jax.plots.motion:stretch_drawn")
 LARGEST_OFFSET_NM = 10_000.0
 """How far a ramp may take the sample from the tip's rest position, either way."""
 MOST_OSCILLATIONS = 1e7
-"""Of the free tip: some minutes of computing."""
+"""Oscillations of the free tip or the drive that are followed at most: some minutes of computing."""
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
 _POINTS = 2001
+"""Rows of trajectory.csv at equal steps of time."""
 _MOST_NODES = 100_000
 """Rows of trajectory.csv within contacts, from which on only every second, third, ... is kept."""
 _TRACE_RESPONSES = 24
 """Response periods of trace.csv at most: enough for an instrument's errors from their scatter."""
 _SAMPLES_A_PERIOD = 400
-"""Of the drive."""
+"""Samples of trace.csv in a drive period."""
 
 
 def simulation(  # noqa: PLR0913

@@ -227,7 +227,7 @@ class Grid(Kind):
 
 
 PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11", "dry")
-"""Of `afm_jax.scenefile.presets`; said here as well, because help and completion must not wait for JAX."""
+"""Names of `afm_jax.scenefile.presets.PRESETS`, stated here too because help and completion must not wait for JAX."""
 
 
 class SceneName(click.ParamType):
