@@ -45,36 +45,34 @@ def lyapunov(
     values = {swept.path: swept.values for swept in ranges}
     motions = scene_batch(scene.scene, values) if values else scene.scene
     start = None if scene.start is None else start_of(motions, scene.start)
+    lengths = {"impacts": impacts, "transient": transient}
     band = None
     with session.working("following the motion (the first run compiles for some seconds)", "motions") as report:
-        result = lyapunov_spectrum(motions, start, impacts=impacts, transient=transient, report=report)
+        result = lyapunov_spectrum(motions, start, **lengths, report=report)
         if scene.unknowns is not None:
-            chosen = {"draws": draws, "impacts": impacts, "transient": transient}
-            band = drawn_exponents(scene.scene, values, scene.unknowns, **chosen)
-    many = result if values else jax.tree.map(lambda part: np.asarray(part)[None], result)
+            band = drawn_exponents(scene.scene, values, scene.unknowns, draws=draws, **lengths)
+    # without a parameter a batch of one motion
+    many = result if values else jax.tree.map(lambda array: np.asarray(array)[None], result)
     verdicts = exponent_verdicts(many)
     payload = _payload(result, verdicts if values else verdicts[0])
     payload |= {"scene": scene_tables(scene.scene), "reason": _why_none(many, verdicts)}
-    columns = _columns(many, verdicts)
     if band is not None:
         payload |= {"draws": draws, "exponent_per_impact_interval95": band if values else band[0]}
-        columns |= {"exponent_per_impact_low": band[:, 0], "exponent_per_impact_high": band[:, 1]}
     files = {}
-    if not values:
+    if values:
+        ((path, along),) = values.items()
+        payload |= {"parameter": path, "values": along}
+        text = [_summary(many, str(ranges[0]))]
+        files[f"lyapunov.{picture}"] = lambda to: draw_exponents(path, along, many.exponents_per_impact, to, band)
+    else:
         text = _text(result, verdicts[0])
         if band is not None:
             text.append("the larger per impact: {:.6g} to {:.6g} in 95 % of the draws".format(*band[0]))
-    else:
-        ((path, along),) = values.items()
-        text = [_summary(many, str(ranges[0]))]
-        payload |= {"parameter": path, "values": along}
-        columns = {path: along, **columns}
-        files[f"lyapunov.{picture}"] = lambda to: draw_exponents(path, along, many.exponents_per_impact, to, band)
     return Output(
         payload=payload,
         text=text,
         impact_speeds=result.approach_speed_nm_per_us,
-        tables={"lyapunov.csv": columns},
+        tables={"lyapunov.csv": {**values, **_columns(many, verdicts, band)}},
         files=files,
         not_valid=payload["reason"],
     )
@@ -97,8 +95,8 @@ def _payload(spectrum: Lyapunov, verdict: Any) -> dict[str, Any]:
     }
 
 
-def _columns(spectrum: Lyapunov, verdicts: list[str]) -> dict[str, Any]:
-    return {
+def _columns(spectrum: Lyapunov, verdicts: list[str], band: np.ndarray | None) -> dict[str, Any]:
+    columns = {
         "exponent_per_impact": spectrum.exponents_per_impact[:, 0],
         "second_exponent_per_impact": spectrum.exponents_per_impact[:, 1],
         "exponent_per_impact_error": spectrum.exponents_per_impact_error[:, 0],
@@ -109,6 +107,9 @@ def _columns(spectrum: Lyapunov, verdicts: list[str]) -> dict[str, Any]:
         "rested": spectrum.rested,
         "verdict": verdicts,
     }
+    if band is not None:
+        columns |= {"exponent_per_impact_low": band[:, 0], "exponent_per_impact_high": band[:, 1]}
+    return columns
 
 
 def _text(spectrum: Lyapunov, verdict: str) -> list[str]:
