@@ -129,7 +129,7 @@ class Command:
         # click lists options in the order of decorators, of which the last is applied first
         for option in reversed((*self.options, *session_options(self.out_file))):
             function = option(function)
-        return click.command(self.name, help=self.help, context_settings={"show_default": True})(function)
+        return click.command(self.name, help=self.help)(function)
 
 
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
