@@ -24,7 +24,7 @@ import afm_jax
 import fitting
 from afm_jax import strict_json
 from afm_jax.cli import main, session
-from afm_jax.cli.columns import Column, printed_table
+from afm_jax.cli.columns import TableColumn, printed_table
 from afm_jax.cli.command import Command, Output
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.options import SCENE
@@ -272,9 +272,9 @@ def test_a_result_with_impacts_says_whether_its_law_is_extrapolated(trial: Calla
 
 def test_tables_to_print_have_dashes_and_words():
     columns = [
-        Column("name", "name", "", left=True),
-        Column("x\nnm", "x"),
-        Column("twice", lambda row: row["ok"], "yes"),
+        TableColumn("name", "name", "", left=True),
+        TableColumn("x\nnm", "x"),
+        TableColumn("twice", lambda row: row["ok"], "yes"),
     ]
     rows = [{"name": "a", "x": 1.23456789, "ok": True}, {"name": "b", "x": None, "ok": np.bool_(0)}]
     table = printed_table("Title", columns, rows)

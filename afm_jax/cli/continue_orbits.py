@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.orbits import IMPACT_COLUMNS, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session
@@ -217,12 +217,12 @@ def _text(followed: Continuation, special: list[dict[str, Any]], curves: list[di
         lines.append(f"  branch {number}: {len(branch.parameter)} points from {low:.6g} to {high:.6g}; ends at {ends}")
     if special:
         columns = [
-            Column("kind", lambda row: row["kind"].replace("_", " "), "", left=True),
-            Column(followed.range.path, "parameter", ".9g"),
-            Column("95 % interval", _interval, ""),
-            Column("peak\nnm", "peak_amplitude_nm", ".5g"),
-            Column("branch", lambda row: str(row["branch"]), ""),
-            Column("admissible", "admissible", "yes", left=True),
+            TableColumn("kind", lambda row: row["kind"].replace("_", " "), "", left=True),
+            TableColumn(followed.range.path, "parameter", ".9g"),
+            TableColumn("95 % interval", _interval, ""),
+            TableColumn("peak\nnm", "peak_amplitude_nm", ".5g"),
+            TableColumn("branch", lambda row: str(row["branch"]), ""),
+            TableColumn("admissible", "admissible", "yes", left=True),
         ]
         lines.append(printed_table("Special points", columns, special))
     for curve in curves:

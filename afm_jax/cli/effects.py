@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction, periods_read, study_effects
@@ -140,19 +140,19 @@ def _flat(effect: Mapping[str, Any]) -> dict[str, Any]:
 def _table(effects: Sequence[Mapping[str, Any]]) -> Table:
     """Return what the scene without each effect changes and costs, as a table to print."""
 
-    def change(heading: str, name: str) -> Column:
-        return Column(heading, lambda effect: _percent(effect["change"][name]), "")
+    def change(heading: str, name: str) -> TableColumn:
+        return TableColumn(heading, lambda effect: _percent(effect["change"][name]), "")
 
     columns = [
-        Column("effect", "name", "", left=True),
+        TableColumn("effect", "name", "", left=True),
         change("peak\nchange", "peak_amplitude"),
         change("lock-in\nchange", "lockin_amplitude"),
-        Column("phase\ndeg", lambda effect: effect["change"]["lockin_phase_deg"], ".3g"),
+        TableColumn("phase\ndeg", lambda effect: effect["change"]["lockin_phase_deg"], ".3g"),
         change("loss/impact\nchange", "energy_per_impact"),
-        Column("time\nus/period", "time_us_per_period", ".4g"),
-        Column("saved", "saved_time_us_per_period", ".3g"),
-        Column("operations\nsaved", "saved_operations", ".0f"),
-        Column("", _remark, "", left=True),
+        TableColumn("time\nus/period", "time_us_per_period", ".4g"),
+        TableColumn("saved", "saved_time_us_per_period", ".3g"),
+        TableColumn("operations\nsaved", "saved_operations", ".0f"),
+        TableColumn("", _remark, "", left=True),
     ]
     return printed_table("Without the effect", columns, effects)
 

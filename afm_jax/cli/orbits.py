@@ -7,7 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
@@ -61,11 +61,11 @@ MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "s
 """What is told of an orbit of several impacts, of its impacts the first."""
 
 _IMPACT_CELLS = (
-    Column("phase\nrad", "phase_rad"),
-    Column("velocity after\nnm/us", "velocity_after_nm_per_us"),
-    Column("approach\nnm/us", "approach_speed_nm_per_us"),
-    Column("rebound\nnm/us", "rebound_speed_nm_per_us"),
-    Column("delay\nus", "delay_us"),
+    TableColumn("phase\nrad", "phase_rad"),
+    TableColumn("velocity after\nnm/us", "velocity_after_nm_per_us"),
+    TableColumn("approach\nnm/us", "approach_speed_nm_per_us"),
+    TableColumn("rebound\nnm/us", "rebound_speed_nm_per_us"),
+    TableColumn("delay\nus", "delay_us"),
 )
 
 
@@ -237,25 +237,25 @@ def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> st
 
 def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
     """Return orbits as a table to print; where base or force drive with what is read at the drive's frequency."""
-    columns = [*_IMPACT_CELLS, Column("peak\nnm", "peak_amplitude_nm")]
+    columns = [*_IMPACT_CELLS, TableColumn("peak\nnm", "peak_amplitude_nm")]
     if orbits and "drive_lockin_amplitude_nm" in orbits[0]:
-        columns.append(Column("at drive\nnm", "drive_lockin_amplitude_nm"))
-        columns.append(Column("at drive\ndeg", "drive_lockin_phase_deg"))
+        columns.append(TableColumn("at drive\nnm", "drive_lockin_amplitude_nm"))
+        columns.append(TableColumn("at drive\ndeg", "drive_lockin_phase_deg"))
         if "peak_deflection_nm" in orbits[0]:
-            columns.append(Column("deflection\nat drive nm", "deflection_drive_lockin_amplitude_nm"))
-        columns.append(Column("lag\ndeg", "phase_lag_deg"))
+            columns.append(TableColumn("deflection\nat drive nm", "deflection_drive_lockin_amplitude_nm"))
+        columns.append(TableColumn("lag\ndeg", "phase_lag_deg"))
     else:
-        columns += [Column("lock-in\nnm", "lockin_amplitude_nm"), Column("lock-in\ndeg", "lockin_phase_deg")]
-    columns += [Column(f"{name}\n", name) for name in ("trace", "determinant")]
-    columns += [Column(name, name, "yes", left=True) for name in ("stable", "admissible")]
+        columns += [TableColumn("lock-in\nnm", "lockin_amplitude_nm"), TableColumn("lock-in\ndeg", "lockin_phase_deg")]
+    columns += [TableColumn(f"{name}\n", name) for name in ("trace", "determinant")]
+    columns += [TableColumn(name, name, "yes", left=True) for name in ("stable", "admissible")]
     return printed_table(title, columns, orbits)
 
 
 def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
     """Return orbits of several impacts as a table to print, a line an impact; the orbit's own numbers in its first."""
 
-    def of_orbit(heading: str, cell: Callable[[Any], str]) -> Column:
-        return Column(heading, lambda row: cell(row["whole"]) if row["first"] else "", "")
+    def of_orbit(heading: str, cell: Callable[[Any], str]) -> TableColumn:
+        return TableColumn(heading, lambda row: cell(row["whole"]) if row["first"] else "", "")
 
     rows = [
         {**impact, "whole": {**orbit, "number": number}, "first": place == 0}
