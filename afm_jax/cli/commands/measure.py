@@ -236,11 +236,17 @@ FIT = Command(
             metavar="SAMPLES",
             help="Intervals by refitting this many synthetic tables, too.",
         ),
-        flag("--posterior", "Credible intervals, too: by a grid, or NUTS for more than two parameters."),
-        flag(
+        click.option(
+            "--posterior",
+            is_flag=True,
+            help="Credible intervals, too: by a grid, or NUTS for more than two parameters.",
+        ),
+        click.option(
             "--trust",
-            "What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks "
-            "in 100 simulated tables, leave-one-out, influence of single rows.",
+            is_flag=True,
+            help="What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks in "
+            "100 "
+            "simulated tables, leave-one-out, influence of single rows.",
         ),
         click.option(
             "--arviz",
@@ -248,7 +254,7 @@ FIT = Command(
             type=click.Path(path_type=Path, dir_okay=False),
             help="Write the posterior for ArviZ (with --posterior; extra `arviz`).",
         ),
-        click.option("--seed", type=click.IntRange(min=0), default=0, help="Of everything random."),
+        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random."),
         click.option(
             "--share",
             type=Names(),
