@@ -222,9 +222,9 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "law": lambda path: (read_prior(path), load_law(path)),
     "speeds": load_law,
 }
+"""What reads a sound file of the corpus of malformed ones."""
 READERS |= dict.fromkeys(("lawscene", "law scene", "drive scene", "contact scene"), READERS["scene"])
 READERS |= {"long trace": READERS["trace"], "nanonis spectrum": READERS["spectrum"]}
-"""What reads a sound file of the corpus of malformed ones."""
 
 
 def fuzz_files(count: int, seed: int) -> None:
