@@ -78,7 +78,7 @@ def gallery(names: list[str]) -> str:
 
 def commands() -> str:
     """Return the page of all commands, each with what `--help` prints."""
-    top = click.Context(main, info_name="afm-jax", max_content_width=100, terminal_width=100)
+    top = click.Context(main, info_name="afm-jax", max_content_width=100, terminal_width=100, **main.context_settings)
     parts = ["# Commands", "What `afm-jax COMMAND --help` prints, command by command."]
     for name in main.list_commands(top):
         command = main.get_command(top, name)

@@ -211,18 +211,20 @@ def spoiled(text: str, random: Random) -> bytes:
 READERS: dict[str, Callable[[Path], Any]] = {
     "table": read_table,
     "tap": lambda path: tapping(read_table(path), law=False),
-    **dict.fromkeys(
-        ("scene", "contact", "lawscene", "law scene", "drive scene", "contact scene"), load_scene_and_start
-    ),
+    "scene": load_scene_and_start,
+    "contact": load_scene_and_start,
     "sweep": lambda path: axes_of(read_toml(str(path)).get("axes", ())),
-    **dict.fromkeys(("trace", "long trace"), lambda path: lockin(read_trace(path))),
-    **dict.fromkeys(("spectrum", "psd", "nanonis spectrum"), read_sweep),
+    "trace": lambda path: lockin(read_trace(path)),
+    "spectrum": read_sweep,
+    "psd": read_sweep,
     "curve": read_curves,
     "nanonis": read_curves,
     "law": lambda path: (read_prior(path), load_law(path)),
     "speeds": load_law,
 }
 """What reads a sound file of the corpus of malformed ones."""
+READERS |= dict.fromkeys(("lawscene", "law scene", "drive scene", "contact scene"), READERS["scene"])
+READERS |= {"long trace": READERS["trace"], "nanonis spectrum": READERS["spectrum"]}
 
 
 def fuzz_files(count: int, seed: int) -> None:

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import click
 import jax
@@ -23,8 +24,10 @@ import afm_jax
 import fitting
 from afm_jax import strict_json
 from afm_jax.cli import main, session
-from afm_jax.cli.command import Command
+from afm_jax.cli.columns import TableColumn, printed_table
+from afm_jax.cli.command import Command, Output
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES, example_path
 from afm_jax.scenefile.presets import PRESETS
@@ -38,11 +41,12 @@ HEAVY = "{'jax', 'numpy', 'matplotlib', 'equinox', 'rich'}"
 def trial(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     """Run a function as the command `trial` of afm-jax."""
 
-    def run(body: Callable[[Session], None], *arguments: str) -> Result:
+    def run(body: Callable[..., Output | None], *arguments: str, options: tuple[Any, ...] = ()) -> Result:
         module = ModuleType("trial_command")
         module.__dict__["body"] = body
         monkeypatch.setitem(sys.modules, "trial_command", module)
-        row = Command(name="trial", group="check", summary="Try.", runs="trial_command:body", help="", computes=False)
+        told = {"name": "trial", "group": "check", "summary": "Try.", "help": "", "options": options}
+        row = Command(**told, runs="trial_command:body", computes=False)
         monkeypatch.setitem(main.COMMANDS, "trial", row)
         return CliRunner().invoke(main.main, ["trial", *arguments])
 
@@ -258,6 +262,24 @@ def test_result_is_printed_before_it_is_called_not_valid(trial: Callable[..., Re
 
     result = trial(body, "--json")
     assert (result.exit_code, json.loads(result.stdout)) == (3, LABEL | {"reason": "open"})
+
+
+def test_a_result_with_impacts_says_whether_its_law_is_extrapolated(trial: Callable[..., Result]):
+    # a formula is known at all speeds, a result may be without impacts: it is said all the same
+    result = trial(lambda *_, **__: Output(payload={}, impact_speeds=()), "figure2", "--json", options=(SCENE,))
+    assert (result.exit_code, json.loads(result.stdout)) == (0, LABEL | {"extrapolated": None})
+
+
+def test_tables_to_print_have_dashes_and_words():
+    columns = [
+        TableColumn("name", "name", "", left=True),
+        TableColumn("x\nnm", "x"),
+        TableColumn("twice", lambda row: row["ok"], "yes"),
+    ]
+    rows = [{"name": "a", "x": 1.23456789, "ok": True}, {"name": "b", "x": None, "ok": np.bool_(0)}]
+    table = printed_table("Title", columns, rows)
+    assert [list(column.cells) for column in table.columns] == [["a", "b"], ["1.23457", "-"], ["yes", "no"]]
+    assert [column.justify for column in table.columns] == ["left", "right", "right"]
 
 
 def test_tables_land_in_the_folder(trial: Callable[..., Result], tmp_path: Path):

@@ -39,11 +39,11 @@ def chart(  # noqa: PLR0913
             paths = (across.path, up.path)
             probability = stable_probability(scene.scene, result, scene.unknowns, paths, draws=draws)
     payload = _payload(scene, result, across, up, probability, draws)
-    arrays = _arrays(result, probability)
+    arrays, speeds = _arrays(result, probability), result.verdicts.approach_speed_nm_per_us
     return Output(
         payload=payload,
         text=_lines(payload),
-        impact_speeds=result.verdicts.approach_speed_nm_per_us,
+        impact_speeds=() if speeds is None else speeds,
         tables={} if zarr else {"chart.csv": _columns(result, across.path, up.path, arrays)},
         files={
             **({"chart.zarr": partial(_write_zarr, result, across.path, up.path, arrays)} if zarr else {}),

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import Output, later
 from afm_jax.cli.contact_law import make_law as law_of
 from afm_jax.cli.contact_options import chosen_contact
@@ -27,18 +27,18 @@ COLUMNS = (
 )
 """What is told of a tip."""
 _PRINTED = (
-    Column("approach\nnm/us", "approach_speed_nm_per_us"),
-    Column("rebound\nnm/us", "rebound_speed_nm_per_us"),
-    Column("delay\nus", "collision_delay_us"),
-    Column("in junction\nus", "time_in_junction_us"),
-    Column("deepest gap\nnm", "deepest_gap_nm"),
-    Column("bridge\naJ lost", "bridge_hysteresis_aj"),
-    Column("junction\naJ lost", "junction_hysteresis_aj"),
-    Column("viscous\naJ lost", "viscous_loss_aj"),
-    Column("outcome", "outcome_name", "", left=True),
+    TableColumn("approach\nnm/us", "approach_speed_nm_per_us"),
+    TableColumn("rebound\nnm/us", "rebound_speed_nm_per_us"),
+    TableColumn("delay\nus", "collision_delay_us"),
+    TableColumn("in junction\nus", "time_in_junction_us"),
+    TableColumn("deepest gap\nnm", "deepest_gap_nm"),
+    TableColumn("bridge\naJ lost", "bridge_hysteresis_aj"),
+    TableColumn("junction\naJ lost", "junction_hysteresis_aj"),
+    TableColumn("viscous\naJ lost", "viscous_loss_aj"),
+    TableColumn("outcome", "outcome_name", "", left=True),
 )
 _MOST_PRINTED = 40
-"""Tips."""
+"""Tips in the printed table at most."""
 
 
 def collide(

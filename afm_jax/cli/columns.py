@@ -28,7 +28,7 @@ def _csv_cell(value: Any) -> Any:
     return "" if value is None or (isinstance(value, float) and not math.isfinite(value)) else value
 
 
-class Column(NamedTuple):
+class TableColumn(NamedTuple):
     """A column of a table to print.
 
     Attributes:
@@ -51,7 +51,7 @@ class Column(NamedTuple):
         return known(value, self.form) if self.form else value
 
 
-def printed_table(title: str, columns: Sequence[Column], rows: Iterable[Any]) -> "Table":
+def printed_table(title: str, columns: Sequence[TableColumn], rows: Iterable[Any]) -> "Table":
     """Return a table to print, a row a line."""
     from rich.table import Table  # noqa: PLC0415 (help is there without it)
 

@@ -7,8 +7,8 @@ options by their names, and returns an `Output`, which the runner writes (None: 
 
     def basins(session: Session, scene: NamedScene, *, grid, speeds, draws, picture) -> Output:
         with session.working("following starts", "starts") as report:
-            found = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
-        return Output({"share": found.share}, ["..."], tables={"basins.csv": found.columns()})
+            result = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
+        return Output(payload={"share": result.share}, text=["..."], tables={"basins.csv": columns_of(result)})
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -129,7 +129,7 @@ class Command:
         # click lists options in the order of decorators, of which the last is applied first
         for option in reversed((*self.options, *session_options(self.out_file))):
             function = option(function)
-        return click.command(self.name, help=self.help, context_settings={"show_default": True})(function)
+        return click.command(self.name, help=self.help)(function)
 
 
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:

@@ -66,15 +66,15 @@ def _replace_damaged(folder: Path, tell: Callable[[str], None]) -> None:
 
     def show(message: Warning | str, *where: Any, **more: Any) -> None:
         nonlocal told
-        found = _DAMAGED.match(str(message))
-        if found is None:
+        entry = _DAMAGED.match(str(message))
+        if entry is None:
             shown(message, *where, **more)
             return
         # the message names the program, not its entry: those of the same name are compiled anew as well
-        for path in folder.glob(f"{found[1]}-*-cache"):
+        for path in folder.glob(f"{entry[1]}-*-cache"):
             path.unlink(missing_ok=True)
         if not told:
-            tell(f"the compilation cache's {found[1]} was rejected and is compiled anew: {' '.join(found[2].split())}")
+            tell(f"the compilation cache's {entry[1]} was rejected and is compiled anew: {' '.join(entry[2].split())}")
         told = True
 
     warnings.filterwarnings("always", message="Error reading persistent compilation cache entry")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from afm_jax.cli.columns import Column, printed_table
+from afm_jax.cli.columns import TableColumn, printed_table
 from afm_jax.cli.command import Output, later
 from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
@@ -40,6 +40,7 @@ DELAY_COLUMNS = (
 )
 """What is told of the delay at a speed: attributes of `ContactDelay`."""
 _SHOWN = 9
+"""Speeds at which the delay is told in JSON and text."""
 
 
 def make_law(
@@ -131,15 +132,15 @@ def law_table(laws: Sequence[ContactLaw]) -> Table:
     low, high = laws[0].speed_range
     title = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us, {laws[0].residuals} residuals"
     columns = [
-        Column("law", lambda law: law.model, "", left=True),
-        Column("r\n", lambda law: law.r, ".5f"),
-        Column("epsilon\nnm^2/us^2", lambda law: law.epsilon, ".5g"),
-        Column("c\nnm/us", lambda law: law.viscous_loss, ".3g"),
-        Column("worst error\n%", lambda law: 100.0 * law.worst_relative_error, ".3g"),
-        Column("rms error\n%", lambda law: 100.0 * law.rms_relative_error, ".3g"),
-        Column("worst error\nnm/us", lambda law: law.worst_error_nm_per_us, ".3g"),
-        Column("of top speed\n%", lambda law: 100.0 * law.worst_share_of_top_speed, ".2g"),
-        Column("capture speed\nnm/us", lambda law: law.capture_speed_nm_per_us, ".5g"),
+        TableColumn("law", lambda law: law.model, "", left=True),
+        TableColumn("r\n", lambda law: law.r, ".5f"),
+        TableColumn("epsilon\nnm^2/us^2", lambda law: law.epsilon, ".5g"),
+        TableColumn("c\nnm/us", lambda law: law.viscous_loss, ".3g"),
+        TableColumn("worst error\n%", lambda law: 100.0 * law.worst_relative_error, ".3g"),
+        TableColumn("rms error\n%", lambda law: 100.0 * law.rms_relative_error, ".3g"),
+        TableColumn("worst error\nnm/us", lambda law: law.worst_error_nm_per_us, ".3g"),
+        TableColumn("of top speed\n%", lambda law: 100.0 * law.worst_share_of_top_speed, ".2g"),
+        TableColumn("capture speed\nnm/us", lambda law: law.capture_speed_nm_per_us, ".5g"),
     ]
     return printed_table(title, columns, laws)
 
@@ -156,9 +157,9 @@ def delay_table(delay: ContactDelay) -> Table:
     """Return the delay at a few speeds as a table to print."""
     times = (("delay", "delay_us"), ("lag", "lag_us"), ("lead", "lead_us"), ("delay law", "fitted_us"))
     columns = [
-        Column("approach\nnm/us", "approach_speed_nm_per_us", ".5g"),
-        Column("rebound\nnm/us", "rebound_speed_nm_per_us", ".5g"),
-        *(Column(f"{heading}\nus", name, ".4f") for heading, name in times),
+        TableColumn("approach\nnm/us", "approach_speed_nm_per_us", ".5g"),
+        TableColumn("rebound\nnm/us", "rebound_speed_nm_per_us", ".5g"),
+        *(TableColumn(f"{heading}\nus", name, ".4f") for heading, name in times),
     ]
     shown = _thinned(delay)
     rows = [dict(zip(shown, values, strict=True)) for values in zip(*shown.values(), strict=True)]

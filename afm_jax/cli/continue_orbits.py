@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.orbits import IMPACT_COLUMNS, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session
@@ -17,6 +17,7 @@ from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve
 from afm_jax.dynamics.sticking_orbits import follow_sticking
 from afm_jax.units import TWO_SIDED_95
+from afm_jax.words import counted
 
 draw_continuation = later("afm_jax.plots.branches:draw_continuation")
 draw_curves = later("afm_jax.plots.branches:draw_curves")
@@ -77,55 +78,55 @@ def follow(  # noqa: PLR0913
     first, *others = ranges_of(scene.name, scene.scene, given, counted=False)
     with session.working("following orbits (the first run compiles for some seconds)", "values") as report:
         if sticking:
-            found = follow_sticking(scene.scene, order, first, report=report)
+            followed = follow_sticking(scene.scene, order, first, report=report)
         else:
-            found = continue_orbits(scene.scene, order, first, impacts=impacts, second=others[0] if others else None)
-    return _output(scene, found, picture)
+            followed = continue_orbits(scene.scene, order, first, impacts=impacts, second=others[0] if others else None)
+    return _output(scene, followed, picture)
 
 
-def _output(scene: NamedScene, found: Continuation, picture: str) -> Output:
+def _output(scene: NamedScene, followed: Continuation, picture: str) -> Output:
     unknowns = scene.unknowns
-    bands = None if unknowns is None else [amplitude_errors(found, branch, unknowns) for branch in found.branches]
-    errors = None if unknowns is None else special_errors(found, unknowns)
+    bands = None if unknowns is None else [amplitude_errors(followed, branch, unknowns) for branch in followed.branches]
+    errors = None if unknowns is None else special_errors(followed, unknowns)
     points = [
         row
-        for number, branch in enumerate(found.branches)
+        for number, branch in enumerate(followed.branches)
         for row in point_rows(number, branch, None if bands is None else bands[number])
     ]
-    special = _special_rows(found, errors)
-    curves = [_curve(curve) for curve in found.curves]
-    reason = None if any(point["admissible"] for point in points) else _why_none(found)
+    special = _special_rows(followed, errors)
+    curves = [_curve(curve) for curve in followed.curves]
+    reason = None if any(point["admissible"] for point in points) else _why_none(followed)
     payload = {
-        "order": found.order,
-        "impacts": found.impacts,
-        "parameter": found.range.path,
-        "range": [found.range.low, found.range.high],
-        "second": None if found.second is None else found.second.path,
+        "order": followed.order,
+        "impacts": followed.impacts,
+        "parameter": followed.range.path,
+        "range": [followed.range.low, followed.range.high],
+        "second": None if followed.second is None else followed.second.path,
         "points": points,
         "special": special,
         "curves": curves,
-        "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in found.branches],
-        "sticking": found.sticking,
+        "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in followed.branches],
+        "sticking": followed.sticking,
         "law_parameters": None if unknowns is None else list(unknowns.paths),
         "reason": reason,
     }
-    files = {f"branches.{picture}": lambda path: draw_continuation(found, path, bands=bands, errors=errors)}
-    if found.curves:
-        files[f"curves.{picture}"] = lambda path: draw_curves(found, path)
+    files = {f"branches.{picture}": lambda path: draw_continuation(followed, path, bands=bands, errors=errors)}
+    if followed.curves:
+        files[f"curves.{picture}"] = lambda path: draw_curves(followed, path)
     return Output(
         payload=payload,
-        text=_text(found, special, curves),
+        text=_text(followed, special, curves),
         impact_speeds=[impact["approach_speed_nm_per_us"] for point in points for impact in point["impacts"]],
-        tables=_tables(found, points, special, curves),
+        tables=_tables(followed, points, special, curves),
         files=files,
         not_valid=reason,
     )
 
 
-def _special_rows(found: Continuation, errors: Any) -> list[dict[str, Any]]:
+def _special_rows(followed: Continuation, errors: Any) -> list[dict[str, Any]]:
     """Return the special points as plain mappings, with an interval where the law has errors."""
     rows = []
-    for index, point in enumerate(found.special):
+    for index, point in enumerate(followed.special):
         row = {
             "kind": point.kind,
             "parameter": point.parameter,
@@ -165,14 +166,14 @@ def _curve(curve: SpecialCurve) -> dict[str, Any]:
 
 
 def _tables(
-    found: Continuation,
+    followed: Continuation,
     points: Sequence[Mapping[str, Any]],
     special: Sequence[Mapping[str, Any]],
     curves: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
     """Return the columns of the CSV files: points, their impacts if there are several, special points, curves."""
     tables = {"branches.csv": columns_of(points, POINT_COLUMNS)}
-    if found.impacts > 1:
+    if followed.impacts > 1:
         rows = [{"point": k, **impact} for k, point in enumerate(points) for impact in point["impacts"]]
         tables["impacts.csv"] = columns_of(rows, ("point", *IMPACT_COLUMNS))
     flat = [
@@ -180,7 +181,7 @@ def _tables(
         for row in special
     ]
     tables["special.csv"] = columns_of(flat, SPECIAL_COLUMNS)
-    if found.second is not None:
+    if followed.second is not None:
         rows = [
             {"curve": k, "kind": curve["kind"], "parameter": p, "second": q, "admissible": flown}
             for k, curve in enumerate(curves)
@@ -190,33 +191,38 @@ def _tables(
     return tables
 
 
-def _why_none(found: Continuation) -> str:
-    if found.sticking:
-        return f"no tip rests on the sample, is let go and rests again after {found.order} periods with {found.range}"
-    what = f"orbit of {found.impacts} impact{'s' if found.impacts != 1 else ''} in {found.order} drive periods"
-    if found.impacts == 0:
-        return f"the tip meets the sample at every value of {found.range}; try --impacts 1"
-    if found.rejected:
-        return f"in every {what} with {found.range} the tip would have to pass through the platform; try another order"
-    return f"no {what} was found with {found.range}; try another order or range"
+def _why_none(followed: Continuation) -> str:
+    order, where = followed.order, f"with {followed.range}"
+    if followed.sticking:
+        return f"no tip rests on the sample, is let go and rests again after {order} periods {where}"
+    what = f"orbit of {counted(followed.impacts, 'impact')} in {order} drive periods"
+    if followed.impacts == 0:
+        return f"the tip meets the sample at every value of {followed.range}; try --impacts 1"
+    if followed.rejected:
+        return f"in every {what} {where} the tip would have to pass through the platform; try another order"
+    return f"no {what} was found {where}; try another order or range"
 
 
-def _text(found: Continuation, special: list[dict[str, Any]], curves: list[dict[str, Any]]) -> list[str | Table]:
-    kind = f"Orbits with a rest, N = {found.order}," if found.sticking else f"({found.impacts}, {found.order}) orbits"
-    what = f"{kind} with {found.range}"
-    lines: list[str | Table] = [what if found.branches else f"No {what}"]
-    for number, branch in enumerate(found.branches):
+def _text(followed: Continuation, special: list[dict[str, Any]], curves: list[dict[str, Any]]) -> list[str | Table]:
+    kind = (
+        f"Orbits with a rest, N = {followed.order},"
+        if followed.sticking
+        else f"({followed.impacts}, {followed.order}) orbits"
+    )
+    what = f"{kind} with {followed.range}"
+    lines: list[str | Table] = [what if followed.branches else f"No {what}"]
+    for number, branch in enumerate(followed.branches):
         low, high = branch.parameter.min(), branch.parameter.max()
         ends = " and ".join(dict.fromkeys(_ENDS[end] for end in branch.ends))
         lines.append(f"  branch {number}: {len(branch.parameter)} points from {low:.6g} to {high:.6g}; ends at {ends}")
     if special:
         columns = [
-            Column("kind", lambda row: row["kind"].replace("_", " "), "", left=True),
-            Column(found.range.path, "parameter", ".9g"),
-            Column("95 % interval", _interval, ""),
-            Column("peak\nnm", "peak_amplitude_nm", ".5g"),
-            Column("branch", lambda row: str(row["branch"]), ""),
-            Column("admissible", "admissible", "yes", left=True),
+            TableColumn("kind", lambda row: row["kind"].replace("_", " "), "", left=True),
+            TableColumn(followed.range.path, "parameter", ".9g"),
+            TableColumn("95 % interval", _interval, ""),
+            TableColumn("peak\nnm", "peak_amplitude_nm", ".5g"),
+            TableColumn("branch", lambda row: str(row["branch"]), ""),
+            TableColumn("admissible", "admissible", "yes", left=True),
         ]
         lines.append(printed_table("Special points", columns, special))
     for curve in curves:

@@ -66,8 +66,8 @@ def excluded_version() -> str | None:
     import jax  # noqa: PLC0415
 
     # what is imported may not be what is installed
-    found = [("jax", jax.__version__), ("jax", _version("jax")), ("jaxlib", _version("jaxlib"))]
-    for name, number in found:
+    versions = [("jax", jax.__version__), ("jax", _version("jax")), ("jaxlib", _version("jaxlib"))]
+    for name, number in versions:
         if number in EXCLUDED_JAX:
             better = ",".join(f"!={version}" for version in EXCLUDED_JAX)
             return f"{name} {number} {EXCLUDED_JAX[number]}; install another with: pip install -U 'jax{better}'"
@@ -120,8 +120,8 @@ def _version(name: str) -> str | None:
 def _lines(payload: dict[str, Any]) -> list[str]:
     cache = payload["cache"]
     devices = ", ".join(f"{device['platform']} ({device['kind']})" for device in payload["devices"])
-    found = f"works: ready after {cache['first_s']} s the first time, {cache['again_s']} s again"
-    state = found if cache["works"] else "does not work" if cache["folder"] else "none"
+    works = f"works: ready after {cache['first_s']} s the first time, {cache['again_s']} s again"
+    state = works if cache["works"] else "does not work" if cache["folder"] else "none"
     return [
         ", ".join(f"{name} {number or 'missing'}" for name, number in payload["versions"].items()),
         *([] if payload["excluded"] is None else [f"Excluded version: {payload['excluded']}"]),

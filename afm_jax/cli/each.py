@@ -53,17 +53,17 @@ def _rows(tables: Sequence[AmplitudeTable], variables: Sequence[str], folder: Pa
     import xarray  # noqa: PLC0415 (an extra package, which --each alone needs)
 
     with xarray.open_zarr(f"{folder}/{STORE}") as store:
-        found = store.load()
-    codes = found["outcome"].attrs
+        results = store.load()
+    codes = results["outcome"].attrs
     words = dict(zip(codes["flag_values"], codes["flag_meanings"].split(), strict=True))
     names = [name.removesuffix("_error") for name in variables if name.endswith("_error")]
     rows = []
     for number, table in enumerate(tables):
-        numbers = {name: found[name].values[number].item() for name in variables if name != "message"}
+        numbers = {name: results[name].values[number].item() for name in variables if name != "message"}
         outcome = words[numbers.pop("outcome")]
         parameters = {name: _parameter(name, numbers) for name in names}
         told = {"table": table.source, "outcome": outcome, "valid": outcome == "valid"}
-        why = str(found["message"].values[number])
+        why = str(results["message"].values[number])
         rows.append(told | numbers | {"message": why, "parameters": parameters})
     return rows
 
@@ -80,8 +80,8 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     names = list(rows[0]["parameters"])
     cells = []
     for row in rows:
-        pairs = ((found["value"], found["standard_error"]) for found in (row["parameters"][name] for name in names))
-        known = [with_error(*(None if math.isnan(part) else part for part in pair)) for pair in pairs]
+        pairs = ((each["value"], each["standard_error"]) for each in (row["parameters"][name] for name in names))
+        values = [with_error(*(None if math.isnan(number) else number for number in pair)) for pair in pairs]
         chi2 = "-" if math.isnan(row["chi2"]) else f"{row['chi2']:.1f}/{row['degrees_of_freedom']}"
-        cells.append([row["table"], *known, chi2, row["outcome"].replace("_", " ")])
+        cells.append([row["table"], *values, chi2, row["outcome"].replace("_", " ")])
     return text_table(["table", *names, "chi2/dof", ""], cells, words=(0, len(names) + 2))

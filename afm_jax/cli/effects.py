@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction, periods_read, study_effects
@@ -107,7 +107,7 @@ def _effect(report: EffectReport, full: Cost, left_out: tuple[str, ...]) -> dict
         "change": report.change._asdict(),
         "reason": report.reason,
         **cost,
-        **{f"saved_{name}": _difference(whole[name], cost[name]) for name in COSTS},
+        **{f"saved_{name}": _saved(whole[name], cost[name]) for name in COSTS},
     }
 
 
@@ -117,8 +117,8 @@ def _cost(cost: Cost | None) -> dict[str, float | None]:
     return dict(zip(COSTS, (cost.time_us, *cost.program), strict=True))
 
 
-def _difference(one: float | None, other: float | None) -> float | None:
-    return None if one is None or other is None else one - other
+def _saved(whole: float | None, cost: float | None) -> float | None:
+    return None if whole is None or cost is None else whole - cost
 
 
 def _reduction(reduction: Reduction | None, written: Path | None) -> dict[str, Any]:
@@ -140,19 +140,19 @@ def _flat(effect: Mapping[str, Any]) -> dict[str, Any]:
 def _table(effects: Sequence[Mapping[str, Any]]) -> Table:
     """Return what the scene without each effect changes and costs, as a table to print."""
 
-    def change(heading: str, name: str) -> Column:
-        return Column(heading, lambda effect: _percent(effect["change"][name]), "")
+    def change(heading: str, name: str) -> TableColumn:
+        return TableColumn(heading, lambda effect: _percent(effect["change"][name]), "")
 
     columns = [
-        Column("effect", "name", "", left=True),
+        TableColumn("effect", "name", "", left=True),
         change("peak\nchange", "peak_amplitude"),
         change("lock-in\nchange", "lockin_amplitude"),
-        Column("phase\ndeg", lambda effect: effect["change"]["lockin_phase_deg"], ".3g"),
+        TableColumn("phase\ndeg", lambda effect: effect["change"]["lockin_phase_deg"], ".3g"),
         change("loss/impact\nchange", "energy_per_impact"),
-        Column("time\nus/period", "time_us_per_period", ".4g"),
-        Column("saved", "saved_time_us_per_period", ".3g"),
-        Column("operations\nsaved", "saved_operations", ".0f"),
-        Column("", _remark, "", left=True),
+        TableColumn("time\nus/period", "time_us_per_period", ".4g"),
+        TableColumn("saved", "saved_time_us_per_period", ".3g"),
+        TableColumn("operations\nsaved", "saved_operations", ".0f"),
+        TableColumn("", _remark, "", left=True),
     ]
     return printed_table("Without the effect", columns, effects)
 

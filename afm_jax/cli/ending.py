@@ -46,7 +46,7 @@ _FORESEEN = (
 
 
 _LONGEST_WORD, _LONGEST_LINE = 300, 2000
-"""Of a message, in letters."""
+"""Letters of a message's words, and of the whole message, at most."""
 
 
 def exit_code_of(run: Callable[[], object]) -> int:
@@ -96,7 +96,7 @@ def _refused_by_the_system(error: OSError) -> str:
 
 
 def _wrong_values(error: Exception) -> tuple[str, int]:
-    """Return the same for values that were refused, by a check of the input or by what computes with them."""
+    """Return the message and the exit code for values refused by a check of the input or by what computes with them."""
     name = type(error).__name__
     if isinstance(error, ValueError) and not is_inner(error):
         # thus also TableError, SceneError and the checks of the objects: the data are wrong

@@ -6,12 +6,12 @@ from typing import Any
 import click
 
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Kind, parse_around_plus_minus
+from afm_jax.cli.values import ValueKind, parse_around_plus_minus
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from fitting.parameters import CONTACT_DEFAULT, model_parameters
 
 
-class Fixed(Kind):
+class Fixed(ValueKind):
     """A parameter held at a value: NAME=VALUE."""
 
     name = "value"
@@ -25,7 +25,7 @@ class Fixed(Kind):
         return name, value
 
 
-class Constraint(Kind):
+class Constraint(ValueKind):
     """What is known of a parameter: NAME=VALUE+-ERROR."""
 
     name = "constraint"
@@ -47,7 +47,7 @@ def _assigned(text: str) -> tuple[str, list[float]]:
     return name.strip(), parse_around_plus_minus(numbers)
 
 
-class Names(Kind):
+class Names(ValueKind):
     """Names in a comma list."""
 
     name = "names"

@@ -53,7 +53,7 @@ def with_fitted_law(scene: Scene, path: Path | None) -> tuple[Scene, UncertainPa
 
 
 def as_drawn(scene: Scene) -> Scene:
-    """Return a scene whose law has lost its errors, as that of a drawn scene has: both run in the same programs."""
+    """Return a scene whose law has no errors, as drawn scenes have none: they then run in one compiled program."""
     law = scene.interaction
     if not isinstance(law, TabulatedLaw) or law.deviations is None:
         return scene

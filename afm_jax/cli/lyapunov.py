@@ -17,6 +17,18 @@ from afm_jax.words import with_error
 
 draw_exponents = later("afm_jax.plots.dynamics:draw_exponents")
 
+_TOLD = (
+    "exponents_per_us",
+    "exponents_per_impact",
+    "exponents_per_us_error",
+    "exponents_per_impact_error",
+    "mean_log_determinant",
+    "impacts",
+    "near_grazing",
+    "rested",
+)
+"""What is told of a motion: attributes of `Lyapunov`."""
+
 
 def lyapunov(
     session: Session,
@@ -33,96 +45,92 @@ def lyapunov(
     values = {swept.path: swept.values for swept in ranges}
     motions = scene_batch(scene.scene, values) if values else scene.scene
     start = None if scene.start is None else start_of(motions, scene.start)
+    lengths = {"impacts": impacts, "transient": transient}
     band = None
     with session.working("following the motion (the first run compiles for some seconds)", "motions") as report:
-        result = lyapunov_spectrum(motions, start, impacts=impacts, transient=transient, report=report)
+        result = lyapunov_spectrum(motions, start, **lengths, report=report)
         if scene.unknowns is not None:
-            chosen = {"draws": draws, "impacts": impacts, "transient": transient}
-            band = drawn_exponents(scene.scene, values, scene.unknowns, **chosen)
-    many = result if values else jax.tree.map(lambda part: np.asarray(part)[None], result)
+            band = drawn_exponents(scene.scene, values, scene.unknowns, draws=draws, **lengths)
+    # without a parameter a batch of one motion
+    many = result if values else jax.tree.map(lambda array: np.asarray(array)[None], result)
     verdicts = exponent_verdicts(many)
     payload = _payload(result, verdicts if values else verdicts[0])
     payload |= {"scene": scene_tables(scene.scene), "reason": _why_none(many, verdicts)}
-    columns = _columns(many, verdicts)
     if band is not None:
         payload |= {"draws": draws, "exponent_per_impact_interval95": band if values else band[0]}
-        columns |= {"exponent_per_impact_low": band[:, 0], "exponent_per_impact_high": band[:, 1]}
     files = {}
-    if not values:
+    if values:
+        ((path, along),) = values.items()
+        payload |= {"parameter": path, "values": along}
+        text = [_summary(many, str(ranges[0]))]
+        files[f"lyapunov.{picture}"] = lambda to: draw_exponents(path, along, many.exponents_per_impact, to, band)
+    else:
         text = _text(result, verdicts[0])
         if band is not None:
             text.append("the larger per impact: {:.6g} to {:.6g} in 95 % of the draws".format(*band[0]))
-    else:
-        ((path, along),) = values.items()
-        text = [_summary(many, str(ranges[0]))]
-        payload |= {"parameter": path, "values": along}
-        columns = {path: along, **columns}
-        files[f"lyapunov.{picture}"] = lambda to: draw_exponents(path, along, many.exponents_per_impact, to, band)
     return Output(
         payload=payload,
         text=text,
         impact_speeds=result.approach_speed_nm_per_us,
-        tables={"lyapunov.csv": columns},
+        tables={"lyapunov.csv": {**values, **_columns(many, verdicts, band)}},
         files=files,
         not_valid=payload["reason"],
     )
 
 
-def _why_none(found: Lyapunov, verdicts: list[str]) -> str | None:
+def _why_none(spectrum: Lyapunov, verdicts: list[str]) -> str | None:
     """Return why there are no exponents at all; None where there are some."""
-    if not np.isnan(found.exponents_per_impact[:, 0]).all():
+    if not np.isnan(spectrum.exponents_per_impact[:, 0]).all():
         return None
     words = "; ".join(dict.fromkeys(verdicts))
     most = "at most " if len(verdicts) > 1 else ""
-    return f"{words}; there were {most}{int(found.impacts.max())} impacts to average over"
+    return f"{words}; there were {most}{int(spectrum.impacts.max())} impacts to average over"
 
 
-def _payload(found: Lyapunov, verdict: Any) -> dict[str, Any]:
+def _payload(spectrum: Lyapunov, verdict: Any) -> dict[str, Any]:
     return {
-        "exponents_per_us": found.exponents_per_us,
-        "exponents_per_impact": found.exponents_per_impact,
-        "exponents_per_us_error": found.exponents_per_us_error,
-        "exponents_per_impact_error": found.exponents_per_impact_error,
-        "mean_log_determinant": found.mean_log_determinant,
-        "impacts": found.impacts,
-        "near_grazing": found.near_grazing,
-        "rested": found.rested,
-        "orbit": {"impacts": found.verdicts.impacts, "periods": found.verdicts.periods},
+        **{name: getattr(spectrum, name) for name in _TOLD},
+        "orbit": {"impacts": spectrum.verdicts.impacts, "periods": spectrum.verdicts.periods},
         "verdict": verdict,
     }
 
 
-def _columns(found: Lyapunov, verdicts: list[str]) -> dict[str, Any]:
-    return {
-        "exponent_per_impact": found.exponents_per_impact[:, 0],
-        "second_exponent_per_impact": found.exponents_per_impact[:, 1],
-        "exponent_per_impact_error": found.exponents_per_impact_error[:, 0],
-        "exponent_per_us": found.exponents_per_us[:, 0],
-        "second_exponent_per_us": found.exponents_per_us[:, 1],
-        "impacts": found.impacts,
-        "near_grazing": found.near_grazing,
-        "rested": found.rested,
+def _columns(spectrum: Lyapunov, verdicts: list[str], band: np.ndarray | None) -> dict[str, Any]:
+    columns = {
+        "exponent_per_impact": spectrum.exponents_per_impact[:, 0],
+        "second_exponent_per_impact": spectrum.exponents_per_impact[:, 1],
+        "exponent_per_impact_error": spectrum.exponents_per_impact_error[:, 0],
+        "exponent_per_us": spectrum.exponents_per_us[:, 0],
+        "second_exponent_per_us": spectrum.exponents_per_us[:, 1],
+        "impacts": spectrum.impacts,
+        "near_grazing": spectrum.near_grazing,
+        "rested": spectrum.rested,
         "verdict": verdicts,
     }
+    if band is not None:
+        columns |= {"exponent_per_impact_low": band[:, 0], "exponent_per_impact_high": band[:, 1]}
+    return columns
 
 
-def _text(found: Lyapunov, verdict: str) -> list[str]:
+def _text(spectrum: Lyapunov, verdict: str) -> list[str]:
     def pair(values: np.ndarray, errors: np.ndarray) -> str:
-        found = zip(values, errors, strict=True)
-        return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in found)
+        pairs = zip(values, errors, strict=True)
+        return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in pairs)
 
     lines = [
-        f"Lyapunov exponents per impact: {pair(found.exponents_per_impact, found.exponents_per_impact_error)}",
-        f"                       per us: {pair(found.exponents_per_us, found.exponents_per_us_error)}",
-        f"{int(found.impacts)} impacts; {verdict}",
+        f"Lyapunov exponents per impact: {pair(spectrum.exponents_per_impact, spectrum.exponents_per_impact_error)}",
+        f"                       per us: {pair(spectrum.exponents_per_us, spectrum.exponents_per_us_error)}",
+        f"{int(spectrum.impacts)} impacts; {verdict}",
     ]
-    if found.near_grazing:
-        lines.append(f"{int(found.near_grazing)} impacts are near grazing, where the map's slopes grow without bound")
+    if spectrum.near_grazing:
+        lines.append(
+            f"{int(spectrum.near_grazing)} impacts are near grazing, where the map's slopes grow without bound"
+        )
     return lines
 
 
-def _summary(found: Lyapunov, what: str) -> str:
-    larger, error = found.exponents_per_impact[:, 0], found.exponents_per_impact_error[:, 0]
+def _summary(spectrum: Lyapunov, what: str) -> str:
+    larger, error = spectrum.exponents_per_impact[:, 0], spectrum.exponents_per_impact_error[:, 0]
     positive = int(np.sum(np.isfinite(larger) & (larger > CHAOTIC_ERRORS * error)))
     return (
         f"{what}: the larger exponent is positive at {positive} values, negative or undecided at "

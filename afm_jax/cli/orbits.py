@@ -7,7 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
@@ -61,11 +61,11 @@ MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "s
 """What is told of an orbit of several impacts, of its impacts the first."""
 
 _IMPACT_CELLS = (
-    Column("phase\nrad", "phase_rad"),
-    Column("velocity after\nnm/us", "velocity_after_nm_per_us"),
-    Column("approach\nnm/us", "approach_speed_nm_per_us"),
-    Column("rebound\nnm/us", "rebound_speed_nm_per_us"),
-    Column("delay\nus", "delay_us"),
+    TableColumn("phase\nrad", "phase_rad"),
+    TableColumn("velocity after\nnm/us", "velocity_after_nm_per_us"),
+    TableColumn("approach\nnm/us", "approach_speed_nm_per_us"),
+    TableColumn("rebound\nnm/us", "rebound_speed_nm_per_us"),
+    TableColumn("delay\nus", "delay_us"),
 )
 
 
@@ -172,8 +172,8 @@ def _resting_words(rests: Mapping[str, Any]) -> str:
 def impact_rows(reading: LoopReading, index: int | None = None) -> list[dict[str, float]]:
     """Return what is told of each impact of an orbit; of one of many, or of the only one."""
     columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
-    own = {name: (part if index is None else part[index]).tolist() for name, part in columns.items()}
-    return [dict(zip(own, values, strict=True)) for values in zip(*own.values(), strict=True)]
+    lists = {name: (values if index is None else values[index]).tolist() for name, values in columns.items()}
+    return [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
 
 
 def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
@@ -188,22 +188,22 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
         "peak_amplitude_nm": float(reading.peak_amplitude_nm[index]),
         "trace": trace,
         "determinant": determinant,
-        "multipliers": [[float(one.real), float(one.imag)] for one in multipliers],
+        "multipliers": [[float(each.real), float(each.imag)] for each in multipliers],
         "stable": bool(is_stable(multipliers)),
         "admissible": bool(reading.admissible[index]),
         "impacts": impacts,
     }
 
 
-def names_of(found: SingleImpactOrbits) -> tuple[str, ...]:
+def names_of(result: SingleImpactOrbits) -> tuple[str, ...]:
     """Return what is told of orbits: what their scene has."""
-    return (*COLUMNS, *(name for name in (*DRIVEN_COLUMNS, "extrapolated") if getattr(found, name) is not None))
+    return (*COLUMNS, *(name for name in (*DRIVEN_COLUMNS, "extrapolated") if getattr(result, name) is not None))
 
 
-def orbit_rows(found: SingleImpactOrbits) -> list[dict[str, Any]]:
+def orbit_rows(result: SingleImpactOrbits) -> list[dict[str, Any]]:
     """Return the orbits that exist as one dict of plain numbers each, by rising approach speed."""
-    columns = {name: getattr(found, name).tolist() for name in names_of(found)}
-    slots = [slot for slot, exists in enumerate(found.exists.tolist()) if exists]
+    columns = {name: getattr(result, name).tolist() for name in names_of(result)}
+    slots = [slot for slot, exists in enumerate(result.exists.tolist()) if exists]
     return [{name: values[slot] for name, values in columns.items()} for slot in slots]
 
 
@@ -237,25 +237,25 @@ def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> st
 
 def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
     """Return orbits as a table to print; where base or force drive with what is read at the drive's frequency."""
-    columns = [*_IMPACT_CELLS, Column("peak\nnm", "peak_amplitude_nm")]
+    columns = [*_IMPACT_CELLS, TableColumn("peak\nnm", "peak_amplitude_nm")]
     if orbits and "drive_lockin_amplitude_nm" in orbits[0]:
-        columns.append(Column("at drive\nnm", "drive_lockin_amplitude_nm"))
-        columns.append(Column("at drive\ndeg", "drive_lockin_phase_deg"))
+        columns.append(TableColumn("at drive\nnm", "drive_lockin_amplitude_nm"))
+        columns.append(TableColumn("at drive\ndeg", "drive_lockin_phase_deg"))
         if "peak_deflection_nm" in orbits[0]:
-            columns.append(Column("deflection\nat drive nm", "deflection_drive_lockin_amplitude_nm"))
-        columns.append(Column("lag\ndeg", "phase_lag_deg"))
+            columns.append(TableColumn("deflection\nat drive nm", "deflection_drive_lockin_amplitude_nm"))
+        columns.append(TableColumn("lag\ndeg", "phase_lag_deg"))
     else:
-        columns += [Column("lock-in\nnm", "lockin_amplitude_nm"), Column("lock-in\ndeg", "lockin_phase_deg")]
-    columns += [Column(f"{name}\n", name) for name in ("trace", "determinant")]
-    columns += [Column(name, name, "yes", left=True) for name in ("stable", "admissible")]
+        columns += [TableColumn("lock-in\nnm", "lockin_amplitude_nm"), TableColumn("lock-in\ndeg", "lockin_phase_deg")]
+    columns += [TableColumn(f"{name}\n", name) for name in ("trace", "determinant")]
+    columns += [TableColumn(name, name, "yes", left=True) for name in ("stable", "admissible")]
     return printed_table(title, columns, orbits)
 
 
 def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
     """Return orbits of several impacts as a table to print, a line an impact; the orbit's own numbers in its first."""
 
-    def of_orbit(heading: str, cell: Callable[[Any], str]) -> Column:
-        return Column(heading, lambda row: cell(row["whole"]) if row["first"] else "", "")
+    def of_orbit(heading: str, cell: Callable[[Any], str]) -> TableColumn:
+        return TableColumn(heading, lambda row: cell(row["whole"]) if row["first"] else "", "")
 
     rows = [
         {**impact, "whole": {**orbit, "number": number}, "first": place == 0}

@@ -143,14 +143,21 @@ class Session:
             what: is done; in brackets at its end what is told of a first run.
             parts: what is counted, by calls of what this gives: how many are done, of how many.
         """
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
         from rich.table import Column  # noqa: PLC0415
 
         console = _console(stderr=True)
         words = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
-        columns = [SpinnerColumn(), words, *([BarColumn()] if parts else []), TimeElapsedColumn()]
-        terminal = {"console": console, "transient": True, "disable": not console.is_terminal}
-        progress = Progress(*columns, **terminal, get_time=time.monotonic, speed_estimate_period=math.inf)
+        progress = Progress(
+            SpinnerColumn(),
+            TimeElapsedColumn(),
+            words,
+            console=console,
+            disable=not console.is_terminal,
+            transient=True,
+            get_time=time.monotonic,
+            speed_estimate_period=math.inf,
+        )
         number = progress.add_task(shown(what), total=None)
         (task,) = progress.tasks
         last = time.monotonic()

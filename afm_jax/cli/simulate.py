@@ -28,16 +28,17 @@ stretch_drawn = later("afm_jax.plots.motion:stretch_drawn")
 LARGEST_OFFSET_NM = 10_000.0
 """How far a ramp may take the sample from the tip's rest position, either way."""
 MOST_OSCILLATIONS = 1e7
-"""Of the free tip: some minutes of computing."""
+"""Oscillations of the free tip or the drive that are followed at most: some minutes of computing."""
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
 _POINTS = 2001
+"""Rows of trajectory.csv at equal steps of time."""
 _MOST_NODES = 100_000
 """Rows of trajectory.csv within contacts, from which on only every second, third, ... is kept."""
 _TRACE_RESPONSES = 24
 """Response periods of trace.csv at most: enough for an instrument's errors from their scatter."""
 _SAMPLES_A_PERIOD = 400
-"""Of the drive."""
+"""Samples of trace.csv in a drive period."""
 
 
 def simulation(  # noqa: PLR0913
@@ -336,11 +337,11 @@ def _write_trace(session: Session, scene: Scene, run: LongRun, window: Window) -
 def _trace_comments(scene: Scene, drive: DrivePeriod) -> list[str]:
     """Return what a trace says of its measurement, a setting each."""
     cantilever, platform = scene.cantilever, scene.platform
-    known = {"drive_frequency_khz": drive.angular_frequency / RAD_PER_US_PER_KHZ}
+    settings = {"drive_frequency_khz": drive.angular_frequency / RAD_PER_US_PER_KHZ}
     if scene.base is None and scene.force is None and drive.aperiodic is None and platform.second is None:
-        known |= {"drive_amplitude_nm": platform.amplitude_nm, "offset_nm": platform.offset_nm}
-    known |= {"free_frequency_khz": cantilever.frequency_khz, "mass_ng": cantilever.mass_ng}
+        settings |= {"drive_amplitude_nm": platform.amplitude_nm, "offset_nm": platform.offset_nm}
+    settings |= {"free_frequency_khz": cantilever.frequency_khz, "mass_ng": cantilever.mass_ng}
     if cantilever.quality_factor is not None:
-        known["quality_factor"] = cantilever.quality_factor
+        settings["quality_factor"] = cantilever.quality_factor
     damping = ["quality_factor = none"] if cantilever.quality_factor is None else []
-    return [*(f"{name} = {float(value)!r}" for name, value in known.items()), *damping]
+    return [*(f"{name} = {float(value)!r}" for name, value in settings.items()), *damping]

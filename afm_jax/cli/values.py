@@ -26,7 +26,7 @@ _MOST_NUMBERS = 1_000_000
 _MOST_STARTS = 16_000_000
 
 
-class Kind(click.ParamType):
+class ValueKind(click.ParamType):
     """A kind of value; each defines how its text is read.
 
     Attributes:
@@ -56,7 +56,7 @@ class Kind(click.ParamType):
             self.fail(f"{self.wanted}{error}{self.advice}", param, ctx)
 
 
-class Finite(Kind):
+class Finite(ValueKind):
     """A number: neither infinite nor "nan", which compares with no limit."""
 
     name = "number"
@@ -76,7 +76,7 @@ class Finite(Kind):
         return number
 
 
-class Numbers(Kind):
+class Numbers(ValueKind):
     """A comma list of numbers; each part a number or a range start:stop:step that holds the stop if it fits.
 
     >>> Numbers(positive=False).read("-1,0,2:3:0.5")
@@ -121,7 +121,7 @@ class Numbers(Kind):
         return [float(f"{start + step * index:.12g}") for index in range(math.floor(steps) + 1)]
 
 
-class Orders(Kind):
+class Orders(ValueKind):
     """A comma list of whole numbers and ranges of them.
 
     >>> Orders().read("1-3,5")
@@ -143,7 +143,7 @@ class Orders(Kind):
         return tuple(dict.fromkeys(orders))
 
 
-class Ends(Kind):
+class Ends(ValueKind):
     """Two positive numbers, low:high.
 
     >>> Ends().read("12:150")
@@ -164,7 +164,7 @@ class Ends(Kind):
         return low, high
 
 
-class Share(Kind):
+class Share(ValueKind):
     """A share between 0 and 100 %, neither of the two.
 
     >>> Share().read("1 %"), Share().read("0.01")
@@ -186,7 +186,7 @@ class Share(Kind):
         return share
 
 
-class ValueAndError(Kind):
+class ValueAndError(ValueKind):
     """A value with its standard error; without an error it is exact.
 
     >>> ValueAndError().read("40 +- 2"), ValueAndError().read("40")
@@ -212,7 +212,7 @@ class ValueAndError(Kind):
         return value, error[0] if error else None
 
 
-class Grid(Kind):
+class Grid(ValueKind):
     """Columns and rows, 1000x1000."""
 
     name = "grid"
@@ -227,7 +227,7 @@ class Grid(Kind):
 
 
 PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11", "dry")
-"""Of `afm_jax.scenefile.presets`; said here as well, because help and completion must not wait for JAX."""
+"""Names of `afm_jax.scenefile.presets.PRESETS`, stated here too because help and completion must not wait for JAX."""
 
 
 class SceneName(click.ParamType):
@@ -251,7 +251,7 @@ class SceneName(click.ParamType):
         return items or [click.shell_completion.CompletionItem(incomplete, type="file")]
 
 
-class PictureFormat(Kind):
+class PictureFormat(ValueKind):
     """The suffix of a picture: png, pdf or svg."""
 
     name = "format"
@@ -310,7 +310,7 @@ def _number(text: str, what: str, *, positive: bool) -> float:
 
 
 def scene_and_start(name: str, *, notes: bool = True) -> "tuple[Scene, Start | None]":
-    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.scene_and_start`.
+    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.read_named_scene`.
 
     Args:
         name: a path, or a preset's name.
@@ -370,5 +370,5 @@ def tables_with(
     if quality_factor is None:
         return read
     value, error = quality_factor
-    own = None if math.isinf(value) else value
-    return [replace(table, quality_factor=own, quality_factor_error=error) for table in read]
+    quality = None if math.isinf(value) else value
+    return [replace(table, quality_factor=quality, quality_factor_error=error) for table in read]

@@ -12,7 +12,7 @@ from afm_jax.cli.design_prior import with_prior_options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
 from afm_jax.cli.session import FIT_PROGRAMS, Session
-from afm_jax.cli.values import Finite, Kind, Numbers, Orders, Share, ValueAndError
+from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError, ValueKind
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
 
 
@@ -501,7 +501,7 @@ _IMAGE_NUMBERS = (
 _IMAGE_SETTINGS = tuple(_number(*row) for row in _IMAGE_NUMBERS)
 
 
-class RowsAndColumns(Kind):
+class RowsAndColumns(ValueKind):
     """Rows and columns, as 10x12."""
 
     name = "grid"

@@ -10,7 +10,7 @@ import click
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Ends, Finite, Grid, Kind, Share
+from afm_jax.cli.values import Ends, Finite, Grid, Share, ValueKind
 
 BASINS = Command(
     name="basins",
@@ -127,7 +127,7 @@ LYAPUNOV = Command(
 )
 
 
-class PositiveInteger(Kind):
+class PositiveInteger(ValueKind):
     """An integer from 1 to a million."""
 
     name = "integer"
@@ -139,7 +139,7 @@ class PositiveInteger(Kind):
         return int(text)
 
 
-class Multiples(Kind):
+class Multiples(ValueKind):
     """Positive integers in a comma list."""
 
     name = "list"
