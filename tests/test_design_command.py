@@ -51,7 +51,7 @@ def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
 
 def test_report_is_written(reported):
     result, folder = reported
-    names = {"design.txt", "design.json", "design.png", "to_fill_in.csv", "design.csv", "candidates.csv"}
+    names = {"design.html", "design.txt", "design.json", "design.png", "to_fill_in.csv", "design.csv", "candidates.csv"}
     assert names == {path.name for path in folder.iterdir()}
     answer = strictly(result.stdout)
     assert strictly((folder / "design.json").read_text(encoding="utf-8")) == answer
