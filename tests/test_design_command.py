@@ -10,6 +10,7 @@ from afm_jax.cli.design_prior import PriorOptions, prior_of_options
 from afm_jax.cli.main import main
 from fitting import fit, read_table
 from tests.fit_tables import EXAMPLE, rows
+from tests.html_pages import first_screen, read_page, section_of, table_of
 from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
@@ -51,7 +52,7 @@ def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
 
 def test_report_is_written(reported):
     result, folder = reported
-    names = {"design.txt", "design.json", "design.png", "to_fill_in.csv", "design.csv", "candidates.csv"}
+    names = {"design.html", "design.txt", "design.json", "design.png", "to_fill_in.csv", "design.csv", "candidates.csv"}
     assert names == {path.name for path in folder.iterdir()}
     answer = strictly(result.stdout)
     assert strictly((folder / "design.json").read_text(encoding="utf-8")) == answer
@@ -68,6 +69,9 @@ def test_report_is_written(reported):
     assert sorted(int(row["chosen"]) for row in candidates if row["chosen"]) == [1, 2, 3, 4, 5, 6]
     assert (folder / "design.png").stat().st_size > 20_000
     assert "95 % interval then" in (folder / "design.txt").read_text(encoding="utf-8")
+    page = read_page((folder / "design.html").read_text(encoding="utf-8"))
+    assert "VALID" in first_screen(page)
+    assert len(table_of(section_of(page, "points"), "What to measure next")) == 1 + len(points)
 
 
 def test_the_table_to_fill_in_is_one_once_filled_in(reported, tmp_path):

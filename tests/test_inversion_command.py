@@ -12,6 +12,7 @@ from afm_jax import TabulatedLaw, load_law, save_law
 from afm_jax.cli.main import main
 from afm_jax.units import TWO_SIDED_95
 from fitting.examples.make_contact_amplitudes import EXAMPLE
+from tests.html_pages import read_page, section_of, table_of, words_of
 from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
@@ -75,6 +76,9 @@ def test_report_is_written(reported):
     text = (folder / "invert.txt").read_text(encoding="utf-8")
     assert "The rows support a viscous loss" in text
     assert "phase 3 pi/2" in text
+    page = read_page((folder / "invert.html").read_text(encoding="utf-8"))
+    assert "The rows support a viscous loss" in words_of(page)
+    assert len(table_of(section_of(page, "rows"), "Every row")) == 1 + len(rows)
     # a drawn picture has many shades; an empty one only a few
     assert len(np.unique(imread(folder / "invert.png"))) > 50
 

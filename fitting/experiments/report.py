@@ -18,15 +18,15 @@ from matplotlib.transforms import ScaledTranslation
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, GRID, label_axes, new_figure
 from afm_jax.whole_files import write_whole
-from afm_jax.words import bullets, interval, known, text_table, value_alone
+from afm_jax.words import interval, known, value_alone
 from fitting.experiments.candidates import LEFT_OUT
 from fitting.experiments.prior import size_of
 from fitting.experiments.result import Design, Forecast
 from fitting.parameters import NUISANCE_NAMES
+from fitting.report.sections import Bullets, Part, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
 
 _CANDIDATE_COLUMNS = ("chosen", "gain", "left_out")
 _CRITERIA = {"D": "D-optimal: smallest joint confidence region of", "A": "A-optimal: smallest sum of variances of"}
-Table = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
 
 
 def point_columns(result: Design) -> tuple[str, ...]:
@@ -46,24 +46,37 @@ def _drive_columns(result: Design) -> tuple[str, ...]:
 
 def design_summary(result: Design) -> str:
     """Return the design as text: verdict, the points, what they will determine, notes."""
+    return text_of(design_report(result))
+
+
+def design_report(result: Design) -> Report:
+    """Return the design as sections: the points, what they will determine, the drives they were chosen from, notes."""
     prior, count = result.prior, int(result.candidates.usable.sum())
-    lines = [
-        f"{len(result.chosen)} points to measure next, of {count} candidates ({prior.problem.model}, {prior.source})",
-        f"  {_CRITERIA[result.criterion]} {', '.join(result.interest)}; {100.0 * result.noise:g} % noise",
-        "",
-        "VALID" if result.valid else "NOT VALID: do not follow this design.",
-        *(f"  - {reason}" for reason in result.reasons),
+    left_out = [f"\n  {number} left out: {LEFT_OUT[name]}" for name, number in result.candidates.left_out.items()]
+    planned = f"  {count} of {len(result.candidates.why_not)} drives can be planned with."
+    forecast = [
+        ReportSection("Points", _points(result), "Points"),
+        ReportSection("Forecast", _forecast(result), "Forecast"),
     ]
-    if len(result.chosen):
-        lines += ["", *_point_lines(result), "", *_forecast_lines(result)]
-    left_out = [f"  {number} left out: {LEFT_OUT[name]}" for name, number in result.candidates.left_out.items()]
-    lines += ["", f"  {count} of {len(result.candidates.why_not)} drives can be planned with.", *left_out]
-    lines += bullets("Notes:", result.warnings)
-    return "\n".join(lines)
+    return Report(
+        title=f"{len(result.chosen)} points to measure next, of {count} candidates "
+        f"({prior.problem.model}, {prior.source})",
+        about=[f"{_CRITERIA[result.criterion]} {', '.join(result.interest)}; {100.0 * result.noise:g} % noise"],
+        valid=result.valid,
+        verdict="VALID" if result.valid else "NOT VALID: do not follow this design.",
+        reasons=result.reasons,
+        sections=[
+            *(forecast if len(result.chosen) else []),
+            ReportSection("Candidates", [Text("".join([planned, *left_out]), "lines")], "Candidates"),
+            *([ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes")] if result.warnings else []),
+        ],
+    )
 
 
-def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]:
-    """Write design.txt, design.json, design.png, to_fill_in.csv, design.csv and candidates.csv into a folder.
+def write_design(
+    result: Design, folder: Path, write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
+) -> list[Path]:
+    """Write design.html, .txt, .json and .png, to_fill_in.csv, design.csv and candidates.csv into a folder.
 
     to_fill_in.csv is an amplitude table of the points whose measured columns are empty: with the readings in them,
     `afm-jax fit` takes it.
@@ -79,12 +92,22 @@ def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]
     Raises:
         OSError: if a file cannot be written.
     """
-    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
     from fitting.report.report import write_report_files  # noqa: PLC0415
 
     blank = folder / "to_fill_in.csv"
-    text, data, picture = design_summary(result), result.to_dict(), png_of(design_figure(result))
-    written = write_report_files(folder, "design", text=text, data=data, picture=picture)
+    report, figure = design_report(result), design_figure(result)
+    shows = (
+        "Expected errors over the number of points; what one more measurement at each drive adds, chosen ones circled."
+    )
+    written = write_report_files(
+        folder,
+        "design",
+        text=text_of(report),
+        data=result.to_dict(),
+        picture=png_of(figure),
+        page=page_of(report, pictures_of([svg_of(figure)], [shows])),
+    )
     write_whole(blank, table_to_fill_in(result))
     write_table("design.csv", result.points(), point_columns(result))
     write_table("candidates.csv", result.all_candidates(), (*point_columns(result), *_CANDIDATE_COLUMNS))
@@ -113,7 +136,7 @@ def table_to_fill_in(result: Design) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _point_lines(result: Design) -> list[str]:
+def _points(result: Design) -> list[Part]:
     shown = result.interest[:4]
     read = ("lockin_amplitude_nm", "phase_lag_deg") if result.tapping else ("peak_amplitude_nm", "lockin_amplitude_nm")
     columns = ("lock-in nm", "lag deg") if result.tapping else ("peak nm", "lock-in nm")
@@ -132,13 +155,11 @@ def _point_lines(result: Design) -> list[str]:
         ]
         for point in result.points()
     ]
-    return [
-        *text_table(head, rows, words=()),
-        "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
-    ]
+    said = "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured"
+    return [Table("What to measure next", head, rows, numbered=True), Text(said)]
 
 
-def _forecast_lines(result: Design) -> list[str]:
+def _forecast(result: Design) -> list[Part]:
     head = ["", "prior", "+- now", "+- then", "95 % interval then"]
     now, then = result.measured_so_far, result.expected
     rows = [
@@ -151,7 +172,8 @@ def _forecast_lines(result: Design) -> list[str]:
         ]
         for name in result.prior.problem.names
     ]
-    return [*text_table(head, rows, words=(0, 4)), "  * what the points are chosen for"]
+    caption = "Standard errors before and after the points are measured"
+    return [Table(caption, head, rows, words=head[-1:]), Text("  * what the points are chosen for")]
 
 
 def _reading(point: dict[str, Any], name: str) -> str:

@@ -17,9 +17,10 @@ from afm_jax.impact.law import Law, errors_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
 from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.units import TWO_SIDED_95
-from afm_jax.words import bullets, decimals, known, text_table, with_error
+from afm_jax.words import decimals, known, with_error
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
 from fitting.parameters import LAWS
+from fitting.report.sections import Bullets, Part, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
 
 ROW_COLUMNS = (
     "line",
@@ -46,27 +47,35 @@ _FORMULAS = {
     "restitution": f"{LAWS['law'].formula}  (eq. 6)",
     "delay": "tau = hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
 }
-NS_PER_US = 1e3
-Table = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
 
 
 def inversion_summary(result: Inversion) -> str:
     """Return the inversion as text: verdict, laws, the rows, the paper's reading on resonance, notes."""
+    return text_of(inversion_report(result))
+
+
+def inversion_report(result: Inversion) -> Report:
+    """Return the inversion as sections: verdict, laws, the rows, the paper's reading on resonance, notes."""
     inverted = int(result.rows.inverted.sum())
-    lines = [
-        f"Direct inversion of {result.table.source}: {inverted} of {result.table.rows} rows",
-        _heading(result),
-        *(f"  - {reason}" for reason in result.reasons),
-        "",
-    ]
+    sections = []
     if inverted:
-        lines += [f"{result.verdict[0].upper()}{result.verdict[1:]}.", ""]
-        for law in (*result.laws.values(), *([result.delay] if result.delay else [])):
-            lines += _law_lines(law)
-        lines += ["", *_row_lines(result)]
-    lines += _resonance_lines(result)
-    lines += bullets("Notes:", result.warnings)
-    return "\n".join(lines)
+        laws = [line for law in (*result.laws.values(), result.delay) if law is not None for line in _law_lines(law)]
+        sections = [
+            ReportSection("Verdict", [Text(f"{result.verdict[0].upper()}{result.verdict[1:]}.")]),
+            ReportSection("Laws", [Text("\n".join(laws), "lines")], "Laws"),
+            ReportSection("Rows", _rows(result), "Rows"),
+        ]
+    if len(result.resonance.row):
+        sections.append(ReportSection("The paper's reading on resonance", _resonance(result), "Resonance"))
+    if result.warnings:
+        sections.append(ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"))
+    return Report(
+        title=f"Direct inversion of {result.table.source}: {inverted} of {result.table.rows} rows",
+        valid=result.valid,
+        verdict=_heading(result),
+        reasons=result.reasons,
+        sections=sections,
+    )
 
 
 def _heading(result: Inversion) -> str:
@@ -77,8 +86,10 @@ def _heading(result: Inversion) -> str:
     return "READ ON AN ASSUMPTION: the phase was not measured but assumed, so that the numbers below are no law."
 
 
-def write_inversion(result: Inversion, folder: Path, write_table: Table) -> list[Path]:
-    """Write invert.txt, invert.json, invert.png, invert.csv and, where one is regressed, law.csv into a folder.
+def write_inversion(
+    result: Inversion, folder: Path, write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
+) -> list[Path]:
+    """Write invert.html, .txt, .json, .png and .csv and, where a law is regressed, law.csv into a folder.
 
     Args:
         result: the inversion.
@@ -91,11 +102,19 @@ def write_inversion(result: Inversion, folder: Path, write_table: Table) -> list
     Raises:
         OSError: if a file cannot be written.
     """
-    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
     from fitting.report.report import write_report_files  # noqa: PLC0415
 
-    text, data, picture = inversion_summary(result), result.to_dict(), png_of(inversion_figure(result))
-    written = write_report_files(folder, "invert", text=text, data=data, picture=picture)
+    report, figure = inversion_report(result), inversion_figure(result)
+    shows = "Loss and delay of every row over the approach speed, with the laws that were regressed on them."
+    written = write_report_files(
+        folder,
+        "invert",
+        text=text_of(report),
+        data=result.to_dict(),
+        picture=png_of(figure),
+        page=page_of(report, pictures_of([svg_of(figure)], [shows])),
+    )
     write_table("invert.csv", result.records(), ROW_COLUMNS)
     if result.law is None:
         return written
@@ -124,7 +143,7 @@ def _coefficient(found: Coefficient) -> str:
     return f"{text} {found.unit}".rstrip()
 
 
-def _row_lines(result: Inversion) -> list[str]:
+def _rows(result: Inversion) -> list[Part]:
     """Return the rows as a table, speeds in nm/us, delays in ns."""
     rows, records = result.rows, result.records()
     head = ["line", "N", "kHz", "nm", "u_in", "+-", "u_out", "+-", "tau", "+-", "loss"]
@@ -141,22 +160,20 @@ def _row_lines(result: Inversion) -> list[str]:
         covariance = rows.covariance[i]
         lost = np.sqrt(max(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1], 0.0))
         loss = with_error(u - w, lost) + (f" ({note})" if note else "")
-        pairs = [(u, du), (w, dw), (NS_PER_US * tau, NS_PER_US * dtau)]
+        pairs = [(u, du), (w, dw), (_NS_PER_US * tau, _NS_PER_US * dtau)]
         cells.append([*start, *(word for pair in pairs for word in with_error(*pair).split(" +- ")), loss])
-    lines = [*text_table(head, cells, words=(10,)), "  Speeds in nm/us, tau in ns; loss: u_in - u_out."]
+    table = Table("Every row by itself", head, cells, words=head[-1:], numbered=True)
+    parts: list[Part] = [table, Text("  Speeds in nm/us, tau in ns; loss: u_in - u_out.")]
     if rows.shared_names:
         names = " and ".join(rows.shared_names)
-        lines.append(
-            f"  Errors are those of each row; the systematic ones, of {names}, stand in invert.csv and --json."
-        )
-    return lines
+        said = f"  Errors are those of each row; the systematic ones, of {names}, stand in invert.csv and --json."
+        parts.append(Text(said))
+    return parts
 
 
-def _resonance_lines(result: Inversion) -> list[str]:
-    reading = result.resonance
-    if not len(reading.row):
-        return []
-    table = result.table
+def _resonance(result: Inversion) -> list[Part]:
+    """Return what the paper's way to read amplitudes on resonance gives, and how far it is off."""
+    reading, table = result.resonance, result.table
     speeds = (reading.approach_speed_nm_per_us, reading.rebound_speed_nm_per_us, reading.speed_error_nm_per_us)
     cells = [
         [
@@ -173,10 +190,9 @@ def _resonance_lines(result: Inversion) -> list[str]:
         "none": "The bias is not known: air damping and the collision delay are left out of this reading.",
     }
     return [
-        "",
-        f"The paper's reading assumes: {reading.assumption}.",
-        *text_table(["line", "u_in", "u_out", "+-", "bias"], cells, words=()),
-        f"  {against[reading.reference]}",
+        Text(f"The paper's reading assumes: {reading.assumption}."),
+        Table("Speeds in nm/µs", ["line", "u_in", "u_out", "+-", "bias"], cells, numbered=True),
+        Text(f"  {against[reading.reference]}"),
     ]
 
 

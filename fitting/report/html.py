@@ -1,4 +1,4 @@
-"""A fit as one HTML file: what the page shows, as plain data; how it looks is in fit.html.jinja."""
+"""A fit as one HTML file: what the page shows, section by section."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -11,7 +11,17 @@ from afm_jax.words import known, plain_words
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FitResult, FittedRows
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS
-from fitting.report.page import Table, in_signs, page, pairs, pictures_of
+from fitting.report.sections import (
+    Bullets,
+    Part,
+    Report,
+    ReportSection,
+    Table,
+    Text,
+    page_of,
+    pairs,
+    pictures_of,
+)
 from fitting.report.words import (
     PULLS,
     SHARE_OF_BAND,
@@ -42,6 +52,7 @@ _FAR = 3.0
 """Residual in standard errors from which a row is marked."""
 _LONGEST = 12
 """Lists longer than that are samples, not findings."""
+_MINUS = "\N{MINUS SIGN}"
 _APPROACH = Markup("u<sub>in</sub> (nm/µs)")
 _COMPARED = {
     "model": "model",
@@ -78,39 +89,94 @@ def fit_page(
         bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.
     """
+    tables = _tables(result)
+    sections = [
+        ReportSection(
+            "What to know besides", [Bullets(result.warnings) if result.warnings else Text("None.")], "Notes"
+        ),
+        ReportSection("Pictures", _pictures_and_law(result, pictures), "Pictures"),
+        ReportSection("Parameters", [_parameters(result), Text(_goodness(result))], "Parameters"),
+        ReportSection("Correlations", [_correlations(result)]),
+        *([ReportSection("Tables", tables, "Tables")] if tables else []),
+        *([] if comparison is None else [_compared(comparison)]),
+        *([] if bootstrap is None else [_sampled("Bootstrap", bootstrap, list(result.parameters))]),
+        *([] if posterior is None else [_sampled("Posterior", posterior, list(result.parameters))]),
+        ReportSection("Rows", [_rows(result)], "Rows"),
+        ReportSection("Minimum", [_minimum(result)]),
+        ReportSection("Inputs", [part for table in result.table.tables for part in _input(table)], "Inputs"),
+        ReportSection(
+            "Settings and versions",
+            [
+                pairs("Options of the fit", ("option", "value"), result.settings),
+                pairs("Versions of what computed it", ("package", "version"), result.versions),
+            ],
+            "Settings",
+        ),
+    ]
+    report = Report(f"Impact law of {result.table.source}", result.valid, "", result.reasons, sections)
+    return page_of(report, _lead(result, comparison), prior_in_words(result))
+
+
+def _lead(result: FitResult, comparison: ComparedModels | None) -> list[Part]:
+    """Return what stands below the verdict: the law in formulas, what the data say of it, and how sure that is."""
+    held, parting = held_in_words(result), parting_in_words(result)
+    parts: list[Part] = [] if result.valid else [Text("What was tried:")]
+    parts += _formulas(result)
+    if held:
+        parts.append(Text(f"{held}."))
+    if result.valid and parting:
+        parts.append(Text(parting))
+    if result.valid and result.model != "contact":
+        parts.append(
+            Text(f"The digits are those it takes to be within {100.0 * SHARE_OF_BAND:g} % of the band's half-width.")
+        )
+    if result.valid:
+        parts.append(_what_the_data_say(result))
+    parts.append(Text(f"{band_in_words(result)} {goodness_in_words(result)}"))
+    if comparison is not None:
+        parts.append(Text(f"Against other models: {comparison.verdict}"))
+    return parts
+
+
+def _formulas(result: FitResult) -> list[Part]:
+    """Return the law, and the delay of impacts that last, with the fitted numbers in them; symbols if not valid."""
+    if result.model == "contact":
+        return [Text("The law and the delay of the resolved contact (meniscus and junction).")]
     names = [*result.parameters, *(result.settings.get("fixed") or {})]
     numbers = {name: PARAMETERS[name].symbol or name for name in names}
-    if result.valid and result.model != "contact":
+    if result.valid:
         numbers = rounded_values(result)
-    samples = {"Bootstrap": bootstrap, "Posterior": posterior}
-    return page(
-        "fit.html.jinja",
-        result=result,
-        title=f"Impact law of {result.table.source}",
-        prior=prior_in_words(result),
-        held=in_signs(held_in_words(result)),
-        numbers=numbers,
-        lasting=result.model.endswith("+delay"),
-        said=_what_the_data_say(result),
-        parting=in_signs(parting_in_words(result)),
-        digits=f"{100.0 * SHARE_OF_BAND:g}",
-        sure=f"{in_signs(band_in_words(result))} {goodness_in_words(result)}",
-        comparison=comparison,
-        compared=None if comparison is None else _compared(comparison),
-        pictures=_pictures(result, pictures),
-        points=_points(result),
-        losses=_losses(result),
-        parameters=_parameters(result),
-        goodness=_goodness(result),
-        correlations=_correlations(result),
-        samples=[_sampled(title, one, list(result.parameters)) for title, one in samples.items() if one is not None],
-        rows=_rows(result),
-        minimum=_minimum(result),
-        tables=_tables(result),
-        inputs=[(_instrument(one), one.remarks, _measured(one)) for one in result.table.tables],
-        settings=pairs("Options of the fit", ("option", "value"), result.settings),
-        versions=pairs("Versions of what computed it", ("package", "version"), result.versions),
+    u_in, u_out, square = Markup("u<sub>in</sub>"), Markup("u<sub>out</sub>"), Markup("<sup>2</sup>")
+
+    def less(name: str) -> str:
+        number = numbers[name]
+        return f" + {number[1:]}" if number.startswith("-") else f" {_MINUS} {number}"
+
+    squared = Markup("({} {}){}").format(numbers["r"], u_in, square) if "r" in numbers else u_in + square
+    if result.model.startswith("restitution"):
+        law = Markup("{} = {} {}").format(u_out, numbers["r"], u_in)
+    elif result.model.startswith("law"):
+        law = Markup("{}{} = {}{}").format(u_out, square, squared, less("epsilon"))
+    else:
+        law = Markup("{}{} = {}{} {}{}").format(u_out, square, squared, less("viscous_loss"), u_in, less("epsilon"))
+    parts: list[Part] = [Text(law, "formula")]
+    lasting = result.model.endswith("+delay")
+    if lasting:
+        delay = Markup(
+            "τ = {hertz} {u_in}<sup>{minus}1/5</sup>{lead} (1/{u_out} {minus} 1/{u_in}){offset}/{u_in}"
+        ).format(
+            minus=_MINUS,
+            hertz=numbers["delay_hertz"],
+            lead=less("delay_lead_nm"),
+            offset=less("delay_offset_nm"),
+            u_in=u_in,
+            u_out=u_out,
+        )
+        parts.append(Text(delay, "formula"))
+    speeds = Markup("Speeds in nm/µs relative to the sample, both positive: approach {}, rebound {}.").format(
+        u_in, u_out
     )
+    return [*parts, Text(speeds + (" Delay τ in µs." if lasting else ""))]
 
 
 def _what_the_data_say(result: FitResult) -> Table:
@@ -118,7 +184,7 @@ def _what_the_data_say(result: FitResult) -> Table:
     caption = "What the data say"
     if len(own) < len(result.parameters):
         caption += " (calibration and damping are fitted along, see Parameters)"
-    rows = [[name, value_in_words(p), interval_in_words(p), in_signs(p.unit)] for name, p in own.items()]
+    rows = [[name, value_in_words(p), interval_in_words(p), p.unit] for name, p in own.items()]
     return Table(caption, ["parameter", "value", "95 % interval", "unit"], rows, words=("95 % interval", "unit"))
 
 
@@ -128,15 +194,11 @@ def _tables(result: FitResult) -> list[Table]:
         return []
     captions = (PULLS, "Scatter of the law between tables", "What each table has to itself")
     found = zip(captions, (tables_in_words(result), scatter_in_words(result), nuisances_in_words(result)), strict=True)
-    return [
-        Table(caption, head, [[in_signs(cell) for cell in row] for row in rows], words=("95 % interval", "unit"))
-        for caption, (head, rows) in found
-        if rows
-    ]
+    return [Table(caption, head, rows, words=("95 % interval", "unit")) for caption, (head, rows) in found if rows]
 
 
-def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]:
-    """Return the pictures with what is to be seen."""
+def _pictures_and_law(result: FitResult, files: Sequence[bytes]) -> list[Part]:
+    """Return the pictures with what is to be seen, and beside them the law in numbers."""
     law = "Rebound speed and energy lost over the approach speed, with their 95 % bands."
     if has_delay(result):
         law = "Rebound speed, energy lost and collision delay over the approach speed, with their 95 % bands."
@@ -146,15 +208,17 @@ def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]
         "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
         "The energy that an impact takes over the approach speed, with its 95 % band; dashed, by the formula.",
     )[: len(files)]
-    return pictures_of(files, shows)
+    rows, law_picture, residuals, *energy = pictures_of(files, shows)
+    losses, points = _losses(result), _points(result)
+    parts = [rows, law_picture, losses, *energy, points, residuals]
+    return [part for part in parts if part is not None]
 
 
 def _losses(result: FitResult) -> Table | None:
     rows = losses_in_words(result)
     if not (result.valid and rows):
         return None
-    cells = [[in_signs(cell) for cell in row] for row in rows]
-    return Table("What an impact takes", ["quantity", "value (95 % interval)"], cells, words=("value (95 % interval)",))
+    return Table("What an impact takes", ["quantity", "value (95 % interval)"], rows, words=("value (95 % interval)",))
 
 
 def _points(result: FitResult) -> Table | None:
@@ -175,7 +239,7 @@ def _parameters(result: FitResult) -> Table:
             value_in_words(parameter),
             known(parameter.standard_error, ".2g"),
             interval_in_words(parameter),
-            in_signs(parameter.unit),
+            parameter.unit,
             "-" if parameter.constraint is None else "{:g} ± {:g}".format(*parameter.constraint),
             remarks_on(parameter),
         ]
@@ -206,14 +270,15 @@ def _correlations(result: FitResult) -> Table:
     return Table(f"Beyond {_TIED:g} in magnitude in bold; - where a variance is not known", ["", *names], rows)
 
 
-def _compared(comparison: ComparedModels) -> Table:
+def _compared(comparison: ComparedModels) -> ReportSection:
     others = dict.fromkeys(name for row in comparison.rows for name in row if name not in _COMPARED)
     names = [*(name for name in _COMPARED if any(name in row for row in comparison.rows)), *others]
     rows = [[plain_words(row.get(name)) for name in names] for row in comparison.rows]
-    return Table("Models of the same amplitudes", [_COMPARED.get(name, name) for name in names], rows)
+    table = Table("Models of the same amplitudes", [_COMPARED.get(name, name) for name in names], rows)
+    return ReportSection("Comparison of models", [Text(comparison.verdict), table], "Comparison of models")
 
 
-def _sampled(title: str, sampled: Sampled, parameters: Sequence[str]) -> dict[str, Any]:
+def _sampled(title: str, sampled: Sampled, parameters: Sequence[str]) -> ReportSection:
     """Return what a bootstrap or a posterior found: a row for each parameter, and everything else by name.
 
     Args:
@@ -226,12 +291,14 @@ def _sampled(title: str, sampled: Sampled, parameters: Sequence[str]) -> dict[st
     columns = {name: value for name, value in flat.items() if _by_parameter(value, parameters)}
     others = {_title(name): value for name, value in flat.items() if name not in columns}
     rows = [[name, *(_cell(column.get(name)) for column in columns.values())] for name in parameters]
-    return {
-        "title": title,
-        "failed": found.get("converged") is False,
-        "by_parameter": Table("By parameter", ["parameter", *map(_title, columns)], rows) if columns else None,
-        "besides": pairs("Besides", ("", "value"), others) if others else None,
-    }
+    parts: list[Part] = []
+    if found.get("converged") is False:
+        parts.append(Text(Markup("<strong>Not converged: do not use these numbers.</strong>")))
+    if columns:
+        parts.append(Table("By parameter", ["parameter", *map(_title, columns)], rows))
+    if others:
+        parts.append(pairs("Besides", ("", "value"), others))
+    return ReportSection(title, parts)
 
 
 def _title(name: str) -> str:
@@ -350,6 +417,12 @@ def _row_remarks(rows: FittedRows, i: int, *, unseen: bool) -> str:
 def _minimum(result: FitResult) -> Table:
     rows = [[name, plain_words(value), _CHECKS.get(name, "")] for name, value in asdict(result.convergence).items()]
     return Table("Checked whatever the optimiser says", ["", "found", "meaning"], rows, words=("meaning",))
+
+
+def _input(measured: AmplitudeTable) -> list[Part]:
+    """Return what a table says of the instrument, the remarks in its file, and its rows."""
+    remarks: list[Part] = [Text("Remarks in the file:"), Bullets(measured.remarks)] if measured.remarks else []
+    return [_instrument(measured), *remarks, _measured(measured)]
 
 
 def _instrument(measured: AmplitudeTable) -> Table:

@@ -10,8 +10,9 @@ import numpy as np
 from afm_jax.saved import saved
 from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.whole_files import write_whole
-from afm_jax.words import bullets, known, text_table
+from afm_jax.words import known
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
+from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, text_of
 from fitting.report.words import (
     PULLS,
     ComparedModels,
@@ -57,26 +58,29 @@ ROW_COLUMNS = (
 def summary(result: FitResult) -> str:
     """Return the fit as text: verdict first, then the law, then goodness of fit and warnings."""
     head = ["parameter", "value", "std. error", "95 % interval"]
-    parameters = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
-    lines = [
-        f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
-        *(f"  {line}" for line in (*formulas(result), held_in_words(result)) if line),
-        "",
-        "VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
-        *(f"  - {reason}" for reason in result.reasons),
-        "",
-        *text_table(head, parameters, words=(0, 3)),
-        "",
+    cells = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
+    parting = parting_in_words(result) if result.valid else ""
+    goodness = [
         f"  {band_in_words(result)}",
-        *([f"  {parting}"] if result.valid and (parting := parting_in_words(result)) else []),
+        *([f"  {parting}"] if parting else []),
         _goodness_line(result),
-        *([f"  {repeats_in_words(repeats)}"] if (repeats := result.repeats) is not None else []),
+        *([] if result.repeats is None else [f"  {repeats_in_words(result.repeats)}"]),
         *_correlation_lines(result),
-        *_table_lines(result),
-        *_loss_lines(result),
-        *bullets("Notes:", result.warnings),
     ]
-    return "\n".join(lines)
+    report = Report(
+        title=f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
+        about=[line for line in (*formulas(result), held_in_words(result)) if line],
+        valid=result.valid,
+        verdict="VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
+        reasons=result.reasons,
+        sections=[
+            ReportSection("Parameters", [Table("", head, cells, words=head[-1:])]),
+            ReportSection("Goodness of fit", [Text("\n".join(goodness))]),
+            *_table_sections(result),
+            ReportSection("Notes", [Bullets(result.warnings, "Notes:")]),
+        ],
+    )
+    return text_of(report)
 
 
 def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
@@ -92,20 +96,19 @@ def _goodness_line(result: FitResult) -> str:
     return f"  {goodness}, AIC {result.aic:.1f}, BIC {result.bic:.1f}"
 
 
-def _table_lines(result: FitResult) -> list[str]:
-    """Return each of several tables' pull, what it has to itself, and the scatter of laws between them."""
-    if not result.tables:
-        return []
-    lines = ["", *text_table(*tables_in_words(result)), f"  {PULLS}."]
-    for head, rows in (scatter_in_words(result), nuisances_in_words(result)):
-        if rows:
-            lines += ["", *text_table(head, rows, words=(0, 1, len(head) - 1))]
-    return lines
-
-
-def _loss_lines(result: FitResult) -> list[str]:
-    rows = losses_in_words(result) if result.valid else []
-    return ["", *text_table(["what an impact takes", "95 % interval"], rows, words=(0, 1))] if rows else []
+def _table_sections(result: FitResult) -> list[ReportSection]:
+    """Return each of several tables' pull, what it has to itself, the scatter of laws, and what an impact takes."""
+    sections = []
+    if result.tables:
+        sections.append(ReportSection("Tables", [Table("", *tables_in_words(result)), Text(f"  {PULLS}.")]))
+        for head, rows in (scatter_in_words(result), nuisances_in_words(result)):
+            if rows:
+                sections.append(ReportSection("Tables", [Table("", head, rows, words=(head[1], head[-1]))]))
+    losses = losses_in_words(result) if result.valid else []
+    if losses:
+        head = ["what an impact takes", "95 % interval"]
+        sections.append(ReportSection("Losses", [Table("", head, losses, words=head)]))
+    return sections
 
 
 def _correlation_lines(result: FitResult) -> list[str]:
@@ -186,19 +189,19 @@ def write_report(
     from fitting.report.plots import fit_pictures  # noqa: PLC0415
 
     picture, *pictures = fit_pictures(result)
-    page = folder / "fit.html"
-    markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
-    write_whole(page, markup)
-    others = write_report_files(folder, "fit", text=summary(result), data=saved(result), picture=picture)
+    page = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
+    written = write_report_files(folder, "fit", text=summary(result), data=saved(result), picture=picture, page=page)
     records = row_records(result)
     write_table("fit_rows.csv", records, tuple(records[0]))
     law = folder / "law.csv"
     save_law_csv(result.law, law)
-    return [page, *others, law]
+    return [*written, law]
 
 
-def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, Any], picture: bytes) -> list[Path]:
-    """Write name.txt, name.json and name.png into a folder and return their paths.
+def write_report_files(
+    folder: Path, name: str, *, text: str, data: dict[str, Any], picture: bytes, page: str | None = None
+) -> list[Path]:
+    """Write name.txt, name.json, name.png and, if there is a page, name.html into a folder and return their paths.
 
     Args:
         folder: an existing folder; files of these names are replaced.
@@ -206,6 +209,7 @@ def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, An
         text: the summary.
         data: everything, as JSON has it.
         picture: a PNG file.
+        page: an HTML file.
 
     Raises:
         OSError: if a file cannot be written.
@@ -214,4 +218,7 @@ def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, An
     write_whole(paths[0], text + "\n")
     write_whole(paths[1], json.dumps(data, indent=1, allow_nan=False) + "\n")
     write_whole(paths[2], picture)
-    return paths
+    if page is None:
+        return paths
+    write_whole(folder / f"{name}.html", page)
+    return [folder / f"{name}.html", *paths]

@@ -73,8 +73,9 @@ def posterior(
         drawn, statistics = _chains(density, jax.random.split(jax.random.key(seed), CHAINS), samples)
         values = np.asarray(_values_of(density.space, drawn))
         halves = jnp.asarray(values[:, : samples // 2 * 2].reshape(2 * CHAINS, samples // 2, -1))
-        r_hat = np.asarray(blackjax.diagnostics.potential_scale_reduction(halves))
-        effective = np.asarray(blackjax.diagnostics.effective_sample_size(halves))
+        # of one parameter they have no axis
+        r_hat = np.atleast_1d(blackjax.diagnostics.potential_scale_reduction(halves))
+        effective = np.atleast_1d(blackjax.diagnostics.effective_sample_size(halves))
     statistics = {name: np.asarray(each) for name, each in statistics.items()}
     chains = PosteriorChains(values, r_hat, effective, int(statistics["diverging"].sum()), seed, statistics)
     return posterior_of_chains(chains, problem.names, tuple(log_uniform))

@@ -194,12 +194,15 @@ def _starts(law: ImpactLaw, cantilever: Cantilever, drives: Drives) -> tuple[Flo
 
 
 def _starts_on_resonance(drives: Drives) -> tuple[Float[np.ndarray, "3 rows"], np.ndarray]:
-    """Return the same of tips that tap on resonance without loss, which are far out where the free one is."""
+    """Return time, position and velocity of taps without loss on resonance, and which drives have one.
+
+    Such a tip is far out where the free one is.
+    """
     height, omega = -drives.offset_nm, 2e-3 * np.pi * drives.frequency_khz
-    share = np.clip(height / drives.amplitude_nm, 0.0, 1.0)
-    speed = omega * drives.amplitude_nm * np.sqrt(1.0 - share**2)
-    starts = np.stack([np.arccos(-share) / omega, np.zeros_like(omega), -speed])
-    return starts, (drives.order == 1) & (share > 0.0) & (share < 1.0)
+    fraction = np.clip(height / drives.amplitude_nm, 0.0, 1.0)
+    speed = omega * drives.amplitude_nm * np.sqrt(1.0 - fraction**2)
+    starts = np.stack([np.arccos(-fraction) / omega, np.zeros_like(omega), -speed])
+    return starts, (drives.order == 1) & (fraction > 0.0) & (fraction < 1.0)
 
 
 def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives, accuracy: float) -> Follow:

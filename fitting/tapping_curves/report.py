@@ -314,7 +314,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         result: what was found.
         pictures: SVG files from `tapping_pictures`.
     """
-    from fitting.report.page import Table, page, pairs, pictures_of  # noqa: PLC0415
+    from fitting.report.sections import Table, page, pairs, pictures_of  # noqa: PLC0415
 
     shows = (
         (

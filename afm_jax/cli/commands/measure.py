@@ -108,8 +108,8 @@ DESIGN = Command(
     orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
     itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
     or 170:190:1. With --out the report: design.csv, to_fill_in.csv (a table for `afm-jax fit`, readings left blank),
-    candidates.csv, design.txt, .json, .png. Exit code 3 if no drive can be planned with, or the points do not determine
-    the law.
+    candidates.csv, design.html, .txt, .json, .png. Exit code 3 if no drive can be planned with, or the points do not
+    determine the law.
     """,
     options=(
         click.option(
@@ -278,8 +278,8 @@ INVERT = Command(
 
     The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses are then regressed on both laws
     (restitution, viscous loss), the delays on the delay law. Rows on resonance are also read as the paper proposes,
-    without their phase. With --out the report: invert.txt, .json, .png, .csv and law.csv. Exit code 3 if the rows
-    determine no law, or none explains them.
+    without their phase. With --out the report: invert.html, .txt, .json, .png, .csv and law.csv. Exit code 3 if
+    the rows determine no law, or none explains them.
     """,
     options=(
         click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path)),

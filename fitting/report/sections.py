@@ -1,0 +1,235 @@
+"""Reports as sections of text, lists, tables and pictures: one renderer for the terminal, one for the HTML page.
+
+A page needs nothing besides itself: pictures are inside, there are no scripts, and its content security policy
+forbids a browser to load anything. Every text is escaped when it enters the page.
+"""
+
+import base64
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from afm_jax.words import plain_words, text_table
+
+_NON_CHARACTERS = "".join(chr(plane << 16 | low) for plane in range(17) for low in (0xFFFE, 0xFFFF))
+_FORBIDDEN = re.compile(rf"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufdd0-\ufdef{_NON_CHARACTERS}]")
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph.
+
+    Attributes:
+        words: the paragraph; of several lines, for the terminal.
+        look: how the page sets it: "" (plain), "formula", or "lines" (spaces and ends of lines as they are).
+    """
+
+    words: str
+    look: str = ""
+    kind: ClassVar[str] = "text"
+
+
+@dataclass(frozen=True)
+class Bullets:
+    """A list of sentences; nothing where there are none.
+
+    Attributes:
+        items: the sentences.
+        title: a line above; the page has the section's heading instead.
+    """
+
+    items: Sequence[str]
+    title: str = ""
+    kind: ClassVar[str] = "bullets"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the page; its first column names the rows.
+
+    Attributes:
+        caption: what it shows.
+        head: the columns' names.
+        rows: a cell for each column.
+        words: names of columns that hold words, not numbers.
+        marked: places of rows that stand out.
+        left_out: where the rows are that are not shown, as a sentence.
+        numbered: the first column holds numbers, which a terminal sets to the right.
+    """
+
+    caption: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    words: Collection[str] = ()
+    marked: Collection[int] = ()
+    left_out: str = ""
+    numbered: bool = False
+    kind: ClassVar[str] = "table"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the page.
+
+    Attributes:
+        source: an SVG file as an address that holds it.
+        shows: what is to be seen, in words; for those too who do not see it.
+    """
+
+    source: str
+    shows: str
+    kind: ClassVar[str] = "picture"
+
+
+Part = Text | Bullets | Table | Picture
+
+
+@dataclass(frozen=True)
+class ReportSection:
+    """A section: a block of the terminal's text, a heading with what is below it on the page.
+
+    Attributes:
+        title: the heading of the page.
+        parts: what it holds, from top to bottom.
+        link: its name among the links at the top of the page; "": it has none.
+    """
+
+    title: str
+    parts: Sequence[Part]
+    link: str = ""
+
+    @property
+    def name(self) -> str:
+        """The section's place in the page's address."""
+        return (self.link or self.title).split()[0].lower()
+
+
+@dataclass(frozen=True)
+class Report:
+    """A result as a person reads it: verdict first, then the sections.
+
+    Attributes:
+        title: what it is about.
+        valid: whether the result may be used.
+        verdict: the verdict's line in the terminal; "VALID" if it is.
+        reasons: why it is not valid.
+        sections: the rest.
+        about: lines below the title in the terminal; on the page paragraphs below the verdict.
+    """
+
+    title: str
+    valid: bool
+    verdict: str
+    reasons: Sequence[str]
+    sections: Sequence[ReportSection]
+    about: Sequence[str] = ()
+
+    def __str__(self) -> str:
+        """Return the report as a terminal shows it."""
+        return text_of(self)
+
+    def _repr_html_(self) -> str:
+        """Return the report as a notebook shows it."""
+        return page_of(self)
+
+
+def text_of(report: Report) -> str:
+    """Return a report as text: blocks with an empty line between; pictures, captions and headings are the page's."""
+    title, verdict = [report.title, *(f"  {line}" for line in report.about)], [report.verdict]
+    verdict += [f"  - {reason}" for reason in report.reasons]
+    blocks = [title, verdict] if report.about else [title + verdict]
+    blocks += [[line for part in section.parts for line in lines_of(part)] for section in report.sections]
+    return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def lines_of(part: Part) -> list[str]:
+    """Return the lines of a part in a terminal."""
+    match part:
+        case Text(words):
+            return [words]
+        case Bullets(items, title):
+            return [*([title] if title and items else []), *(f"  - {item}" for item in items)]
+        case Table(head=head, rows=rows, words=words, numbered=numbered):
+            to_the_left = [k for k, name in enumerate(head) if name in words or (k == 0 and not numbered)]
+            return text_table(head, rows, words=to_the_left)
+        case Picture():
+            return []
+
+
+def page_of(report: Report, lead: Sequence[Part] = (), words: str = "") -> str:
+    """Return a report as one HTML file; it is well-formed XML too.
+
+    Args:
+        report: what it shows.
+        lead: parts between the verdict and the links to the sections.
+        words: a sentence of the verdict; "": the terminal's, if it says more than VALID.
+    """
+    verdict = "" if report.verdict in {"VALID", "NOT VALID"} else report.verdict.removeprefix("NOT VALID: ")
+    lead = [with_signs(part) for part in (*map(Text, report.about), *lead)]
+    sections = [replace(one, parts=[with_signs(part) for part in one.parts]) for one in report.sections]
+    shown = replace(report, sections=sections)
+    return page("page.html.jinja", result=shown, title=report.title, lead=lead, words=in_signs(words or verdict))
+
+
+def with_signs(part: Part) -> Part:
+    """Return a part with the signs that a terminal may lack, µs, ² and ±; what is HTML already stays."""
+
+    def signed(words: str) -> str:
+        return words if isinstance(words, Markup) else in_signs(words).replace("+-", "±")
+
+    match part:
+        case Text(words):
+            return replace(part, words=signed(words))
+        case Table(head=head, rows=rows, words=words):
+            cells = [[signed(cell) for cell in row] for row in rows]
+            return replace(part, head=[*map(signed, head)], rows=cells, words=[*map(signed, words)])
+        case _:
+            return part
+
+
+def page(template: str, **parts: Any) -> str:
+    """Return a page from a template of this folder.
+
+    Args:
+        template: its file name.
+        parts: what it shows; texts are escaped, what HTML may not hold becomes U+FFFD.
+    """
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        finalize=_allowed,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(template).render(**parts)
+
+
+def _allowed(value: Any) -> Any:
+    """Return a text with U+FFFD for what HTML may not hold: controls, surrogates, non-characters."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return _FORBIDDEN.sub("\ufffd", value)
+
+
+def in_signs(words: str) -> str:
+    """Return text with the signs that a terminal may lack: µs for us, ² for ^2."""
+    return re.sub(r"\bus\b", "µs", words).replace("^2", "²").replace("^3", "³")
+
+
+def pairs(caption: str, head: tuple[str, str], values: Mapping[str, Any]) -> Table:
+    """Return a table of names and plain values."""
+    return Table(caption, head, [[name, plain_words(value)] for name, value in values.items()], words=head[1:])
+
+
+def pictures_of(files: Sequence[bytes], shows: Sequence[str]) -> list[Picture]:
+    """Return pictures, SVG files, with what is to be seen in words."""
+    return [
+        Picture(f"data:image/svg+xml;base64,{base64.b64encode(file).decode('ascii')}", words)
+        for file, words in zip(files, shows, strict=True)
+    ]
