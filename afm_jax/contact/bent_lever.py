@@ -81,7 +81,7 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
     """
     junction = find_junction(contact)
     tip = free_tip(contact, junction, lever.mass_ng)._replace(lever_n_per_m=lever.stiffness_n_per_m)
-    plane = jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
+    plane = tip.ends_nm
     straight = lever.angular_frequency**2 * plane
     near, far, off = junction.forms_gap_nm, contact.bridge_forms_nm, junction.breaks_gap_nm
     between = near * (far / near) ** jnp.linspace(0.0, 1.0, _GAPS)
@@ -182,12 +182,11 @@ def _solved(matrix: Float[Array, "n n"], values: Float[Array, "n k"]) -> Float[A
 
 def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float[Array, ""]) -> Float[Array, ""]:
     """Return the energy in aJ with which the junction must form for the tip to come from the plane and to get back."""
-    junction, solid = tip.junction, tip.solid
+    junction = tip.junction
     fraction = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
     on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
-    elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
     out, back = breaks * (plane / breaks) ** fraction, on * (contact.bridge_forms_nm / on) ** fraction
-    leaving = elastic - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
+    leaving = tip.elastic_aj - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
     coming = tip.potential(back) - tip.potential(on)
     most = jnp.maximum(largest(leaving), largest(coming)) + _ABOVE * taken
     # a rounded maximum with a little energy
