@@ -9,7 +9,7 @@ from scipy import optimize
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
-from afm_jax.solve.derivatives import absent, by_tangents, largest
+from afm_jax.solve.derivatives import absent, by_tangents, halved, largest
 from afm_jax.solve.lanes import (
     again_for,
     again_for_the_open,
@@ -19,7 +19,7 @@ from afm_jax.solve.lanes import (
     map_in_blocks,
     power_of_two,
 )
-from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, halved, newton, newton_rows, shortened
+from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, newton, newton_rows, shortened
 from afm_jax.solve.quadrature import gauss_nodes, mean_matrix, series_tail
 
 VALUES = np.arange(1.0, 24.0)

@@ -27,7 +27,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, Leg, free_tip
 from afm_jax.contact.junction import Junction
 from afm_jax.contact.settings import QuickSetting, Setting
-from afm_jax.solve.newton import halved
+from afm_jax.solve.derivatives import halved
 from afm_jax.solve.quadrature import gauss_nodes, nodes_along
 
 _NEAREST = 1e-14

@@ -18,7 +18,7 @@ from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase, require_junction
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.newton import halved
+from afm_jax.solve.derivatives import halved
 
 _NODES = 64
 _ITERATIONS = 12

@@ -6,8 +6,7 @@ program, such as a simulation: each round evaluates the rows that are still open
 
 A scalar equation for every element of an array is `newton(misfit, guess, parameters, settings, elementwise=True)`. A
 search over a batch of slots of which few hold a guess names those by `where`. A step that must not leave the domain of
-f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`. Where no derivative helps,
-`halved` narrows an interval.
+f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`.
 """
 
 import enum
@@ -157,26 +156,6 @@ def _forward(residual: Callable[[Array, Any], Array], *, elementwise: bool) -> C
 def _quotient(value: Array, slope: Array) -> Array:
     """Return value/slope, NaN where the slope is 0."""
     return jnp.where(slope != 0.0, value / jnp.where(slope != 0.0, slope, 1.0), jnp.nan)
-
-
-def halved(
-    holds: Callable[[Array], Array], low: Float[Array, ""], high: Float[Array, ""], *, rounds: int = 50
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the ends of an interval in which a condition ceases to hold, halved again and again; without derivative.
-
-    Args:
-        holds: the condition, taken to hold at the low end and not at the high one.
-        low: one end, which may be the larger number.
-        high: the other end.
-        rounds: how often the interval is halved.
-    """
-
-    def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        middle = 0.5 * (ends[0] + ends[1])
-        held = holds(middle)
-        return jnp.where(held, middle, ends[0]), jnp.where(held, ends[1], middle)
-
-    return lax.fori_loop(0, rounds, halve, (low, high))
 
 
 class LinearisedRows(NamedTuple):
