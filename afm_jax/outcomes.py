@@ -57,7 +57,9 @@ class CollisionOutcome(enum.IntEnum):
 _COLLISION_SENTENCES = {
     CollisionOutcome.REBOUND: "The tip formed the junction, broke it and left.",
     CollisionOutcome.TURNED_IN_BRIDGE: "The bridge turned the tip round before the junction formed; it left.",
-    CollisionOutcome.CAPTURED_BY_BRIDGE: "The tip came too slowly to leave again: the liquid bridge holds it.",
+    CollisionOutcome.CAPTURED_BY_BRIDGE: (
+        "The tip came too slowly to leave again: the liquid bridge holds it, or a dry contact's attraction."
+    ),
     CollisionOutcome.CAPTURED_BY_JUNCTION: "The tip came too slowly to leave again: the solid junction holds it.",
     CollisionOutcome.NO_JUNCTION: "With these parameters no junction forms: force and stiffness are equal nowhere.",
     CollisionOutcome.INVALID_START: "The approach speed is not a positive finite number.",

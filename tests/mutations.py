@@ -28,6 +28,7 @@ LAW_MOTION = "tests/test_law_motion.py::"
 COLLIDE = "tests/test_collide.py::"
 COLLISIONS = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[diffrax]"
 STEPS = "tests/test_contact_legs.py::test_steps_in_time_take_a_free_tip_where_collide_does"
+SOLVE = "tests/test_solve.py::"
 COLLOCATION = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[collocation]"
 
 
@@ -213,18 +214,18 @@ MUTATIONS = {
         "tests/test_dry_contact.py::test_collisions_are_those_of_an_independent_integration[changed0-False]",
     ),
     "delay counted from where the bridge forms, both ways": Mutation(
-        "approach_speed + ways.outer_gap_nm",
-        "approach_speed + contact.bridge_forms_nm",
+        "approach_speed + gaps_nm[1]",
+        "approach_speed + gaps_nm[0]",
         COLLISIONS,
     ),
     "bridge that breaks where it formed": Mutation(
-        "outer = jnp.maximum(contact.bridge_breaks_nm, breaks)\n    pull_in",
-        "outer = jnp.maximum(contact.bridge_forms_nm, breaks)\n    pull_in",
+        "jnp.maximum(self.breaks_nm, self.junction",
+        "jnp.maximum(self.forms_nm, self.junction",
         COLLISIONS,
     ),
     "turning point on the wrong side of the well": Mutation(
-        "> jnp.argmin(potential)",
-        "< jnp.argmin(potential)",
+        "> jnp.argmin(above)",
+        "< jnp.argmin(above)",
         "tests/hard_cases/test_collisions.py::test_a_sharp_tip_turns_in_the_bridge[3.0]",
     ),
     "air that takes half": Mutation(
@@ -320,21 +321,71 @@ MUTATIONS = {
     "Newton's step taken in full": Mutation(
         "step if self.damping is None else self.damping(x, step)",
         "step",
-        "tests/test_solve.py::test_equations_of_elements_end_one_by_one_within_their_domain",
+        f"{SOLVE}test_equations_of_elements_end_one_by_one_within_their_domain",
     ),
     "Newton's method content with a small residual or a small step": Mutation(
         "found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)",
         "found = finite & (small | np.all(sizes <= settings.step_tolerance, axis=1))",
-        "tests/test_solve.py::test_rows_are_solved_each_on_its_own",
+        f"{SOLVE}test_rows_are_solved_each_on_its_own",
     ),
     "implicit derivative of a system turned round": Mutation(
         "return x, -solved_columns(",
         "return x, solved_columns(",
-        "tests/test_solve.py::test_newton_finds_scipys_root_with_the_derivatives_of_differences",
+        f"{SOLVE}test_newton_finds_scipys_root_with_the_derivatives_of_differences",
     ),
     "a curve's plane through the origin": Mutation(
         "normal @ (points[0] - guess)",
         "normal @ points[0]",
-        "tests/test_solve.py::test_a_curve_is_followed_round_its_fold",
+        f"{SOLVE}test_a_curve_is_followed_round_its_fold",
+    ),
+    "blocks that all begin with the first lane": Mutation(
+        "filled(leaf[first : first + width], width)",
+        "filled(leaf[:width], width)",
+        f"{SOLVE}test_many_lanes_are_worked_on_in_blocks_of_one_size[23-sizes3]",
+    ),
+    "blocks of a program that keep the wrong lanes": Mutation(
+        "*part.shape[2:])[:size]",
+        "*part.shape[2:])[-size:]",
+        f"{SOLVE}test_blocks_inside_a_program_have_values_and_both_derivatives[False]",
+    ),
+    "the first of the lanes in need again and again": Mutation(
+        "lax.dynamic_slice(order, (done,), (width,))",
+        "lax.dynamic_slice(order, (0 * done,), (width,))",
+        f"{SOLVE}test_only_lanes_in_need_are_computed_again[4]",
+    ),
+    "settled lanes computed again": Mutation(
+        "np.flatnonzero(~np.asarray(settled))",
+        "np.flatnonzero(np.asarray(settled))",
+        f"{SOLVE}test_open_lanes_are_computed_again_whether_numbers_are_known_or_not",
+    ),
+    "lanes in need worked on once too often": Mutation(
+        "jnp.any(state[2]) & (state[0] < self.passes)",
+        "jnp.any(state[2]) & (state[0] <= self.passes)",
+        "tests/test_contact_legs.py::test_the_few_get_what_each_would_alone[3]",
+    ),
+    "a lane's own tangent taken off": Mutation(
+        "total = total + slopes[:, place] * tangent",
+        "total = total - slopes[:, place] * tangent",
+        f"{SOLVE}test_derivatives_of_a_batch_are_found_forward_and_transposed[True]",
+    ),
+    "an absent number that spreads": Mutation(
+        "jnp.where(asked == 0.0, 0.0, jnp.nan)",
+        "jnp.where(asked == 0.0, jnp.nan, jnp.nan)",
+        f"{SOLVE}test_an_absent_number_has_an_absent_derivative_where_it_is_asked_for",
+    ),
+    "the least for the largest": Mutation(
+        "values[jnp.argmax(values)]",
+        "values[jnp.argmin(values)]",
+        f"{SOLVE}test_the_largest_value_has_the_slope_of_one_of_them",
+    ),
+    "the half in which nothing changes": Mutation(
+        "held = holds(middle)",
+        "held = ~holds(middle)",
+        f"{SOLVE}test_an_interval_is_halved_down_to_rounding_in_either_direction",
+    ),
+    "Legendre series with the wrong weights": Mutation(
+        "(np.arange(count)[:, None] + 0.5)",
+        "(np.arange(count)[:, None] + 1.0)",
+        f"{SOLVE}test_quadrature_of_polynomials_is_exact",
     ),
 }

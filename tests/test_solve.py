@@ -1,4 +1,4 @@
-"""Numerics without physics: blocks of lanes, the hard few again, roots, and points of curves of solutions."""
+"""Numerics without physics: lanes in blocks and again, roots, points of curves, quadrature, derivatives by rules."""
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +9,18 @@ from scipy import optimize
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
-from afm_jax.solve.derivatives import largest
-from afm_jax.solve.lanes import again_for, again_for_the_open, filled, in_blocks, map_in_blocks, power_of_two
+from afm_jax.solve.derivatives import absent, by_tangents, halved, largest
+from afm_jax.solve.lanes import (
+    again_for,
+    again_for_the_open,
+    filled,
+    for_each_lane,
+    in_blocks,
+    map_in_blocks,
+    power_of_two,
+)
 from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, newton, newton_rows, shortened
+from afm_jax.solve.quadrature import gauss_nodes, mean_matrix, series_tail
 
 VALUES = np.arange(1.0, 24.0)
 
@@ -94,6 +103,15 @@ def test_open_lanes_are_computed_again_whether_numbers_are_known_or_not():
     assert jax.grad(lambda factor: jnp.sum(both(factor)))(jnp.asarray(3.0)) == pytest.approx(20.0 + 21.0 + 22.0 + 23.0)
     nothing = again_for_the_open(careful, jnp.ones(3, bool), (jnp.asarray(1.0), jnp.ones(3)), {"found": jnp.ones(3)})
     np.testing.assert_array_equal(nothing["found"], 1.0)
+
+
+def test_a_function_of_one_lane_takes_shared_numbers_and_a_value_a_lane():
+    def of_one(both, value):
+        return both["shared"] * jnp.linspace(0.0, value, 3)[1] + both["own"]
+
+    both = {"shared": jnp.asarray(2.0), "own": jnp.arange(4.0)}
+    np.testing.assert_array_equal(for_each_lane(of_one, both, jnp.asarray(3.0)), 3.0 + np.arange(4.0))
+    assert for_each_lane(of_one, both | {"own": jnp.asarray(1.0)}, jnp.asarray(3.0)) == 4.0
 
 
 def coupled(x, p):
@@ -265,6 +283,60 @@ def test_the_largest_value_has_the_slope_of_one_of_them():
     values = jnp.asarray([1.0, 4.0, 2.0, 4.0])
     assert largest(values) == 4.0
     np.testing.assert_array_equal(jax.grad(largest)(values), [0.0, 1.0, 0.0, 0.0])
+
+
+def waves(shared, lanes, *, power):
+    return {"wave": jnp.sin(shared * lanes) ** power, "sign": jnp.sign(lanes).astype(jnp.int32)}
+
+
+@pytest.mark.parametrize("small", [True, False])
+def test_derivatives_of_a_batch_are_found_forward_and_transposed(small: bool):  # noqa: FBT001
+    shared, lanes = jnp.asarray(0.3), jnp.asarray([0.5, 2.0, -1.0])
+
+    def wave(shared, lanes):
+        return by_tangents(waves, shared, lanes, small=small, power=2)["wave"]
+
+    slope = 2.0 * np.sin(0.3 * lanes) * np.cos(0.3 * lanes)
+    along = jax.jvp(wave, (shared, lanes), (jnp.asarray(1.0), jnp.asarray([1.0, 0.0, 2.0])))[1]
+    np.testing.assert_allclose(along, slope * (lanes + 0.3 * np.array([1.0, 0.0, 2.0])), rtol=1e-14)
+    backwards = jax.grad(lambda *given: jnp.sum(wave(*given) * jnp.arange(3.0)), argnums=(0, 1))(shared, lanes)
+    np.testing.assert_allclose(backwards[0], np.sum(np.arange(3.0) * slope * lanes), rtol=1e-14)
+    np.testing.assert_allclose(backwards[1], np.arange(3.0) * slope * 0.3, rtol=1e-14)
+    # second derivatives, and examples side by side
+    curvature = jax.vmap(jax.hessian(lambda shared: jnp.sum(wave(shared, lanes))))(jnp.asarray([0.3, 0.7]))
+    expected = [np.sum(2.0 * lanes**2 * np.cos(2.0 * at * lanes)) for at in (0.3, 0.7)]
+    np.testing.assert_allclose(curvature, expected, rtol=1e-13)
+
+
+def test_an_absent_number_has_an_absent_derivative_where_it_is_asked_for():
+    def both(x):
+        return jnp.stack([absent(x), x**2])
+
+    np.testing.assert_array_equal(both(jnp.asarray(3.0)), [np.nan, 9.0])
+    np.testing.assert_array_equal(jax.jacfwd(both)(jnp.asarray(3.0)), [np.nan, 6.0])
+    assert jax.grad(lambda x: both(x)[1])(jnp.asarray(3.0)) == 6.0
+    assert np.isnan(jax.grad(lambda x: both(x)[0])(jnp.asarray(3.0)))
+
+
+def test_an_interval_is_halved_down_to_rounding_in_either_direction():
+    for low, high in ((1.0, 2.0), (2.0, 1.0)):
+        ends = halved(lambda x, low=low: (x**2 < 2.0) == (low < 1.5), jnp.asarray(low), jnp.asarray(high), rounds=60)
+        np.testing.assert_allclose(ends, np.sqrt(2.0), rtol=1e-15)
+
+
+def test_quadrature_of_polynomials_is_exact():
+    points, weights, cumulative = gauss_nodes(5)
+    for degree in range(10):
+        assert weights @ points**degree == pytest.approx(1.0 / (degree + 1.0), rel=1e-14)
+    for degree in range(5):
+        integral = points ** (degree + 1) / (degree + 1.0)
+        np.testing.assert_allclose(cumulative @ points**degree, integral, rtol=1e-13, atol=1e-15)
+        # (1/y^2) int_0^y t^n 2 t dt
+        mean = 2.0 / (degree + 2.0) * np.append(points, 1.0) ** degree
+        np.testing.assert_allclose(mean_matrix(5) @ points**degree, mean, rtol=1e-13, atol=1e-14)
+    # P_4 of 2 x - 1 begins with 70 x^4
+    assert float(series_tail(jnp.asarray(points**3))) == pytest.approx(1.0 / 20.0, rel=1e-13)
+    assert float(series_tail(jnp.asarray(70.0 * points**4 - 140.0 * points**3))) == pytest.approx(1.0, rel=1e-12)
 
 
 @pytest.mark.slow

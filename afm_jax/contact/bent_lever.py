@@ -40,8 +40,8 @@ _DRAWN, _WIDEST = 1.1, 0.02
 _FARTHEST = 100.0
 """Speed with which a junction forms at most, in terms of the speed that hysteresis takes."""
 _ABOVE, _ROUND = 0.05, 0.05
-"""Energy above what a hard tap needs to get away, and rounding of that where its reason changes: fractions of what
-hysteresis takes."""
+"""In terms of what hysteresis takes: energy of the weakest hard tap above what it needs to get away, and the width over
+which this need is smoothed where another barrier becomes the highest."""
 
 
 class _Near(NamedTuple):
@@ -81,22 +81,15 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
     """
     junction = find_junction(contact)
     tip = free_tip(contact, junction, lever.mass_ng)._replace(lever_n_per_m=lever.stiffness_n_per_m)
-    plane = jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
-    straight = lever.angular_frequency**2 * plane
-    near, far, off = junction.forms_gap_nm, contact.bridge_forms_nm, junction.breaks_gap_nm
-    between = near * (far / near) ** jnp.linspace(0.0, 1.0, _GAPS)
-    # where the bridge draws more than the lever pulls no tip turns round
-    drawn = _DRAWN * largest(-tip.bridge.force(between)) / lever.mass_ng - straight
-    least = jnp.maximum(pulls[0], _WIDEST * pulls[1])
-    weakest = jnp.stack([jnp.maximum(least, drawn), least])
-    ends = jnp.stack([weakest, jnp.maximum(pulls[1], 1.01 * weakest)])
-    # hard ones also where the lever hardly pulls, or pushes
-    ends = jnp.concatenate([ends, jnp.stack([jnp.minimum(pulls[0], 0.5 * least), least])[:, None]], axis=1)
-    more = jnp.maximum(straight - ends[0], 0.0) * jnp.array([0.0, 0.0, 1.0])
+    plane = tip.ends_nm
+    # by how much the lever pulls more at gap 0 than at the plane
+    raised = lever.angular_frequency**2 * plane
+    near, far, off = junction.forms_gap_nm, tip.forms_nm, junction.breaks_gap_nm
+    ends, more = _pull_ranges(tip, pulls, raised)
+    # at gap 0, of shape (pulls, kinds): light taps, hard ones, and hard ones with hardly any pull
     first, last = ends + more
-    pull = straight + first * (last / first) ** jnp.asarray(0.5 - 0.5 * _points(PULLS))[:, None] - more
+    pull = raised + first * (last / first) ** jnp.asarray(0.5 - 0.5 * _points(PULLS))[:, None] - more
     fraction = jnp.asarray(0.5 - 0.5 * _points(SPEEDS))
-    turns = jax.vmap(lambda g: _turns(tip._replace(pull=g), near, far))(pull[:, 0])
     taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
     scale = jnp.sqrt(2.0 * taken / lever.mass_ng)
 
@@ -106,19 +99,39 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
         formed = formed + _needed(contact, bent, plane, taken)
         return formed, jax.vmap(lambda energy: pass_through_junction(bent, energy, _JUNCTION))(formed)
 
+    # a light tap begins at rest where it turns, a hard one with the energies where the junction forms and breaks
+    turns = jax.vmap(lambda g: _turns(tip._replace(pull=g), near, far))(pull[:, 0])
+    nothing = jnp.zeros_like(turns)
+    light = (turns, turns), (nothing, nothing), _Stretch(*(nothing,) * 6)
     formed, inside = jax.vmap(jax.vmap(of_hard))(pull[:, 1:])
     moments = (inside.time_us ** (n - 1) * inside.gap_nm_us / n for n in (2, 3))
     solid = _Stretch(inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, *moments)
-    nothing = jnp.zeros_like(turns)
-    legs = (turns, turns), (nothing, nothing), _Stretch(*(nothing,) * 6)
-    others = (jnp.full_like(formed, near), jnp.full_like(formed, off)), (formed, inside.energy_aj), solid
-    kinds = jax.tree.map(lambda light, hard: jnp.concatenate([light[:, None], hard], axis=1), legs, others)
+    hard = (jnp.full_like(formed, near), jnp.full_like(formed, off)), (formed, inside.energy_aj), solid
+    lanes = jax.tree.map(lambda light, hard: jnp.concatenate([light[:, None], hard], axis=1), light, hard)
 
     def of_pull(g, lanes):
         return jax.vmap(lambda lane: _tap(contact, tip._replace(pull=g), plane, *lane))(lanes)
 
-    taps = jax.vmap(jax.vmap(of_pull))(pull, kinds)
+    taps = jax.vmap(jax.vmap(of_pull))(pull, lanes)
     return PulledImpact(_filled(taps, ends, more, far / near, scale), tabulated(contact, lever.mass_ng), plane)
+
+
+def _pull_ranges(
+    tip: Driven, pulls: Float[Array, " 2"], raised: Float[Array, ""]
+) -> tuple[Float[Array, "2 kinds"], Float[Array, " kinds"]]:
+    """Return weakest and strongest pull at the plane of the three kinds of taps, and what is added for the logarithm.
+
+    The kinds are light taps, hard ones, and hard ones where the lever hardly pulls, or pushes.
+    """
+    near, far = tip.junction.forms_gap_nm, tip.forms_nm
+    between = near * (far / near) ** jnp.linspace(0.0, 1.0, _GAPS)
+    # where the bridge draws more than the lever pulls no tip turns round
+    drawn = _DRAWN * largest(-tip.bridge.force(between)) / tip.mass_ng - raised
+    least = jnp.maximum(pulls[0], _WIDEST * pulls[1])
+    weakest = jnp.stack([jnp.maximum(least, drawn), least])
+    ends = jnp.stack([weakest, jnp.maximum(pulls[1], 1.01 * weakest)])
+    ends = jnp.concatenate([ends, jnp.stack([jnp.minimum(pulls[0], 0.5 * least), least])[:, None]], axis=1)
+    return ends, jnp.maximum(raised - ends[0], 0.0) * jnp.array([0.0, 0.0, 1.0])
 
 
 def _turns(tip: Driven, near: Float[Array, ""], far: Float[Array, ""]) -> Float[Array, " speeds"]:
@@ -182,12 +195,11 @@ def _solved(matrix: Float[Array, "n n"], values: Float[Array, "n k"]) -> Float[A
 
 def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float[Array, ""]) -> Float[Array, ""]:
     """Return the energy in aJ with which the junction must form for the tip to come from the plane and to get back."""
-    junction, solid = tip.junction, tip.solid
+    junction = tip.junction
     fraction = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
     on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
-    elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
     out, back = breaks * (plane / breaks) ** fraction, on * (contact.bridge_forms_nm / on) ** fraction
-    leaving = elastic - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
+    leaving = tip.elastic_aj - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
     coming = tip.potential(back) - tip.potential(on)
     most = jnp.maximum(largest(leaving), largest(coming)) + _ABOVE * taken
     # a rounded maximum with a little energy

@@ -27,6 +27,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, Leg, free_tip
 from afm_jax.contact.junction import Junction
 from afm_jax.contact.settings import QuickSetting, Setting
+from afm_jax.solve.derivatives import halved
 from afm_jax.solve.quadrature import gauss_nodes, nodes_along
 
 _NEAREST = 1e-14
@@ -442,8 +443,10 @@ def turn_in_bridge(
         gap = jnp.where(goes_in, next_gap, gap)
         ends = jnp.where(goes_in, tip.forms_nm, gap), jnp.where(goes_in, gap, tip.breaks_nm)
         level = jnp.where(goes_in, total, tip.potential(gap))
-        passage, settles = _to_or_from(tip, ends, level)
-        return (gap, jnp.where(goes_in, turns, before[1]), passage, inward), settles
+        way = Way(tip, 1.0, jnp.zeros_like(level), level, tip.potential(ends[1]), Turning(*ends))
+        half = collocate(way, _TURN_NODES, _TURN_ITERATIONS)
+        settles = half.end_change_aj <= 1e-9 * (jnp.abs(level) + jnp.abs(half.passage.dissipated_aj)) + 1e-12
+        return (gap, jnp.where(goes_in, turns, before[1]), half.passage, inward), settles
 
     nothing = jnp.zeros_like(total)
     begin = Passage(nothing, nothing, spent + nothing)
@@ -459,51 +462,29 @@ def turn_in_bridge(
     )
 
 
-def _to_or_from(
-    tip: Driven, gaps: tuple[Float[Array, "..."], Float[Array, "..."]], level: Float[Array, "..."]
-) -> tuple[Passage, Bool[Array, "..."]]:
-    """Return the passage between two gaps one of which is the turning point, and whether its iterations settled.
-
-    Args:
-        tip: a free tip.
-        gaps: where it starts and where it ends.
-        level: its energy at the start, kinetic and potential.
-    """
-    way = Way(tip, 1.0, jnp.zeros_like(level), level, tip.potential(gaps[1]), Turning(*gaps))
-    collocation = collocate(way, _TURN_NODES, _TURN_ITERATIONS)
-    lost = collocation.passage.dissipated_aj
-    return collocation.passage, collocation.end_change_aj <= 1e-9 * (jnp.abs(level) + jnp.abs(lost)) + 1e-12
-
-
 def _turning_gap(tip: Driven, level: Float[Array, "..."]) -> tuple[Float[Array, "..."], Bool[Array, "..."]]:
-    """Return the largest gap at which the potential rises to a level, and whether there is one."""
+    """Return the largest gap in nm at which the potential rises to a level in aJ, and whether there is one."""
+
+    def excess(log_gap, tip, level):
+        return tip.potential(jnp.exp(log_gap)) - level
+
     outer, inner = tip.forms_nm, tip.junction.forms_gap_nm
-    fixed, known = lax.stop_gradient((tip, level))
-
-    def missing(log_gap, model=fixed, value=known):
-        return model.potential(jnp.exp(log_gap)) - value
-
-    points = lax.stop_gradient(
-        jnp.log(outer) + jnp.log(inner / outer) * jnp.linspace(0.0, 1.0, _SCAN, dtype=level.dtype)
-    )
-    potential = fixed.potential(jnp.exp(points))
+    log_gaps = jnp.log(outer) + jnp.log(inner / outer) * jnp.linspace(0.0, 1.0, _SCAN, dtype=level.dtype)
+    log_gaps, fixed_tip, fixed_level = lax.stop_gradient((log_gaps, tip, level))
+    above = excess(log_gaps, fixed_tip, fixed_level)
     # only repulsion stops a tip, so that it turns closer to the sample than where the potential is least
-    beyond = jnp.arange(_SCAN) > jnp.argmin(potential)
-    stopped = beyond & (potential >= known)
+    stopped = (jnp.arange(_SCAN) > jnp.argmin(above)) & (above >= 0.0)
     first = jnp.maximum(jnp.argmax(stopped), 1)
 
-    def halve(_, ends):
-        middle = 0.5 * (ends[0] + ends[1])
-        inside = missing(middle) >= 0.0
-        return jnp.where(inside, ends[0], middle), jnp.where(inside, middle, ends[1])
+    def passes(log_gap):
+        return excess(log_gap, fixed_tip, fixed_level) < 0.0
 
-    _, point = lax.fori_loop(0, 60, halve, (points[first - 1], points[first]))
-
-    def improve(point, _):
-        value, slope = jax.jvp(lambda at: missing(at, tip, level), (point,), (jnp.ones_like(point),))
+    def improve(log_gap, _):
+        value, slope = jax.jvp(lambda at: excess(at, tip, level), (log_gap,), (jnp.ones_like(log_gap),))
         # where nothing stops the tip a step would lead anywhere
         steep = stopped.any() & (slope != 0.0)
-        return point - jnp.where(steep, value / jnp.where(steep, slope, 1.0), 0.0), None
+        return log_gap - jnp.where(steep, value / jnp.where(steep, slope, 1.0), 0.0), None
 
-    # two Newton steps carry first and second derivatives
-    return jnp.exp(lax.scan(improve, point, length=2)[0]), stopped.any()
+    _, turning = halved(passes, log_gaps[first - 1], log_gaps[first], rounds=60)
+    # two steps of Newton's method carry first and second derivatives
+    return jnp.exp(lax.scan(improve, turning, length=2)[0]), stopped.any()

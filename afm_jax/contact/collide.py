@@ -222,9 +222,7 @@ def three_parts(
         crossing: integrates a way through the bridge in place of the setting's integrator; None: the setting's.
     """
     tip = free_tip(contact, junction, mass)
-    breaks = junction.breaks_gap_nm
-    outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
-    gaps_in, gaps_out = (contact.bridge_forms_nm, junction.forms_gap_nm), (outer, breaks)
+    gaps_in, gaps_out = (tip.forms_nm, junction.forms_gap_nm), (tip.ends_nm, junction.breaks_gap_nm)
     # aJ: what the bridge's pull at an outer gap does along such a gap; tells how slow a tip is there (`margin_of`)
     pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap, _ in (gaps_in, gaps_out))
     start = 0.5 * mass * approach_speed * approach_speed
@@ -253,7 +251,7 @@ def three_parts(
     # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
     energy_left = jnp.where(solid.energy_aj > 0.0, retract.energy_aj, solid.energy_aj)
     clear = (energy_left > _NEAR_CAPTURE[1] * start) | (energy_left < _NEAR_CAPTURE[0] * start)
-    return Parts(approach, solid, retract, outer, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
+    return Parts(approach, solid, retract, tip.ends_nm, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
 
 
 _Pair = tuple[Any, Any]

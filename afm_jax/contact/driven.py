@@ -94,6 +94,17 @@ class Driven(NamedTuple):
         return self.solid.depth_scale_nm
 
     @property
+    def ends_nm(self) -> Float[Array, "..."]:
+        """Gap at which contact ends: where the bridge breaks, or the junction where that outlives the bridge."""
+        return jnp.maximum(self.breaks_nm, self.junction.breaks_gap_nm)
+
+    @property
+    def elastic_aj(self) -> Float[Array, "..."]:
+        """Energy that the junction takes from where it forms to where it breaks."""
+        work = self.solid.work
+        return self.solid.energy_scale_aj * (work(self.solid.fold) - work(self.junction.forms_root))
+
+    @property
     def cantilever(self) -> Cantilever:
         """The cantilever of a tip that has one."""
         return self._driven_by().cantilever

@@ -1,14 +1,15 @@
-"""Where the solid junction forms and where it breaks: tangency of bridge and JKR curve, and the JKR fold.
+"""Where the solid junction forms, D_on, and where it breaks, D_off, from a contact's parameters.
 
 An approaching tip changes from the bridge's force curve to the JKR curve where force and stiffness of both are equal.
 The force of the bridge at a gap fixes the point of the JKR curve that bears it (closed form), so that the stiffness is
-one equation for the gap; the point found fixes where the JKR curve sits on the gap axis: depth = shift - gap.
+one equation for the gap, which is D_on; the point of the JKR curve fixes where the curve sits on the gap axis, depth =
+shift - gap. D_off is the fold of the JKR curve. A dry contact forms and breaks where its solids meet.
 
-The phases of contact and their hysteresis: which force law holds depends on where the tip has been.
+Which forces act depends on where the tip has been (`Phase`), and within a phase they are smooth:
 
-DRY -> BRIDGE when the gap falls to `bridge_forms_nm`; BRIDGE -> DRY when it rises to `bridge_breaks_nm`;
-BRIDGE -> JUNCTION when it falls to D_on; JUNCTION -> BRIDGE at D_off, or straight to DRY where D_off lies beyond the
-bridge's range. Within a phase every force is smooth.
+    DRY ----- gap falls to bridge_forms_nm ---> BRIDGE ----- gap falls to D_on ----> JUNCTION
+    DRY <---- gap rises to bridge_breaks_nm --- BRIDGE <---- gap rises to D_off ---- JUNCTION
+    DRY <---- gap rises to D_off, where that lies beyond the bridge's breaking ----- JUNCTION
 """
 
 import enum
@@ -31,6 +32,7 @@ from afm_jax.solve.derivatives import implicit_root
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""
 _POINTS = 24
+"""Gaps of a scan."""
 Tangent = tuple[Bridge, Float[Array, "..."], Float[Array, "..."]]
 """The bridge and the JKR contact's units of load and depth."""
 
@@ -80,8 +82,8 @@ def find_junction(contact: Contact) -> Junction:
         return _dry_junction(contact, contact.junction)
     forces, solid = bridge_of(contact), contact.junction
     scales = solid.load_scale_nn, solid.depth_scale_nm
-    found, exists = _tangency(lax.stop_gradient((forces, *scales)), lax.stop_gradient(contact.bridge_forms_nm))
-    gap = jnp.exp(implicit_root(_excess_stiffness, found, (forces, *scales)))
+    log_gap, exists = _tangency(lax.stop_gradient((forces, *scales)), lax.stop_gradient(contact.bridge_forms_nm))
+    gap = jnp.exp(implicit_root(_excess_stiffness, log_gap, (forces, *scales)))
     force = forces.force(gap)
     root = jkr.root_of_load(force / solid.load_scale_nn)
     shift = gap + solid.depth_scale_nm * jkr.depth(root)
@@ -104,6 +106,7 @@ def find_junction(contact: Contact) -> Junction:
 
 
 def _dry_junction(contact: Contact, junction: Hertz) -> Junction:
+    """Return the junction of a dry contact, without hysteresis; none where its solids meet outside its range."""
     bridge, gap = bridge_of(contact), junction.begins_nm
     none = jnp.zeros_like(gap)
     return Junction(

@@ -1,12 +1,17 @@
-"""The way through the junction, to its turning point and from there to the fold where it breaks: free tips and driven.
+"""The way of a tip through the junction, free or driven: to the turning point, and from there to the fold.
 
-In s = sqrt(A) the JKR potential is a polynomial and the fold, where the contact breaks, is smooth. With s = turn - y^2,
-w^2 = y^2 (unit mean(work') + 2 scale mean(depth') g), where mean(f') is the mean slope from s to the turning point and
-g the mean over that depth of what accelerates the gap beside the contact: drive, spring and air. Both square roots at
-the turning point are thereby gone. The means of g, which varies little, are improved in iterations.
+In the root s of the elastic contact (sqrt(A) for JKR) work and depth are polynomials, and the fold, where the contact
+breaks, is smooth. With s = turn - y^2, turn the root at the turning point, and w the gap's rate,
+
+    w^2 = y^2 (unit mean(work') + 2 scale mean(depth') g),
+
+mean(f') the mean slope by s from s to the turning point, unit = 2 energy_scale/m, scale the unit of the depth, and g
+the mean over that depth of what accelerates the gap beside the contact: drive, spring and air. The square root at the
+turning point is thereby gone. The means of g, which varies little, are improved by Picard's iterations.
 
 For a free tip g = 0 and the junction conserves energy: the turning point is a root of the polynomial, and the times are
-quadratures. A free tip that hardly gets away is slow at the fold; from there s = s_fold + sigma sinh(q).
+quadratures (`pass_through_junction`). A free tip that hardly gets away is slow at the fold; from there
+s = fold + width sinh(q). `go_through_junction` is the leg of a driven tip.
 """
 
 from typing import NamedTuple
@@ -51,7 +56,7 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
     unit = solid.energy_scale_aj
     level = solid.work(form) + jnp.maximum(energy_aj, 0.0) / unit
     turn = turning_root(solid, level)
-    leaving = energy_aj + unit * (solid.work(form) - solid.work(solid.fold))
+    leaving = energy_aj - tip.elastic_aj
     points, weights, _ = nodes_along(nodes, turn)
     if tip.pull is not None:
         leaving, pull = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm), tip.pull

@@ -1,8 +1,8 @@
 """The law that a contact amounts to: rebound speed and delay of its free collisions, in parameters and in tables.
 
-From what becomes of free tips four things are made: the impact law closest to their rebound speeds (`fit_law`), the
-delay law closest to their delays (`fit_delay`), both roughly and at once where a guess will do (`law_of_contact`), and
-a table of both that is as exact as the collisions themselves (`tabulated`).
+Five functions make a law of collisions: the formula closest to their rebound speeds (`fit_law`), the formula
+closest to their delays (`fit_delay`), both roughly and at once where a guess will do (`law_of_contact`), a table for
+scenes and files (`make_law`), and a table that has derivatives in every parameter, for fits of a contact (`tabulated`).
 
 The delay is what the straight paths in and out, extrapolated to gap 0, leave between them; the difference of two times:
 
@@ -11,9 +11,9 @@ The delay is what the straight paths in and out, extrapolated to gap 0, leave be
           the time that the tip needs for these ways outside the junction: it is pulled in, and on the way out still
           has the energy that hysteresis takes only later.
 
-For the table a collision is followed against time, from the speed with which the tip leaves to the one with which it
-came: there is no capture that way, and the speed and the time in contact are smooth functions of the rebound speed down
-to 0. The capture speed is where a rebound speed of 0 comes from.
+For the last table a collision is followed against time, from the speed with which the tip leaves to the one with which
+it came: there is no capture that way, and the speed and the time in contact are smooth functions of the rebound speed
+down to 0. The capture speed is where a rebound speed of 0 comes from.
 """
 
 import math
@@ -29,9 +29,9 @@ from jaxtyping import Array, Float
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
-from afm_jax.contact.contact import Bridge, Contact, bridge_of
-from afm_jax.contact.driven import free_tip
-from afm_jax.contact.junction import Junction, find_junction
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Driven, free_tip
+from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
 from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, HertzContact, ImpactLaw, TabulatedLaw
@@ -45,16 +45,19 @@ RESIDUALS = ("relative", "absolute")
 LAW_SPEEDS = 1.5, 250.0
 """The range of `fit_law` if none is given: from this multiple of the capture speed to this speed in nm/us."""
 DELAY_SPEEDS = 1.37, 700.0
-"""The same of `fit_delay`: for the paper's contact 15 to 700 nm/us."""
+"""The range of `fit_delay` if none is given, likewise: for the paper's contact 15 to 700 nm/us."""
 _NAMES = ("r", "epsilon", "viscous_loss")
 _STEPS, _TOLERANCE, _SETTLED = 100, 1e-28, 1e-18
 """Distances of the sum of squares to its minimum, over the squared rebound speeds, to stop at and to have settled."""
 
 _GUESSES = 12
+"""Collisions of `law_of_contact`."""
 _GUESS_SPEEDS = 1.4, 500.0
-"""The same of `law_of_contact`."""
+"""Their range, likewise."""
 _SLOWEST_GUESS = 5.0
-"""Its lowest speed, in nm/us, where no speed is captured."""
+"""Their lowest speed in nm/us where no tip is captured."""
+_NEAREST, _FASTEST = 0.2, 700.0
+"""Where the table of `make_law` begins, as sqrt(u^2 - u_c^2) over the capture speed, and ends, in nm/us."""
 
 TERMS = 32
 """Terms of the series: measured on random contacts, 24 leave errors of 1e-5, 40 gain nothing."""
@@ -224,10 +227,6 @@ def fit_law(
     )
 
 
-_NEAREST, _FASTEST = 0.2, 700.0
-"""Where the table of `make_law` begins, as sqrt(u^2 - u_c^2) over the capture speed, and ends, in nm/us."""
-
-
 @checked
 def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS) -> TabulatedLaw:
     """Return the law that a contact amounts to, as a table of free collisions: what a scene takes in its place.
@@ -247,13 +246,13 @@ def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS
         raise ValueError("the contact captures tips of every speed that was tried: there is no law to make")
     # a contact that captures no tip still needs a positive speed
     beyond = np.geomspace(max(_NEAREST * capture, 1e-3 * _FASTEST), _FASTEST, points)
-    found = rebounds(contact, np.hypot(beyond, capture), mass_ng)
-    approach, rebound = found["approach_speed_nm_per_us"], found["rebound_speed_nm_per_us"]
+    leaving = rebounds(contact, np.hypot(beyond, capture), mass_ng)
+    approach, rebound = leaving["approach_speed_nm_per_us"], leaving["rebound_speed_nm_per_us"]
     return TabulatedLaw(
         approach,
         # without any loss rounding may add to the speed
         np.minimum(rebound, approach),
-        found["collision_delay_us"],
+        leaving["collision_delay_us"],
         capture_speed_nm_per_us=capture,
         mass_ng=mass_ng,
         origin=f"contact: {', '.join(contact.effects)}",
@@ -277,7 +276,7 @@ def closest_law(
     losses = np.stack([approach**2, np.ones_like(approach), approach], axis=1)[:, free] * scales
     weights = 1.0 / rebound if residuals == "relative" else np.ones_like(rebound)
 
-    def look(place: Float[np.ndarray, "1 p"], _: object) -> Searches:
+    def evaluate(place: Float[np.ndarray, "1 p"], _: object) -> Searches:
         # a law that captures a tip of the range has the smallest speed instead: far from any minimum
         fitted = np.sqrt(np.maximum(approach**2 - place @ losses.T, 1e-12))
         residual = (fitted - rebound) * weights
@@ -291,12 +290,12 @@ def closest_law(
     guess /= max(1.0, 1.01 * float(np.max(losses @ guess / approach**2)))
     size = float(np.sum((weights * rebound) ** 2))
     box = Box(np.zeros(len(scales)), np.full(len(scales), np.inf), np.zeros((1, len(scales)), bool))
-    found = descended(look, look(guess[None], None), box, settled=_TOLERANCE * size, most=_STEPS)
+    minimum = descended(evaluate, evaluate(guess[None], None), box, settled=_TOLERANCE * size, most=_STEPS)
     values = np.zeros(3)
-    values[free] = found.place[0] * scales
+    values[free] = minimum.place[0] * scales
     loss, epsilon, viscous_loss = values.tolist()
     law = ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss)
-    return law, bool(distance(found, box)[0] < _SETTLED * size)
+    return law, bool(distance(minimum, box)[0] < _SETTLED * size)
 
 
 def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> dict[str, np.ndarray]:
@@ -305,13 +304,13 @@ def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) 
     Raises:
         ValueError: if one is captured, or not resolved.
     """
-    found = collide_in_blocks(contact, speeds, mass_ng)
-    stays = np.flatnonzero(~(found["rebound_speed_nm_per_us"] > 0.0))
+    tips = collide_in_blocks(contact, speeds, mass_ng)
+    stays = np.flatnonzero(~(tips["rebound_speed_nm_per_us"] > 0.0))
     if stays.size:
         raise ValueError(
             f"`speed_range` must hold rebounding tips only, but the one of {speeds[stays[-1]]:.6g} nm/us does not leave"
         )
-    return found
+    return tips
 
 
 def range_above_capture(
@@ -405,9 +404,9 @@ def fit_delay(
     if points < 3:
         raise ValueError(f"`points` must be at least the number of parameters, 3, but is {points}")
     low, high = range_above_capture(speed_range, float(capture_speed(contact, mass_ng)), *DELAY_SPEEDS)
-    found = rebounds(contact, np.geomspace(low, high, points), mass_ng)
+    tips = rebounds(contact, np.geomspace(low, high, points), mass_ng)
     names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us")
-    approach, rebound, delay, lag = (found[name] for name in names)
+    approach, rebound, delay, lag = (tips[name] for name in names)
     law, fitted = closest_delay(approach, rebound, delay)
     return ContactDelay(
         delay=law,
@@ -458,9 +457,9 @@ def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     low = max(_GUESS_SPEEDS[0] * slowest, _SLOWEST_GUESS)
     u = np.geomspace(low, max(_GUESS_SPEEDS[1], 4.0 * low), _GUESSES)
     # a guess needs no more digits
-    found = collide(contact, jnp.asarray(u), mass_ng, accuracy=1e-6)
-    w, delay = np.asarray(found.rebound_speed_nm_per_us), np.asarray(found.collision_delay_us)
-    free = ~np.asarray(found.captured) & (w > 0.0)
+    result = collide(contact, jnp.asarray(u), mass_ng, accuracy=1e-6)
+    w, delay = np.asarray(result.rebound_speed_nm_per_us), np.asarray(result.collision_delay_us)
+    free = ~np.asarray(result.captured) & (w > 0.0)
     if np.count_nonzero(free) <= 3:
         return None
     u, w, delay = u[free], w[free], delay[free]
@@ -469,13 +468,6 @@ def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     lost = (u * u - w * w - epsilon) / u
     viscous = max(float(np.mean(lost)), 0.0)
     return ImpactLaw(1.0, max(epsilon, 0.0), viscous, closest_delay(u, w, delay)[0])
-
-
-class TracedBack(NamedTuple):
-    """Where a rebound comes from, and how long it takes: nm/us and us."""
-
-    approach_speed: Float[Array, "..."]
-    time: Float[Array, "..."]
 
 
 @jax.jit
@@ -489,21 +481,22 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
         contact: the contact, of numbers.
         mass_ng: the tip's mass in ng.
     """
-    junction, bridge = find_junction(contact), bridge_of(contact)
-    outer = jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
+    junction = find_junction(contact)
+    tip = free_tip(contact, junction, mass_ng)
+    outer = tip.ends_nm
     taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
-    pulled = bridge.potential(outer) - bridge.potential(junction.breaks_gap_nm)
+    pulled = tip.potential(outer) - tip.potential(junction.breaks_gap_nm)
     scale = jnp.sqrt(2.0 * jnp.maximum(pulled, 0.25 * taken) / mass_ng)
     highest = FARTHEST * jnp.sqrt(2.0 * taken / mass_ng)
     excess = scale * jnp.sinh(stretched(highest / scale) * jnp.asarray(_PLACES))
     # the root of 0 has no derivative
-    left = 0.5 * mass_ng * excess**2 + _barrier(contact, bridge, junction, outer)
+    left = 0.5 * mass_ng * excess**2 + _barrier(tip)
 
-    def back(energies, rule):
-        return jax.vmap(lambda energy: _traced_back(contact, junction, mass_ng, energy, rule))(energies)
+    def back(tip, energies, rule):
+        return jax.vmap(lambda energy: _traced_back(tip, energy, rule))(energies)
 
-    u, time = back(left, _USUAL)
-    finer = lax.stop_gradient(back(lax.stop_gradient(left[_COMPARED]), _FINER))
+    u, time = back(tip, left, _USUAL)
+    finer_u, finer_time = lax.stop_gradient(back(*lax.stop_gradient((tip, left[_COMPARED])), _FINER))
     lowest = u[0]
     # through values at places that the loss has shifted a little
     far = stretched(jnp.sqrt(jnp.maximum(u[1:] ** 2 - lowest**2, 1e-12)) / scale)
@@ -523,49 +516,46 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
         outer_nm=outer,
         closest=HertzContact(delay * u[-1] ** 0.2, jnp.zeros(()), jnp.zeros(()), contact.bridge_breaks_nm),
         loss_error=_tail(loss),
-        speed_error=largest(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
-        time_error=_tail(time_terms) + largest(jnp.abs(finer.time - time[_COMPARED])),
+        speed_error=largest(jnp.abs(finer_u / u[_COMPARED] - 1.0)),
+        time_error=_tail(time_terms) + largest(jnp.abs(finer_time - time[_COMPARED])),
     )
     lead, raised = _lead_and_height(table)
     return replace(table, closest=table.closest._replace(lead_nm=lead, raised_nm=raised))
 
 
-def _traced_back(
-    contact: Contact, junction: Junction, mass: Float[Array, ""], left: Float[Array, ""], rule: _Rule
-) -> TracedBack:
-    """Return where a tip comes from that leaves with an energy: out, junction and in, each followed against time."""
-    tip = free_tip(contact, junction, mass)
+def _traced_back(tip: Driven, leaving_aj: Float[Array, ""], rule: _Rule) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the approach speed in nm/us of a tip that leaves with an energy, and how long its contact lasts, in us.
+
+    Retraction, junction and approach are followed against time, so that drag gives back what it took.
+    """
     tip = tip._replace(bridge=tip.bridge.reversed())
-    bridge, solid = tip.bridge, tip.solid
-    forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
-    outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
-    margin = margin_of(left, bridge.force(outer) * -outer)
-    out = pass_by_collocation(way_through(tip, (outer, breaks), left, margin, inward=True), rule.nodes, rule.iterations)
-    elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
-    formed = out.energy_aj + elastic
+    forms, ends = tip.forms_nm, tip.ends_nm
+    on, off = tip.junction.forms_gap_nm, tip.junction.breaks_gap_nm
+    margin = margin_of(leaving_aj, tip.bridge.force(ends) * -ends)
+    retract = way_through(tip, (ends, off), leaving_aj, margin, inward=True)
+    out = pass_by_collocation(retract, rule.nodes, rule.iterations)
+    formed = out.energy_aj + tip.elastic_aj
     inside = pass_through_junction(tip, formed, rule.junction)
-    came = formed + bridge.potential(junction.forms_gap_nm) - bridge.potential(forms)
-    margin = margin_of(jnp.maximum(came, 0.0), bridge.force(forms) * -forms)
-    back = pass_by_collocation(
-        way_through(tip, (forms, junction.forms_gap_nm), formed, margin, inward=False), rule.nodes, rule.iterations
+    arriving = formed + tip.potential(on) - tip.potential(forms)
+    margin = margin_of(jnp.maximum(arriving, 0.0), tip.bridge.force(forms) * -forms)
+    approach = pass_by_collocation(
+        way_through(tip, (forms, on), formed, margin, inward=False), rule.nodes, rule.iterations
     )
-    approach = jnp.sqrt(2.0 * jnp.maximum(back.energy_aj, 1e-12) / mass)
-    return TracedBack(approach, out.time_us + inside.time_us + back.time_us)
+    speed = jnp.sqrt(2.0 * jnp.maximum(approach.energy_aj, 1e-12) / tip.mass_ng)
+    return speed, out.time_us + inside.time_us + approach.time_us
 
 
-def _barrier(contact: Contact, bridge: Bridge, junction: Junction, outer: Float[Array, ""]) -> Float[Array, ""]:
+def _barrier(tip: Driven) -> Float[Array, ""]:
     """Return the energy in aJ that a tip must leave with to have passed every barrier: 0 if the end is the highest.
 
     Drag, which a barrier spares the tip, is left out: with a barrier the table begins a little above capture.
     """
-    share = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
-    on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
-    out = bridge.potential(breaks * (outer / breaks) ** share) - bridge.potential(outer)
+    fraction = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
+    on, off, ends = tip.junction.forms_gap_nm, tip.junction.breaks_gap_nm, tip.ends_nm
+    out = tip.potential(off * (ends / off) ** fraction) - tip.potential(ends)
     # the junction's fold stands as high as the bridge where it breaks; what it takes, the tip had before
-    solid = contact.solid
-    elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
-    inward = bridge.potential(on * (contact.bridge_forms_nm / on) ** share) - bridge.potential(on)
-    before = inward - elastic + bridge.potential(breaks) - bridge.potential(outer)
+    inward = tip.potential(on * (tip.forms_nm / on) ** fraction) - tip.potential(on)
+    before = inward - tip.elastic_aj + tip.potential(off) - tip.potential(ends)
     return jnp.maximum(jnp.maximum(largest(out), largest(before)), 0.0)
 
 

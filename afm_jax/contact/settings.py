@@ -1,4 +1,4 @@
-"""How many nodes, iterations and steps a wanted accuracy of a contact needs: of free collisions and of driven contacts.
+"""How many nodes, iterations and steps an accuracy needs: of free collisions and of driven contacts.
 
 Measured by `afm-jax accuracy collide` and `afm-jax bench --only scenes`.
 """

@@ -1,16 +1,14 @@
-"""One impact in time: gap, speed, phase and force along the way of a free tip through the contact.
+"""One impact of a free tip in time: gap, velocity, phase and force on its way through the contact.
 
-The legs of `collide`, read at their Gauss nodes, which crowd where the tip is slow; time is a result here, so that the
-points are not equally spaced.
+The tip's ways through bridge and junction are computed as in `collide`, with the gap or the root s in place of time,
+and told at their Gauss nodes; these crowd where the tip is slow, so that times are not equally spaced.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from afm_jax.checks import as_parameter, check_parameter, check_scalar, checked, refuse_float32
@@ -20,6 +18,7 @@ from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase, require_junction
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.derivatives import halved
 
 _NODES = 64
 _ITERATIONS = 12
@@ -90,7 +89,7 @@ def _course(
     junction = find_junction(contact)
     tip = free_tip(contact, junction, mass)
     solid = tip.solid
-    forms, breaks = contact.bridge_forms_nm, jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
+    forms, breaks = tip.forms_nm, tip.ends_nm
     pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, breaks))
     start = 0.5 * mass * speed * speed
 
@@ -109,21 +108,10 @@ def _course(
 
     end = end_at(breaks)
     # a tip that does not get out stops at the gap to which its energy just suffices
-    stop = jnp.where(end > 0.0, breaks, _largest(lambda gap: end_at(gap) > 0.0, junction.breaks_gap_nm, breaks))
+    stop = jnp.where(end > 0.0, breaks, halved(lambda gap: end_at(gap) > 0.0, junction.breaks_gap_nm, breaks)[0])
     outward, left = _crossing(way_out(stop, margin_of(jnp.maximum(end, 0.0), pull_out)))
     rebound = jnp.where((off > 0.0) & (end > 0.0), jnp.sqrt(2.0 * jnp.maximum(left, 0.0) / mass), 0.0)
     return junction, [inward, loading, unloading, outward], jnp.stack([on, off, rebound])
-
-
-def _largest(holds: Callable[[Array], Array], low: Float[Array, ""], high: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the largest value up to which a condition holds, by halving."""
-
-    def halve(_, ends):
-        middle = 0.5 * (ends[0] + ends[1])
-        inside = holds(middle)
-        return jnp.where(inside, middle, ends[0]), jnp.where(inside, ends[1], middle)
-
-    return lax.fori_loop(0, 50, halve, (low, high))[0]
 
 
 def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
@@ -145,7 +133,7 @@ def _junction_legs(tip: Driven, level: Float[Array, ""]) -> tuple[_Leg, _Leg]:
     lowest = solid.unloaded  # of the work: left of it the contact pulls
     fold = jnp.full_like(turn, solid.fold)
     breaks = level > solid.work(fold)
-    stop = lowest + fold - _largest(lambda s: solid.work(lowest + fold - s) < level, fold, lowest)
+    stop = lowest + fold - halved(lambda s: solid.work(lowest + fold - s) < level, fold, lowest)[0]
     out = stretch_in_junction(tip, level, turn, jnp.where(breaks, fold, stop), _NODES)
     into = stretch_in_junction(tip, level, turn, tip.junction.forms_root, _NODES)
     # the way in is the way out of the same energy, backwards

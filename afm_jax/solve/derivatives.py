@@ -1,18 +1,18 @@
 """Derivatives that need care: of a root, of the largest value, of a number that is absent, and of a batch of tips.
 
-A root x(p) of f(x, p) = 0 that some search has found obeys dx/dp = -(df/dp)/(df/dx). The rule calls itself for the
-root it differentiates at, so that second derivatives (forward over reverse, Hessians) are right as well; a Newton step
-behind `stop_gradient` would give wrong Hessians. So would `jax.custom_jvp` as soon as the root is found inside
-`lax.scan`: reverse mode evaluates a loop's body partially to move what does not change out of the loop, and drops
-custom rules on the way (jax 0.10.1). A primitive keeps its rule.
+A root x(p) of f(x, p) = 0 that some search (such as `halved`) has found obeys dx/dp = -(df/dp)/(df/dx). The rule calls
+itself for the root it differentiates at, so that second derivatives (forward over reverse, Hessians) are right as well;
+a Newton step behind `stop_gradient` would give wrong Hessians. So would `jax.custom_jvp` as soon as the root is found
+inside `lax.scan`: reverse mode evaluates a loop's body partially to move what does not change out of the loop, and
+drops custom rules on the way (jax 0.10.1). A primitive keeps its rule.
 
-What becomes of a tip of a batch depends on its own numbers only, and there are few of them: the derivatives of all
-results by all numbers that move are one forward pass along each (`by_tangents`). Reverse mode then has nothing of the
-way itself to turn round, which is what takes long to compile and leaves much behind in memory: a product of these
-derivatives is transposed. Second derivatives are found in the same way. Inside `lax.scan` JAX may drop the rule; the
-function itself is differentiated. Under `vmap` the tips of all examples are side by side: a question about all tips
-("do all get along with few steps?") stays one question, where a batch of questions would do both answers' work for
-every tip.
+`by_tangents` is for a batch of tips each of which depends on its own few numbers. With n of them, n forward passes give
+the matrix of a tip's derivatives; the derivative of the batch is the product of these matrices with the tangents, and
+reverse mode transposes that product. So reverse mode never turns round the function itself, which would take long to
+compile and leave much behind in memory. Second derivatives are those of the matrices, found in this way again. Under
+`vmap` the tips of all examples are laid side by side as one batch: a question about all tips ("are few steps enough for
+all?") stays one question, where a batch of questions would do both answers' work for every tip. Inside `lax.scan` JAX
+may drop the rule; the function itself is then differentiated.
 """
 
 from collections.abc import Callable, Hashable, Sequence
@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
@@ -158,6 +159,26 @@ ad.primitive_jvps[_implicit_root] = _differentiate
 batching.primitive_batchers[_implicit_root] = _map_over_batch
 
 
+def halved(
+    holds: Callable[[Array], Array], low: Float[Array, ""], high: Float[Array, ""], *, rounds: int = 50
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the ends of an interval in which a condition ceases to hold, halved again and again; without derivative.
+
+    Args:
+        holds: the condition, taken to hold at the low end and not at the high one.
+        low: one end, which may be the larger number.
+        high: the other end.
+        rounds: how often the interval is halved.
+    """
+
+    def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = 0.5 * (ends[0] + ends[1])
+        held = holds(middle)
+        return jnp.where(held, middle, ends[0]), jnp.where(held, ends[1], middle)
+
+    return lax.fori_loop(0, rounds, halve, (low, high))
+
+
 def largest(values: Float[Array, " n"]) -> Float[Array, ""]:
     """Return the largest of some values, with the derivative of that one.
 
@@ -211,7 +232,7 @@ def by_tangents(function: Callable[..., Any], *arguments: Any, small: bool, **se
 
 
 class _Work(NamedTuple):
-    """A function of flat arguments."""
+    """A function of flat arguments, which can be compared: equal work shares compiled programs."""
 
     function: Callable[..., Any]
     structure: Any
@@ -222,7 +243,7 @@ class _Work(NamedTuple):
 
 
 class _Slopes(NamedTuple):
-    """The results of work, and their derivatives by those leaves that move, along an axis behind the tips'."""
+    """Work that gives results and their derivatives by the leaves that move, along an axis behind the tips'."""
 
     work: "_Work | _Slopes"
     moving: tuple[int, ...]
@@ -232,6 +253,7 @@ class _Slopes(NamedTuple):
 
 
 def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bool) -> Any:
+    """Return the results of work, whose derivative is the product of `_Slopes` with the tangents."""
     ruled = jax.custom_jvp(partial(_side_by_side, work))
 
     def derivative(values, tangents):
@@ -247,7 +269,7 @@ def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bo
 
 
 def _along(result: Array, slopes: Array, tangents: Sequence[Array]) -> Any:
-    """Return the tangent of a result; numbers for all tips in one product, whose transpose adds up before it parts."""
+    """Return the tangent of a result; numbers for all tips are one product, so that its transpose is a single sum."""
     if not _is_real(result):
         return np.zeros(result.shape, jax.dtypes.float0)
     shared = [place for place, tangent in enumerate(tangents) if not tangent.ndim]
@@ -263,6 +285,8 @@ def _along(result: Array, slopes: Array, tangents: Sequence[Array]) -> Any:
 
 @partial(jax.jit, static_argnames="asked")
 def _with_slopes(leaves: tuple[Array, ...], asked: _Slopes) -> tuple[Any, Any]:
+    """Return results and derivatives: the derivatives by shifts, at 0, that all tips' numbers have in common."""
+
     def shifted(shifts):
         moved = list(leaves)
         for place, i in enumerate(asked.moving):
