@@ -68,16 +68,20 @@ class Tips(NamedTuple):
 
 
 class Record(NamedTuple):
-    """What is kept of impacts, arrays (lanes, impacts); NaN where there was none. Times within the drive's period."""
+    """Impacts of tips, arrays (lanes, impacts), NaN where there was none.
+
+    Times in us count within the drive's period, speeds are in nm/us; the approach speed is relative to the platform.
+    """
 
     arrival_us: Float[Any, "lanes impacts"]
     approach_nm_per_us: Float[Any, "lanes impacts"]
     departure_us: Float[Any, "lanes impacts"]
-    """After a rest that of the release."""
+    """Beginning of the next flight; after a rest that is the release."""
     velocity_after_nm_per_us: Float[Any, "lanes impacts"]
     arrival_periods: Float[Any, "lanes impacts"]
     """Whole drive periods before the arrival."""
     departure_periods: Float[Any, "lanes impacts"]
+    """Whole drive periods before the departure."""
     near_grazing: Bool[Any, "lanes impacts"]
     rested: Bool[Any, "lanes impacts"]
 
@@ -91,10 +95,10 @@ def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float
 
     Args:
         scenes: a batch of scenes with laws or contacts.
-        tips: where they are.
+        tips: at the beginning of a flight each.
         skip: impacts before those that are recorded.
         record: impacts that are recorded.
-        accuracy: of resolved contacts.
+        accuracy: of `simulate`, for contacts.
     """
     if isinstance(scenes.interaction, Contact):
         return follow_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
@@ -114,43 +118,43 @@ class MapStep(NamedTuple):
 
 
 def advance(scenes: Scene, tips: Tips) -> MapStep:
-    """Return the next impacts of a block of tips, and where their flights after them begin.
+    """Return one step of the impact map for a block of tips: the next impacts, and where the flights after them begin.
 
     Args:
-        scenes: a batch of scenes, every number of one lane a tip.
-        tips: where they are.
+        scenes: a batch of scenes with a law, every number of one lane a tip.
+        tips: at the beginning of a flight each.
     """
     going = tips.outcome == Outcome.IMPACT
     impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
     slow = going & (impact.outcome == Outcome.STEP_LIMIT)
     longer = jax.vmap(partial(_one_impact, max_steps=MAX_STEPS))
     impact = again_for(longer, slow, (scenes, tips), impact, block=_FEW)
-    return landed(scenes, tips, impact)
+    return after_impacts(scenes, tips, impact)
 
 
-def landed(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
-    """Return the step of tips to impacts that were found."""
+def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
+    """Return the step of the map for impacts that are known: what follows each, a flight, a rest or the end."""
     going = tips.outcome == Outcome.IMPACT
     captured = going & (impact.outcome == Outcome.CAPTURED)
     landed = captured | (going & (impact.outcome == Outcome.IMPACT))
     surface = scenes.platform
     rebound = impact.velocity_after_nm_per_us - surface.velocity(impact.time_us)
     leaving = Departure(impact.time_us, jnp.zeros_like(rebound), impact.velocity_after_nm_per_us)
-    no = jnp.zeros_like(going)
+    never = jnp.zeros_like(going)
     # without adhesion alone a tip that came to rest may leave again, and chatter comes to an end
     law = impact_law_of(scenes)
     may_rest = landed & (~law.adheres) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
 
     (time, gap, velocity), rested, held = again_for(
-        jax.vmap(_rest), may_rest, (scenes, impact), (leaving, no, no), block=_FEW
+        jax.vmap(_rest), may_rest, (scenes, impact), (leaving, never, never), block=_FEW
     )
     stuck = (captured & law.adheres) | held
     goes_on = landed & ~stuck
     outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
-    whole = jnp.floor(jnp.where(goes_on, time, 0.0) / surface.period_us)
+    passed = jnp.floor(jnp.where(goes_on, time, 0.0) / surface.period_us)
     end = Tips(
-        time_us=jnp.where(goes_on, time - whole * surface.period_us, tips.time_us),
-        periods=tips.periods + whole,
+        time_us=jnp.where(goes_on, time - passed * surface.period_us, tips.time_us),
+        periods=tips.periods + passed,
         gap_nm=jnp.where(goes_on, gap, 0.0),
         velocity_nm_per_us=jnp.where(goes_on, velocity, tips.velocity_nm_per_us),
         outcome=jnp.where(going, outcome, tips.outcome).astype(tips.outcome.dtype),
@@ -173,7 +177,7 @@ def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
 
 
 def _rest(scene: Scene, impact: NextImpact) -> tuple[Departure, Bool[Array, ""], Bool[Array, ""]]:
-    """Return where the next flight begins, whether the tip rested before, and whether it does for ever."""
+    """Return where the flight after an impact begins, whether the tip rests before, and whether it rests for ever."""
     landed = (impact.outcome == Outcome.IMPACT) | (impact.outcome == Outcome.CAPTURED)
     until = jnp.where(landed, impact.arrival_time_us, 0.0) + _RIDE_PERIODS * scene.platform.period_us
     row, departure, _ = through_impact(scene, impact, landed, until)
@@ -200,24 +204,24 @@ def recorded(scenes: Scene, tips: Tips, *, impacts: int) -> tuple[Tips, Record]:
 
 
 def record_of(scenes: Scene, step: MapStep) -> Record:
-    """Return what is kept of a step, arrays of one lane a tip."""
+    """Return the record of the impacts of a step, arrays of one lane a tip."""
     impact, end = step.impact, step.end
     landed = (step.start.outcome == Outcome.IMPACT) & (end.outcome == Outcome.IMPACT)
     platform = scenes.platform
     arrival = jnp.where(landed, impact.arrival_time_us, 0.0)
-    whole = jnp.floor(arrival / platform.period_us)
+    passed = jnp.floor(arrival / platform.period_us)
     approach = platform.velocity(arrival) - impact.velocity_before_nm_per_us
 
-    def known(value: Array) -> Array:
+    def if_landed(value: Array) -> Array:
         return jnp.where(landed, value, jnp.nan)
 
     return Record(
-        arrival_us=known(arrival - whole * platform.period_us),
-        approach_nm_per_us=known(approach),
-        departure_us=known(end.time_us),
-        velocity_after_nm_per_us=known(end.velocity_nm_per_us),
-        arrival_periods=known(step.start.periods + whole),
-        departure_periods=known(end.periods),
+        arrival_us=if_landed(arrival - passed * platform.period_us),
+        approach_nm_per_us=if_landed(approach),
+        departure_us=if_landed(end.time_us),
+        velocity_after_nm_per_us=if_landed(end.velocity_nm_per_us),
+        arrival_periods=if_landed(step.start.periods + passed),
+        departure_periods=if_landed(end.periods),
         near_grazing=landed & impact.near_grazing,
         rested=landed & step.rested,
     )
@@ -244,12 +248,12 @@ def follow_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, accura
     if not stretches:
         empty = np.full((len(tips.time_us), record), np.nan)
         return tips, Record(*[empty] * 6, *[np.zeros_like(empty, bool)] * 2)
-    whole = [np.concatenate(parts, axis=1)[:, -record:] for parts in zip(*stretches, strict=True)]
-    return tips, Record(*(np.pad(part, ((0, 0), (record - part.shape[1], 0)), mode="edge") for part in whole))
+    columns = [np.concatenate(parts, axis=1)[:, -record:] for parts in zip(*stretches, strict=True)]
+    return tips, Record(*(np.pad(rows, ((0, 0), (record - rows.shape[1], 0)), mode="edge") for rows in columns))
 
 
 def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
-    """Return tips after the contacts of a stretch, and these."""
+    """Return tips after the next 40 contacts, simulated together, and these contacts."""
     period, slower = np.asarray(scenes.platform.period_us), _slower_period_us(scenes)
     motion = jax.tree.map(np.asarray, _followed(scenes, tips, _PERIODS_EACH * _ROWS * slower, accuracy=accuracy))
     contacts = motion.contacts
@@ -262,30 +266,33 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     full = count == _ROWS
     since = motion.final.time_us - np.where(count > 0, np.take_along_axis(departure, last, axis=1)[:, 0], tips.time_us)
     held = (motion.phase != Phase.DRY) & (since > HELD_PERIODS * slower)
-    ended = np.where(held, Outcome.CAPTURED, np.where(since > _AWAY * slower, Outcome.NO_FURTHER_IMPACT, 3))
-    outcome = np.where(full, Outcome.IMPACT, ended)
+    outcome = np.select(
+        [full, held, since > _AWAY * slower],
+        [Outcome.IMPACT, Outcome.CAPTURED, Outcome.NO_FURTHER_IMPACT],
+        Outcome.STEP_LIMIT,
+    )
     goes_on = going & full
-    whole, whole_arrival = np.floor(departure / period[:, None]), np.floor(arrival / period[:, None])
+    passed, passed_at_arrival = np.floor(departure / period[:, None]), np.floor(arrival / period[:, None])
     velocity = np.where(leaves, contacts.departure_velocity_nm_per_us, np.nan)
 
     def of_last(rows: np.ndarray, old: np.ndarray) -> np.ndarray:
         return np.where(goes_on, np.take_along_axis(rows, last, axis=1)[:, 0], old)
 
-    within = departure - whole * period[:, None]
+    time_in_period = departure - passed * period[:, None]
     end = Tips(
-        time_us=of_last(within, tips.time_us),
-        periods=tips.periods + of_last(whole, np.zeros_like(tips.periods)),
+        time_us=of_last(time_in_period, tips.time_us),
+        periods=tips.periods + of_last(passed, np.zeros_like(tips.periods)),
         gap_nm=np.where(goes_on, np.asarray(scenes.interaction.bridge_breaks_nm), tips.gap_nm),
         velocity_nm_per_us=of_last(velocity, tips.velocity_nm_per_us),
         outcome=np.where(going, outcome, tips.outcome).astype(np.int32),
     )
     rows = Record(
-        arrival_us=arrival - whole_arrival * period[:, None],
+        arrival_us=arrival - passed_at_arrival * period[:, None],
         approach_nm_per_us=np.where(leaves, contacts.approach_speed_nm_per_us, np.nan),
-        departure_us=within,
+        departure_us=time_in_period,
         velocity_after_nm_per_us=velocity,
-        arrival_periods=tips.periods[:, None] + whole_arrival,
-        departure_periods=tips.periods[:, None] + whole,
+        arrival_periods=tips.periods[:, None] + passed_at_arrival,
+        departure_periods=tips.periods[:, None] + passed,
         near_grazing=np.zeros_like(leaves),
         rested=np.zeros_like(leaves),
     )

@@ -17,7 +17,7 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.dynamics.many_tips import MAX_STEPS, Tips, landed
+from afm_jax.dynamics.many_tips import MAX_STEPS, Tips, after_impacts
 from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
@@ -120,15 +120,16 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
         start: time, height and velocity in the lab, one value for all or one a scene.
     """
 
-    def one(scene: Scene, start: State) -> NextImpact:
+    def first_impact_of(scene: Scene, start: State) -> NextImpact:
         gap = start.position_nm - scene.platform.position(start.time_us)
         # on the surface but for rounding
         gap = jnp.where(jnp.abs(gap) < _TOUCHING * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
         departure = Departure(start.time_us, gap, start.velocity_nm_per_us)
         return or_rest(scene, departure, impact_after(scene, departure, Search(MAX_STEPS, from_above=True)))
 
-    whole = State(*(jnp.broadcast_to(part, scenes.platform.frequency_khz.shape) for part in start))
-    return landed(scenes, tips_at(scenes, whole.time_us, whole.velocity_nm_per_us), jax.vmap(one)(scenes, whole)).end
+    starts = State(*(jnp.broadcast_to(part, scenes.platform.frequency_khz.shape) for part in start))
+    tips = tips_at(scenes, starts.time_us, starts.velocity_nm_per_us)
+    return after_impacts(scenes, tips, jax.vmap(first_impact_of)(scenes, starts)).end
 
 
 def leaving_tips(scenes: Scene) -> Tips:
