@@ -169,7 +169,10 @@ def basins_of_attraction(
 
 
 class _Finder:
-    """The attractors of one scene that have been found so far, and how starts are matched with them."""
+    """The attractors of one scene that are known so far, and how starts are matched with them.
+
+    Points are drive phases in rad and velocities in nm/us just after an impact.
+    """
 
     def __init__(self, scene: Scene):
         self.scene = scene
@@ -190,7 +193,7 @@ class _Finder:
         return jax.tree.map(np.asarray, tips)
 
     def _later(self, tips: Tips, impacts: int, report: Report | None = None) -> tuple[Tips, Record]:
-        """Return tips after some impacts and those that are recorded, and these."""
+        """Return tips some impacts later, and the record of the last ones."""
 
         def work(some: Tips) -> tuple[Tips, Record]:
             return follow(self.scenes(len(some.time_us)), some, skip=impacts, record=RECORDED, accuracy=1e-6)
@@ -216,16 +219,20 @@ class _Finder:
             velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
             kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])
             approach = record.approach_nm_per_us[lane, -m:]
-            label[lane] = self._known(kind, phase, velocity, approach[np.isfinite(approach)])
+            label[lane] = self._number_of(kind, phase, velocity, approach[np.isfinite(approach)])
         return label
 
-    def _known(
+    def _number_of(
         self,
         kind: tuple[int, int, int],
         phase: np.ndarray = _NOTHING,
         velocity: np.ndarray = _NOTHING,
         approach: np.ndarray = _NOTHING,
     ) -> int:
+        """Return the number of the attractor of a kind (`MotionKind`, m, N) through a motion's last points.
+
+        One that is not among those known so far is added.
+        """
         for number, attractor in enumerate(self.attractors):
             if (attractor.kind, attractor.impacts, attractor.periods) != kind:
                 continue
@@ -305,10 +312,10 @@ class _Finder:
             ):
                 ended = tips.outcome == outcome
                 if ended.any():
-                    arrival[ended] = self._known((int(kind), 0, 0))
+                    arrival[ended] = self._number_of((int(kind), 0, 0))
             lost = (tips.outcome != Outcome.IMPACT) & (arrival < 0)
             if lost.any():
-                arrival[lost] = self._known((int(MotionKind.UNRESOLVED), 0, 0))
+                arrival[lost] = self._number_of((int(MotionKind.UNRESOLVED), 0, 0))
             label[remaining] = arrival
             going = arrival < 0
             remaining, tips = remaining[going], jax.tree.map(lambda part, going=going: part[going], tips)
@@ -319,7 +326,7 @@ class _Finder:
         if remaining.size <= _LEFT:
             label[remaining] = self.told_apart(tips)
         else:
-            label[remaining] = self._known((int(MotionKind.IRREGULAR), 0, 0))
+            label[remaining] = self._number_of((int(MotionKind.IRREGULAR), 0, 0))
         return label
 
     def _targets(self) -> tuple[Array, Array, np.ndarray]:

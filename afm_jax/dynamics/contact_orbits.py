@@ -132,11 +132,11 @@ def contact_loops(
     return loops_told_apart(loops, order)
 
 
-def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
-    """Return the orbits of the law with delay closest to the contact, as guesses."""
+def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, "guesses n"]:
+    """Return the orbits of the law with delay closest to the contact, as guesses: m departure phases, m speeds."""
     law = law_of_contact(scene.interaction, float(scene.cantilever.mass_ng))
     if law is None:
-        return []
+        return np.zeros((0, 2 * impacts))
     law_scene = eqx.tree_at(lambda scene: scene.interaction, scene, law)
     if impacts == 1:
         # all of them, close to capture too, where no start of a search stays
@@ -147,14 +147,12 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
     else:
         reading = many_impact_orbits(law_scene, order, impacts).reading
         phases, rebounds = np.asarray(reading.phase_rad), np.asarray(reading.rebound_speed_nm_per_us)
-    # `phase_rad` is within [0, 2 pi): the impacts follow one another
-    starts = np.array([_ascending(phase) for phase in phases]).reshape(rebounds.shape)
+    # `phase_rad` is within [0, 2 pi), but the impacts follow one another: a phase that falls is one turn later
+    turns = np.cumsum(np.diff(phases, axis=1) < 0.0, axis=1)
+    starts = phases + 2.0 * np.pi * np.pad(turns, ((0, 0), (1, 0)))
     departures, speeds = _where_the_bridge_breaks(scene, starts, rebounds)
-    return [
-        np.concatenate(guess)
-        for guess in zip(departures, speeds, strict=True)
-        if np.isfinite(guess).all() and np.min(guess[1]) > 0.0
-    ]
+    guesses = np.concatenate([departures, speeds], axis=1)
+    return guesses[np.isfinite(guesses).all(axis=1) & (speeds > 0.0).all(axis=1)]
 
 
 def _where_the_bridge_breaks(
@@ -181,16 +179,8 @@ def _where_the_bridge_breaks(
     return phases + omega * rise_us, speed
 
 
-def _ascending(phases: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return phases in rad that ascend, by whole turns that are added."""
-    ascending = phases.copy()
-    for place in range(1, len(phases)):
-        ascending[place] += 2.0 * np.pi * np.ceil((ascending[place - 1] - ascending[place]) / (2.0 * np.pi))
-    return ascending
-
-
 def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
-    """Return stretches of m contacts in nearly N drive periods that a few simulated tips come to, as guesses."""
+    """Return sequences of m contacts in nearly N drive periods that a few simulated tips come to, as guesses."""
     scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS, *leaf.shape)), scene)
     tips = leaving_tips(scenes)
     period = drive_of(scene).period_us

@@ -218,6 +218,7 @@ def _sums_of(
 
 
 def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int) -> Lyapunov:
+    """Return the exponents of a block of motions in law scenes: means over all impacts, of orbits the multipliers."""
     each = -(-impacts // _PARTS)
     tips = skipped(scenes, tips, impacts=transient)
     tips, sums = _measured(scenes, tips, each=each)
