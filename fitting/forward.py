@@ -26,13 +26,12 @@ from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.closure import OrbitPlace, OrbitProblem
+from afm_jax.impact.closure import OrbitPlace, OrbitProblem, follow_root, harmless_coordinate
 from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
-from afm_jax.impact.roots import follow_root, harmless_coordinate
 from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import in_blocks
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of

@@ -154,6 +154,11 @@ MUTATIONS = {
         "longer + fraction",
         f"{LASTING}test_a_lead_is_covered_sooner_with_a_push",
     ),
+    "solid as high as the delay's whole offset": Mutation(
+        "0.5 * self.delay.offset_nm, length",
+        "self.delay.offset_nm, length",
+        f"{LASTING}test_a_delay_with_an_offset_is_that_of_a_raised_surface",
+    ),
     "close pairs of roots stepped over": Mutation(
         "bottom * dips.middle < 0.0",
         "bottom * dips.middle > 0.0",

@@ -13,9 +13,8 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected
 from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
-from afm_jax.impact.closure import OrbitProblem
+from afm_jax.impact.closure import TAPPED, OrbitProblem, Scan, find_roots
 from afm_jax.impact.orbits import steady_orbits
-from afm_jax.impact.roots import TAPPED, Scan, find_roots
 from fitting import read_table
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow

@@ -11,7 +11,7 @@ from afm_jax.cli.main import main
 from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.continuation import continue_orbits
-from afm_jax.dynamics.iteration import bouncing_tips
+from afm_jax.dynamics.starts import bouncing_tips
 from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 from tests.reference_driven_contact import DrivenContact, follow
 from tests.strict_reading import strictly

@@ -17,7 +17,7 @@ from afm_jax.cli.main import main
 from afm_jax.dynamics.basins import basins_of_attraction, boundary_dimension
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
-from afm_jax.dynamics.iteration import bouncing_tips
+from afm_jax.dynamics.starts import bouncing_tips
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from tests.strict_reading import strictly
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.impact.closure import OrbitPlace, OrbitProblem
+from afm_jax.impact.closure import COARSE, OrbitPlace, OrbitProblem, find_roots, follow_root
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits, amplitudes, near_fold, orbit_state, steady_orbits
-from afm_jax.impact.roots import COARSE, find_roots, follow_root
 from tests.reference_examples import DELAY, scene
 from tests.reference_lasting import closing_impacts, closing_speeds
 from tests.reference_systems import Parameters

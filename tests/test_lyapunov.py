@@ -9,9 +9,9 @@ from click.testing import CliRunner
 
 import afm_jax as afm
 from afm_jax.cli.main import main
-from afm_jax.dynamics.contact_sequence import follow_contacts
 from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum
-from afm_jax.dynamics.iteration import Record, batch_and_tips, recorded
+from afm_jax.dynamics.many_tips import Record, follow_contacts, recorded
+from afm_jax.dynamics.starts import batch_and_tips
 from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.outcomes import Outcome

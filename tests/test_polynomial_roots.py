@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from afm_jax.impact.roots import evaluate, real_roots
+from afm_jax.solve.polynomial_roots import evaluate, real_roots
 
 LOW, HIGH = 0.0, 10.0
 find = jax.jit(real_roots)

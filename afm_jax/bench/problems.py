@@ -16,7 +16,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.driven import ContactState, driven_by
 from afm_jax.contact.settings import DrivenSetting, QuickSetting
-from afm_jax.dynamics.iteration import evenly_spread
+from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.law import MOST_KNOTS, ImpactLaw, TabulatedLaw
 from afm_jax.impact.map import iterate_batch
 from afm_jax.motion.contact_motion import cross

@@ -19,9 +19,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
 from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
 from afm_jax.dynamics.continuation import Continuation
-from afm_jax.dynamics.curves import BLOCK, Equations, Frame, equations_at, loop_at
+from afm_jax.dynamics.curves import BLOCK, Equations, equations_at, loop_at
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
+from afm_jax.dynamics.impact_loop import Frame, closing_gaps, highest_point
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.solve.lanes import in_blocks
@@ -134,8 +134,7 @@ def _amplitude_slopes(frame: Frame, points: Array, equations: Equations) -> Floa
 
         def gaps_and_peak(unknowns, values):
             loop = loop_at(jnp.concatenate([followed, values]), frame, equations)
-            gaps = closing_gaps(unknowns, frame.scale, loop)
-            return gaps, highest_point(unknowns, frame.scale, loop, equations.samples)
+            return closing_gaps(unknowns, loop), highest_point(unknowns, loop, equations.samples)
 
         slopes = jax.jacfwd(gaps_and_peak, argnums=(0, 1))(point[:count], uncertain)
         (gaps_by_loop, gaps_by_uncertain), (peak_by_loop, peak_by_uncertain) = slopes
@@ -184,7 +183,7 @@ def verdict_probability(
     draws: int,
     impacts: int,
 ) -> Float[np.ndarray, " values"]:
-    """Return the share of drawn scenes whose sweep comes to the same verdict, at each value.
+    """Return the fraction of drawn scenes whose sweep comes to the same verdict, at each value.
 
     Args:
         scene: the scene.

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float, Int
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.bifurcations import follow, settled_below
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
-from afm_jax.dynamics.iteration import Record, Tips, advance, evenly_spread, leaving_tips, sample_driven, tips_at
-from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
+from afm_jax.dynamics.many_tips import Record, Tips, advance, follow
+from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
+from afm_jax.dynamics.verdicts import RECORDED, MotionKind, settled_below, verdicts_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import LANES, Report, in_blocks
@@ -29,7 +29,7 @@ from afm_jax.units import within_turn
 
 _SAMPLE = 2048
 _LONG = 1000
-"""Impacts after which a sample is looked at."""
+"""Impacts after which the motions of a sample are told apart."""
 _SAME = 1e-3
 """Distance below which points are those of one orbit."""
 _RADII = (0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.0)
@@ -38,7 +38,7 @@ _BACK = 300
 """Impacts after which a tip near an orbit must be on it."""
 _POINTS = 64
 _ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
-"""Impacts between two looks at which starts have arrived."""
+"""Impacts after each of which starts that have arrived drop out."""
 _PART = 8 * LANES
 _LEFT = 20_000
 """Starts at most that are told apart one by one in the end."""
@@ -151,10 +151,10 @@ def basins_of_attraction(
     share = count[order] / label.size
     dimension, error = boundary_dimension(label)
 
-    def in_lab(found: Attractor) -> Attractor:
-        moved = np.asarray(seen.response(found.phase_rad / finder.omega)[1])
-        phase = within_turn(found.phase_rad + ahead, 2.0 * np.pi)
-        return found._replace(phase_rad=phase, velocity_nm_per_us=found.velocity_nm_per_us + moved)
+    def in_lab(attractor: Attractor) -> Attractor:
+        moved = np.asarray(seen.response(attractor.phase_rad / finder.omega)[1])
+        phase = within_turn(attractor.phase_rad + ahead, 2.0 * np.pi)
+        return attractor._replace(phase_rad=phase, velocity_nm_per_us=attractor.velocity_nm_per_us + moved)
 
     return Basins(
         phase_rad=phase,
@@ -169,7 +169,10 @@ def basins_of_attraction(
 
 
 class _Finder:
-    """The attractors of one scene that have been found so far, and how starts are matched with them."""
+    """The attractors of one scene that are known so far, and how starts are matched with them.
+
+    Points are drive phases in rad and velocities in nm/us just after an impact.
+    """
 
     def __init__(self, scene: Scene):
         self.scene = scene
@@ -190,7 +193,7 @@ class _Finder:
         return jax.tree.map(np.asarray, tips)
 
     def _later(self, tips: Tips, impacts: int, report: Report | None = None) -> tuple[Tips, Record]:
-        """Return tips after some impacts and those that are recorded, and these."""
+        """Return tips some impacts later, and the record of the last ones."""
 
         def work(some: Tips) -> tuple[Tips, Record]:
             return follow(self.scenes(len(some.time_us)), some, skip=impacts, record=RECORDED, accuracy=1e-6)
@@ -216,23 +219,27 @@ class _Finder:
             velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
             kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])
             approach = record.approach_nm_per_us[lane, -m:]
-            label[lane] = self._known(kind, phase, velocity, approach[np.isfinite(approach)])
+            label[lane] = self._number_of(kind, phase, velocity, approach[np.isfinite(approach)])
         return label
 
-    def _known(
+    def _number_of(
         self,
         kind: tuple[int, int, int],
         phase: np.ndarray = _NOTHING,
         velocity: np.ndarray = _NOTHING,
         approach: np.ndarray = _NOTHING,
     ) -> int:
-        for number, known in enumerate(self.attractors):
-            if (known.kind, known.impacts, known.periods) != kind:
+        """Return the number of the attractor of a kind (`MotionKind`, m, N) through a motion's last points.
+
+        One that is not among those known so far is added.
+        """
+        for number, attractor in enumerate(self.attractors):
+            if (attractor.kind, attractor.impacts, attractor.periods) != kind:
                 continue
             if not kind[1]:
                 return number
             size = max(1.0, np.abs(velocity[-1]) / self.top)
-            if self._distance(known, phase[-1:], velocity[-1:])[0] < _SAME * size:
+            if self._distance(attractor, phase[-1:], velocity[-1:])[0] < _SAME * size:
                 return number
         name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
         self.attractors.append(Attractor(name, *kind, phase, velocity, approach))
@@ -244,27 +251,27 @@ class _Finder:
         across, up = evenly_spread(_SAMPLE).T
         tips = self.tips(2.0 * np.pi * across, low + (high - low) * up)
         label = self.told_apart(tips)
-        orbits = [number for number, found in enumerate(self.attractors) if found.impacts]
+        orbits = [number for number, attractor in enumerate(self.attractors) if attractor.impacts]
         if orbits:
             self._find_radii(orbits)
-        for number, found in enumerate(self.attractors):
-            if found.kind == MotionKind.IRREGULAR:
+        for number, attractor in enumerate(self.attractors):
+            if attractor.kind == MotionKind.IRREGULAR:
                 chosen = np.flatnonzero(label == number)[:16]
                 some = jax.tree.map(lambda part, chosen=chosen: part[chosen], tips)
                 exponents = exponents_of_law(self.scenes(len(chosen)), some, impacts=1000, transient=_LONG)
                 larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
                 known = np.isfinite(larger)
                 if known.any() and np.median(larger[known]) > CHAOTIC_ERRORS * np.median(error[known]):
-                    self.attractors[number] = found._replace(name="chaotic")
+                    self.attractors[number] = attractor._replace(name="chaotic")
 
-    def _find_radii(self, orbits: list[int]) -> None:
+    def _find_radii(self, numbers: list[int]) -> None:
         """Find the largest radius around the points of each orbit from within which all tips come back to it."""
         angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
         ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], 1) * size for size in (1.0, 0.5)])
         rows, owner, sizes = [], [], []
-        for number in orbits:
-            found = self.attractors[number]
-            for phase, velocity in zip(found.phase_rad, found.velocity_nm_per_us, strict=True):
+        for number in numbers:
+            orbit = self.attractors[number]
+            for phase, velocity in zip(orbit.phase_rad, orbit.velocity_nm_per_us, strict=True):
                 for size in _RADII[:-1]:
                     rows.append(np.stack([phase + size * ring[:, 0], velocity + size * ring[:, 1] * self.top], 1))
                     owner += [number] * len(ring)
@@ -278,18 +285,18 @@ class _Finder:
         end, record = self._later(tips, _BACK)
         # on the orbit: the last point is one of its own
         phase, velocity = self.omega * record.departure_us[:, -1], record.velocity_after_nm_per_us[:, -1]
-        for number in orbits:
-            mine, found = owner == number, self.attractors[number]
-            apart = self._distance(found, phase[mine], velocity[mine])
-            size = max(1.0, np.abs(found.velocity_nm_per_us).max() / self.top)
-            back = ((apart < _SAME * size) & (end.outcome[mine] == Outcome.IMPACT)) | into[mine]
-            good = [size for size in _RADII if back[sizes[mine] <= size].all()]
+        for number in numbers:
+            around, orbit = owner == number, self.attractors[number]
+            apart = self._distance(orbit, phase[around], velocity[around])
+            size = max(1.0, np.abs(orbit.velocity_nm_per_us).max() / self.top)
+            back = ((apart < _SAME * size) & (end.outcome[around] == Outcome.IMPACT)) | into[around]
+            good = [size for size in _RADII if back[sizes[around] <= size].all()]
             self.radius[number] = max(good, default=0.0)
 
     def arrived(self, tips: Tips, report: Report | None) -> Int[np.ndarray, " lanes"]:
         """Return the attractor of every start, as soon as it has arrived."""
         count = len(tips.time_us)
-        label, left = np.full(count, -1), np.arange(count)
+        label, remaining = np.full(count, -1), np.arange(count)
         for impacts in _ROUNDS:
             points, radius, owner = self._targets()
 
@@ -298,40 +305,40 @@ class _Finder:
 
             tips, nearest = in_blocks(work, tips, block=_PART)
             near = nearest >= 0
-            found = np.where(near, owner[np.maximum(nearest, 0)], -1)
+            arrival = np.where(near, owner[np.maximum(nearest, 0)], -1)
             for outcome, kind in (
                 (Outcome.CAPTURED, MotionKind.STUCK),
                 (Outcome.NO_FURTHER_IMPACT, MotionKind.FREE),
             ):
                 ended = tips.outcome == outcome
                 if ended.any():
-                    found[ended] = self._known((int(kind), 0, 0))
-            lost = (tips.outcome != Outcome.IMPACT) & (found < 0)
+                    arrival[ended] = self._number_of((int(kind), 0, 0))
+            lost = (tips.outcome != Outcome.IMPACT) & (arrival < 0)
             if lost.any():
-                found[lost] = self._known((int(MotionKind.UNRESOLVED), 0, 0))
-            label[left] = found
-            going = found < 0
-            left, tips = left[going], jax.tree.map(lambda part, going=going: part[going], tips)
+                arrival[lost] = self._number_of((int(MotionKind.UNRESOLVED), 0, 0))
+            label[remaining] = arrival
+            going = arrival < 0
+            remaining, tips = remaining[going], jax.tree.map(lambda part, going=going: part[going], tips)
             if report is not None:
-                report(count - left.size, count)
-            if not left.size:
+                report(count - remaining.size, count)
+            if not remaining.size:
                 return label
-        if left.size <= _LEFT:
-            label[left] = self.told_apart(tips)
+        if remaining.size <= _LEFT:
+            label[remaining] = self.told_apart(tips)
         else:
-            label[left] = self._known((int(MotionKind.IRREGULAR), 0, 0))
+            label[remaining] = self._number_of((int(MotionKind.IRREGULAR), 0, 0))
         return label
 
     def _targets(self) -> tuple[Array, Array, np.ndarray]:
         """Return points of orbits (phase, velocity over beta omega), their radii and whose they are, filled up."""
         points, radius, owner = np.zeros((_POINTS, 2)), np.full(_POINTS, -1.0), np.zeros(_POINTS, int)
         used = 0
-        for number, found in enumerate(self.attractors):
-            if found.impacts and used + found.impacts <= _POINTS and self.radius[number] > 0.0:
-                some = slice(used, used + found.impacts)
-                points[some] = np.stack([found.phase_rad, found.velocity_nm_per_us / self.top], axis=1)
+        for number, orbit in enumerate(self.attractors):
+            if orbit.impacts and used + orbit.impacts <= _POINTS and self.radius[number] > 0.0:
+                some = slice(used, used + orbit.impacts)
+                points[some] = np.stack([orbit.phase_rad, orbit.velocity_nm_per_us / self.top], axis=1)
                 radius[some], owner[some] = self.radius[number], number
-                used += found.impacts
+                used += orbit.impacts
         return jnp.asarray(points), jnp.asarray(radius), owner
 
 
@@ -358,33 +365,31 @@ def _towards(
 
 def _with_names(attractors: list[Attractor]) -> list[Attractor]:
     """Return attractors whose names tell them apart: "(1,5) a" and "(1,5) b"."""
-    names = [found.name for found in attractors]
+    names = [attractor.name for attractor in attractors]
     letters = {name: iter("abcdefghijklmnopqrstuvwxyz") for name in names if names.count(name) > 1}
-    return [
-        found._replace(name=f"{found.name} {next(letters[found.name], '+')}") if found.name in letters else found
-        for found in attractors
-    ]
+    told_apart = [f"{name} {next(letters[name], '+')}" if name in letters else name for name in names]
+    return [attractor._replace(name=name) for attractor, name in zip(attractors, told_apart, strict=True)]
 
 
 def boundary_dimension(attractor: Int[np.ndarray, "rows columns"]) -> tuple[float, float]:
     """Return the dimension of the boundary between basins, and its standard error.
 
-    The share of pairs of starts k cells apart that end in different places goes as k^alpha; the dimension is 2 - alpha.
-    NaN where all starts end in one place, or the grid is too small.
+    The fraction of pairs of starts k cells apart that end in different places goes as k^alpha, and the dimension is
+    2 - alpha. NaN where all starts end in one place, or the grid is too small.
 
     Args:
         attractor: the number of each start's attractor.
     """
     widest = min(attractor.shape) // _NARROWEST
     apart = [1 << power for power in range(max(widest, 1).bit_length())]
-    shares = []
+    fractions = []
     for cells in apart:
         across = attractor[:, cells:] != attractor[:, :-cells]
         up = attractor[cells:] != attractor[:-cells]
-        shares.append((across.sum() + up.sum()) / (across.size + up.size))
-    if len(apart) < 3 or not all(shares):
+        fractions.append((across.sum() + up.sum()) / (across.size + up.size))
+    if len(apart) < 3 or not all(fractions):
         return float("nan"), float("nan")
-    x, y = np.log(apart), np.log(shares)
+    x, y = np.log(apart), np.log(fractions)
     slope, _ = np.polyfit(x, y, 1)
     off = y - np.polyval(np.polyfit(x, y, 1), x)
     error = np.sqrt((off**2).sum() / (len(x) - 2) / ((x - x.mean()) ** 2).sum())

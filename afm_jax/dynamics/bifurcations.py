@@ -20,9 +20,9 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.contact_sequence import follow_contacts
-from afm_jax.dynamics.iteration import Record, SampleDriven, Tips, batch_and_tips, recorded, sample_driven, skipped
-from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
+from afm_jax.dynamics.many_tips import Record, Tips, follow, follow_contacts, skipped
+from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
+from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
@@ -38,8 +38,6 @@ _HURRIED = 100
 """Impacts at each value of the first, hurried sweep."""
 _PASSES = 40
 """Times at most that stretches are swept again."""
-_SETTLED, _SETTLED_CONTACT = 1e-6, 1e-4
-"""Estimated distance from an orbit below which a motion is on it, with laws and with resolved contacts."""
 _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 
@@ -224,27 +222,6 @@ class _Sweeper:
         return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
 
 
-def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float) -> tuple[Tips, Record]:
-    """Return a block of tips some impacts or contacts later, and the last of these, arrays (lanes, impacts).
-
-    Args:
-        scenes: a batch of scenes with laws or contacts.
-        tips: where they are.
-        skip: impacts before those that are recorded.
-        record: impacts that are recorded.
-        accuracy: of resolved contacts.
-    """
-    if isinstance(scenes.interaction, Contact):
-        return follow_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
-    tips, rows = recorded(scenes, skipped(scenes, tips, impacts=skip), impacts=record)
-    return tips, Record(*(np.asarray(part).T for part in rows))
-
-
-def settled_below(scenes: Scene) -> float:
-    """Return the estimated distance from an orbit below which a motion is on it."""
-    return _SETTLED_CONTACT if isinstance(scenes.interaction, Contact) else _SETTLED
-
-
 @jax.jit
 def _hurried_law(firsts: Scene, fresh: Tips) -> Tips:
     def one(state, place: tuple[Scene, Tips]):
@@ -269,14 +246,14 @@ def carried(before: Scene, after: Scene, fresh: Tips, tips: Tips) -> Tips:
     """
     time = tips.time_us * (after.platform.period_us / before.platform.period_us)
     rebound = tips.velocity_nm_per_us - before.platform.velocity(tips.time_us)
-    kept = tips._replace(
+    tips_there = tips._replace(
         time_us=time,
         periods=jnp.zeros_like(time),
         velocity_nm_per_us=after.platform.velocity(time) + rebound,
         gap_nm=after.interaction.bridge_breaks_nm if isinstance(after.interaction, Contact) else tips.gap_nm,
     )
     going = tips.outcome == Outcome.IMPACT
-    return jax.tree.map(lambda old, new: jnp.where(going, old, new), kept, fresh)
+    return jax.tree.map(lambda old, new: jnp.where(going, old, new), tips_there, fresh)
 
 
 def _same(one: _SweptRows, other: _SweptRows) -> Bool[np.ndarray, " lanes"]:
@@ -331,7 +308,7 @@ def _sweep_of(
 
 
 _STROBE_IMPACTS, _STROBES = 48, 8
-"""Last impacts in whose flights the tip is looked at, and looks at most in a flight."""
+"""Last impacts in whose flights the tip's height is taken, and heights at most in a flight."""
 
 
 def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.ndarray) -> np.ndarray:

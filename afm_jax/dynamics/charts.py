@@ -22,11 +22,10 @@ from afm_jax.checks import check_kind, checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
-from afm_jax.dynamics.iteration import SampleDriven, sample_driven
-from afm_jax.impact.closure import OrbitPlace, OrbitProblem
+from afm_jax.dynamics.starts import SampleDriven, sample_driven
+from afm_jax.impact.closure import OrbitPlace, OrbitProblem, find_roots
 from afm_jax.impact.law import TabulatedLaw, impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
-from afm_jax.impact.roots import find_roots
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.parameter_paths import scene_family
 from afm_jax.solve.lanes import Report, again_for, in_blocks
@@ -121,7 +120,7 @@ def highest_orbits(
 
     Args:
         scenes: a batch of scenes with a law.
-        frame: theirs, a batch.
+        frame: of each scene, a batch.
         orders: N.
 
     Returns:
@@ -130,13 +129,13 @@ def highest_orbits(
     """
     names = ORBIT_NUMBERS[:-1] + (() if frame.response is None else DRIVEN_NUMBERS)
 
-    def problem_of(scene: Scene, own: FreeFrame, order: Array) -> OrbitProblem:
-        return orbit_problem(scene.cantilever, own.platform, impact_law_of(scene), order)
+    def problem_of(scene: Scene, own_frame: FreeFrame, order: Array) -> OrbitProblem:
+        return orbit_problem(scene.cantilever, own_frame.platform, impact_law_of(scene), order)
 
     def of_order(order: Array) -> dict[str, Array]:
         def orbit_of(place: OrbitPlace, row: Array) -> tuple[Array, Array, Array]:
-            scene, own = jax.tree.map(lambda leaf: leaf[row], (scenes, frame))
-            orbit = orbit_at(place, jnp.ones((), bool), own, problem_of(scene, own, order))
+            scene, own_frame = jax.tree.map(lambda leaf: leaf[row], (scenes, frame))
+            orbit = orbit_at(place, jnp.ones((), bool), own_frame, problem_of(scene, own_frame, order))
             half, determinant = 0.5 * jnp.abs(orbit.trace), orbit.determinant
             inside = half**2 - determinant
             # a pair on a circle has the root of the determinant for its size
@@ -145,7 +144,7 @@ def highest_orbits(
             numbers = jnp.stack([*(getattr(orbit, name) for name in names), size])
             return orbit.admissible, orbit.admissible & orbit.stable, numbers
 
-        roots = jax.vmap(lambda scene, own: find_roots(problem_of(scene, own, order)))(scenes, frame)
+        roots = jax.vmap(lambda scene, own_frame: find_roots(problem_of(scene, own_frame, order)))(scenes, frame)
         count, slots = roots.found.shape
         places = jax.tree.map(lambda part: part.ravel(), roots.place)
         rows = jnp.arange(count * slots) // slots
@@ -153,8 +152,8 @@ def highest_orbits(
         there = frame.periodic & impact_law_of(scenes).leaves
         few = max(count // _ORBITS_AT_ONCE, 1)
         found = roots.found.ravel() & jnp.repeat(there, slots)
-        known = again_for(jax.vmap(orbit_of), found, (places, rows), nothing, block=few)
-        admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in known)
+        columns = again_for(jax.vmap(orbit_of), found, (places, rows), nothing, block=few)
+        admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in columns)
         highest = jnp.argmax(jnp.where(steady, numbers[..., 0], -jnp.inf), axis=1)
         chosen = jnp.take_along_axis(numbers, highest[:, None, None], axis=1)[:, 0]
         chosen = jnp.where(steady.any(axis=1)[:, None], chosen, jnp.nan)
@@ -282,11 +281,11 @@ def stability_chart(
 def stable_probability(
     scene: Scene, chart: StabilityChart, uncertain: UncertainParameters, paths: tuple[str, str], *, draws: int
 ) -> Float[np.ndarray, "orders points"]:
-    """Return the share of draws of uncertain parameters in which an orbit of each order is stable.
+    """Return the fraction of draws of uncertain parameters in which an orbit of each order is stable.
 
     Args:
         scene: that of the chart.
-        chart: whose points are meant.
+        chart: at whose points.
         uncertain: parameters that are drawn; a parameter of the chart counts as its axis says.
         paths: of the chart's parameters.
         draws: how many.

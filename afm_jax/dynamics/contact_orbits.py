@@ -20,8 +20,7 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.dynamics.contact_sequence import follow_contacts, next_contact
-from afm_jax.dynamics.impact_loop import FreeFlights, LoopReading, driven_part, lowest_of_flights
+from afm_jax.dynamics.impact_loop import Frame, FreeFlights, LoopReading, driven_part, lowest_of_flights
 from afm_jax.dynamics.impact_orbits import (
     ManyImpactOrbits,
     check_loop,
@@ -30,9 +29,9 @@ from afm_jax.dynamics.impact_orbits import (
     many_impact_orbits,
     multipliers_of,
 )
-from afm_jax.dynamics.iteration import SampleDriven, evenly_spread, laws_of, leaving_tips
-from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, peak_amplitude
-from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
+from afm_jax.dynamics.many_tips import follow_contacts, next_contact
+from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leaving_tips
+from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_sum, peak_amplitude, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
@@ -133,11 +132,11 @@ def contact_loops(
     return loops_told_apart(loops, order)
 
 
-def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
-    """Return the orbits of the law with delay closest to the contact, as guesses."""
+def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, "guesses n"]:
+    """Return the orbits of the law with delay closest to the contact, as guesses: m departure phases, m speeds."""
     law = law_of_contact(scene.interaction, float(scene.cantilever.mass_ng))
     if law is None:
-        return []
+        return np.zeros((0, 2 * impacts))
     law_scene = eqx.tree_at(lambda scene: scene.interaction, scene, law)
     if impacts == 1:
         # all of them, close to capture too, where no start of a search stays
@@ -148,14 +147,12 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
     else:
         reading = many_impact_orbits(law_scene, order, impacts).reading
         phases, rebounds = np.asarray(reading.phase_rad), np.asarray(reading.rebound_speed_nm_per_us)
-    # `phase_rad` is within [0, 2 pi): the impacts follow one another
-    starts = np.array([_ascending(phase) for phase in phases]).reshape(rebounds.shape)
+    # `phase_rad` is within [0, 2 pi), but the impacts follow one another: a phase that falls is one turn later
+    turns = np.cumsum(np.diff(phases, axis=1) < 0.0, axis=1)
+    starts = phases + 2.0 * np.pi * np.pad(turns, ((0, 0), (1, 0)))
     departures, speeds = _where_the_bridge_breaks(scene, starts, rebounds)
-    return [
-        np.concatenate(guess)
-        for guess in zip(departures, speeds, strict=True)
-        if np.isfinite(guess).all() and np.min(guess[1]) > 0.0
-    ]
+    guesses = np.concatenate([departures, speeds], axis=1)
+    return guesses[np.isfinite(guesses).all(axis=1) & (speeds > 0.0).all(axis=1)]
 
 
 def _where_the_bridge_breaks(
@@ -182,16 +179,8 @@ def _where_the_bridge_breaks(
     return phases + omega * rise_us, speed
 
 
-def _ascending(phases: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return phases in rad that ascend, by whole turns that are added."""
-    ascending = phases.copy()
-    for place in range(1, len(phases)):
-        ascending[place] += 2.0 * np.pi * np.ceil((ascending[place - 1] - ascending[place]) / (2.0 * np.pi))
-    return ascending
-
-
 def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
-    """Return stretches of m contacts in nearly N drive periods that a few simulated tips come to, as guesses."""
+    """Return sequences of m contacts in nearly N drive periods that a few simulated tips come to, as guesses."""
     scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS, *leaf.shape)), scene)
     tips = leaving_tips(scenes)
     period = drive_of(scene).period_us
@@ -419,23 +408,6 @@ _CLOSING_A_CHART = Newton(rounds=15, residual_tolerance=1e-7, damping=_damped)
 """Of single contacts: a phase in rad, a speed relative to itself."""
 
 
-class CurveUnits(NamedTuple):
-    """What a curve of loops is measured in: the unit of speeds, and the parameters' ranges."""
-
-    speed_nm_per_us: float
-    low: Float[np.ndarray, " parameters"]
-    width: Float[np.ndarray, " parameters"]
-
-    def scales(self, impacts: int) -> Float[np.ndarray, " n"]:
-        """Return the units of a loop's unknowns: m phases, m speeds."""
-        return np.repeat([1.0, self.speed_nm_per_us], impacts)
-
-    def of_points(self, points: Float[np.ndarray, "points n"]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the loops and the values of the parameters at points of a curve."""
-        count = points.shape[1] - len(self.low)
-        return points[:, :count] * self.scales(count // 2), self.low + self.width * points[:, count:]
-
-
 class FlownLoop(NamedTuple):
     """A loop as it was simulated; phases in rad, rebound speeds in nm/us."""
 
@@ -513,21 +485,21 @@ class ContactFlights:
         phase, rebound = loops[:, :count], loops[:, count:]
         following = np.concatenate([phase[:, 1:], phase[:, :1] + turn], axis=1)
         shortest = np.min(following - phase, axis=1, keepdims=True)
-        found: list[FlownLoop | None] = [None] * len(loops)
+        flown_loops: list[FlownLoop | None] = [None] * len(loops)
         flies = np.flatnonzero((shortest[:, 0] > 0.0) & (rebound > 0.0).all(axis=1))
         if not flies.size:
-            return found
+            return flown_loops
         lanes = (part[flies].ravel() for part in (phase, rebound, following + _LONGEST_CONTACT * shortest))
         whole = (*lanes, np.repeat(values[flies], count, axis=0))
         flown = in_blocks(lambda part: self._fly(*part), whole, block=_LANES, widths=())
         by_loops = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), flown)
-        for place, one in enumerate(flies):
+        for place, number in enumerate(flies):
             later, contacts, slopes = jax.tree.map(lambda part, place=place: part[place], by_loops)
             if (contacts.kind == ContactKind.IMPACT).all() and np.isfinite(slopes).all():
-                gaps = np.concatenate([later[:, 0] - following[one], later[:, 1] - np.roll(rebound[one], -1)])
+                gaps = np.concatenate([later[:, 0] - following[number], later[:, 1] - np.roll(rebound[number], -1)])
                 whole = _closing_slopes(slopes)
-                found[one] = FlownLoop(loops[one], values[one], gaps, whole, contacts, slopes[:, :, :2])
-        return found
+                flown_loops[number] = FlownLoop(loops[number], values[number], gaps, whole, contacts, slopes[:, :, :2])
+        return flown_loops
 
     def readings(
         self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
@@ -558,9 +530,9 @@ class ContactFlights:
         )
         return LoopReading(*(jnp.asarray(part) for part in facts))
 
-    def readings_of_points(self, points: Float[np.ndarray, "points n"], units: CurveUnits) -> LoopReading:
+    def readings_of_points(self, points: Float[np.ndarray, "points n"], frame: Frame) -> LoopReading:
         """Return what there is to know of the loops at points of a curve (`solve`), NumPy arrays."""
-        readings = [reading for reading in self.readings(*units.of_points(points)) if reading is not None]
+        readings = [reading for reading in self.readings(*frame.loops_and_values(points)) if reading is not None]
         if len(readings) < len(points):
             raise ValueError("a loop that was closed does not fly")
         return _stacked(readings, len(readings[0].phase_rad))
@@ -571,38 +543,38 @@ class ContactFlights:
         there = self.family(*flown.values)
         return there, phase / float(RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz), rebound
 
-    def linearised(self, point: Float[np.ndarray, " n"], units: CurveUnits, kind: int | None) -> EquationsAt | None:
+    def linearised(self, point: Float[np.ndarray, " n"], frame: Frame, kind: int | None) -> EquationsAt | None:
         """Return the closing conditions at a point of a curve, and the test functions there; None where none flies.
 
         Args:
-            point: m phases in rad, m rebound speeds in the unit of speeds, the parameters as shares of their ranges.
-            units: of the same.
+            point: m phases in rad, m rebound speeds in the unit of speeds, the parameters as fractions of their ranges.
+            frame: of the curve.
             kind: number of the test function that is to be 0 besides; None: the loop closes, and that is all.
         """
         # the test function's derivatives are differences, which only lead to its root
         size = len(point)
         around = [np.eye(size), -np.eye(size)] if kind is not None else []
         aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
-        flown = [one for one in self.flown(*units.of_points(point + aside)) if one is not None]
+        flown = [one for one in self.flown(*frame.loops_and_values(point + aside)) if one is not None]
         if len(flown) < len(aside):
             return None
         here = flown[0]
-        scales = units.scales(len(here.loop) // 2)
-        value, slopes = here.gaps / scales, here.slopes * np.concatenate([scales, units.width]) / scales[:, None]
+        units = frame.units(len(here.loop) // 2)
+        value, slopes = here.gaps / units, here.slopes * np.concatenate([units, frame.width]) / units[:, None]
         if kind is not None:
-            tests = np.array([self.tests(one, units, grazing=kind == _GRAZING)[kind] for one in flown])
+            tests = np.array([self.tests(one, frame, grazing=kind == _GRAZING)[kind] for one in flown])
             value = np.append(value, tests[0])
             slopes = np.vstack([slopes, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
         return EquationsAt(value, slopes, here)
 
-    def tests(self, flown: FlownLoop, units: CurveUnits, *, grazing: bool = True) -> np.ndarray:
+    def tests(self, flown: FlownLoop, frame: Frame, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `curves`; that of grazing NaN where it is not asked for."""
         trace, determinant = flown.trace_and_determinant
-        slowest = np.split(flown.loop, 2)[1].min() / units.speed_nm_per_us
+        slowest = np.split(flown.loop, 2)[1].min() / float(frame.speed_unit)
         near = np.nan
         if grazing:
             lowest, omega = _lowest_gap(*self._departures(flown), flown.contacts.arrival_time_us)
-            near = float(lowest * omega) / units.speed_nm_per_us
+            near = float(lowest * omega) / float(frame.speed_unit)
         return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, [near, slowest])
 
 

@@ -20,7 +20,6 @@ from afm_jax.dynamics.curves import (
     CurveLeg,
     Equations,
     FollowedCurve,
-    Frame,
     followed_both_ways,
     frame_of,
     lies_on,
@@ -28,7 +27,7 @@ from afm_jax.dynamics.curves import (
     root_on,
     tested_by,
 )
-from afm_jax.dynamics.impact_loop import driven_part, samples_for
+from afm_jax.dynamics.impact_loop import Frame, driven_part, samples_for
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.dynamics.special_points import (
     OrbitBranch,
@@ -114,11 +113,11 @@ def continue_orbits(
     flights = ContactFlights(scene, order, (given.path,)) if isinstance(scene.interaction, Contact) else None
     equations = Equations((given.path,), driven, samples_for(scene, order, driven), flights=flights)
     starts, rejected = _orbits_in_range(scene, order, impacts, given, flights)
-    scale = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
-    frame = frame_of(scene, order, scale, (given,))
+    speed_unit = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
+    frame = frame_of(scene, order, speed_unit, (given,))
     followed: list[FollowedCurve] = []
     for fraction, loop in starts:
-        start = np.concatenate([loop[:impacts], loop[impacts:] / scale, [fraction]])
+        start = np.concatenate([loop[:impacts], loop[impacts:] / speed_unit, [fraction]])
         if not any(lies_on(start, curve, frame, equations) for curve in followed):
             curve = followed_both_ways(start, frame, equations)
             if curve is not None:
@@ -129,7 +128,7 @@ def continue_orbits(
     )
     curves = ()
     if second is not None:
-        both = frame_of(scene, order, scale, ranges)
+        both = frame_of(scene, order, speed_unit, ranges)
         curves = special_curves(special, both, equations, second, parameter_values(scene)[second.path])
     return Continuation(order, impacts, given, second, branches, special, curves, rejected, frame, equations)
 

@@ -25,8 +25,9 @@ from jaxtyping import Array, Float
 from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.dynamics.contact_orbits import ContactFlights, CurveUnits
+from afm_jax.dynamics.contact_orbits import ContactFlights
 from afm_jax.dynamics.impact_loop import (
+    Frame,
     ImpactLoop,
     LoopReading,
     closing_gaps,
@@ -70,16 +71,6 @@ _UNLIKE = 1e-3
 _SAME = 1e-5
 
 
-class Frame(NamedTuple):
-    """The scene of a curve, its order N, the unit of its speeds in nm/us, and the ranges of its parameters."""
-
-    scene: Scene
-    order: Float[Array, ""]
-    scale: Float[Array, ""]
-    low: Float[Array, " parameters"]
-    width: Float[Array, " parameters"]
-
-
 class Equations(NamedTuple):
     """Which equations are solved, static: each is a program of its own."""
 
@@ -95,16 +86,16 @@ class Equations(NamedTuple):
     """Simulates the loops of a scene with a contact; None: the scene has a law."""
 
 
-def frame_of(scene: Scene, order: int, scale: float, ranges: Sequence[ParameterRange]) -> Frame:
-    """Return the frame of curves through the ranges of some parameters; the scale of speeds in nm/us."""
+def frame_of(scene: Scene, order: int, speed_unit: float, ranges: Sequence[ParameterRange]) -> Frame:
+    """Return the frame of curves through the ranges of some parameters; the unit of speeds in nm/us."""
     low, high = (jnp.asarray([getattr(given, end) for given in ranges]) for end in ("low", "high"))
-    return Frame(scene, jnp.asarray(float(order)), jnp.asarray(scale), low, high - low)
+    return Frame(scene, jnp.asarray(float(order)), jnp.asarray(speed_unit), low, high - low)
 
 
 def loop_at(fractions: Float[Array, " parameters"], frame: Frame, equations: Equations) -> ImpactLoop:
     """Return the loop of a law scene where the parameters are at fractions of their ranges."""
     values = dict(zip(equations.paths, frame.low + frame.width * fractions, strict=True))
-    return loop_of(with_numbers(frame.scene, values), frame.order, equations.driven)
+    return loop_of(with_numbers(frame.scene, values), frame.order, equations.driven, frame.speed_unit)
 
 
 def split_point(point: Array, equations: Equations) -> tuple[Array, Array]:
@@ -113,29 +104,29 @@ def split_point(point: Array, equations: Equations) -> tuple[Array, Array]:
     return point[:count], point[count:]
 
 
-def _tests(unknowns: Array, frame: Frame, loop: ImpactLoop, equations: Equations) -> list[Array]:
+def _tests(unknowns: Array, loop: ImpactLoop, equations: Equations) -> list[Array]:
     """Return the test functions in the order of `KINDS`, without dimension."""
-    trace, determinant = trace_and_determinant_of(unknowns, frame.scale, loop)
-    near = nearest_approach(unknowns, frame.scale, loop, equations.samples).gap_nm
+    trace, determinant = trace_and_determinant_of(unknowns, loop)
+    near = nearest_approach(unknowns, loop, equations.samples).gap_nm
     if equations.kind == CAPTURE:
-        near = jnp.minimum(near, _rise_when_captured(unknowns, frame, loop))
+        near = jnp.minimum(near, _rise_when_captured(unknowns, loop))
     speeds = unknowns[unknowns.shape[0] // 2 :]
     slowest = -largest(-speeds) if speeds.size else jnp.inf
     return [
         1.0 - trace + determinant,
         1.0 + trace + determinant,
         determinant - 1.0,
-        near * loop.cantilever.angular_frequency / frame.scale,
-        slowest - loop.impact.lowest / frame.scale,
+        near * loop.cantilever.angular_frequency / loop.speed_unit,
+        slowest - loop.impact.lowest / loop.speed_unit,
     ]
 
 
-def _rise_when_captured(unknowns: Array, frame: Frame, loop: ImpactLoop) -> Array:
+def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
     """Return how the gap opens after the slowest impact, which leaves without speed: z'' - z_p'' over Omega^2, in nm.
 
     Where it is negative the tip passes through the surface, in a dip too shallow and short to be seen among samples.
     """
-    impacts = impacts_at(unknowns, frame.scale, loop)
+    impacts = impacts_at(unknowns, loop)
     slowest = jnp.argmin(unknowns[unknowns.shape[0] // 2 :])
     leaving, height, velocity = impacts.leaving_us[slowest], impacts.height[slowest], impacts.velocity[slowest]
     omega, decay = loop.cantilever.angular_frequency, loop.cantilever.decay_rate
@@ -146,10 +137,10 @@ def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) 
     """Return the closing conditions at a point of a curve, and behind them the test function that is to be 0."""
     unknowns, fractions = split_point(point, equations)
     loop = loop_at(fractions, frame, equations)
-    gaps = closing_gaps(unknowns, frame.scale, loop)
+    gaps = closing_gaps(unknowns, loop)
     if equations.kind is None:
         return gaps
-    test = _tests(unknowns, frame, loop, equations)[equations.kind]
+    test = _tests(unknowns, loop, equations)[equations.kind]
     return jnp.append(gaps, test)
 
 
@@ -181,9 +172,9 @@ def _tests_and_delay(frame: Frame, point: Array, equations: Equations) -> tuple[
     loop = loop_at(fractions, frame, equations)
     delay = jnp.zeros(())
     if loop.impact.delayed:
-        delays = impacts_at(unknowns, frame.scale, loop).speeds.delay
+        delays = impacts_at(unknowns, loop).speeds.delay
         delay = jnp.max(jnp.abs(delays)) * loop.angular_frequency / (2.0 * jnp.pi)
-    return jnp.stack(_tests(unknowns, frame, loop, equations)), delay
+    return jnp.stack(_tests(unknowns, loop, equations)), delay
 
 
 def solved_point(frame: Frame, guess: np.ndarray, normal: np.ndarray, equations: Equations) -> CurvePoint | None:
@@ -192,7 +183,7 @@ def solved_point(frame: Frame, guess: np.ndarray, normal: np.ndarray, equations:
 
     def linearised(point: np.ndarray) -> EquationsAt | None:
         if flights is not None:
-            return flights.linearised(point, units_of(frame), equations.kind)
+            return flights.linearised(point, frame, equations.kind)
         return EquationsAt(*(np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations)))
 
     point = point_in_plane(linearised, guess, normal, _CLOSING)
@@ -201,20 +192,15 @@ def solved_point(frame: Frame, guess: np.ndarray, normal: np.ndarray, equations:
     if flights is None:
         tests, delay = (np.asarray(part) for part in _tests_and_delay(frame, jnp.asarray(point.x), equations))
     else:
-        tests, delay = flights.tests(point.details, units_of(frame)), 0.0
+        tests, delay = flights.tests(point.details, frame), 0.0
     return CurvePoint(point.x, point.tangent, tests, delay)
-
-
-def units_of(frame: Frame) -> CurveUnits:
-    """Return what a frame measures speeds and parameters in."""
-    return CurveUnits(float(frame.scale), np.asarray(frame.low), np.asarray(frame.width))
 
 
 @partial(jax.jit, static_argnames=("equations",))
 def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
     def reading_at(point):
         unknowns, fractions = split_point(point, equations)
-        return reading_of(unknowns, frame.scale, loop_at(fractions, frame, equations), equations.samples)
+        return reading_of(unknowns, loop_at(fractions, frame, equations), equations.samples)
 
     return jax.vmap(reading_at)(points)
 
@@ -222,7 +208,7 @@ def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
 def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: Equations) -> LoopReading:
     """Return the readings of the orbits at points of a curve, NumPy arrays."""
     if equations.flights is not None:
-        return equations.flights.readings_of_points(points, units_of(frame))
+        return equations.flights.readings_of_points(points, frame)
     return in_blocks(lambda block: _read(frame, block, equations), points, block=BLOCK, widths=())
 
 

@@ -19,8 +19,17 @@ from jaxtyping import Array, Float, Int
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.contact_sequence import departure_jacobians, follow_contacts
-from afm_jax.dynamics.iteration import MapStep, Record, Tips, advance, batch_and_tips, record_of, sample_driven, skipped
+from afm_jax.dynamics.many_tips import (
+    MapStep,
+    Record,
+    Tips,
+    advance,
+    departure_jacobians,
+    follow_contacts,
+    record_of,
+    skipped,
+)
+from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.law import impact_law_of
@@ -72,12 +81,12 @@ CHAOTIC_ERRORS = 3.0
 """Standard errors by which the larger exponent must be above 0 to be called positive."""
 
 
-def exponent_verdicts(found: Lyapunov) -> list[str]:
+def exponent_verdicts(exponents: Lyapunov) -> list[str]:
     """Return in words what the exponents of each of many motions say."""
     words = []
-    for lane, name in enumerate(found.verdicts.names()):
-        kind = found.verdicts.kind[lane]
-        larger, error = found.exponents_per_impact[lane, 0], found.exponents_per_impact_error[lane, 0]
+    for lane, name in enumerate(exponents.verdicts.names()):
+        kind = exponents.verdicts.kind[lane]
+        larger, error = exponents.exponents_per_impact[lane, 0], exponents.exponents_per_impact_error[lane, 0]
         if kind == MotionKind.ORBIT:
             forgets = ", the tip rests on the platform and forgets its start" if np.isneginf(larger) else ""
             words.append(f"regular: the motion has come to a {name} orbit{forgets}")
@@ -143,10 +152,10 @@ def lyapunov_spectrum(
     single = scene.platform.frequency_khz.ndim == 0
     scenes, tips = batch_and_tips(seen.scenes, None if start is None else seen.start(start))
     if isinstance(scene.interaction, Contact):
-        found = _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
+        exponents = _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
     else:
-        found = exponents_of_law(scenes, tips, impacts=impacts, transient=transient, report=report)
-    return jax.tree.map(lambda part: part[0], found) if single else found
+        exponents = exponents_of_law(scenes, tips, impacts=impacts, transient=transient, report=report)
+    return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 
 def exponents_of_law(
@@ -170,43 +179,46 @@ def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient
     departure, velocity = record.departure_us, record.velocity_after_nm_per_us
     turns = record.departure_periods * period[:, None] + departure
     passed = np.diff(turns, axis=1)
-    known = np.isfinite(passed)
+    exists = np.isfinite(passed)
     steps = passed.shape[1]
-    pairs = [np.where(known, part, 0.0).ravel() for part in (departure[:, :-1], velocity[:, :-1], passed)]
+    pairs = [np.where(exists, part, 0.0).ravel() for part in (departure[:, :-1], velocity[:, :-1], passed)]
     of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps, axis=0), scenes)
 
     def work(rows: tuple[Scene, Array, Array, Array]) -> Array:
         each_scene, time, speed, duration = rows
         return departure_jacobians(each_scene, time, speed, time + duration, accuracy=accuracy)
 
-    found = in_blocks(work, (of_all, *pairs), block=_CONTACTS_AT_ONCE).reshape(lanes, steps, 2, 2)
+    slopes = in_blocks(work, (of_all, *pairs), block=_CONTACTS_AT_ONCE).reshape(lanes, steps, 2, 2)
     unit = np.asarray(scenes.platform.angular_frequency * scenes.platform.top_speed_nm_per_us)
     scale = np.stack([np.ones_like(unit), unit, 1.0 / unit, np.ones_like(unit)], axis=1).reshape(lanes, 1, 2, 2)
-    jacobians = np.moveaxis(np.where(known[..., None, None], found * scale, np.eye(2)), 1, 0)
+    jacobians = np.moveaxis(np.where(exists[..., None, None], slopes * scale, np.eye(2)), 1, 0)
     determinants = np.linalg.det(jacobians)
     last = steps - (_PARTS + 1) * each
-    sums = _sums_of(jacobians[last:], determinants[last:], known.T[last:], np.where(known, passed, 0.0).T[last:], each)
+    sums = _sums_of(
+        jacobians[last:], determinants[last:], exists.T[last:], np.where(exists, passed, 0.0).T[last:], each
+    )
     flat = np.moveaxis(jacobians.reshape(steps, lanes, 4), 1, 2)
     return _of_orbits(_of_sums(sums, verdicts, record.approach_nm_per_us[:, -RECORDED:]), flat, determinants, period)
 
 
 def _sums_of(
-    jacobians: np.ndarray, determinants: np.ndarray, known: np.ndarray, passed: np.ndarray, each: int
+    jacobians: np.ndarray, determinants: np.ndarray, exists: np.ndarray, passed: np.ndarray, each: int
 ) -> _Sums:
-    """Return what `_measured` does, from the Jacobians; the axis of impacts first."""
+    """Return the sums of `_measured` from Jacobians that are known, the axis of impacts first."""
     vector = np.broadcast_to([0.8, 0.6], (jacobians.shape[1], 2))
-    growth = np.zeros(known.shape)
+    growth = np.zeros(exists.shape)
     for number, matrix in enumerate(jacobians):
         image = np.einsum("lij,lj->li", matrix, vector)
         length = np.linalg.norm(image, axis=1)
         length = np.where(length > 0.0, length, 1.0)
         vector, growth[number] = image / length[:, None], np.log(length)
-    logs = np.log(np.where(known & (determinants != 0.0), np.abs(determinants), 1.0))
-    parts = [growth, logs, known.astype(float), passed, np.zeros(known.shape), np.zeros(known.shape)]
+    logs = np.log(np.where(exists & (determinants != 0.0), np.abs(determinants), 1.0))
+    parts = [growth, logs, exists.astype(float), passed, np.zeros(exists.shape), np.zeros(exists.shape)]
     return _Sums(*(part.reshape(_PARTS + 1, each, -1).sum(axis=1)[1:] for part in parts))
 
 
 def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int) -> Lyapunov:
+    """Return the exponents of a block of motions in law scenes: means over all impacts, of orbits the multipliers."""
     each = -(-impacts // _PARTS)
     tips = skipped(scenes, tips, impacts=transient)
     tips, sums = _measured(scenes, tips, each=each)
@@ -215,8 +227,8 @@ def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: i
     period = np.asarray(scenes.platform.period_us)
     outcome = np.asarray(tips.outcome)
     verdicts = verdicts_of(record, outcome, period, tolerance=_ARRIVED)
-    found = _of_sums(_Sums(*(np.asarray(part) for part in sums)), verdicts, record.approach_nm_per_us)
-    return _of_orbits(found, np.asarray(jacobians), np.asarray(determinants), period)
+    means = _of_sums(_Sums(*(np.asarray(part) for part in sums)), verdicts, record.approach_nm_per_us)
+    return _of_orbits(means, np.asarray(jacobians), np.asarray(determinants), period)
 
 
 @partial(jax.jit, static_argnames=("each",))
@@ -284,9 +296,9 @@ def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, 
         law = impact_law_of(scene)
         flight = flight_jacobian(cantilever, platform, time, velocity, arrival)
         contact = contact_jacobian(law, cantilever, platform, arrival, before)
-        kept = jnp.exp(-2.0 * cantilever.decay_rate * (arrival - time))
+        damped = jnp.exp(-2.0 * cantilever.decay_rate * (arrival - time))
         ratio = (velocity - platform.velocity(time)) / (before - platform.velocity(arrival))
-        determinant = kept * ratio * (contact[0, 0] * contact[1, 1] - contact[0, 1] * contact[1, 0])
+        determinant = damped * ratio * (contact[0, 0] * contact[1, 1] - contact[0, 1] * contact[1, 0])
         (a, b), (c, d) = contact
         (e, f), (g, h) = flight
         unit = platform.angular_frequency * platform.top_speed_nm_per_us
@@ -303,27 +315,27 @@ def _of_sums(sums: _Sums, verdicts: Verdicts, approach: Float[np.ndarray, "lanes
     kind = verdicts.kind
     rested = sums.rested.sum(axis=0)
     forgotten = (kind == MotionKind.STUCK) | (rested > 0)
-    known = enough & ~forgotten & np.isin(kind, (MotionKind.ORBIT, MotionKind.IRREGULAR))
+    measured = enough & ~forgotten & np.isin(kind, (MotionKind.ORBIT, MotionKind.IRREGULAR))
     logs = np.stack([sums.growth, sums.determinant - sums.growth], axis=-1)
 
     def mean_and_error(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        total = np.where(known, weight.sum(axis=0), 1.0)[:, None]
+        total = np.where(measured, weight.sum(axis=0), 1.0)[:, None]
         mean = logs.sum(axis=0) / total
         off = logs - mean * weight[..., None]
         error = np.sqrt((off**2).sum(axis=0) * _PARTS / (_PARTS - 1)) / total
         larger = np.argsort(-mean, axis=1)
         mean, error = (np.take_along_axis(part, larger, axis=1) for part in (mean, error))
-        mean = np.where(known[:, None], mean, np.where(forgotten[:, None], -np.inf, np.nan))
-        return mean, np.where(known[:, None], error, np.where(forgotten[:, None], 0.0, np.nan))
+        mean = np.where(measured[:, None], mean, np.where(forgotten[:, None], -np.inf, np.nan))
+        return mean, np.where(measured[:, None], error, np.where(forgotten[:, None], 0.0, np.nan))
 
     per_impact, per_us = mean_and_error(sums.impacts), mean_and_error(sums.time_us)
-    determinant = sums.determinant.sum(axis=0) / np.where(known, impacts, 1.0)
+    determinant = sums.determinant.sum(axis=0) / np.where(measured, impacts, 1.0)
     return Lyapunov(
         exponents_per_impact=per_impact[0],
         exponents_per_us=per_us[0],
         exponents_per_impact_error=per_impact[1],
         exponents_per_us_error=per_us[1],
-        mean_log_determinant=np.where(known, determinant, np.where(forgotten, -np.inf, np.nan)),
+        mean_log_determinant=np.where(measured, determinant, np.where(forgotten, -np.inf, np.nan)),
         impacts=impacts.astype(int),
         near_grazing=sums.near_grazing.sum(axis=0).astype(int),
         rested=rested.astype(int),
@@ -332,20 +344,20 @@ def _of_sums(sums: _Sums, verdicts: Verdicts, approach: Float[np.ndarray, "lanes
     )
 
 
-def _of_orbits(found: Lyapunov, jacobians: np.ndarray, determinants: np.ndarray, period: np.ndarray) -> Lyapunov:
-    """Return the same with the multipliers' logarithms where the motion has come to an orbit.
+def _of_orbits(means: Lyapunov, jacobians: np.ndarray, determinants: np.ndarray, period: np.ndarray) -> Lyapunov:
+    """Return exponents with the multipliers' logarithms in place of means where the motion has come to an orbit.
 
     Args:
-        found: the means.
+        means: exponents as means over all impacts.
         jacobians: of the last impacts, (impacts, 4, lanes).
-        determinants: theirs, (impacts, lanes).
+        determinants: of these Jacobians, (impacts, lanes).
         period: of the drive in us.
     """
-    verdicts = found.verdicts
+    verdicts = means.verdicts
     count = verdicts.impacts
-    lanes = np.flatnonzero((count > 0) & np.isfinite(found.exponents_per_impact[:, 0]))
+    lanes = np.flatnonzero((count > 0) & np.isfinite(means.exponents_per_impact[:, 0]))
     if not lanes.size:
-        return found
+        return means
     m = count[lanes]
     product = np.broadcast_to(np.eye(2), (lanes.size, 2, 2))
     logarithm = np.zeros(lanes.size)
@@ -368,10 +380,10 @@ def _of_orbits(found: Lyapunov, jacobians: np.ndarray, determinants: np.ndarray,
         old[lanes] = new
         return old
 
-    return found._replace(
-        exponents_per_impact=replaced(found.exponents_per_impact, logs),
-        exponents_per_us=replaced(found.exponents_per_us, logs * per_us[:, None]),
-        exponents_per_impact_error=replaced(found.exponents_per_impact_error, error),
-        exponents_per_us_error=replaced(found.exponents_per_us_error, error * per_us[:, None]),
-        mean_log_determinant=replaced(found.mean_log_determinant, logarithm / m),
+    return means._replace(
+        exponents_per_impact=replaced(means.exponents_per_impact, logs),
+        exponents_per_us=replaced(means.exponents_per_us, logs * per_us[:, None]),
+        exponents_per_impact_error=replaced(means.exponents_per_impact_error, error),
+        exponents_per_us_error=replaced(means.exponents_per_us_error, error * per_us[:, None]),
+        mean_log_determinant=replaced(means.mean_log_determinant, logarithm / m),
     )

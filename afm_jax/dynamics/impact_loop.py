@@ -14,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -21,26 +22,27 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import Surface, surface_of
-from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, peak_amplitude
-from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.impact.first_impact import Flight
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import lasting
+from afm_jax.impact.lasting_impact import speeds_of_lasting_impact
 from afm_jax.impact.law import Law, Speeds, impact_law_of
-from afm_jax.outcomes import Outcome
+from afm_jax.impact.orbits import FlightEnds, ends_at_its_own_impact, highest_of_sum, peak_amplitude
 from afm_jax.solve.derivatives import largest
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 SAMPLES_PER_TURN = 32
-"""Heights of a flight that are looked at, for every turn of the faster of drive and tip."""
+"""Heights computed of a flight for every period of the faster of drive and tip."""
 _MOST_SAMPLES = 4096
 _RESTING_PERIODS = 1.25
-"""Of a tip that meets nothing: more than one, so that its nearest approach is no end of what is looked at."""
-_EARLY = 1e-7
-"""How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
+"""Response periods searched of a tip that meets nothing: more than one, so that its nearest approach is inside."""
 
 
 class ImpactLoop(NamedTuple):
-    """What an (m, N) orbit is an orbit of: the surface is the one that the free tip sees (`surface_of`)."""
+    """What an (m, N) orbit is an orbit of: the surface is the one that the free tip sees (`surface_of`).
+
+    The unknowns of a loop are m drive phases at the arrivals in rad, ascending, and m coordinates of the impacts
+    (`Impact.speeds`) in the unit of speeds.
+    """
 
     cantilever: Cantilever
     surface: Platform | Surface
@@ -50,6 +52,8 @@ class ImpactLoop(NamedTuple):
     """N drive periods."""
     angular_frequency: Float[Array, ""]
     """Of the drive, in rad/us."""
+    speed_unit: Float[Array, ""]
+    """Unit of the coordinates among a loop's unknowns, in nm/us."""
 
 
 class Impacts(NamedTuple):
@@ -80,22 +84,24 @@ def driven_part(scene: Scene) -> str:
     return "platform" if float(scene.platform.amplitude_nm) or not moving else moving[0]
 
 
-def loop_of(scene: Scene, order: Float[Array, ""], driven: str) -> ImpactLoop:
+def loop_of(scene: Scene, order: Float[Array, ""], driven: str, speed_unit: Array | None = None) -> ImpactLoop:
     """Return what (m, N) orbits of a scene close.
 
     Args:
-        scene: its interaction is an `ImpactLaw`; its numbers may be traced.
+        scene: its interaction is a law; its numbers may be traced.
         order: N.
         driven: the part that sets the period (`driven_part`).
+        speed_unit: unit of the unknown coordinates in nm/us; None: the surface's top speed.
     """
     omega = RAD_PER_US_PER_KHZ * getattr(scene, driven).frequency_khz
     surface, response = surface_of(scene)
-    law = impact_law_of(scene)
-    return ImpactLoop(scene.cantilever, surface, response, law, 2.0 * jnp.pi * order / omega, omega)
+    unit = surface.top_speed_nm_per_us if speed_unit is None else speed_unit
+    law, period = impact_law_of(scene), 2.0 * jnp.pi * order / omega
+    return ImpactLoop(scene.cantilever, surface, response, law, period, omega, unit)
 
 
 def samples_for(scene: Scene, order: int, driven: str) -> int:
-    """Return how many heights of every flight of an orbit of an order are looked at: a power of 2."""
+    """Return how many heights are computed of every flight of an orbit of an order: a power of 2."""
     ratio = float(scene.cantilever.frequency_khz) / float(getattr(scene, driven).frequency_khz)
     wanted, samples = SAMPLES_PER_TURN * order * max(1.0, ratio), 64
     while samples < wanted and samples < _MOST_SAMPLES:
@@ -103,45 +109,43 @@ def samples_for(scene: Scene, order: int, driven: str) -> int:
     return samples
 
 
-def impacts_at(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Impacts:
-    """Return the impacts that unknowns stand for: m phases in rad, m coordinates over a scale in nm/us."""
+def impacts_at(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Impacts:
+    """Return the impacts that the unknowns of a loop stand for."""
     count = unknowns.shape[0] // 2
     omega, impact, surface = loop.angular_frequency, loop.impact, loop.surface
     arrival = unknowns[:count] / omega
 
     def speeds_of(time, coordinate):
         free = impact.speeds(coordinate)
-        return lasting(free, impact, time, loop.cantilever, surface) if impact.lasts else free
+        return speeds_of_lasting_impact(free, impact, time, loop.cantilever, surface) if impact.lasts else free
 
-    speeds = jax.vmap(speeds_of)(arrival, scale * unknowns[count:])
+    speeds = jax.vmap(speeds_of)(arrival, loop.speed_unit * unknowns[count:])
     leaving = arrival + speeds.delay
     height, velocity = surface.position_and_velocity(leaving)
     following = jnp.append(arrival[1:], arrival[:1] + loop.period_us)
     return Impacts(arrival, speeds, leaving, height, velocity + speeds.rebound, following - leaving)
 
 
-def closing_gaps(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Float[Array, " n"]:
-    """Return by how much every flight misses the next arrival: heights by Omega/scale, velocities by 1/scale."""
-    if unknowns.shape[0] == 0:
-        return unknowns
-    impacts = impacts_at(unknowns, scale, loop)
+def closing_gaps(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Float[Array, " n"]:
+    """Return by how much every flight misses the next arrival: m heights times Omega, m velocities, over the unit."""
+    impacts = impacts_at(unknowns, loop)
     height, velocity = loop.surface.position_and_velocity(impacts.arrival_us)
     position, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
     omega = loop.cantilever.angular_frequency
     missed = position - jnp.roll(height, -1)
     slower = speed - jnp.roll(velocity - impacts.speeds.approach, -1)
-    return jnp.concatenate([omega * missed, slower]) / scale
+    return jnp.concatenate([omega * missed, slower]) / loop.speed_unit
 
 
 def trace_and_determinant_of(
-    unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop
+    unknowns: Float[Array, " n"], loop: ImpactLoop
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return T and D of the linearised map of a closed loop; of the free motion where there is no impact in it."""
     cantilever, surface = loop.cantilever, loop.surface
     if unknowns.shape[0] == 0:
         p = cantilever.propagator(loop.period_us)
         return p.position_per_position + p.velocity_per_velocity, jnp.exp(-2.0 * cantilever.decay_rate * loop.period_us)
-    impacts = impacts_at(unknowns, scale, loop)
+    impacts = impacts_at(unknowns, loop)
 
     def one(leaving, velocity, duration, before):
         arrival = leaving + duration
@@ -165,23 +169,20 @@ class NearestApproach(NamedTuple):
     """Number of the flight, a whole number."""
 
 
-def nearest_approach(
-    unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop, samples: int
-) -> NearestApproach:
-    """Return the lowest point of a loop's flights above the surface, differentiable.
+def nearest_approach(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> NearestApproach:
+    """Return the lowest point of a closed loop's flights above the surface, differentiable.
 
     Args:
-        unknowns: of `impacts_at`; the loop is closed.
-        scale: of the same.
-        loop: whose.
-        samples: heights looked at in every flight; the lowest of them is improved by Newton's method.
+        unknowns: of the loop.
+        loop: what it closes.
+        samples: heights computed in every flight; the lowest of them is improved by Newton's method.
     """
     if unknowns.shape[0] == 0:
         zero = jnp.zeros((1,))
         begin, first = zero, zero
         height, velocity, lasts = zero, zero, _RESTING_PERIODS * loop.period_us[None]
     else:
-        impacts = impacts_at(unknowns, scale, loop)
+        impacts = impacts_at(unknowns, loop)
         begin, height, velocity, lasts = impacts.leaving_us, impacts.height, impacts.velocity, impacts.duration_us
         # a flight counts from max(t_in, t_out) on
         first = jnp.maximum(-impacts.speeds.delay, 0.0)
@@ -231,39 +232,35 @@ def lowest_of_flights(
         return jnp.clip(time + move, guess - width, guess + width)
 
     # its own change counts nothing, because the gap is lowest there
-    found, _, _ = motion(*start, lax.stop_gradient(lax.fori_loop(0, 6, improve, guess)))
-    return NearestApproach(jnp.where(lowest.any(), found, jnp.inf), flight.astype(found.dtype))
+    gap, _, _ = motion(*start, lax.stop_gradient(lax.fori_loop(0, 6, improve, guess)))
+    return NearestApproach(jnp.where(lowest.any(), gap, jnp.inf), flight.astype(gap.dtype))
 
 
-def flies(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Bool[Array, ""]:
+def flies(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Bool[Array, ""]:
     """Say whether every flight of a closed loop is one of the map: its first impact is the loop's next one."""
     if unknowns.shape[0] == 0:
         return -loop.surface.offset_nm >= loop.surface.reach_nm
-    impacts = impacts_at(unknowns, scale, loop)
+    impacts = impacts_at(unknowns, loop)
     drive_us = 2.0 * jnp.pi / loop.angular_frequency
 
     def one(leaving, velocity, duration, rebound, delay):
         flight = Flight(loop.cantilever, loop.surface, leaving, velocity)
         skip = jnp.maximum(-delay, 0.0) if loop.impact.delayed else None
-        first = first_impact(flight, skip_us=skip)
-        hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration - _EARLY * drive_us)
-        # rounding can lift the end of the flight off the surface where the impact is a graze
-        clear = hit | (first.outcome == Outcome.NO_FURTHER_IMPACT)
-        return (rebound > 0.0) & (duration > 0.0) & clear
+        return (rebound > 0.0) & ends_at_its_own_impact(flight, duration, skip, drive_us)
 
     speeds = impacts.speeds
     free = jax.vmap(one)(impacts.leaving_us, impacts.velocity, impacts.duration_us, speeds.rebound, speeds.delay)
     return jnp.all(free) & jnp.all(speeds.approach > 0.0)
 
 
-def highest_point(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop, samples: int) -> Array:
+def highest_point(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> Array:
     """Return the largest height of the tip above its rest position, in nm."""
     response = loop.response
     if unknowns.shape[0] == 0:
         zero = jnp.zeros(())
         free = FlightEnds(zero, loop.period_us, zero, zero, zero, zero)
         return zero if response is None else highest_of_sum(loop.cantilever, free, response, samples)
-    impacts = impacts_at(unknowns, scale, loop)
+    impacts = impacts_at(unknowns, loop)
     end, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
     flights = FlightEnds(impacts.leaving_us, impacts.duration_us, impacts.height, impacts.velocity, end, speed)
 
@@ -283,7 +280,7 @@ class LoopReading(eqx.Module):
         velocity_after_nm_per_us: tip velocity in the lab just after.
         velocity_before_nm_per_us: just before.
         approach_speed_nm_per_us: relative to the surface.
-        rebound_speed_nm_per_us: likewise.
+        rebound_speed_nm_per_us: relative to the surface.
         delay_us: collision delay.
         peak_amplitude_nm: largest height above the rest position.
         trace: T of the linearised map.
@@ -305,36 +302,53 @@ class LoopReading(eqx.Module):
     missing: Float[Array, "*loops"]
 
 
-def reading_of(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop, samples: int) -> LoopReading:
+def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> LoopReading:
     """Return what there is to know of a closed loop.
 
     Args:
-        unknowns: of `impacts_at`.
-        scale: of the same.
-        loop: whose.
+        unknowns: of the loop.
+        loop: what it closes.
         samples: of `nearest_approach`.
     """
-    trace, determinant = trace_and_determinant_of(unknowns, scale, loop)
-    impacts = impacts_at(unknowns, scale, loop) if unknowns.shape[0] else None
-    none = jnp.zeros((0,))
-    moves, before, phase = none, none, none
-    if impacts is not None:
-        phase = within_turn(impacts.leaving_us * loop.angular_frequency, 2.0 * jnp.pi)
-        moves, before = impacts.velocity, loop.surface.velocity(impacts.arrival_us) - impacts.speeds.approach
-        if loop.response is not None:
-            moves = moves + loop.response.velocity(impacts.leaving_us)
-            before = before + loop.response.velocity(impacts.arrival_us)
-    gaps = closing_gaps(unknowns, scale, loop)
+    trace, determinant = trace_and_determinant_of(unknowns, loop)
+    impacts = impacts_at(unknowns, loop)
+    after, before = impacts.velocity, loop.surface.velocity(impacts.arrival_us) - impacts.speeds.approach
+    if loop.response is not None:
+        after = after + loop.response.velocity(impacts.leaving_us)
+        before = before + loop.response.velocity(impacts.arrival_us)
     return LoopReading(
-        phase_rad=phase,
-        velocity_after_nm_per_us=moves,
+        phase_rad=within_turn(impacts.leaving_us * loop.angular_frequency, 2.0 * jnp.pi),
+        velocity_after_nm_per_us=after,
         velocity_before_nm_per_us=before,
-        approach_speed_nm_per_us=none if impacts is None else impacts.speeds.approach,
-        rebound_speed_nm_per_us=none if impacts is None else impacts.speeds.rebound,
-        delay_us=none if impacts is None else impacts.speeds.delay,
-        peak_amplitude_nm=highest_point(unknowns, scale, loop, samples),
+        approach_speed_nm_per_us=impacts.speeds.approach,
+        rebound_speed_nm_per_us=impacts.speeds.rebound,
+        delay_us=impacts.speeds.delay,
+        peak_amplitude_nm=highest_point(unknowns, loop, samples),
         trace=trace,
         determinant=determinant,
-        admissible=flies(unknowns, scale, loop),
-        missing=jnp.max(jnp.abs(gaps), initial=0.0),
+        admissible=flies(unknowns, loop),
+        missing=jnp.max(jnp.abs(closing_gaps(unknowns, loop)), initial=0.0),
     )
+
+
+class Frame(NamedTuple):
+    """The scene of a curve of loops, its order N, and what loops and parameters are measured in along the curve."""
+
+    scene: Scene
+    order: Float[Array, ""]
+    speed_unit: Float[Array, ""]
+    """In nm/us."""
+    low: Float[Array, " parameters"]
+    """Lower ends of the parameters' ranges."""
+    width: Float[Array, " parameters"]
+    """Widths of the ranges: parameters count as fractions of them."""
+
+    def units(self, impacts: int) -> Float[np.ndarray, " n"]:
+        """Return the units of a loop's unknowns: m phases in rad, m speeds or coordinates in nm/us."""
+        return np.repeat([1.0, float(self.speed_unit)], impacts)
+
+    def loops_and_values(self, points: Float[np.ndarray, "points n"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the loops in rad and nm/us, and the values of the parameters, at points of a curve."""
+        count = points.shape[1] - len(self.low)
+        values = np.asarray(self.low) + np.asarray(self.width) * points[:, count:]
+        return points[:, :count] * self.units(count // 2), values

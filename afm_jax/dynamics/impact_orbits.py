@@ -1,10 +1,7 @@
-"""Orbits of m impacts in N drive periods: found from many starts, told apart, polished; orbits with a rest likewise.
+"""Orbits of m impacts in N drive periods: found from many starts, told apart, polished.
 
 Starts are flown through the map; every window of m of their impacts that takes about N periods is a first guess, and
 Newton's method closes the whole loop (`impact_loop`). What is left are loops that the map flies, each once.
-
-Without adhesion and delay a tip can come to rest on the surface by infinitely many impacts. Where it is let go again
-depends on the surface alone, so that one flight from there tells whether it comes to rest again: then it repeats.
 """
 
 from functools import partial
@@ -26,12 +23,13 @@ from afm_jax.dynamics.impact_loop import (
     reading_of,
     samples_for,
 )
-from afm_jax.dynamics.iteration import evenly_spread
+from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import Departure, follow_impacts
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.lanes import power_of_two
 from afm_jax.solve.newton import Newton, newton
 
 DEFAULT_STARTS = 512
@@ -120,19 +118,16 @@ def many_impact_orbits(scene: SceneLike, order: int, impacts: int, *, starts: in
     check_loop(order, impacts)
     check_count("starts", starts)
     number = jnp.asarray(float(order))
-    found, scale, good = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
-    loops = loops_told_apart(np.asarray(found)[np.asarray(good)], order)
-    size = max(16, 1 << max(len(loops) - 1, 0).bit_length())
-    padded = np.concatenate([loops, np.zeros((size - len(loops), 2 * impacts))])
-    reading = read_loops(
-        scene, number, jnp.asarray(padded), scale, driven=driven, samples=samples_for(scene, order, driven)
-    )
+    unknowns, speed_unit, closed = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
+    loops = loops_told_apart(np.asarray(unknowns)[np.asarray(closed)], order)
+    padded = np.concatenate([loops, np.zeros((power_of_two(len(loops), 16) - len(loops), 2 * impacts))])
+    reading = _read_loops(scene, number, jnp.asarray(padded), driven=driven, samples=samples_for(scene, order, driven))
     reading = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(loops)], reading)
     keep = reading.admissible & (reading.missing < _CLOSED)
     rank = np.argsort(-reading.peak_amplitude_nm, kind="stable")
     chosen = rank[keep[rank]]
     reading = jax.tree.map(lambda leaf: leaf[chosen], reading)
-    absolute = loops[chosen] * np.repeat([1.0, float(scale)], impacts)
+    absolute = loops[chosen] * np.repeat([1.0, float(speed_unit)], impacts)
     multipliers = multipliers_of(reading.trace, reading.determinant)
     return ManyImpactOrbits(absolute, reading, multipliers, is_stable(multipliers))
 
@@ -149,24 +144,23 @@ def check_loop(order: int, impacts: int) -> None:
 
 
 @partial(jax.jit, static_argnames=("driven", "samples"))
-def read_loops(
-    scene: Scene, order: Float[Array, ""], loops: Float[Array, "loops n"], scale: Array, *, driven: str, samples: int
+def _read_loops(
+    scene: Scene, order: Float[Array, ""], loops: Float[Array, "loops n"], *, driven: str, samples: int
 ) -> LoopReading:
     """Return what there is to know of loops of one scene (`reading_of`)."""
     loop = loop_of(scene, order, driven)
-    return jax.vmap(lambda unknowns: reading_of(unknowns, scale, loop, samples))(loops)
+    return jax.vmap(lambda unknowns: reading_of(unknowns, loop, samples))(loops)
 
 
 def _starts(number: int) -> Float[Array, "starts 2"]:
-    """Return phases and logarithms of speeds, both as shares of their range, that fill the square evenly."""
+    """Return phases and logarithms of speeds, both as fractions of their range, that fill the square evenly."""
     return jnp.asarray((0.5 + evenly_spread(number)) % 1.0)
 
 
 @partial(jax.jit, static_argnames=("impacts", "driven"))
 def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: str):
-    """Return loops, the scale of their coordinates, and which of them close."""
+    """Return the unknowns of loops, the unit of their coordinates in nm/us, and which of them close."""
     loop = loop_of(scene, order, driven)
-    top_speed = loop.surface.top_speed_nm_per_us
     seen = eqx.tree_at(lambda parts: parts.platform, scene, loop.surface)
     phases, speeds = _walks(seen, loop, starts, _WINDOWS[-1] + impacts + 1)
     guesses, misfit = [], []
@@ -176,16 +170,16 @@ def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: 
         change = (speed[:, -1] - speed[:, 0]) / (speed[:, -1] + speed[:, 0])
         misfit.append(jnp.abs(turns) + jnp.abs(change))
         coordinates = loop.impact.coordinate(speed[:, :-1])
-        guesses.append(jnp.concatenate([phase[:, :-1], coordinates / top_speed], axis=1))
+        guesses.append(jnp.concatenate([phase[:, :-1], coordinates / loop.speed_unit], axis=1))
     guesses, misfit = jnp.concatenate(guesses), jnp.concatenate(misfit)
     near = jnp.argsort(jnp.where(jnp.isfinite(misfit), misfit, jnp.inf))[: starts.shape[0]]
     usable = jnp.isfinite(misfit[near])
     guesses = jnp.where(usable[:, None], guesses[near], 1.0)
-    found = jax.vmap(lambda guess: closed_loop(guess, top_speed, loop))(guesses)
-    missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, top_speed, loop))))(found)
+    loops = jax.vmap(lambda guess: _closed_loop(guess, loop))(guesses)
+    missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, loop))))(loops)
     # a free motion that touches the surface is no orbit of impacts
-    leaves = jnp.min(found[:, impacts:], axis=1) > loop.impact.lowest / top_speed + _GRAZES
-    return found, top_speed, usable & (missing < _CLOSED) & leaves
+    leaves = jnp.min(loops[:, impacts:], axis=1) > loop.impact.lowest / loop.speed_unit + _GRAZES
+    return loops, loop.speed_unit, usable & (missing < _CLOSED) & leaves
 
 
 def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[Array, Array]:
@@ -205,24 +199,21 @@ def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[A
     return jax.vmap(one)(starts)
 
 
-def closed_loop(guess: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Float[Array, " n"]:
-    """Return the loop that Newton's method finds from a guess; whether it closes is for the caller to see."""
+def _closed_loop(guess: Float[Array, " n"], loop: ImpactLoop) -> Float[Array, " n"]:
+    """Return the unknowns that Newton's method finds from a guess; whether the loop closes is for the caller to see."""
     count = guess.shape[0] // 2
 
     def damped(unknowns: Array, step: Array) -> Array:
-        nearer = -_SHARE * (unknowns[count:] - loop.impact.lowest / scale)
+        nearer = -_SHARE * (unknowns[count:] - loop.impact.lowest / loop.speed_unit)
         return jnp.concatenate([jnp.clip(step[:count], -_TURN, _TURN), jnp.maximum(step[count:], nearer)])
 
-    def gaps(unknowns: Array, scaled_loop: tuple[Array, ImpactLoop]) -> Array:
-        return closing_gaps(unknowns, *scaled_loop)
-
-    return newton(gaps, guess, (scale, loop), _CLOSING._replace(damping=damped)).x
+    return newton(closing_gaps, guess, loop, _CLOSING._replace(damping=damped)).x
 
 
 def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
     """Return each loop once, its hardest impact first; without those that repeat a shorter one."""
     count = loops.shape[1] // 2
-    kept: dict[tuple[int, ...], list[np.ndarray]] = {}
+    seen: dict[tuple[int, ...], list[np.ndarray]] = {}
     result = []
     for unknowns in loops:
         phases, sizes = unknowns[:count], unknowns[count:]
@@ -231,26 +222,28 @@ def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[n
         first = int(np.argmax(np.round(sizes / sizes.max(), 7)))
         turned = np.concatenate([phases[first:], phases[:first] + 2.0 * np.pi * order])
         turned -= 2.0 * np.pi * np.floor(turned[0] / (2.0 * np.pi))
-        own = np.stack([np.cos(turned), np.sin(turned), np.roll(sizes, -first) / sizes.max()])
-        if _repeats(own):
+        states = np.stack([np.cos(turned), np.sin(turned), np.roll(sizes, -first) / sizes.max()])
+        if _repeats(states):
             continue
         # neighbours of a rounded number may be rounded apart: both are looked up
-        invariant = np.array([own.sum(), sizes.sum() / sizes.max()])
+        invariant = np.array([states.sum(), sizes.sum() / sizes.max()])
         keys = {tuple(int(part) for part in np.floor(invariant * 1e4 + shift)) for shift in (0.0, 0.5)}
-        others = [other for key in keys for other in kept.get(key, [])]
-        if any(_is_a_turn_of(own, other) for other in others):
+        others = [other for key in keys for other in seen.get(key, [])]
+        if any(_is_a_turn_of(states, other) for other in others):
             continue
         for key in keys:
-            kept.setdefault(key, []).append(own)
+            seen.setdefault(key, []).append(states)
         result.append(np.concatenate([turned, np.roll(sizes, -first)]))
     return np.array(result).reshape(-1, 2 * count)
 
 
-def _repeats(own: np.ndarray) -> bool:
+def _repeats(states: np.ndarray) -> bool:
     """Say whether a loop comes back to its state after fewer impacts than it has."""
-    count = own.shape[1]
-    return any(count % part == 0 and np.abs(own - np.roll(own, part, axis=1)).max() < _SAME for part in range(1, count))
+    count = states.shape[1]
+    return any(
+        count % part == 0 and np.abs(states - np.roll(states, part, axis=1)).max() < _SAME for part in range(1, count)
+    )
 
 
-def _is_a_turn_of(own: np.ndarray, other: np.ndarray) -> bool:
-    return any(np.abs(np.roll(own, turn, axis=1) - other).max() < _SAME for turn in range(own.shape[1]))
+def _is_a_turn_of(states: np.ndarray, other: np.ndarray) -> bool:
+    return any(np.abs(np.roll(states, turn, axis=1) - other).max() < _SAME for turn in range(states.shape[1]))

@@ -25,7 +25,6 @@ from afm_jax.dynamics.curves import (
     CurvePoint,
     Equations,
     FollowedCurve,
-    Frame,
     followed_both_ways,
     lies_on,
     loop_at,
@@ -34,7 +33,7 @@ from afm_jax.dynamics.curves import (
     split_point,
     tested_by,
 )
-from afm_jax.dynamics.impact_loop import LoopReading
+from afm_jax.dynamics.impact_loop import Frame, LoopReading
 from afm_jax.scenefile.parameter_paths import ParameterRange
 
 _ASIDE = 1e-5

@@ -145,29 +145,29 @@ def follow_sticking(
     check_ranges(scene, given)
     family, width = scene_family(scene, given.path), given.high - given.low
 
-    def at(share: float) -> StickingOrbit | None:
-        found = sticking_orbit(family(given.low + width * share))
-        return found if isinstance(found, StickingOrbit) and found.order == order else None
+    def at(fraction: float) -> StickingOrbit | None:
+        orbit = sticking_orbit(family(given.low + width * fraction))
+        return orbit if isinstance(orbit, StickingOrbit) and orbit.order == order else None
 
-    shares, orbits = np.linspace(0.0, 1.0, values).tolist(), []
-    for number, share in enumerate(shares):
-        orbits.append(at(share))
+    fractions, orbits = np.linspace(0.0, 1.0, values).tolist(), []
+    for number, fraction in enumerate(fractions):
+        orbits.append(at(fraction))
         if report is not None:
             report(number + 1, values)
     short = _SHORT_REST * drive_of(scene).period_us
 
-    def least(share: float) -> float:
-        return _least_push(family(given.low + width * share))
+    def least(fraction: float) -> float:
+        return _least_push(family(given.low + width * fraction))
 
-    stretches = [_ended(at, least, shares, orbits, stretch, short) for stretch in _stretches(orbits)]
+    stretches = [_ended(at, least, fractions, orbits, stretch, short) for stretch in _stretches(orbits)]
     branches, special = [], []
     for number, (points, ends) in enumerate(stretches):
-        places = given.low + width * np.array([share for share, _ in points])
+        places = given.low + width * np.array([fraction for fraction, _ in points])
         readings = _readings([one for _, one in points], [family(value) for value in places])
         branches.append(OrbitBranch(places, np.zeros((len(points), 0)), readings, ends))
         for place, kind in ((0, ends[0]), (len(points) - 1, ends[1])):
             if kind != "range":
-                own = jax.tree.map(lambda part, place=place: part[place], readings)
+                reading = jax.tree.map(lambda part, place=place: part[place], readings)
                 point = SpecialPoint(
                     kind=kind,
                     parameter=float(places[place]),
@@ -175,7 +175,7 @@ def follow_sticking(
                     position=float(place),
                     admissible=True,
                     unknowns=np.zeros(0),
-                    reading=own,
+                    reading=reading,
                     test=_NO_TEST,
                 )
                 special.append(point)
@@ -209,22 +209,22 @@ def _least_push(scene: Scene) -> float:
 def _ended(
     at: _At,
     least: Callable[[float], float],
-    shares: list[float],
+    fractions: list[float],
     orbits: list[StickingOrbit | None],
     stretch: range,
     short_us: float,
 ) -> tuple[list[_Found], tuple[str, str]]:
     """Return the points of a stretch with its narrowed ends, and why it ends there."""
-    points = [(shares[k], one) for k in stretch if (one := orbits[k]) is not None]
+    points = [(fractions[k], one) for k in stretch if (one := orbits[k]) is not None]
     ends = []
     for last, beyond in ((0, stretch[0] - 1), (-1, stretch[-1] + 1)):
-        if not 0 <= beyond < len(shares):
+        if not 0 <= beyond < len(fractions):
             ends.append("range")
             continue
-        end, kind = _narrowed(at, points[last], shares[beyond]), None
-        if least(end[0]) < 0.0 <= least(shares[beyond]):
+        end, kind = _narrowed(at, points[last], fractions[beyond]), None
+        if least(end[0]) < 0.0 <= least(fractions[beyond]):
             # shortly before, the flight is too short to be flown
-            held = float(np.asarray(brentq(least, end[0], shares[beyond], xtol=1e-14)))
+            held = float(np.asarray(brentq(least, end[0], fractions[beyond], xtol=1e-14)))
             if abs(held - end[0]) < _SHORT_FLIGHT:
                 end, kind = (held, end[1]), "held"
         if end[0] != points[last][0]:
@@ -237,9 +237,9 @@ def _narrowed(at: _At, inside: _Found, outside: float) -> _Found:
     """Return the last point on the inner side of an end of the orbit."""
     while abs(outside - inside[0]) > _NARROWED:
         middle = 0.5 * (inside[0] + outside)
-        found = at(middle)
-        if found is not None and found.rests == inside[1].rests:
-            inside = middle, found
+        orbit = at(middle)
+        if orbit is not None and orbit.rests == inside[1].rests:
+            inside = middle, orbit
         else:
             outside = middle
     return inside

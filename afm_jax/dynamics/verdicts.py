@@ -6,7 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from afm_jax.dynamics.iteration import Record
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.many_tips import Record
 from afm_jax.motion.settle import LONGEST, ROUNDING, find_repetitions
 from afm_jax.outcomes import Outcome
 
@@ -56,11 +58,19 @@ REPEATED = 2
 RECORDED = (2 * REPEATED + 1) * LONGEST
 """Impacts that are recorded to tell orbits of up to `LONGEST` impacts."""
 
+_SETTLED, _SETTLED_CONTACT = 1e-6, 1e-4
+"""Estimated distance from an orbit below which a motion is on it, with laws and with resolved contacts."""
+
 _KIND_OF = {
     Outcome.IMPACT: MotionKind.IRREGULAR,
     Outcome.CAPTURED: MotionKind.STUCK,
     Outcome.NO_FURTHER_IMPACT: MotionKind.FREE,
 }
+
+
+def settled_below(scenes: Scene) -> float:
+    """Return the estimated distance from an orbit below which a motion is on it."""
+    return _SETTLED_CONTACT if isinstance(scenes.interaction, Contact) else _SETTLED
 
 
 def verdicts_of(
@@ -83,8 +93,9 @@ def verdicts_of(
     # resolved contacts, for which the tolerance is wide, repeat to no more than their accuracy
     rounding = max(ROUNDING, 1e-2 * tolerance)
     velocities = record.velocity_after_nm_per_us
-    found = find_repetitions(turns, velocities, tolerance=tolerance, repeated=REPEATED, rounding=rounding)
-    impacts, periods, remaining = found
+    impacts, periods, remaining = find_repetitions(
+        turns, velocities, tolerance=tolerance, repeated=REPEATED, rounding=rounding
+    )
     for lane in np.flatnonzero((impacts == 0) & (kind == MotionKind.IRREGULAR) & (record.rested.sum(axis=1) > 1)):
         before, last = np.flatnonzero(record.rested[lane])[-2:]
         apart = turns[lane, last] - turns[lane, before]

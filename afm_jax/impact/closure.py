@@ -1,36 +1,52 @@
-"""The closing condition of a single-impact orbit, as one scalar equation for the approach speed.
+"""The closing condition of a single-impact orbit, one scalar equation for the approach speed, and all its roots.
 
 Equation 9 asks for the impact phase. Read the other way round it has no poles and nothing special at resonance: for an
 assumed approach speed u the law gives the rebound speed w and the delay tau, and the two conditions that the flight of
 duration N T - tau ends where the next one begins are *linear* in a = cos(omega t_out), b = sin(omega t_out). Every root
 of a^2 + b^2 = 1 is an orbit. Both signs of eq. 9's root are among them, and nothing else, because w > 0 throughout.
 
-In place of u stands a coordinate of the impact in which the law is smooth up to capture (`Law.speeds`). Without a delay
-the condition is then a quartic in it. Where the impact lasts, speeds and delay need the phase: three passes alternate
-between the two, close enough to find every orbit, and Newton's method closes the map itself from there.
+In place of u stands a coordinate of the impact in which the law is smooth up to capture (`Impact.speeds`). Of a formula
+without a delay the condition is a quartic in it, of which no root can be missed. Otherwise it is scanned: every change
+of sign between neighbours of the scan is narrowed, and every pair of roots that it stepped over, seen by the extremum
+between them. Where the impact lasts, speeds and delay need the phase: three passes alternate between the two, close
+enough to find every orbit, and Newton's method closes the map itself from there (`follow_root`).
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever, Propagator
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.impact.lasting_impact import corrected, lasting, middle_of_contact
+from afm_jax.impact.lasting_impact import PulledImpact, corrected, middle_of_contact, speeds_of_lasting_impact
 from afm_jax.impact.law import Impact, ImpactLaw, Speeds
-from afm_jax.solve.derivatives import solved_pair
+from afm_jax.solve.newton import Newton, newton
+from afm_jax.solve.polynomial_roots import real_roots
 
 _REGULAR = 1e-12
 """Relative size below which a determinant is taken for the rounding of 0."""
 _PASSES = 3
 _CLOSE = 1e-10
 """Gaps, and the last step of Newton's method, that leave an error of the order of their square."""
+_CLOSED = 1e-9
+"""By how much a turn of the map may miss its start, in units of the drive: near a fold rounding leaves as much."""
+_NEWTON = 6
+"""Steps of Newton's method at most."""
 _LONGEST_STEP = 0.3
-"""Of Newton's method: share of the distance from capture, and rad."""
+"""Longest step of it: fraction of the distance from capture, and rad."""
+_LEAVING = 0.4
+"""Fraction of the drive's period that a leaving tip may take to lose its energy: beyond, no law of impacts holds."""
+_REGULA_FALSI, _BEFORE_NEWTON = 20, 10
+"""Steps towards a root of the scalar condition: to its last digit, and to where Newton's method goes on."""
+_SECTIONS = 16
+_GOLDEN = 0.6180339887498949
+_SAME = 1e-7
+"""Relative difference of approach speeds below which roots are one."""
 
 
 class OrbitProblem(NamedTuple):
@@ -106,6 +122,12 @@ def closure(coordinate: Float[Array, ""], problem: OrbitProblem) -> Closure:
     return Closure(speeds, _delayed(speeds, problem))
 
 
+@jax.jit
+def closing_residual(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, ""]:
+    """Return a^2 + b^2 - 1 times the squared determinant, relative to the sum of its terms: 0 on an orbit."""
+    return closure(coordinate, problem).system.residual
+
+
 class OrbitPlace(NamedTuple):
     """An orbit: the coordinate of its impact in nm/us, and the drive's phase in rad when the tip arrives."""
 
@@ -121,7 +143,7 @@ def place_of(coordinate: Float[Array, ""], speeds: Speeds, system: ClosingSystem
 def speeds_at_place(place: OrbitPlace, problem: OrbitProblem) -> Speeds:
     """Return what the impact is at a place: that of the map."""
     cantilever, platform, impact, _ = problem
-    return lasting(
+    return speeds_of_lasting_impact(
         impact.speeds(place.coordinate), impact, place.phase / platform.angular_frequency, cantilever, platform
     )
 
@@ -141,46 +163,31 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
     return jnp.stack([(position - height) / platform.amplitude_nm, missing])
 
 
-class ClosedMap(NamedTuple):
-    """Coordinate and phase where Newton's method has ended, and the last gaps it has seen."""
-
-    unknowns: Float[Array, " 2"]
-    gaps: Float[Array, " 2"]
-
-
-def close_map(place: OrbitPlace, problem: OrbitProblem, steps: int, wanted: Bool[Array, ""]) -> ClosedMap:
-    """Return where steps of Newton's method towards the orbit of the map end: as many as it takes.
+@jax.jit
+def follow_root(
+    near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Array, ""]
+) -> tuple[OrbitPlace, Bool[Array, ""]]:
+    """Return where the map of a lasting impact closes, and whether it does, without derivatives.
 
     Args:
-        place: where to begin.
+        near: coordinate of the impact, close to that of the orbit.
         problem: what orbits are of.
-        steps: at most.
-        wanted: False: none at all.
+        wanted: whether the orbit is asked for; if not, no step of Newton's method is made.
     """
+    problem = lax.stop_gradient(problem)
 
-    def twice(unknowns):
-        value = map_gaps(unknowns, problem)
-        return value, value
-
-    def longest(unknowns):
+    def longest(unknowns: Array) -> Array:
         return jnp.stack([unknowns[0] - problem.impact.lowest, jnp.ones_like(unknowns[1])])
 
-    def unsettled(state):
-        count, unknowns, gaps, step = state
-        small = (jnp.abs(gaps) < _CLOSE) & (jnp.abs(step) < _CLOSE * longest(unknowns))
-        return wanted & (count < steps) & ~jnp.all(small)
+    def damped(unknowns: Array, step: Array) -> Array:
+        most = _LONGEST_STEP * longest(unknowns)
+        return jnp.clip(step, -most, most)
 
-    def improve(state):
-        count, unknowns, _, _ = state
-        slopes, gaps = jax.jacfwd(twice, has_aux=True)(unknowns)
-        most = longest(unknowns) * _LONGEST_STEP
-        step = jnp.clip(-solved_pair([slopes[:, 0], slopes[:, 1]], gaps), -most, most)
-        return count + 1, unknowns + step, gaps, step
-
-    first = jnp.stack(place)
-    far = jnp.full_like(first, jnp.inf)
-    _, unknowns, gaps, _ = lax.while_loop(unsettled, improve, (0, first, far, far))
-    return ClosedMap(unknowns, gaps)
+    speeds, system = closure(near, problem)
+    settings = Newton(_NEWTON, step_tolerance=_CLOSE, residual_tolerance=_CLOSE, unit=longest, damping=damped)
+    place = jnp.stack(place_of(near, speeds, system, problem))
+    root = newton(map_gaps, place, problem, settings, where=wanted)
+    return OrbitPlace(*root.x), system.regular & jnp.all(jnp.abs(root.residual) < _CLOSED)
 
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
@@ -201,12 +208,6 @@ def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
 def _law_of(problem: OrbitProblem) -> ImpactLaw:
     assert isinstance(problem.impact, ImpactLaw)  # the formula alone makes a quartic  # noqa: S101
     return problem.impact
-
-
-@jax.jit
-def closing_residual(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, ""]:
-    """Return a^2 + b^2 - 1 times the squared determinant, relative to the sum of its terms: 0 on an orbit."""
-    return closure(coordinate, problem).system.residual
 
 
 class _ReturningFlight(NamedTuple):
@@ -281,3 +282,295 @@ def _squared(quadratic: Float[Array, " 3"]) -> Float[Array, " 5"]:
     """Return the square of a quadratic (jnp.polymul's convolution takes 50 times as long under vmap)."""
     a, b, c = quadratic
     return jnp.array([a * a, 2.0 * a * b, b * b + 2.0 * a * c, 2.0 * b * c, c * c])
+
+
+class Scan(NamedTuple):
+    """At how many coordinates the closing condition is evaluated, and how many roots there is room for."""
+
+    points: int
+    """Coordinates, at equal ratios of their distance from capture."""
+    lowest: float
+    """Distance from capture at which they begin, in terms of the drive's speed or the capture coordinate."""
+    highest: float
+    crossings: int
+    """Changes of sign that are followed."""
+    turns: int
+    """Turning points without one that are searched for a pair of roots."""
+    slots: int
+    """Roots there is room for."""
+    within: int = 0
+    """Coordinates at which an interval with a change of sign is evaluated again, `points/crossings`; 0: at none."""
+
+
+FINE = Scan(8192, 1e-7, 1e5, crossings=16, turns=6, slots=16)
+"""Some 680 points to the decade: for whoever asks for all orbits."""
+COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
+"""Some 70 to the decade: for fits, which search a hundred thousand times."""
+TAPPED = Scan(192, 1e-2, 3.0, crossings=6, turns=2, slots=6, within=32)
+"""Of taps, each of which takes long to evaluate, and none of which is much faster than the drive. From light to hard
+ones the condition jumps: to either side of that there may be an orbit, and between neighbours of the scan both."""
+
+
+class OrbitRoots(NamedTuple):
+    """Roots of the closing condition.
+
+    ``place`` and ``found``, one a slot; ``complete``: there were no more roots than slots.
+    """
+
+    place: OrbitPlace
+    found: Bool[Array, " slots"]
+    complete: Bool[Array, ""]
+
+
+def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
+    """Return all places of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere.
+
+    Args:
+        problem: what orbits are of.
+        scan: how closely the condition is scanned where there is a delay; without one there are 4 slots.
+    """
+    problem = lax.stop_gradient(problem)
+    driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
+    coordinate, found, complete = _quartic_roots(problem) if _is_quartic(problem) else _scanned_roots(problem, scan)
+    safe = jnp.where(found, coordinate, harmless_coordinate(problem))
+    if problem.impact.lasts:
+        place, there = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
+    else:
+        place, there = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
+    found = found & driven & there
+    if problem.impact.lasts:
+        found = found & ~_seen_before(place.coordinate, found)
+    return OrbitRoots(OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
+
+
+def _is_quartic(problem: OrbitProblem) -> bool:
+    """Say whether the closing condition is a quartic: that of the formula without a delay."""
+    return isinstance(problem.impact, ImpactLaw) and not problem.impact.delayed
+
+
+def _seen_before(coordinate: Float[Array, " slots"], found: Bool[Array, " slots"]) -> Bool[Array, " slots"]:
+    """Say which roots are those of an earlier slot: from two brackets Newton's method may come to one orbit."""
+    same = jnp.abs(coordinate[:, None] - coordinate) <= _SAME * coordinate
+    return jnp.any(jnp.tril(same & found, k=-1), axis=1)
+
+
+def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
+    """Return a coordinate for slots without a root: some speed well above capture, harmless to compute with."""
+    return problem.impact.lowest + 2.0 * _scale(problem) + 2.0
+
+
+def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[OrbitPlace, Bool[Array, ""]]:
+    """Return the place at a root, and whether the phase is determined there."""
+    speeds, system = closure(coordinate, problem)
+    return place_of(coordinate, speeds, system, problem), system.regular
+
+
+class _Coordinates(NamedTuple):
+    """Roots of the scalar condition: coordinates, which of them are some, and whether those are all."""
+
+    coordinate: Float[Array, " slots"]
+    found: Bool[Array, " slots"]
+    complete: Bool[Array, ""]
+
+
+def _quartic_roots(problem: OrbitProblem) -> _Coordinates:
+    """Solve (Y cosine)^2 + (Y sine)^2 = (Y determinant)^2, a quartic in Y over beta omega."""
+    quartic = instantaneous_quartic(problem)
+    scale = problem.platform.top_speed_nm_per_us
+    low = problem.impact.lowest / scale
+    # Cauchy's bound; a quartic without leading term (no loss at exact resonance) has a root at infinity, not here.
+    top = jnp.max(jnp.abs(quartic))
+    leading = jnp.maximum(jnp.abs(quartic[0]), 1e-15 * top)
+    high = jnp.maximum(1.0 + top / jnp.where(leading > 0.0, leading, 1.0), 2.0 * low + 1.0)
+    roots, found = real_roots(quartic, low, high)
+    return _Coordinates(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
+
+
+def _scale(problem: OrbitProblem) -> Float[Array, ""]:
+    return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.reach)
+
+
+class _Samples(NamedTuple):
+    """Coordinates, the residuals there, and whether impacts are over soon."""
+
+    grid: Float[Array, " points"]
+    value: Float[Array, " points"]
+    brief: Bool[Array, " points"]
+
+
+def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
+    """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
+    grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
+    coarse, fine = _sampled_twice(grid, problem, scan) if scan.within else (_sampled(grid, problem),) * 2
+    coarse_crossing, crossing = _changes(coarse), _changes(fine)
+    if scan.within:
+        # from one interval to the next there is nothing
+        inside = np.arange(1, scan.points) % scan.within != 0
+        exists = _inside(coarse_crossing, scan)[1]
+        crossing = crossing & inside & jnp.repeat(exists, scan.within)[1:]
+    root, exists = _narrowed(_crossings(crossing, fine, scan), _dips(coarse, scan), problem)
+    # the fastest ones if there are too many
+    fastest = jnp.argsort(jnp.where(exists, -root, jnp.inf))[: scan.slots]
+    order = fastest[jnp.argsort(jnp.where(exists[fastest], root[fastest], jnp.inf))]
+    most = jnp.maximum(jnp.sum(coarse_crossing), jnp.sum(crossing))
+    complete = (most <= scan.crossings) & (jnp.sum(exists) <= scan.slots)
+    return _Coordinates(root[order], exists[order], complete)
+
+
+def _sampled(grid: Float[Array, " points"], problem: OrbitProblem) -> _Samples:
+    speeds, system = jax.vmap(closure, in_axes=(0, None))(grid, problem)
+    value = jax.vmap(lambda system: system.residual)(system)
+    if isinstance(problem.impact, PulledImpact):
+        # a bent lever pulls the tip out of the bridge
+        return _Samples(grid, value, jnp.abs(speeds.delay) < 0.5 * problem.platform.period_us)
+    return _Samples(grid, value, jax.vmap(_brief, in_axes=(0, None))(grid, problem))
+
+
+def _sampled_twice(grid: Float[Array, " points"], problem: OrbitProblem, scan: Scan) -> tuple[_Samples, _Samples]:
+    """Return the residual on a grid, and within the intervals where it changes its sign, one after the other."""
+
+    def again(_, state):
+        grid, _, last = state
+        here = _sampled(grid, problem)
+        at, _ = _inside(_changes(here), scan)
+        fraction = jnp.linspace(0.0, 1.0, scan.within)
+        return (grid[at, None] + fraction * (grid[at + 1] - grid[at])[:, None]).ravel(), last, here
+
+    # a loop, because the residual is compiled for every use of it
+    nothing = _Samples(grid, jnp.zeros_like(grid), jnp.zeros(grid.shape, bool))
+    return lax.fori_loop(0, 2, again, (grid, nothing, nothing))[1:]
+
+
+def _changes(samples: _Samples) -> Bool[Array, " intervals"]:
+    """Say in which intervals the residual changes its sign, between impacts that are over soon."""
+    _, value, brief = samples
+    return (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
+
+
+def _inside(crossing: Bool[Array, " intervals"], scan: Scan) -> tuple[Array, Array]:
+    """Return where the changes of sign are, ascending, the fastest ones if there are too many, and which exist."""
+    at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0]
+    return at[::-1], (jnp.arange(scan.crossings) < jnp.sum(crossing))[::-1]
+
+
+def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
+    """Say whether an impact is over soon: the lead grows without bound towards capture.
+
+    One that lasts must end within half a drive period, and the tip have lost its energy by then.
+    """
+    period = problem.platform.period_us
+    speeds = problem.impact.speeds(coordinate)
+    if not problem.impact.lasts:
+        return jnp.abs(speeds.delay) < period
+    length = problem.impact.hertz_contact.length_nm
+    return (jnp.abs(speeds.delay) < 0.5 * period) & (length / speeds.rebound < _LEAVING * period)
+
+
+class _Brackets(NamedTuple):
+    """Ends of intervals and the residuals there; which of them are some."""
+
+    left: Float[Array, " n"]
+    right: Float[Array, " n"]
+    low: Float[Array, " n"]
+    high: Float[Array, " n"]
+    real: Bool[Array, " n"]
+
+    def or_empty(self, harmless: Float[Array, ""]) -> "_Brackets":
+        """Return the brackets, those that are none with values 0 at a harmless coordinate."""
+        left, right = (jnp.where(self.real, end, harmless) for end in self[:2])
+        low, high = (jnp.where(self.real, end, 0.0) for end in self[2:4])
+        return _Brackets(left, right, low, high, self.real)
+
+
+class _Dips(NamedTuple):
+    """Three neighbours of one sign each, the middle one closest to zero: the extremum may lie beyond."""
+
+    ends: _Brackets
+    middle: Float[Array, " n"]
+    """The residual there."""
+
+
+def _crossings(crossing: Bool[Array, " intervals"], samples: _Samples, scan: Scan) -> _Brackets:
+    """Return the changes of sign, the fastest ones if there are too many: close to capture the law itself ends."""
+    at, real = _inside(crossing, scan)
+    grid, value, _ = samples
+    return _Brackets(grid[at], grid[at + 1], value[at], value[at + 1], real)
+
+
+def _dips(samples: _Samples, scan: Scan) -> _Dips:
+    """Return where the scan may have stepped over a pair of roots."""
+    grid, value, brief = samples
+    size = jnp.abs(value)
+    same = (value[:-2] * value[1:-1] > 0.0) & (value[1:-1] * value[2:] > 0.0)
+    dip = same & (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & brief[1:-1]
+    at, real = _lowest_of(jnp.where(dip, size[1:-1], jnp.inf), scan.turns)
+    return _Dips(_Brackets(grid[at], grid[at + 2], value[at], value[at + 2], real), value[at + 1])
+
+
+def _lowest_of(size: Float[Array, " n"], count: int) -> tuple[Array, Array]:
+    """Return where the smallest numbers are, and which of them are finite."""
+
+    def take(size, _):
+        place = jnp.argmin(size)
+        return size.at[place].set(jnp.inf), (place, jnp.isfinite(size[place]))
+
+    _, (at, real) = lax.scan(take, size, None, length=count)
+    return at, real
+
+
+def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple[Array, Array]:
+    """Return the root of every bracket, and which there are: of changes of sign, then left and right in every dip.
+
+    Changes of sign are narrowed by the Illinois method: the newer end stays, the other one loses weight. In a dip a
+    golden section goes to the extremum first, with both inner points at once in the places of the two roots to either
+    side of it. All in one loop, because the residual is compiled for every use of it.
+    """
+    residual = jax.vmap(closing_residual, in_axes=(0, None))
+    harmless = harmless_coordinate(problem)
+    count, turns = crossings.left.shape[0], dips.middle.shape[0]
+    sign = jnp.sign(dips.middle)
+    waits = jnp.arange(count + 2 * turns) >= count
+    illinois = _BEFORE_NEWTON if problem.impact.lasts else _REGULA_FALSI
+
+    def pairs(middle, bottom) -> _Brackets:
+        """Return the brackets to either side of the extrema."""
+        (left, right, low, high, real), across = dips.ends, bottom * dips.middle < 0.0
+        columns = ((left, middle), (middle, right), (low, bottom), (bottom, high), (real & across, real & across))
+        return _Brackets(*(jnp.concatenate(column) for column in columns)).or_empty(harmless)
+
+    def narrow(step, state):
+        brackets, (a, b) = state
+        points = jnp.stack([b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)])
+        points = jnp.where(step < _SECTIONS, points, 0.5 * (a + b))
+        gap = brackets.high - brackets.low
+        chord = brackets.left * brackets.high - brackets.right * brackets.low
+        x = jnp.where(gap == 0.0, brackets.left, chord / jnp.where(gap == 0.0, 1.0, gap))
+        x = jnp.where(waits & (step <= _SECTIONS), jnp.pad(points.ravel(), (count, 0)), x)
+        value = residual(x, problem)
+        first, second = value[count:].reshape(2, -1) * sign
+        inner = jnp.where(first < second, a, points[0]), jnp.where(first < second, points[1], b)
+        passed = value * brackets.low < 0.0
+        closer = _Brackets(
+            x,
+            jnp.where(passed, brackets.left, brackets.right),
+            value,
+            jnp.where(passed, brackets.low, 0.5 * brackets.high),
+            brackets.real,
+        )
+        either = jax.tree.map(
+            lambda head, tail: jnp.concatenate([head[:count], tail]), brackets, pairs(points[0], value[count:][:turns])
+        )
+        begun = jnp.where(waits, step > _SECTIONS, step < illinois)
+        brackets = jax.tree.map(
+            lambda new, found, old: jnp.where(begun, new, jnp.where(step == _SECTIONS, found, old)),
+            closer,
+            either,
+            brackets,
+        )
+        return brackets, inner
+
+    empty = jax.tree.map(lambda part: jnp.zeros((2 * turns,), part.dtype), dips.ends).or_empty(harmless)
+    begin = jax.tree.map(lambda head, tail: jnp.concatenate([head, tail]), crossings.or_empty(harmless), empty)
+    steps = _SECTIONS + 1 + illinois
+    brackets, _ = lax.fori_loop(0, steps, narrow, (begin, (dips.ends.left, dips.ends.right)))
+    return brackets.left, brackets.real

@@ -22,8 +22,10 @@ The corrections have no parameter of their own. Terms of higher order in J, whic
 amplitudes of orbits over a driven platform are within about 0.01 % of those of the full contact, within 1 % at twice
 the capture speed.
 
-At the end stand the impacts of a resolved contact, which orbits and predictions take in place of a law: collisions of a
-free tip (`TabulatedImpact`) and taps of a bent lever, which contain their pull (`PulledImpact`), as Chebyshev series.
+`speeds_of_impact` is what map, orbits, simulation and fits ask, for any impact and the time of its arrival;
+`delay_before` reads an impact backwards from its end. At the end of the file stand the impacts of a resolved contact,
+which orbits and predictions take in place of a law: collisions of a free tip (`TabulatedImpact`) and taps of a bent
+lever, which contain their pull (`PulledImpact`), as Chebyshev series.
 """
 
 from collections.abc import Callable
@@ -83,19 +85,19 @@ def speeds_of_impact(
     if not impact.lasts:
         return free
     leaves = free.rebound > 0.0
-    safe = Speeds(*(jnp.where(leaves, part, usual) for part, usual in zip(free, (1.0, 1.0, 0.0), strict=True)))
-    lasted = lasting(safe, impact, arrival_us, cantilever, surface)
-    return Speeds(approach_speed, *(jnp.where(leaves, part, 0.0) for part in lasted[1:]))
+    safe = Speeds(*(jnp.where(leaves, speed, usual) for speed, usual in zip(free, (1.0, 1.0, 0.0), strict=True)))
+    _, rebound, delay = speeds_of_lasting_impact(safe, impact, arrival_us, cantilever, surface)
+    return Speeds(approach_speed, jnp.where(leaves, rebound, 0.0), jnp.where(leaves, delay, 0.0))
 
 
-def lasting(
+def speeds_of_lasting_impact(
     free: Speeds,
     impact: Impact,
     arrival_us: Float[Array, ""],
     cantilever: Cantilever,
     surface: Platform | Surface,
 ) -> Speeds:
-    """Return speeds (nm/us) and delay (us) of an impact that lasts, for the arrival of a tip that leaves.
+    """Return speeds (nm/us) and delay (us) of an impact that lasts, of a tip that leaves again.
 
     Mid contact is half a delay after the arrival, and the delay contains the corrections: each of a few passes between
     the two leaves a hundredth of the change or less.
@@ -130,11 +132,13 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
         return impact.during(u, middle, cantilever).speeds
     pull, hertz = middle.acceleration, impact.hertz_contact
     raised, length = hertz.raised_nm, hertz.length_nm
+    # contact begins at the solid's surface, which the tip reaches from gap 0 under the pull
     at_surface = speed_over(u, raised, pull)
     tau = hertz.time(at_surface)
     gained, longer = gained_and_longer(at_surface, tau, middle, cantilever)
     rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
     longer = longer + tau - hertz.time(u) - _lag(u, raised, pull) - _lag(w, raised, pull)
+    # by how much later the tip passes the length over which it keeps its energy; of the lead that is its fraction
     later = _lag(w, length, pull) - _lag(u, length, pull)
     fraction = jnp.maximum(hertz.lead_nm, 0.0) / (USUAL_LEAD * length)
     return Speeds(u, rebound, free.delay + longer - fraction * later)
@@ -247,7 +251,7 @@ def depth_of_impact(
 
 
 def _lag(speed: Float[Array, ""], length: Float[Array, ""], acceleration: Float[Array, ""]) -> Float[Array, ""]:
-    """Return how much longer the tip takes for a length (nm) at constant acceleration than without, in us."""
+    """Return how much longer in us the tip takes for a length in nm at constant acceleration than at its speed."""
     return 2.0 * length / (speed_over(speed, length, acceleration) + speed) - length / speed
 
 
@@ -412,7 +416,7 @@ class TabulatedImpact(Impact):
             formula that is closest to the delay, half the offset d that is left then, and the gap at which the bridge
             breaks.
         loss_error: estimated error of the series for the loss, in nm^2/us^2.
-        speed_error: estimated error of the approach speeds that it goes through, as a share.
+        speed_error: estimated error of the approach speeds that it goes through, relative to them.
         time_error: estimated error of the time in us.
     """
 
@@ -453,18 +457,18 @@ class TabulatedImpact(Impact):
         return Speeds(u, _rebound(u, loss), chebyshev_sum(self.time, place) - straight)
 
     def errors(self, approach_speed: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the estimated errors of the rebound speed, as a share of it, and of the delay in us.
+        """Return the estimated errors of the rebound speed, relative to it, and of the delay in us.
 
         Infinite outside the table: up to 1 % above capture, and beyond its end.
         """
         w = self.speeds(approach_speed).rebound
-        share = (0.5 * self.loss_error + self.speed_error * approach_speed**2) / w**2
+        relative = (0.5 * self.loss_error + self.speed_error * approach_speed**2) / w**2
         inside = (approach_speed > NEAREST * self.lowest) & (approach_speed <= (1.0 + _ROUNDING) * self.highest)
-        late = self.time_error + self.outer_nm * share / w
-        return jnp.where(inside, share, jnp.inf), jnp.where(inside, late, jnp.inf)
+        late = self.time_error + self.outer_nm * relative / w
+        return jnp.where(inside, relative, jnp.inf), jnp.where(inside, late, jnp.inf)
 
     def _place(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return where a speed lies in the table, -1 to 1."""
+        """Return the series' variable for a speed, -1 at capture to 1 at the table's end."""
         free = u > self.lowest
         square = jnp.where(free, u * u - self.lowest**2, 1.0)
         far = jnp.where(free, stretched(jnp.sqrt(square) / self.scale), 0.0)

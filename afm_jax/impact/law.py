@@ -498,9 +498,9 @@ class TabulatedLaw(Law):
             collision_delay_us: of every row; None: instantaneous impacts.
             rebound_changes: changes of u_out in nm/us, shape (unknowns, rows), by one standard deviation of each of
                 several independent unknowns.
-            delay_changes: likewise of the delay in us; None: it is known.
-            capture_changes: likewise of the capture speed, shape (unknowns,), for a speed that is given; None: where it
-                is extrapolated it changes with the rebounds, else it is known.
+            delay_changes: such changes of the delay in us; None: it is known.
+            capture_changes: such changes of a capture speed that is given, shape (unknowns,); None: an extrapolated one
+                changes with the rebounds, a given one is known.
             options: `capture_speed_nm_per_us`, `delay`, `mass_ng` and `origin` of a law.
 
         Raises:
@@ -978,7 +978,7 @@ def _formula(u: Array, capture: Array, r: Array, viscous_loss: Array) -> Array:
 
 
 def _place(v: Array, scale: Array) -> Array:
-    """Return where a table's splines are looked at, 0 at capture, 1 at infinite speed."""
+    """Return the splines' variable v/(v + V), 0 at capture, 1 at infinite speed."""
     return v / (v + scale)
 
 

@@ -142,14 +142,8 @@ def next_impact(
     ...     print(round(float(next_impact(scene, 4.0, 6.0).time_us), 6))
     9.646489
     """
-    scene = as_scene(scene)
-    require_float64(scene)
-    impact_law_of(scene)
-    _check_search(time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
-    seen, response = seen_freely(scene)
-    start = _start_of(scene, response, time_us, velocity_nm_per_us)
-    tolerance = jnp.asarray(root_tolerance_us, scene.platform.frequency_khz.dtype)
-    return _in_lab(_next_impact(seen, start, tolerance, max_steps=max_steps), response)
+    free = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
+    return _in_lab(_next_impact(free.scene, free.start, free.tolerance_us, max_steps=max_steps), free.response)
 
 
 @checked
@@ -181,56 +175,65 @@ def iterate_map(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if `impacts` is not positive, or an undamped cantilever is driven at its free frequency.
     """
+    free = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
+    if impacts < 1:
+        raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
+    rows = follow_impacts(free.scene, free.start, free.tolerance_us, impacts=impacts, max_steps=max_steps)
+    return _in_lab(rows, free.response)
+
+
+class _FreeStart(NamedTuple):
+    """A start as the freely moving tip sees it: without the steady response to base and force."""
+
+    scene: Scene
+    response: Surface | None
+    start: Departure
+    tolerance_us: Float[Array, ""]
+
+
+def _free_start(
+    scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike
+) -> _FreeStart:
+    """Return scene and start as the freely moving tip sees them, checked; a start that is no flight is an outcome.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
+        TypeError: if the scene's interaction is not an impact law.
+        ValueError: if something is an array, or the search has no step or no tolerance.
+    """
     scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
-    if impacts < 1:
-        raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
-    _check_search(time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
-    seen, response = seen_freely(scene)
-    start = _start_of(scene, response, time_us, velocity_nm_per_us)
-    tolerance = jnp.asarray(root_tolerance_us, scene.platform.frequency_khz.dtype)
-    return _in_lab(follow_impacts(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
-
-
-def _start_of(scene: Scene, response: Surface | None, time_us: ArrayLike, velocity_nm_per_us: ArrayLike) -> Departure:
-    """Return the departure at a time and with a velocity in the lab, from which the steady response is taken out."""
-    dtype = scene.platform.frequency_khz.dtype
-    time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
-    return Departure(time, None, velocity if response is None else velocity - response.velocity(time))
-
-
-def _check_search(time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike) -> None:
-    """Check what a search for impacts is given; a start that is no flight is an outcome.
-
-    Raises:
-        ValueError: if something is an array, or the search has no step or no tolerance.
-    """
     for name, value in (("time_us", time_us), ("velocity_nm_per_us", velocity_nm_per_us)):
         check_scalar(name, value, "`iterate_batch` and `jax.vmap` take many")
     check_scalar("root_tolerance_us", tolerance_us)
     check_count("max_steps", max_steps)
     check_parameter("root_tolerance_us", tolerance_us, "above 0")
+    seen, response = seen_freely(scene)
+    dtype = scene.platform.frequency_khz.dtype
+    time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
+    start = Departure(time, None, velocity if response is None else velocity - response.velocity(time))
+    return _FreeStart(seen, response, start, jnp.asarray(tolerance_us, dtype))
 
 
-def _in_lab(found: NextImpact, response: Surface | None) -> NextImpact:
+def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
     """Return impacts with the velocities of the steady response added."""
     if response is None:
-        return found
+        return impacts
 
     def added(velocity, time):
         there = jnp.isfinite(time)
         return velocity + jnp.where(there, response.velocity(jnp.where(there, time, 0.0)), 0.0)
 
-    before = added(found.velocity_before_nm_per_us, found.arrival_time_us)
-    after = added(found.velocity_after_nm_per_us, found.time_us)
+    before = added(impacts.velocity_before_nm_per_us, impacts.arrival_time_us)
+    after = added(impacts.velocity_after_nm_per_us, impacts.time_us)
     return eqx.tree_at(
-        lambda row: (row.velocity_before_nm_per_us, row.velocity_after_nm_per_us), found, (before, after)
+        lambda row: (row.velocity_before_nm_per_us, row.velocity_after_nm_per_us), impacts, (before, after)
     )
 
 
 _IMPACTS_EACH = 8
-"""Impacts between two looks at whether all tips of a batch have ended."""
+"""Impacts after which it is asked whether all tips of a batch have ended."""
 
 
 def follow_tip(
@@ -439,12 +442,12 @@ def _iterate_batch(
     block: int,
     max_steps: int,
 ) -> NextImpact:
-    own, shared = eqx.partition(scene, jax.tree.map(lambda leaf, axes: leaf.ndim > axes, scene, axes_of_one(scene)))
+    varied, shared = eqx.partition(scene, jax.tree.map(lambda leaf, axes: leaf.ndim > axes, scene, axes_of_one(scene)))
 
     def one_tip(row):
-        own_parameters, (time, velocity) = row
+        parameters, (time, velocity) = row
         return iterate_map(
-            eqx.combine(own_parameters, shared),
+            eqx.combine(parameters, shared),
             time,
             velocity,
             impacts,
@@ -452,4 +455,4 @@ def _iterate_batch(
             root_tolerance_us=tolerance,
         )
 
-    return map_in_blocks(jax.vmap(one_tip), (own, starts), block=block)
+    return map_in_blocks(jax.vmap(one_tip), (varied, starts), block=block)

@@ -1,7 +1,10 @@
-"""Single-impact orbits: one impact in N drive periods (eq. 9); admissible, stable, and what one measures of them.
+"""Single-impact orbits, one impact in N drive periods (eq. 9): which there are, whether they last, and their readings.
 
-One machinery for impacts of every kind: roots of the closing condition, the motion at a root, whether it can be and
-whether it lasts, and what one measures of it.
+`single_impact_orbits` takes a scene with a law and returns every orbit of an order N. The roots of the closing
+condition (`closure`) are approach speeds; `orbit_state` makes of a root the motion, the flight between two impacts;
+`judge` says whether the flight passes through the platform, and by the map's Jacobian (eq. 8) whether the orbit is
+stable; at the end stands what an experiment reads of the flight: peak height, lock-in amplitude and phase. Fits take
+the same functions for impacts of every kind (`steady_orbits`, `amplitudes`).
 """
 
 from typing import NamedTuple
@@ -17,13 +20,15 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import FreeFrame, Surface, Wave, free_frame, size_and_lag
-from afm_jax.checks import checked, is_traced, require_float64
-from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, lockin, peak_amplitude
+from afm_jax.checks import as_argument, checked, is_traced, require_float64
 from afm_jax.impact.closure import (
+    COARSE,
+    TAPPED,
     OrbitPlace,
     OrbitProblem,
     closing_residual,
     closure,
+    find_roots,
     map_gaps,
     speeds_at_place,
 )
@@ -31,7 +36,6 @@ from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import PulledImpact, crawls, depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Impact, ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
-from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
 from afm_jax.solve.derivatives import absent, implicit_root, implicit_system
@@ -40,9 +44,9 @@ from afm_jax.units import within_turn
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
 _NEARBY = 1e-5
-"""How far from a root its slope is looked at, in terms of its distance from capture."""
+"""Distance from a root at which its slope is taken, as a fraction of its distance from capture."""
 _ARRIVAL_TOLERANCE = 1e-7
-"""How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
+"""Drive periods by which the first impact of a flight may lie before the orbit's own, by rounding."""
 
 
 @public_result(picture="afm_jax.plots.dynamics:orbits_figure")
@@ -184,7 +188,7 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
     if frame.response is not None:
         ends = jnp.stack([flight.start_us, flight.start_us + flight.duration_us])
         velocities = velocities + _alone(frame.response).velocity(ends)
-    seen, law = _seen(state, frame, problem), problem.impact
+    law = problem.impact
 
     def known(value):
         return jnp.where(found, value, absent(value))
@@ -204,8 +208,22 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
         determinant=known(verdict.determinant),
         complete=found,
         extrapolated=found & law.extrapolated(speeds.approach) if isinstance(law, TabulatedLaw) else None,
-        **{name: known(value) for name, value in seen.items()},
+        **{name: known(value) for name, value in _lab_readings(state, frame, problem).items()},
     )
+
+
+class FlightEnds(NamedTuple):
+    """A free flight between two impacts, its start and its end.
+
+    Positions in nm, velocities in nm/us, the start's time and the duration in us.
+    """
+
+    start_us: Float[Array, ""]
+    duration_us: Float[Array, ""]
+    start_position: Float[Array, ""]
+    start_velocity: Float[Array, ""]
+    end_position: Float[Array, ""]
+    end_velocity: Float[Array, ""]
 
 
 class OrbitState(NamedTuple):
@@ -227,9 +245,9 @@ class Verdict(NamedTuple):
 
 
 class SteadyOrbits(NamedTuple):
-    """The roots of a problem, which of them are steady (admissible and stable), and what is seen of them.
+    """The roots of a problem, which of them are steady (admissible and stable), and their readings.
 
-    That is peak and lock-in amplitude in nm and the phase in degrees.
+    A reading is peak and lock-in amplitude in nm and the phase in degrees.
     """
 
     place: OrbitPlace
@@ -238,10 +256,10 @@ class SteadyOrbits(NamedTuple):
     amplitude_nm: Float[Array, "slots 3"]
 
 
-def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[str, Float[Array, ""]]:
-    """Return what is read of an orbit, height and deflection, under the names of `SingleImpactOrbits`."""
+def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[str, Float[Array, ""]]:
+    """Return the readings of height and deflection in the lab, under the names of `SingleImpactOrbits`."""
     cantilever, order = problem.cantilever, problem.order
-    peak, amplitude, angle = _observed(state, problem)
+    peak, amplitude, angle = _readings(state, problem)
     if frame.response is None:
         return {"peak_amplitude_nm": peak, "lockin_amplitude_nm": amplitude, "lockin_phase_deg": angle}
 
@@ -254,9 +272,9 @@ def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[st
 
     def read(motion: Wave) -> tuple[Float[Array, ""], ...]:
         """Return peak, readings at omega/N and at omega, and the lag, of the free motion with another one added."""
-        with_it, alone = (along_and_across(amplitude, angle, wave) for wave in (motion, None))
+        with_motion, free = (along_and_across(amplitude, angle, wave) for wave in (motion, None))
         # the drive's frequency is the response's for N = 1 alone; the scene's own clock is ahead by the frame's phase
-        along, across = (jnp.where(order == 1.0, one, other) for one, other in zip(with_it, alone, strict=True))
+        along, across = (jnp.where(order == 1.0, *parts) for parts in zip(with_motion, free, strict=True))
         size, behind = size_and_lag(along, across, frame.phase_rad, order)
         at_drive = along_and_across(drive_amplitude, drive_angle, motion)
         drive_size, drive_behind = size_and_lag(*at_drive, frame.phase_rad)
@@ -267,15 +285,15 @@ def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[st
 
     names = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
     peak, *readings, lag = read(frame.response)
-    seen = {"peak_amplitude_nm": peak, "phase_lag_deg": lag} | dict(zip(names, readings, strict=True))
+    readings_of_height = {"peak_amplitude_nm": peak, "phase_lag_deg": lag} | dict(zip(names, readings, strict=True))
     if frame.base is None:
-        return seen
+        return readings_of_height
     response, base = frame.response, frame.base
     peak, *readings, lag = read(
         Wave(response.cosine - base.cosine, response.sine - base.sine, response.angular_frequency)
     )
     of_deflection = {f"deflection_{name}": value for name, value in zip(names, readings, strict=True)}
-    return seen | {"peak_deflection_nm": peak, "phase_lag_deg": lag} | of_deflection
+    return readings_of_height | {"peak_deflection_nm": peak, "phase_lag_deg": lag} | of_deflection
 
 
 def _alone(wave: Wave) -> Surface:
@@ -309,7 +327,10 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
     trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
     # the flight counts from max(t_in, t_out) on
     skip = jnp.maximum(-state.speeds.delay, 0.0) if impact.delayed else None
-    flies = found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip)
+    # an empty slot does not leave the platform, so that its search ends at once
+    velocity = jnp.where(found, state.flight.start_velocity, -jnp.inf)
+    flight = Flight(cantilever, platform, state.flight.start_us, velocity)
+    flies = found & ends_at_its_own_impact(flight, state.flight.duration_us, skip, platform.period_us)
     if isinstance(impact, Law) and impact.delayed:
         flies = flies & ~crawls(impact, impact.at_approach(state.speeds.approach), cantilever)
     return Verdict(
@@ -338,12 +359,12 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     problem = lax.stop_gradient(problem)
     roots = find_roots(problem, TAPPED if isinstance(problem.impact, PulledImpact) else COARSE)
 
-    def one(place, found):
+    def orbit_of(place, found):
         state = orbit_state(place, problem)
         verdict = judge(place, found, state, problem)
-        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)
+        return verdict.admissible & verdict.stable, verdict.near_double, _readings(state, problem)
 
-    return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
+    return SteadyOrbits(roots.place, *jax.vmap(orbit_of)(roots.place, roots.found))
 
 
 def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
@@ -356,33 +377,34 @@ def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array,
     roots = find_roots(problem, COARSE)
     states = jax.vmap(orbit_state, in_axes=(0, None))(roots.place, problem)
 
-    def lasts(state):
+    def is_stable(state):
         return contracts(*trace_and_determinant(impact, cantilever, platform, state.flight))
 
-    def looking(so_far):
-        left, _, steady = so_far
-        return jnp.any(left > -jnp.inf) & ~steady
+    def goes_on(search):
+        untried, _, steady = search
+        return jnp.any(untried > -jnp.inf) & ~steady
 
-    def look(so_far):
-        left, _, _ = so_far
-        slot = jnp.argmax(left)
+    def try_fastest(search):
+        untried, _, _ = search
+        slot = jnp.argmax(untried)
         place, state = jax.tree.map(lambda leaf: leaf[slot], (roots.place, states))
-        # of a batch, one that is done looks for nothing
-        verdict = judge(place, looking(so_far), state, problem)
-        return left.at[slot].set(-jnp.inf), slot, verdict.admissible
+        # of a batch, a search that has ended follows no flight
+        verdict = judge(place, goes_on(search), state, problem)
+        return untried.at[slot].set(-jnp.inf), slot, verdict.admissible
 
-    left = jnp.where(roots.found & jax.vmap(lasts)(states), states.speeds.approach, -jnp.inf)
-    _, slot, steady = lax.while_loop(looking, look, (left, jnp.argmax(left), jnp.zeros((), bool)))
+    untried = jnp.where(roots.found & jax.vmap(is_stable)(states), states.speeds.approach, -jnp.inf)
+    _, slot, steady = lax.while_loop(goes_on, try_fastest, (untried, jnp.argmax(untried), jnp.zeros((), bool)))
     return jax.tree.map(lambda leaf: leaf[slot], states), steady
 
 
 def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
     """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
-    return _observed(orbit_state(place, problem), problem)
+    return _readings(orbit_state(place, problem), problem)
 
 
 @jax.jit
-def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
+def _readings(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
+    """Return peak and lock-in amplitude in nm and the phase in degrees of an orbit's free motion."""
     return jnp.stack([peak_amplitude(problem.cantilever, state.flight), *_lockin(state, problem)])
 
 
@@ -426,25 +448,133 @@ def contracts(trace: Float[Array, ""], determinant: Float[Array, ""]) -> Bool[Ar
 
 
 def ends_at_its_own_impact(
-    cantilever: Cantilever,
-    platform: Platform,
-    flight: FlightEnds,
-    found: Bool[Array, ""],
-    skip_us: Float[Array, ""] | None,
+    flight: Flight, duration_us: Float[Array, ""], skip_us: Float[Array, ""] | None, drive_us: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    """Say whether the first impact of the flight is the orbit's own: the flight never passes through the platform.
+    """Say whether the first impact of a flight is the one at its end: it never passes through the surface before.
+
+    Args:
+        flight: its beginning, over the surface that it must not meet.
+        duration_us: until its own impact.
+        skip_us: time after the start at which the flight begins to count, max(t_in, t_out); None: at once.
+        drive_us: the drive's period.
+    """
+    first = first_impact(flight, skip_us=skip_us)
+    hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration_us - _ARRIVAL_TOLERANCE * drive_us)
+    # rounding can lift the end of the flight off the surface where the impact is a graze
+    return (duration_us > 0.0) & (hit | (first.outcome == Outcome.NO_FURTHER_IMPACT))
+
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+"""Gauss's rule for the integral of the platform's height over a delay."""
+SAMPLES = 512
+"""Heights computed of a flight that has no closed form for its highest."""
+
+
+def peak_amplitude(cantilever: Cantilever, flight: FlightEnds) -> Float[Array, ""]:
+    """Return the largest height of the tip above its rest position during a flight, in nm.
+
+    The amplitude decays, so the first turning point after the start is the highest one inside the flight:
+    tan(Omega_d s) = v/((gamma v + Omega^2 z)/Omega_d).
+    """
+    omega_d = cantilever.damped_angular_frequency
+    fall = cantilever.decay_rate * flight.start_velocity + cantilever.angular_frequency**2 * flight.start_position
+    # At rest at the start (v = 0) there is nothing to turn: keep the angle's derivative finite there.
+    moving = (flight.start_velocity != 0.0) | (fall != 0.0)
+    angle = jnp.arctan2(jnp.where(moving, flight.start_velocity, 1.0), jnp.where(moving, fall / omega_d, 0.0))
+    # A tip that starts downward turns at the bottom first; the top follows half a turn later.
+    turn = jnp.where(angle > 0.0, angle, angle + 2.0 * jnp.pi) / omega_d
+    top, _ = cantilever.propagator(turn)(flight.start_position, flight.start_velocity)
+    ends = jnp.maximum(flight.start_position, flight.end_position)
+    return jnp.where(turn < flight.duration_us, jnp.maximum(ends, top), ends)
+
+
+def highest_of_sum(
+    cantilever: Cantilever, flight: FlightEnds, motion: Surface, samples: int = SAMPLES
+) -> Float[Array, ""]:
+    """Return the largest sum of a flight's height and another motion during the flight, in nm.
 
     Args:
         cantilever: of the free flight.
-        platform: that it must not meet before its end.
         flight: from impact to impact.
-        found: whether there is an orbit at all.
-        skip_us: time after the start at which the flight begins to count, max(t_in, t_out); None: at once.
+        motion: added to it: a steady response, less a base's motion where the deflection is meant.
+        samples: heights looked at; the highest of them is improved by Newton's method.
     """
-    # An empty slot does not leave the platform, so that its search ends at once.
-    velocity = jnp.where(found, flight.start_velocity, -jnp.inf)
-    first = first_impact(Flight(cantilever, platform, flight.start_us, velocity), skip_us=skip_us)
-    duration = flight.duration_us
-    hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration - _ARRIVAL_TOLERANCE * platform.period_us)
-    # Rounding can lift the end of the flight off the platform where the impact is a graze.
-    return (duration > 0.0) & (hit | (first.outcome == Outcome.NO_FURTHER_IMPACT))
+
+    def at(after):
+        position, velocity = cantilever.propagator(after)(flight.start_position, flight.start_velocity)
+        height, rate = motion.position_and_velocity(flight.start_us + after)
+        bend = cantilever.acceleration(position, velocity) + motion.acceleration(flight.start_us + after)
+        return position + height, velocity + rate, bend
+
+    step = flight.duration_us / samples
+    times = step * jnp.arange(samples + 1.0)
+    seen, _, _ = at(times)
+
+    def improve(_, after):
+        _, rate, bend = at(after)
+        move = jnp.where(bend < 0.0, -rate / jnp.where(bend < 0.0, bend, 1.0), 0.0)
+        return jnp.clip(after + jnp.clip(move, -step, step), 0.0, flight.duration_us)
+
+    # its own change counts nothing, because the height is largest there
+    top = lax.fori_loop(0, 5, improve, times[jnp.argmax(seen)])
+    return at(lax.stop_gradient(top))[0]
+
+
+def lockin(  # noqa: PLR0913
+    cantilever: Cantilever,
+    platform: Platform,
+    flight: FlightEnds,
+    order: ArrayLike,
+    *,
+    delayed: bool,
+    indentation: ArrayLike = 0.0,
+    late_us: ArrayLike = 0.0,
+    at_drive: bool = False,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return lock-in amplitude in nm and phase in degrees of an orbit at its response frequency omega/N, or omega.
+
+    a exp(i phi) = 2/T int z exp(-i nu t) dt over one response period T; nu = omega/N, phi modulo 360/N, or with
+    `at_drive` the drive's nu = omega, phi modulo 360. The flight's integral
+    is closed: with [.] the difference of the ends, I (Omega^2 - nu^2 + i nu Omega/Q) = -[v e] - (i nu + Omega/Q)[z e],
+    e = exp(-i nu t). From the flight's end to the next start (a collision delay, if there is one: `delayed`) the tip
+    rides on the platform, or below it: `indentation` is the time integral of how much, in nm us, and
+    `late_us` by how much its mean time is behind the middle.
+    """
+    period = as_argument(order) * platform.period_us
+    turns = 1.0 if at_drive else as_argument(order)
+    nu = platform.angular_frequency / turns
+    loss = 2.0 * cantilever.decay_rate
+    end_us = flight.start_us + flight.duration_us
+    first, last = _turned_back(nu, flight.start_us), _turned_back(nu, end_us)
+    # Real and imaginary parts side by side, as arrays of shape (2,).
+    velocity = flight.end_velocity * last - flight.start_velocity * first
+    position = flight.end_position * last - flight.start_position * first
+    source = -velocity - loss * position - nu * jnp.array([-position[1], position[0]])
+    real, imaginary = cantilever.angular_frequency**2 - nu**2, nu * loss
+    size = real**2 + imaginary**2
+    # Without damping a free flight can be exactly resonant with the response; no orbit lives there.
+    size = jnp.where(size == 0.0, 1.0, size)
+    flying = jnp.array([real * source[0] + imaginary * source[1], real * source[1] - imaginary * source[0]]) / size
+    if delayed:
+        start_us = flight.start_us + period
+        flying = flying + _platform_integral(platform, nu, end_us, start_us)
+        flying = flying - indentation * _turned_back(nu, 0.5 * (end_us + start_us) + late_us)
+    cosine, sine = 2.0 / period * flying
+    phase = within_turn(jnp.rad2deg(jnp.arctan2(sine, cosine)), 360.0 / turns)
+    return jnp.sqrt(cosine**2 + sine**2), phase
+
+
+def _turned_back(nu: Float[Array, ""], time_us: Float[Array, "..."]) -> Float[Array, "2 ..."]:
+    """Return exp(-i nu t) as its real and imaginary part."""
+    return jnp.stack([jnp.cos(nu * time_us), -jnp.sin(nu * time_us)])
+
+
+def _platform_integral(
+    platform: Platform, nu: Float[Array, ""], begin_us: Float[Array, ""], end_us: Float[Array, ""]
+) -> Float[Array, " 2"]:
+    """Integrate z_p exp(-i nu t) between two times by Gauss's rule; the interval is a collision delay."""
+    half = 0.5 * (end_us - begin_us)
+    times = 0.5 * (begin_us + end_us) + half * jnp.asarray(_NODES, half.dtype)
+    weighted = half * jnp.asarray(_WEIGHTS, half.dtype) * platform.position(times)
+    # A product and a sum: under vmap a matrix product of this size costs ten times as much.
+    return jnp.sum(_turned_back(nu, times) * weighted, axis=1)

@@ -23,9 +23,9 @@ from jaxtyping import ArrayLike, Bool, Float, Int
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
 from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Law
+from afm_jax.impact.orbits import FlightEnds, peak_amplitude
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap
 from afm_jax.motion.settle import Settled, Window, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Flights, Trajectory, dense_path, flights_of, fly
@@ -565,7 +565,7 @@ def impact_integral(
 ) -> complex:
     """Return what impacts of a law add to int z exp(-i nu t) dt of flights and rests, in nm us.
 
-    In an impact that lasts the tip is below the surface by the indentation of a Hertz contact (`impact/amplitude.py`
+    In an impact that lasts the tip is below the surface by the indentation of a Hertz contact (`impact/orbits.py`
     has the same of an orbit). A negative collision delay lets a flight begin before the last one has ended: until then
     both are there, and the surface once too often. Counted are impacts whose middle is in the window.
 

@@ -23,7 +23,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import highest_orbits
 from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.dynamics.iteration import sample_driven
+from afm_jax.dynamics.starts import sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.impact.law import TabulatedLaw, axes_of_one, extrapolation_of, impact_law_of
 from afm_jax.motion.follow import follow_long

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.lasting_impact import gained_and_longer, indentation, middle_of_contact
+from afm_jax.impact.orbits import FlightEnds, lockin, peak_amplitude
 from afm_jax.least_squares import Box, Searches, descended
 
 _HALF_SINE = 0.42441318157838753

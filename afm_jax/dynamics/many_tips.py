@@ -1,0 +1,357 @@
+"""Many tips followed from impact to impact at once: the engine behind exponents, bifurcation diagrams and basins.
+
+`follow` takes `Tips`, each at the beginning of a flight, and returns them some impacts later with a `Record` of the
+last ones. Times count within the drive's period, so that long motions keep the digits of their phase.
+
+Of laws, `advance` is one step of the impact map (`impact_after`) for a block of tips that fits the processor's cache.
+It is written for arrays, not as a `vmap` of one tip: what only a resting tip needs (chatter summed up, the ride, the
+release) and long searches for an impact are computed in the steps in which a tip of the block needs them.
+
+Contacts are simulated, a stretch of many at a time. A tip departs where the bridge breaks, at one gap always, so that
+its next contact depends on time and velocity alone: a map of two variables like that of impacts, whose Jacobian is the
+forward derivative of the simulation (`departure_jacobians`).
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import Phase
+from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
+from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, through_impact
+from afm_jax.motion.record import ContactKind, Contacts, Simulation, State
+from afm_jax.motion.settle import HELD_PERIODS
+from afm_jax.motion.simulate import simulate
+from afm_jax.outcomes import Outcome
+from afm_jax.solve.lanes import again_for
+
+MAX_STEPS = 2000
+"""Steps of the search for one impact."""
+_QUICK_STEPS = 14
+"""Steps of the search that all tips of a block take together; those that need more go on among themselves."""
+_RIDE_PERIODS = 1.1
+"""Drive periods within which a resting tip is let go, or never: the push on it repeats every one."""
+_FEW = 16
+"""Tips of a block whose rest, or long search, is computed together."""
+_ROWS = 40
+"""Contacts of a stretch that is simulated at a time."""
+_PERIODS_EACH = 6.0
+"""Periods, the slower of drive and free tip, that are allowed for each of them."""
+_AWAY = 30.0
+"""Such periods without a contact after which the tip has left the sample."""
+_BEYOND = 1e-3
+"""Free periods after a departure at which its contact is surely over, and the next not begun."""
+
+
+class Tips(NamedTuple):
+    """Tips at the beginning of a flight each, arrays of one lane a tip."""
+
+    time_us: Float[Any, " lanes"]
+    """Within the first drive period."""
+    periods: Float[Any, " lanes"]
+    """Whole drive periods gone before."""
+    gap_nm: Float[Any, " lanes"]
+    """0 just after an impact, next to nothing after a release."""
+    velocity_nm_per_us: Float[Any, " lanes"]
+    """In the lab."""
+    outcome: Int[Any, " lanes"]
+    """An `Outcome`: IMPACT while the motion goes on, else how it ended."""
+
+
+class Record(NamedTuple):
+    """Impacts of tips, arrays (lanes, impacts), NaN where there was none.
+
+    Times in us count within the drive's period, speeds are in nm/us; the approach speed is relative to the platform.
+    """
+
+    arrival_us: Float[Any, "lanes impacts"]
+    approach_nm_per_us: Float[Any, "lanes impacts"]
+    departure_us: Float[Any, "lanes impacts"]
+    """Beginning of the next flight; after a rest that is the release."""
+    velocity_after_nm_per_us: Float[Any, "lanes impacts"]
+    arrival_periods: Float[Any, "lanes impacts"]
+    """Whole drive periods before the arrival."""
+    departure_periods: Float[Any, "lanes impacts"]
+    """Whole drive periods before the departure."""
+    near_grazing: Bool[Any, "lanes impacts"]
+    rested: Bool[Any, "lanes impacts"]
+
+    def turns(self, period_us: Float[np.ndarray, " lanes"]) -> Float[np.ndarray, "lanes impacts"]:
+        """Return the times of the departures in drive periods."""
+        return self.departure_periods + self.departure_us / period_us[:, None]
+
+
+def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float) -> tuple[Tips, Record]:
+    """Return a block of tips some impacts or contacts later, and the last of these, arrays (lanes, impacts).
+
+    Args:
+        scenes: a batch of scenes with laws or contacts.
+        tips: at the beginning of a flight each.
+        skip: impacts before those that are recorded.
+        record: impacts that are recorded.
+        accuracy: of `simulate`, for contacts.
+    """
+    if isinstance(scenes.interaction, Contact):
+        return follow_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
+    tips, rows = recorded(scenes, skipped(scenes, tips, impacts=skip), impacts=record)
+    return tips, Record(*(np.asarray(column).T for column in rows))
+
+
+class MapStep(NamedTuple):
+    """One step of the map, arrays of one lane a tip; numbers without meaning where a tip had ended before."""
+
+    start: Tips
+    impact: NextImpact
+    """Times count from the same period as the start's."""
+    rested: Bool[Array, " lanes"]
+    """The tip came to rest on the platform, by a capture or by chatter."""
+    end: Tips
+
+
+def advance(scenes: Scene, tips: Tips) -> MapStep:
+    """Return one step of the impact map for a block of tips: the next impacts, and where the flights after them begin.
+
+    Args:
+        scenes: a batch of scenes with a law, every number of one lane a tip.
+        tips: at the beginning of a flight each.
+    """
+    going = tips.outcome == Outcome.IMPACT
+    impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
+    slow = going & (impact.outcome == Outcome.STEP_LIMIT)
+    longer = jax.vmap(partial(_one_impact, max_steps=MAX_STEPS))
+    impact = again_for(longer, slow, (scenes, tips), impact, block=_FEW)
+    return after_impacts(scenes, tips, impact)
+
+
+def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
+    """Return the step of the map for impacts that are known: what follows each, a flight, a rest or the end."""
+    going = tips.outcome == Outcome.IMPACT
+    captured = going & (impact.outcome == Outcome.CAPTURED)
+    landed = captured | (going & (impact.outcome == Outcome.IMPACT))
+    surface = scenes.platform
+    rebound = impact.velocity_after_nm_per_us - surface.velocity(impact.time_us)
+    leaving = Departure(impact.time_us, jnp.zeros_like(rebound), impact.velocity_after_nm_per_us)
+    never = jnp.zeros_like(going)
+    # without adhesion alone a tip that came to rest may leave again, and chatter comes to an end
+    law = impact_law_of(scenes)
+    may_rest = landed & (~law.adheres) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
+
+    (time, gap, velocity), rested, held = again_for(
+        jax.vmap(_rest), may_rest, (scenes, impact), (leaving, never, never), block=_FEW
+    )
+    stuck = (captured & law.adheres) | held
+    goes_on = landed & ~stuck
+    outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
+    passed = jnp.floor(jnp.where(goes_on, time, 0.0) / surface.period_us)
+    end = Tips(
+        time_us=jnp.where(goes_on, time - passed * surface.period_us, tips.time_us),
+        periods=tips.periods + passed,
+        gap_nm=jnp.where(goes_on, gap, 0.0),
+        velocity_nm_per_us=jnp.where(goes_on, velocity, tips.velocity_nm_per_us),
+        outcome=jnp.where(going, outcome, tips.outcome).astype(tips.outcome.dtype),
+    )
+    return MapStep(tips, impact, rested, end)
+
+
+def _one_impact(scene: Scene, tip: Tips, *, max_steps: int) -> NextImpact:
+    departure = Departure(tip.time_us, tip.gap_nm, tip.velocity_nm_per_us)
+    return impact_after(scene, departure, Search(max_steps), flies=tip.outcome == Outcome.IMPACT)
+
+
+def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
+    """Return a bound in nm/us of the rebound speeds from which on impacts may be summed up (`law_motion.chatter`)."""
+    surface, bed = scene.platform, Bed(scene.cantilever, scene.platform)
+    omega, decay = scene.cantilever.angular_frequency, scene.cantilever.decay_rate
+    reach = jnp.abs(surface.offset_nm) + surface.amplitude_nm
+    push = surface.largest_acceleration_nm_per_us2 + 2.0 * decay * surface.top_speed_nm_per_us + omega**2 * reach
+    return 0.5 * CONSTANT_PUSH * push * (1.0 - impact_law_of(scene).slow_restitution) / bed.fastest
+
+
+def _rest(scene: Scene, impact: NextImpact) -> tuple[Departure, Bool[Array, ""], Bool[Array, ""]]:
+    """Return where the flight after an impact begins, whether the tip rests before, and whether it rests for ever."""
+    landed = (impact.outcome == Outcome.IMPACT) | (impact.outcome == Outcome.CAPTURED)
+    until = jnp.where(landed, impact.arrival_time_us, 0.0) + _RIDE_PERIODS * scene.platform.period_us
+    row, departure, _ = through_impact(scene, impact, landed, until)
+    held = row.kind == ContactKind.HELD
+    rested = (row.kind == ContactKind.CHATTER) | (impact.outcome == Outcome.CAPTURED)
+    return departure, rested & ~held, held
+
+
+@partial(jax.jit, static_argnames=("impacts",))
+def skipped(scenes: Scene, tips: Tips, *, impacts: int) -> Tips:
+    """Return a block of tips some impacts later."""
+    return lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now).end, tips)
+
+
+@partial(jax.jit, static_argnames=("impacts",))
+def recorded(scenes: Scene, tips: Tips, *, impacts: int) -> tuple[Tips, Record]:
+    """Return a block of tips some impacts later, and the impacts, with axes (impacts, lanes)."""
+
+    def one(now: Tips, _: None) -> tuple[Tips, Record]:
+        step = advance(scenes, now)
+        return step.end, record_of(scenes, step)
+
+    return lax.scan(one, tips, length=impacts)
+
+
+def record_of(scenes: Scene, step: MapStep) -> Record:
+    """Return the record of the impacts of a step, arrays of one lane a tip."""
+    impact, end = step.impact, step.end
+    landed = (step.start.outcome == Outcome.IMPACT) & (end.outcome == Outcome.IMPACT)
+    platform = scenes.platform
+    arrival = jnp.where(landed, impact.arrival_time_us, 0.0)
+    passed = jnp.floor(arrival / platform.period_us)
+    approach = platform.velocity(arrival) - impact.velocity_before_nm_per_us
+
+    def if_landed(value: Array) -> Array:
+        return jnp.where(landed, value, jnp.nan)
+
+    return Record(
+        arrival_us=if_landed(arrival - passed * platform.period_us),
+        approach_nm_per_us=if_landed(approach),
+        departure_us=if_landed(end.time_us),
+        velocity_after_nm_per_us=if_landed(end.velocity_nm_per_us),
+        arrival_periods=if_landed(step.start.periods + passed),
+        departure_periods=if_landed(end.periods),
+        near_grazing=landed & impact.near_grazing,
+        rested=landed & step.rested,
+    )
+
+
+def follow_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float) -> tuple[Tips, Record]:
+    """Return tips some contacts later, and the last contacts.
+
+    Args:
+        scenes: a batch of scenes with a contact.
+        tips: at a departure each, or anywhere free above the sample.
+        skip: contacts before those that are recorded.
+        record: contacts that are recorded.
+        accuracy: of `simulate`.
+    """
+    stretches = []
+    needed = -(-record // _ROWS)
+    tips = jax.tree.map(np.asarray, tips)
+    for _ in range(-(-skip // _ROWS) + needed):
+        tips, rows = _stretch(scenes, tips, accuracy)
+        stretches = [*stretches, rows][-needed:] if needed else []
+        if np.all(tips.outcome != Outcome.IMPACT):
+            break
+    if not stretches:
+        empty = np.full((len(tips.time_us), record), np.nan)
+        return tips, Record(*[empty] * 6, *[np.zeros_like(empty, bool)] * 2)
+    columns = [np.concatenate(parts, axis=1)[:, -record:] for parts in zip(*stretches, strict=True)]
+    return tips, Record(*(np.pad(rows, ((0, 0), (record - rows.shape[1], 0)), mode="edge") for rows in columns))
+
+
+def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
+    """Return tips after the next 40 contacts, simulated together, and these contacts."""
+    period, slower = np.asarray(scenes.platform.period_us), _slower_period_us(scenes)
+    motion = jax.tree.map(np.asarray, _followed(scenes, tips, _PERIODS_EACH * _ROWS * slower, accuracy=accuracy))
+    contacts = motion.contacts
+    going = tips.outcome == Outcome.IMPACT
+    leaves = (contacts.kind == ContactKind.IMPACT) & going[:, None]
+    count = leaves.sum(axis=1)
+    last = np.maximum(count - 1, 0)[:, None]
+    departure = np.where(leaves, contacts.departure_time_us, np.nan)
+    arrival = np.where(leaves, contacts.arrival_time_us, np.nan)
+    full = count == _ROWS
+    since = motion.final.time_us - np.where(count > 0, np.take_along_axis(departure, last, axis=1)[:, 0], tips.time_us)
+    held = (motion.phase != Phase.DRY) & (since > HELD_PERIODS * slower)
+    outcome = np.select(
+        [full, held, since > _AWAY * slower],
+        [Outcome.IMPACT, Outcome.CAPTURED, Outcome.NO_FURTHER_IMPACT],
+        Outcome.STEP_LIMIT,
+    )
+    goes_on = going & full
+    passed, passed_at_arrival = np.floor(departure / period[:, None]), np.floor(arrival / period[:, None])
+    velocity = np.where(leaves, contacts.departure_velocity_nm_per_us, np.nan)
+
+    def of_last(rows: np.ndarray, old: np.ndarray) -> np.ndarray:
+        return np.where(goes_on, np.take_along_axis(rows, last, axis=1)[:, 0], old)
+
+    time_in_period = departure - passed * period[:, None]
+    end = Tips(
+        time_us=of_last(time_in_period, tips.time_us),
+        periods=tips.periods + of_last(passed, np.zeros_like(tips.periods)),
+        gap_nm=np.where(goes_on, np.asarray(scenes.interaction.bridge_breaks_nm), tips.gap_nm),
+        velocity_nm_per_us=of_last(velocity, tips.velocity_nm_per_us),
+        outcome=np.where(going, outcome, tips.outcome).astype(np.int32),
+    )
+    rows = Record(
+        arrival_us=arrival - passed_at_arrival * period[:, None],
+        approach_nm_per_us=np.where(leaves, contacts.approach_speed_nm_per_us, np.nan),
+        departure_us=time_in_period,
+        velocity_after_nm_per_us=velocity,
+        arrival_periods=tips.periods[:, None] + passed_at_arrival,
+        departure_periods=tips.periods[:, None] + passed,
+        near_grazing=np.zeros_like(leaves),
+        rested=np.zeros_like(leaves),
+    )
+    return end, rows
+
+
+@eqx.filter_jit
+def _followed(scenes: Scene, tips: Tips, duration_us: Float[Any, " lanes"], *, accuracy: float) -> Simulation:
+    def one(scene: Scene, tip: Tips, duration: Array) -> Simulation:
+        position = scene.platform.position(tip.time_us) + tip.gap_nm
+        # one whose motion has ended flies for next to no time
+        duration = jnp.where(tip.outcome == Outcome.IMPACT, duration, 1e-9)
+        start = State(tip.time_us, position, tip.velocity_nm_per_us)
+        return simulate(scene, start, duration, max_contacts=_ROWS, accuracy=accuracy)
+
+    return jax.vmap(one)(scenes, tips, duration_us)
+
+
+def next_contact(
+    scene: Scene, departure_us: Array, velocity_nm_per_us: Array, until_us: Array, accuracy: float
+) -> Contacts:
+    """Return the first contact after a departure, followed until a time; one scene, a velocity in the lab."""
+    height = scene.platform.position(departure_us) + scene.interaction.bridge_breaks_nm
+    start = State(departure_us, height, velocity_nm_per_us)
+    rows = simulate(scene, start, until_us - departure_us, max_contacts=1, accuracy=accuracy).contacts
+    return jax.tree.map(lambda part: part[0], rows._replace(detail=None))
+
+
+@partial(jax.jit, static_argnames=("accuracy",))
+def departure_jacobians(
+    scenes: Scene,
+    departure_us: Float[Array, " lanes"],
+    velocity_nm_per_us: Float[Array, " lanes"],
+    next_departure_us: Float[Array, " lanes"],
+    *,
+    accuracy: float,
+) -> Float[Array, "lanes 2 2"]:
+    """Return the derivatives of next departures, d(time, velocity) over d(time, velocity) of these.
+
+    Args:
+        scenes: a batch of scenes with a contact.
+        departure_us: when the tips depart.
+        velocity_nm_per_us: in the lab, then.
+        next_departure_us: when their next contacts end.
+        accuracy: of `simulate`.
+    """
+
+    def one(scene: Scene, time: Array, velocity: Array, later: Array) -> Array:
+        until = later + _BEYOND / scene.cantilever.frequency_khz * 1e3
+
+        def next_departure(state: Array) -> Array:
+            contact = next_contact(scene, state[0], state[1], until, accuracy)
+            return jnp.stack([contact.departure_time_us, contact.departure_velocity_nm_per_us])
+
+        return jax.jacfwd(next_departure)(jnp.stack([time, velocity]))
+
+    return jax.vmap(one)(scenes, departure_us, velocity_nm_per_us, next_departure_us)
+
+
+def _slower_period_us(scenes: Scene) -> Float[np.ndarray, " lanes"]:
+    free = 2.0 * np.pi / np.asarray(scenes.cantilever.angular_frequency)
+    return np.maximum(np.asarray(scenes.platform.period_us), free)

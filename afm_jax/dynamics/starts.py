@@ -1,0 +1,227 @@
+"""Where motions begin: tips of many scenes, in the frame in which every drive is a sample that moves with one cosine.
+
+`sample_driven` takes scenes into that frame and checks that they repeat; `batch_and_tips` gives their tips there, from
+a start in the lab or on the stable single-impact orbit of the order nearest to resonance.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import FreeFrame, free_frame
+from afm_jax.checks import require_float64
+from afm_jax.contact.collide import capture_speed
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.dynamics.many_tips import MAX_STEPS, Tips, after_impacts
+from afm_jax.impact.law import Law, impact_law_of
+from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
+from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
+from afm_jax.motion.law_motion import or_rest
+from afm_jax.motion.record import State
+from afm_jax.motion.start import default_start
+from afm_jax.outcomes import Outcome
+from afm_jax.solve.lanes import in_blocks
+
+_TOUCHING = 1e-13
+"""Gap over the heights it is the difference of, below which it is rounding."""
+_ORBITS_AT_ONCE = 128
+_RISEN = 0.9
+"""Fraction of the gap at which the bridge breaks: from there a tip on its way up is free."""
+
+
+class SampleDriven(NamedTuple):
+    """Scenes as their freely moving tips see them, whatever drives them: over a platform that moves with one cosine."""
+
+    scenes: Scene
+    """Without base and force; impacts and contacts are the same ones at the same times of the frame's clock."""
+    frame: FreeFrame
+
+    def start(self, start: State) -> State:
+        """Return a start in the lab as it is in the frame."""
+        frame = self.frame
+        if frame.response is None:
+            return start
+        omega = frame.platform.angular_frequency
+        time = start.time_us + (2.0 * jnp.pi - frame.phase_rad % (2.0 * jnp.pi)) / omega
+        height, velocity = self.response(time)
+        return State(time, start.position_nm - height, start.velocity_nm_per_us - velocity)
+
+    def response(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return height and velocity of what the frame leaves out, at a time of its clock: the free tip's response."""
+        time, wave = jnp.asarray(time_us), self.frame.response
+        if wave is None:
+            return jnp.zeros_like(time), jnp.zeros_like(time)
+        cosine, sine, omega = (
+            part.reshape(*part.shape, *[1] * (time.ndim - part.ndim))
+            for part in (wave.cosine, wave.sine, wave.angular_frequency)
+        )
+        turned = jnp.cos(omega * time), jnp.sin(omega * time)
+        return cosine * turned[0] + sine * turned[1], omega * (sine * turned[0] - cosine * turned[1])
+
+
+def sample_driven(scenes: Scene) -> SampleDriven:
+    """Return scenes as their freely moving tips see them, checked that they repeat with one drive period.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scenes were built.
+        ValueError: if the tip meets nothing, the offset ramps, what the tip sees rests, or the drive has several
+            frequencies.
+    """
+    require_float64(scenes)
+    if scenes.interaction is None:
+        raise ValueError("the scene has no interaction: a tip that meets nothing has no impacts")
+    if np.any(np.asarray(scenes.platform.offset_rate_nm_per_us) != 0.0):
+        raise ValueError("`offset_rate_nm_per_us` must be 0 here: under a ramp no motion repeats")
+    frame = free_frame(scenes)
+    if not np.all(np.asarray(frame.periodic)):
+        raise ValueError("the drive has several frequencies, so that no period of the drive repeats")
+    if not np.all(np.asarray(frame.platform.amplitude_nm) > 0.0):
+        raise ValueError("`amplitude_nm` of the platform must be positive here: on a resting platform motion dies away")
+    if frame.response is not None:
+        scenes = Scene(scenes.cantilever, frame.platform, scenes.interaction)
+    return SampleDriven(scenes, frame)
+
+
+def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tips]:
+    """Return one scene or many as a batch of scenes, and where their tips begin.
+
+    Args:
+        scene: one scene, or a batch of scenes.
+        start: the tip in the lab; None: `default_start` of one scene, of many `bouncing_tips`.
+
+    Raises:
+        ValueError: if the tip cannot start there.
+    """
+    if scene.platform.frequency_khz.ndim == 0:
+        start = default_start(scene) if start is None else start
+        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
+    if start is None:
+        return scene, bouncing_tips(scene)
+    if not isinstance(scene.interaction, Contact):
+        tips = landed_tips(scene, start)
+        if np.all(np.asarray(tips.outcome) == Outcome.INVALID_START):
+            raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
+        return scene, tips
+    gap = start.position_nm - scene.platform.position(start.time_us)
+    return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
+
+
+@jax.jit
+def landed_tips(scenes: Scene, start: State) -> Tips:
+    """Return tips just after the first impact of a flight from anywhere above the platform, or of a rest on it.
+
+    Args:
+        scenes: a batch of scenes.
+        start: time, height and velocity in the lab, one value for all or one a scene.
+    """
+
+    def first_impact_of(scene: Scene, start: State) -> NextImpact:
+        gap = start.position_nm - scene.platform.position(start.time_us)
+        # on the surface but for rounding
+        gap = jnp.where(jnp.abs(gap) < _TOUCHING * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
+        departure = Departure(start.time_us, gap, start.velocity_nm_per_us)
+        return or_rest(scene, departure, impact_after(scene, departure, Search(MAX_STEPS, from_above=True)))
+
+    starts = State(*(jnp.broadcast_to(part, scenes.platform.frequency_khz.shape) for part in start))
+    tips = tips_at(scenes, starts.time_us, starts.velocity_nm_per_us)
+    return after_impacts(scenes, tips, jax.vmap(first_impact_of)(scenes, starts)).end
+
+
+def leaving_tips(scenes: Scene) -> Tips:
+    """Return tips that leave the platform upward at its highest speed, at that speed again or twice the capture speed.
+
+    Args:
+        scenes: a batch of scenes.
+    """
+    platform, interaction = scenes.platform, scenes.interaction
+    time = 0.75 * platform.period_us
+    if isinstance(interaction, Contact):
+        slowest, gap = jax.vmap(capture_speed)(interaction, scenes.cantilever.mass_ng), interaction.bridge_breaks_nm
+    else:
+        slowest, gap = impact_law_of(scenes).capture_speed_nm_per_us, jnp.zeros_like(time)
+    rebound = jnp.maximum(platform.top_speed_nm_per_us, jnp.where(jnp.isfinite(slowest), 2.0 * slowest, 0.0))
+    return tips_at(scenes, time, platform.velocity(time) + rebound)._replace(gap_nm=gap)
+
+
+def bouncing_tips(scenes: Scene) -> Tips:
+    """Return tips where there is motion: on the stable single-impact orbit of the order nearest to resonance.
+
+    The fastest one if there are several; of a contact that of the law closest to it. Where there is none the tip is one
+    of `leaving_tips`.
+
+    Args:
+        scenes: a batch of scenes, driven by the sample alone.
+    """
+    usual, gap = leaving_tips(scenes), jnp.zeros_like(scenes.platform.frequency_khz)
+    laws = laws_of(scenes)
+    if laws is None:
+        return usual
+    law, has_law = laws
+    if isinstance(scenes.interaction, Contact):
+        gap = scenes.interaction.bridge_breaks_nm
+
+    def work(lanes: tuple[Scene, Array]) -> tuple[Array, Tips]:
+        return _on_orbits(*lanes)
+
+    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), block=_ORBITS_AT_ONCE)
+    return jax.tree.map(lambda on_orbit, elsewhere: jnp.where(there & has_law, on_orbit, elsewhere), tips, usual)
+
+
+@jax.jit
+def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Bool[Array, " lanes"], Tips]:
+    """Return which scenes with laws have a stable orbit, and tips on them, about as high above the platform as told."""
+
+    def one(scene: Scene, clearance: Array) -> tuple[Array, ...]:
+        platform = scene.platform
+        order = jnp.round(platform.angular_frequency / (2.0 * scene.cantilever.angular_frequency))
+        law = impact_law_of(scene)
+        orbit, steady = fastest_steady_orbit(orbit_problem(scene.cantilever, platform, law, jnp.maximum(1.0, order)))
+        start, velocity = orbit.flight.start_us, orbit.flight.start_velocity
+        rise = clearance / orbit.speeds.rebound
+        height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
+        gap = jnp.where(clearance > 0.0, height - platform.position(start + rise), 0.0)
+        risen = (clearance == 0.0) | (gap > _RISEN * clearance)
+        return steady & risen & law.leaves, (start + rise) % platform.period_us, gap, speed
+
+    there, time, gap, velocity = jax.vmap(one)(scenes, clearance_nm)
+    return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
+
+
+def laws_of(scenes: Scene) -> tuple[Law, Bool[np.ndarray, " lanes"]] | None:
+    """Return a batch of laws, those closest to the contacts of scenes with one, and where there is one; None: nowhere.
+
+    Args:
+        scenes: a batch of scenes.
+    """
+    if not isinstance(scenes.interaction, Contact):
+        return impact_law_of(scenes), np.ones(len(scenes.platform.frequency_khz), bool)
+    columns = [np.asarray(leaf) for leaf in (*jax.tree.leaves(scenes.interaction), scenes.cantilever.mass_ng)]
+    _, first, owner = np.unique(np.stack(columns, axis=1), axis=0, return_index=True, return_inverse=True)
+    each = []
+    for lane in first:
+        contact = jax.tree.map(lambda leaf, lane=lane: jnp.asarray(leaf)[lane], scenes.interaction)
+        each.append(law_of_contact(contact, float(columns[-1][lane])))
+    some = next((law for law in each if law is not None), None)
+    if some is None:
+        return None
+    has_law = np.array([law is not None for law in each])[owner.ravel()]
+    laws = jax.tree.map(lambda *parts: jnp.stack(parts), *(some if law is None else law for law in each))
+    return jax.tree.map(lambda leaf: leaf[owner.ravel()], laws), has_law
+
+
+def tips_at(scenes: Scene, time_us: Array, velocity_nm_per_us: Array) -> Tips:
+    """Return tips that leave the platform at a time in us with a velocity in nm/us in the lab; arrays of one shape."""
+    zero = jnp.zeros_like(scenes.platform.frequency_khz)
+    going = jnp.full(zero.shape, int(Outcome.IMPACT), jnp.int32)
+    return Tips(zero + time_us, zero, zero, zero + velocity_nm_per_us, going)
+
+
+def evenly_spread(count: int) -> Float[np.ndarray, "count 2"]:
+    """Return pairs that fill the unit square evenly: multiples of the plastic number's inverse powers, modulo 1."""
+    plastic = 1.324717957244746
+    return np.arange(1.0, count + 1.0)[:, None] / [plastic, plastic**2] % 1.0
