@@ -391,7 +391,7 @@ def parse_share(text: str) -> float:
 
 
 def scene_and_start(name: str, *, notes: bool = True) -> "tuple[Scene, Start | None]":
-    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.scene_and_start`.
+    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.read_named_scene`.
 
     Args:
         name: a path, or a preset's name.
