@@ -29,7 +29,7 @@ from afm_jax.motion.record import ContactKind, MotionOutcome, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.law_files import load_law
-from afm_jax.scenefile.scenefile import load_scene_and_start, read_toml
+from afm_jax.scenefile.scenefile import read_scene, read_toml
 from afm_jax.sweeps.axes import axes_of
 from fitting.calibration.sweep import read_sweep
 from fitting.experiments.prior import read_prior
@@ -211,8 +211,8 @@ def spoiled(text: str, random: Random) -> bytes:
 READERS: dict[str, Callable[[Path], Any]] = {
     "table": read_table,
     "tap": lambda path: tapping(read_table(path), law=False),
-    "scene": load_scene_and_start,
-    "contact": load_scene_and_start,
+    "scene": read_scene,
+    "contact": read_scene,
     "sweep": lambda path: axes_of(read_toml(str(path)).get("axes", ())),
     "trace": lambda path: lockin(read_trace(path)),
     "spectrum": read_sweep,

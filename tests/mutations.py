@@ -237,7 +237,7 @@ MUTATIONS = {
         "air = 2.0 * float(cantilever.decay_rate)", "air = float(cantilever.decay_rate)", RESPONSE
     ),
     "lock-in of a motion with half its height": Mutation(
-        "2.0 / self.span_us * (complex", "1.0 / self.span_us * (complex", RESPONSE
+        "2.0 / motion.span_us * (complex", "1.0 / motion.span_us * (complex", RESPONSE
     ),
     "an approach that is taken to be over": Mutation(
         "rate / np.where(rate < 1.0, 1.0 - rate, 1.0)",

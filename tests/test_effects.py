@@ -15,7 +15,7 @@ from afm_jax.effects.study import Change, Programs, Reduction, study_effects
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.start import start_of
 from afm_jax.scenefile.presets import contact_scene
-from afm_jax.scenefile.scenefile import load_scene_and_start
+from afm_jax.scenefile.scenefile import read_scene
 from tests.answers import answer, table
 
 LAW = ImpactLaw(0.998, 100.0, 0.1, CollisionDelay(0.206, 5.64, 0.726, corrections=False))
@@ -275,7 +275,7 @@ def test_the_reduced_file_loads_and_is_as_accurate_as_wanted(called):
     assert payload["not_needed"] == ["viscous_loss", "restitution"]
     assert float(reduced.interaction.r) == 1.0
     assert 0.0 < np.abs(change).max() < 0.01
-    start = load_scene_and_start(folder / "reduced.toml")[1]
+    start = read_scene(folder / "reduced.toml").start
     assert start is not None
     assert start._asdict() == payload["start"]
 

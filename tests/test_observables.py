@@ -9,9 +9,8 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, sing
 from afm_jax.apparatus.drives import BaseDrive, Tone
 from afm_jax.apparatus.scene import drive_of
 from afm_jax.motion.follow import LongRun, follow_long
-from afm_jax.motion.observe import OBSERVABLES, Observables, observe
+from afm_jax.motion.observe import OBSERVABLES, Observables, observe, poincare_section
 from afm_jax.motion.periodic import close_periods
-from afm_jax.motion.section import poincare_section
 from afm_jax.motion.settle import find_repetition, find_repetitions, last_fifth, settled
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.scenefile.presets import contact_scene, figure10_scene, figure11_scene

@@ -7,7 +7,7 @@ import pytest
 
 from afm_jax import Contact, ImpactLaw, load_scene, save_scene
 from afm_jax.scenefile import presets
-from afm_jax.scenefile.scenefile import load_scene_and_start
+from afm_jax.scenefile.scenefile import read_scene
 
 # from the paper's captions: reduced frequency, drive amplitude, offset at the start; figures 2 and 3 are charts
 CAPTIONS = {
@@ -47,20 +47,17 @@ def test_a_preset_is_the_scene_of_its_caption(name: str, tmp_path: Path):
     assert isinstance(scene.interaction, Contact if resolved else ImpactLaw)
     assert (scene.cantilever.quality_factor is not None) == resolved
     path = tmp_path / "scene.toml"
-    save_scene(scene, path, start=presets.preset_start(name))
+    save_scene(scene, path, start=presets.read_named_scene(name).start)
     assert eqx.tree_equal(load_scene(path), scene)
-    assert load_scene_and_start(path)[1] == presets.preset_start(name)
+    assert read_scene(path).start == presets.read_named_scene(name).start
 
 
 def test_figure_8_starts_as_told():
-    assert presets.preset_start("figure8") == presets.figure8_start(80.0) == (270.0, 5.0, 80.0)
+    assert presets.read_named_scene("figure8").start == presets.figure8_start(80.0) == (270.0, 5.0, 80.0)
     assert presets.figure8_start(40.0).velocity_nm_per_us == 40.0
-    assert presets.preset_start("figure10") is None
+    assert presets.read_named_scene("figure10").start is None
 
 
 def test_an_unknown_name_is_refused():
-    for call in (presets.preset, presets.preset_start):
-        with pytest.raises(
-            ValueError, match="there is no preset 'figure4'; choose from figure2, figure3, figure8, fig"
-        ):
-            call("figure4")
+    with pytest.raises(ValueError, match="there is no preset 'figure4'; choose from figure2, figure3, figure8, fig"):
+        presets.preset("figure4")

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
-from afm_jax.scenefile.scenefile import Start, load_scene_and_start
+from afm_jax.scenefile.scenefile import Start, read_scene
 
 CANTILEVER = "[cantilever]\nfrequency_khz = 90\n"
 PLATFORM = "[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n"
@@ -84,12 +84,12 @@ def test_byte_order_mark_and_windows_lines_are_no_mistake(written):
 
 def test_start_is_kept_beside_the_scene(written):
     path = written(CANTILEVER + PLATFORM + LAW + START)
-    scene, start = load_scene_and_start(path)
+    scene, start, _ = read_scene(path)
     assert start == Start(phase_deg=270.0, height_above_platform_nm=5.0, velocity_nm_per_us=80.0)
     save_scene(scene, path, start=start)
-    assert load_scene_and_start(path)[1] == start
+    assert read_scene(path).start == start
     save_scene(scene, path)
-    assert load_scene_and_start(path)[1] is None
+    assert read_scene(path).start is None
 
 
 positive = st.floats(min_value=1e-30, max_value=1e30)

@@ -8,7 +8,7 @@ import pytest
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
 from afm_jax.cli.values import scene_and_start
-from afm_jax.scenefile.scenefile import Start, load_scene_and_start
+from afm_jax.scenefile.scenefile import Start, read_scene
 
 HEAD = (
     "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 180\noffset_rate_nm_per_us = 0.5\n"
@@ -50,11 +50,11 @@ GOOD = [
 @pytest.mark.parametrize(("interaction", "start"), GOOD)
 def test_loop_is_exact(path: Path, interaction: str, start: Start):
     write(path, interaction, start)
-    assert load_scene_and_start(path)[1] == start
+    assert read_scene(path).start == start
     scene = load_scene(path)
     path.unlink()
     save_scene(scene, path, start=start)
-    assert load_scene_and_start(path)[1] == start
+    assert read_scene(path).start == start
 
 
 def test_a_start_that_cannot_be_is_not_saved(path: Path):

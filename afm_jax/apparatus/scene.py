@@ -71,7 +71,7 @@ def as_scene(given: SceneLike) -> Scene:
         return given
     check_kind("scene", given, SceneLike)
     # what reads files is built on scenes
-    return import_module("afm_jax.scenefile.presets").scene_and_start(os.fspath(given))[0]
+    return import_module("afm_jax.scenefile.presets").read_named_scene(os.fspath(given)).scene
 
 
 _SAME_MASS = 1e-3

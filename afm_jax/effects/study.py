@@ -13,19 +13,21 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.stages import Compiled
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
 from afm_jax.effects.scene_effects import SceneEffect, effects_in
 from afm_jax.motion.follow import follow_in_pieces, joined, why_over
-from afm_jax.motion.observe import Reading, read_window
+from afm_jax.motion.observe import MotionWindow
 from afm_jax.motion.periodic import Orbit, follow_to_orbit, why_impossible
 from afm_jax.motion.record import Simulation, State
 from afm_jax.motion.settle import last_fifth
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import dense_path
+from afm_jax.units import within_turn
 
 PERIODS_AT_MOST = 400.0
 """Drive periods after which a motion that has not settled is given up."""
@@ -86,6 +88,20 @@ class View(NamedTuple):
         first = float(self.start.time_us)
         window = last_fifth(first, first + self.duration_us, self.drive)
         return window.from_us, window.to_us
+
+
+class Reading(NamedTuple):
+    """What a motion shows in a window of time, in a few numbers."""
+
+    peak_amplitude_nm: float
+    """Largest height above the rest position."""
+    lockin_amplitude_nm: float
+    """2/T |integral z exp(-i omega t)| at the given frequency."""
+    lockin_phase_deg: float
+    """In [0, 360)."""
+    energy_per_impact_aj: float | None
+    """None without impacts."""
+    impacts: int
 
 
 class Observed(NamedTuple):
@@ -298,10 +314,18 @@ def _observe_last_fifth(programs: "Programs", scene: Scene, view: View) -> Obser
     return Observed(scene, _read(scene, joined(pieces), view.window, view.drive.angular_frequency), None, None)
 
 
-def _read(scene: Scene, motion: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
-    """Return a reading; contacts, short against the period, are not integrated once more for every scene."""
-    dense = dense_path(scene, motion, *window, integrated=False)
-    return read_window(dense, *window, angular_frequency=angular_frequency)
+def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
+    """Return a reading, a smooth function of a simulation's numbers: contacts, short, are not integrated once more."""
+    motion = MotionWindow(dense_path(scene, simulation, *window, integrated=False), *window)
+    value = motion.height.lockin(angular_frequency)
+    lost = motion.rows.energy_lost_aj[motion.begun]
+    return Reading(
+        peak_amplitude_nm=motion.height.largest,
+        lockin_amplitude_nm=float(abs(value)),
+        lockin_phase_deg=float(within_turn(np.degrees(np.angle(value)), 360.0)),
+        energy_per_impact_aj=float(lost.mean()) if lost.size else None,
+        impacts=int(lost.size),
+    )
 
 
 def _cost(programs: "Programs", observed: Observed, view: View, like: tuple[Scene, Cost] | None) -> Cost:

@@ -184,26 +184,13 @@ def preset(name: str) -> Scene:
     Raises:
         ValueError: if there is no such preset.
     """
-    return _preset_of(name).scene()
-
-
-def preset_start(name: str) -> Start | None:
-    """Return where the simulation of a preset begins, or None where it does not matter.
-
-    Raises:
-        ValueError: if there is no such preset.
-    """
-    return _preset_of(name).start
-
-
-def _preset_of(name: str) -> _Preset:
     if name not in _PRESETS:
         raise ValueError(f"there is no preset {name!r}; choose from {', '.join(_PRESETS)}")
-    return _PRESETS[name]
+    return _PRESETS[name].scene()
 
 
-def scene_and_start(name: str) -> tuple[Scene, Start | None]:
-    """Return the scene that a path or a name means, and the start that comes with it; None where it is to be chosen.
+def read_named_scene(name: str) -> SceneAsRead:
+    """Return the scene that a path or a name means, its start, and what a reader should know of the file.
 
     Args:
         name: a path, or a name of `PRESETS` where there is no file of that name.
@@ -211,17 +198,8 @@ def scene_and_start(name: str) -> tuple[Scene, Start | None]:
     Raises:
         ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
     """
-    return read_named_scene(name)[:2]
-
-
-def read_named_scene(name: str) -> SceneAsRead:
-    """Return the scene and the start as of `scene_and_start`, with what a reader should know of the file.
-
-    Raises:
-        ValueError: as `scene_and_start`.
-    """
     if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
         return read_scene(name)
-    if name not in PRESETS:
+    if name not in _PRESETS:
         raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
-    return SceneAsRead(preset(name), preset_start(name), ())
+    return SceneAsRead(preset(name), _PRESETS[name].start, ())

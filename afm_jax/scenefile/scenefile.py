@@ -48,8 +48,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -68,7 +67,6 @@ from afm_jax.scenefile.law_files import law_beside
 from afm_jax.scenefile.tables import (
     INNER_TABLES,
     KEYS,
-    LAW_NUMBERS,
     MODELS,
     TABLES,
     SceneError,
@@ -80,72 +78,181 @@ from afm_jax.scenefile.tables import (
 )
 from afm_jax.whole_files import write_whole
 
-if TYPE_CHECKING:
-    from afm_jax.contact.contact import Contact
-
-
 Excited = TypeVar("Excited", BaseDrive, ForceDrive)
 Driven = TypeVar("Driven", Platform, BaseDrive, ForceDrive)
 
 _SAME_FREQUENCY = 1e-12
 """Relative distance of two frequencies that only rounding makes different."""
+MASS_ASSUMED = (
+    "1 ng assumed: nothing says the tip's mass, on which hang all energies and speeds of a contact; give mass_ng or "
+    "spring_constant_n_per_m"
+)
 
 
-def read_drives(
-    tables: Mapping[str, SceneTable], cantilever: Cantilever
-) -> tuple[Platform, BaseDrive | None, ForceDrive | None]:
-    """Return what drives a scene.
+class Start(NamedTuple):
+    """Where a simulation begins: `phase_deg` of the drive, height above the platform, velocity in the lab."""
+
+    phase_deg: float
+    height_above_platform_nm: float
+    velocity_nm_per_us: float
+
+
+class SceneAsRead(NamedTuple):
+    """What a scene file holds: scene and start (None: left to the simulation), and what a reader should know of it."""
+
+    scene: Scene
+    start: Start | None
+    notes: tuple[str, ...]
+
+
+@checked
+def load_scene(path: str | os.PathLike[str]) -> Scene:
+    """Return the scene that a TOML file describes, or that a preset's name means.
 
     Args:
-        tables: the tables of the file, their keys checked.
-        cantilever: gives the unit of reduced frequencies, and may have no steady response to a drive.
+        path: the file, or a name of `PRESETS` where there is no file of that name.
 
     Raises:
-        SceneError: if a value is missing, of a wrong type or impossible.
+        SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
+            junction; the message names the place and says how to mend it.
     """
-    base = _excitation_of(tables, "base", BaseDrive, cantilever)
-    force = _excitation_of(tables, "force", ForceDrive, cantilever)
-    return _platform_of(tables, cantilever, base or force), base, force
+    # presets are read from files of scenes
+    return import_module("afm_jax.scenefile.presets").read_named_scene(os.fspath(path)).scene
 
 
-def drive_tables(scene: Scene) -> dict[str, dict[str, Any]]:
-    """Return the tables of a scene's drives; what is absent is left out.
+def read_scene(path: str | os.PathLike[str]) -> SceneAsRead:
+    """Return what a scene file holds.
 
     Raises:
-        ValueError: if the scene is a batch of scenes, a second frequency is equal to the first, or an undamped
-            cantilever is driven at its free frequency.
+        SceneError: as `load_scene`.
+    """
+    source = os.fspath(path)
+    tables = _checked(read_toml(source), source)
+    scene = _scene_of(tables)
+    stated = {"mass_ng", "spring_constant_n_per_m"} & set(tables["cantilever"].values)
+    assumed = tables["interaction"].model == "contact" and not stated
+    notes, table = (f"{MASS_ASSUMED} in [cantilever].",) if assumed else (), tables.get("start")
+    if table is None:
+        return SceneAsRead(scene, None, notes)
+    start = Start(**table.numbers(*Start._fields))
+    table.build(check_start, start, scene)
+    return SceneAsRead(scene, start, notes)
+
+
+def scene_of_tables(contents: Mapping[str, Any], source: str) -> Scene:
+    """Return the scene of tables as a file holds them and `scene_tables` returns them.
+
+    Args:
+        contents: the tables.
+        source: what the messages call their origin.
+
+    Raises:
+        SceneError: as `load_scene`.
+    """
+    return _scene_of(_checked(contents, source))
+
+
+@checked
+def save_scene(scene: SceneLike, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
+    """Write a scene, and a start if there is one, to a TOML file from which `load_scene` returns an equal scene.
+
+    The file names a contact's effects in the paper's order, whatever the order of its forces.
+
+    Raises:
+        OSError: if the file cannot be written.
+        TypeError: if the interaction is neither an impact law nor a contact nor None.
+        ValueError: if the scene is a batch of scenes, its contact or its drives are none that a file can hold, or the
+            start is impossible in it.
+    """
+    scene = as_scene(scene)
+    tables = scene_tables(scene)
+    if start is not None:
+        check_start(start, scene)
+        tables["start"] = {key: float(value) for key, value in start._asdict().items()}
+    write_whole(path, tomli_w.dumps(tables), named_by_user=True)
+
+
+def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
+    """Return a scene as the tables of its file, dicts of numbers; what is absent is left out.
+
+    Raises:
+        TypeError: if the interaction is neither an impact law nor a contact nor None.
+        ValueError: if the scene is a batch of scenes, its contact is none that a file can hold, a second frequency is
+            equal to the first, or an undamped cantilever is driven at its free frequency.
     """
     drives = {"platform": scene.platform, "base": scene.base, "force": scene.force}
     for name, drive in drives.items():
         if isinstance(drive, BaseDrive | ForceDrive):
             check_steady_response(scene.cantilever, drive.tones, name)
-    return {name: _table_of(name, drive) for name, drive in drives.items() if drive is not None}
-
-
-def numbers_of(part: eqx.Module, table: str) -> dict[str, Any]:
-    """Return the numbers of a part of a scene under the keys of its table; what is absent or no number is left out.
-
-    Raises:
-        ValueError: if one is no single number.
-    """
-    values = {key: getattr(part, key, None) for key in KEYS[table]}
     return {
-        key: number_of(value, key)
-        for key, value in values.items()
-        if value is not None and not isinstance(value, (eqx.Module, bool))
+        "cantilever": _numbers_of(scene.cantilever, "cantilever"),
+        **{name: _drive_table(name, drive) for name, drive in drives.items() if drive is not None},
+        "interaction": _interaction_table(scene.interaction),
     }
 
 
-def number_of(value: ArrayLike, key: str) -> float:
-    """Return a parameter as a number.
+def read_toml(source: str) -> dict[str, Any]:
+    """Return the contents of a TOML file.
 
     Raises:
-        ValueError: if it is an array of numbers.
+        SceneError: if it cannot be read, or is no TOML.
     """
-    number = np.asarray(value)
-    if number.ndim:
-        raise ValueError(f"`{key}` has shape {number.shape}, but a scene file holds one scene: save them one by one")
-    return float(number)
+    where, text = printable(source), read_text(source)
+    try:
+        return tomllib.loads(text)
+    except ValueError as error:
+        raise SceneError(f"{where}: not TOML: {' '.join(str(error).split())}") from error
+    except RecursionError:
+        raise SceneError(f"{where}: not TOML: too many brackets within each other") from None
+
+
+def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
+    """Check the names of tables and of their keys."""
+    for name, value in contents.items():
+        if name not in TABLES:
+            message = advise_table(name, is_table=isinstance(value, dict))
+            raise SceneError(f"{printable(source)}: {printable(name)}: {message}")
+    tables = {name: _table(source, name, value) for name, value in contents.items()}
+    for name in ("cantilever", "platform", "interaction"):
+        if name not in tables:
+            keys = ", ".join(key for key in KEYS[name] if f"{name}.{key}" not in INNER_TABLES)
+            raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {keys}")
+    model = _model_of(tables["interaction"])
+    tables["interaction"] = tables["interaction"]._replace(model=model)
+    for name in INNER_TABLES:
+        outer, _, key = name.partition(".")
+        if outer in tables and key in tables[outer].values and (outer != "interaction" or model == "law"):
+            tables[name] = _table(source, name, tables[outer].values[key])
+    for table in tables.values():
+        table.check_keys()
+    return tables
+
+
+def _table(source: str, name: str, value: Any) -> SceneTable:
+    if not isinstance(value, dict):
+        raise SceneError(f"{printable(source)}: {name} must be a table, [{name}], but is {in_words(value)}")
+    return SceneTable(source, name, value)
+
+
+def _model_of(table: SceneTable) -> str:
+    """Return the model, looked at first: it decides which keys are known."""
+    model = table.values.get("model")
+    if model is None:
+        table.fail('missing; add model = "law" or model = "contact", or model = "none" for a free cantilever', "model")
+    if model not in MODELS:
+        table.fail('must be "law" or "contact", or "none" for a free cantilever', "model")
+    return model
+
+
+def _scene_of(tables: dict[str, SceneTable]) -> Scene:
+    table = tables["cantilever"]
+    cantilever = table.build(Cantilever, **table.numbers("frequency_khz"))
+    base = _excitation_of(tables, "base", BaseDrive, cantilever)
+    force = _excitation_of(tables, "force", ForceDrive, cantilever)
+    platform = _platform_of(tables, cantilever, base or force)
+    interaction = _interaction_of(tables)
+    tables["interaction"].build(check_mass, interaction, cantilever)
+    return tables["platform"].build(Scene, cantilever, platform, interaction, base, force)
 
 
 def _platform_of(
@@ -155,10 +262,9 @@ def _platform_of(
     table = tables["platform"]
     may_rest = excitation is not None and "platform.second" not in tables
     needed = () if may_rest else ("amplitude_nm",)
-    optional = ("amplitude_nm", "frequency_khz", "reduced_frequency", "offset_nm", "offset_rate_nm_per_us")
-    numbers = {"amplitude_nm": 0.0} | table.numbers(required=needed, optional=optional)
-    own_frequency = "frequency_khz" in numbers or "reduced_frequency" in numbers
-    if excitation is not None and may_rest and numbers["amplitude_nm"] == 0.0 and not own_frequency:
+    numbers = {"amplitude_nm": 0.0} | table.numbers(*needed)
+    has_frequency = "frequency_khz" in numbers or "reduced_frequency" in numbers
+    if excitation is not None and may_rest and numbers["amplitude_nm"] == 0.0 and not has_frequency:
         return table.build(Platform, **numbers, frequency_khz=excitation.frequency_khz)
     platform = table.build(Platform, **_with_frequency(table, numbers, cantilever))
     return _with_second(tables, "platform", platform, cantilever)
@@ -167,23 +273,23 @@ def _platform_of(
 def _excitation_of(
     tables: Mapping[str, SceneTable], name: str, kind: type[Excited], cantilever: Cantilever
 ) -> Excited | None:
+    """Return base or force; its amplitude may be given as that of the free tip's height, `free_amplitude_nm`."""
     table = tables.get(name)
     if table is None:
         return None
-    own, free = _amplitude(name), "free_amplitude_nm"
-    if own in table.values and free in table.values:
-        table.fail(f"has both {own} and {free}; give one of them")
-    needed = free if free in table.values else own
-    numbers = table.numbers(required=(needed,), optional=("frequency_khz", "reduced_frequency", "phase_deg"))
-    numbers = _with_frequency(table, numbers, cantilever)
-    if needed == free:
+    amplitude, free = _amplitude(name), "free_amplitude_nm"
+    if amplitude in table.values and free in table.values:
+        table.fail(f"has both {amplitude} and {free}; give one of them")
+    given = free if free in table.values else amplitude
+    numbers = _with_frequency(table, table.numbers(given), cantilever)
+    if given == free:
         table.build(check_parameter, free, numbers[free], "not negative")
         # the tone's amplitude only says that it moves
         tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
         table.build(check_steady_response, cantilever, (tone,), name)
-        numbers[own] = numbers.pop(free) * float(drive_per_free_height(cantilever, numbers["frequency_khz"], kind))
-    drive = table.build(kind, **numbers)
-    drive = _with_second(tables, name, drive, cantilever)
+        per_height = float(drive_per_free_height(cantilever, numbers["frequency_khz"], kind))
+        numbers[amplitude] = numbers.pop(free) * per_height
+    drive = _with_second(tables, name, table.build(kind, **numbers), cantilever)
     table.build(check_steady_response, cantilever, drive.tones, name)
     return drive
 
@@ -194,7 +300,7 @@ def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, can
     if table is None:
         return drive
     key = _amplitude(name)
-    numbers = table.numbers(required=(key,), optional=("frequency_khz", "reduced_frequency", "phase_deg"))
+    numbers = table.numbers(key)
     table.build(check_parameter, key, numbers[key], "not negative")
     numbers = _with_frequency(table, numbers, cantilever)
     second = table.build(Tone, numbers.pop(key), **numbers)
@@ -218,15 +324,56 @@ def _with_frequency(table: SceneTable, numbers: dict[str, float], cantilever: Ca
     return {**others, "frequency_khz": 2.0 * reduced * float(cantilever.frequency_khz)}
 
 
-def _table_of(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[str, Any]:
-    table = numbers_of(drive, name)
+def _interaction_of(tables: dict[str, SceneTable]) -> Any:
+    table = tables["interaction"]
+    if table.model == "none":
+        return None
+    if table.model == "contact":
+        # only here, so that scenes with a law do without the contact's modules
+        from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
+        from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
+
+        effects = table.texts("effects")
+        return table.build(make_contact, EFFECTS if effects is None else effects, table.numbers())
+    if "file" in table.values or "table" in table.values:
+        return _tabulated(table)
+    numbers, delay = table.numbers("r"), tables.get("interaction.delay")
+    if delay is None:
+        return table.build(ImpactLaw, **numbers)
+    # what has a default may be left out
+    required = (field.name for field in fields(CollisionDelay) if field.default is MISSING)
+    parameters = delay.numbers(*required) | {"corrections": delay.truth("corrections", usual=True)}
+    return table.build(ImpactLaw, **numbers, delay=delay.build(CollisionDelay, **parameters))
+
+
+def _tabulated(table: SceneTable) -> TabulatedLaw:
+    """Return the law of a file that the table names, or that is written out in it."""
+    source = "file" if "file" in table.values else "table"
+    others = [key for key in table.values if key not in ("model", source)]
+    if others:
+        table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
+    given = table.values[source]
+    if source == "file":
+        if not isinstance(given, str):
+            table.fail(f"must be the path of a law's file, as text, but is {in_words(given)}", "file")
+        return table.build(law_beside, table.source, given)
+    if not isinstance(given, dict):
+        table.fail(f"must be a table, [interaction.table], but is {in_words(given)}", "table")
+    try:
+        return table.build(law_of_dict, given)
+    except (KeyError, TypeError) as error:
+        table.fail(f"is no law: {error}", "table")
+
+
+def _drive_table(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[str, Any]:
+    table = _numbers_of(drive, name)
     second = drive.second
     if second is None:
         return table
     if _same_frequency(drive, second):
         raise ValueError(f"the second frequency of `{name}` is that of the first: add the two up to one cosine")
-    amplitude = {_amplitude(name): number_of(second.amplitude, _amplitude(name))}
-    return {**table, "second": {**amplitude, **numbers_of(second, f"{name}.second")}}
+    amplitude = {_amplitude(name): _number_of(second.amplitude, _amplitude(name))}
+    return {**table, "second": {**amplitude, **_numbers_of(second, f"{name}.second")}}
 
 
 def _same_frequency(drive: Platform | BaseDrive | ForceDrive, second: Tone) -> bool:
@@ -237,12 +384,58 @@ def _amplitude(name: str) -> str:
     return "amplitude_nn" if name == "force" else "amplitude_nm"
 
 
-class Start(NamedTuple):
-    """Where a simulation begins: `phase_deg` of the drive, height above the platform, velocity in the lab."""
+def _interaction_table(interaction: Any) -> dict[str, Any]:
+    if interaction is None:
+        return {"model": "none"}
+    if isinstance(interaction, TabulatedLaw):
+        if interaction.capture.ndim:
+            raise ValueError(
+                f"the law has shape {interaction.capture.shape}, but a scene file holds one scene: save them one by one"
+            )
+        return {"model": "law", "table": interaction.to_dict()}
+    if isinstance(interaction, ImpactLaw):
+        table: dict[str, Any] = {"model": "law", **_numbers_of(interaction, "interaction")}
+        if interaction.delay is not None:
+            table["delay"] = _numbers_of(interaction.delay, "interaction.delay")
+            if not interaction.delay.corrections:
+                table["delay"]["corrections"] = False
+        return table
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.contact.parameters import ALL_EFFECTS  # noqa: PLC0415
+    from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
 
-    phase_deg: float
-    height_above_platform_nm: float
-    velocity_nm_per_us: float
+    if not isinstance(interaction, Contact):
+        kind = type(interaction).__name__
+        raise TypeError(f"a scene file holds an ImpactLaw or a Contact as interaction, not {kind}")
+    numbers = {key: _number_of(value, key) for key, value in contact_parameters(interaction).items()}
+    return {"model": "contact", "effects": [name for name in ALL_EFFECTS if name in interaction.effects], **numbers}
+
+
+def _numbers_of(part: eqx.Module, table: str) -> dict[str, Any]:
+    """Return the numbers of a part of a scene under the keys of its table; what is absent or no number is left out.
+
+    Raises:
+        ValueError: if one is no single number.
+    """
+    values = {key: getattr(part, key, None) for key in KEYS[table]}
+    return {
+        key: _number_of(value, key)
+        for key, value in values.items()
+        if value is not None and not isinstance(value, (eqx.Module, bool))
+    }
+
+
+def _number_of(value: ArrayLike, key: str) -> float:
+    """Return a parameter as a number.
+
+    Raises:
+        ValueError: if it is an array of numbers.
+    """
+    number = np.asarray(value)
+    if number.ndim:
+        raise ValueError(f"`{key}` has shape {number.shape}, but a scene file holds one scene: save them one by one")
+    return float(number)
 
 
 def check_start(start: Start, scene: Scene) -> None:
@@ -303,263 +496,3 @@ def as_in_file(scene: Scene, state: State) -> Start:
     phase = 360.0 * (time / drive_of(scene).period_us)
     height = float(state.position_nm) - float(scene.platform.position(time))
     return Start(phase % 360.0, height, float(state.velocity_nm_per_us))
-
-
-@checked
-def load_scene(path: str | os.PathLike[str]) -> Scene:
-    """Return the scene that a TOML file describes, or that a preset's name means.
-
-    Args:
-        path: the file, or a name of `PRESETS` where there is no file of that name.
-
-    Raises:
-        SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
-            junction; the message names the place and says how to mend it.
-    """
-    source = os.fspath(path)
-    if Path(source).exists():
-        return read_scene(source).scene
-    # presets are read from files of scenes
-    return import_module("afm_jax.scenefile.presets").scene_and_start(source)[0]
-
-
-def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
-    """Return scene and start of a file; no start where it leaves the choice to the simulation.
-
-    Raises:
-        SceneError: as `load_scene`.
-    """
-    return read_scene(path)[:2]
-
-
-MASS_ASSUMED = (
-    "1 ng assumed: nothing says the tip's mass, on which hang all energies and speeds of a contact; give mass_ng or "
-    "spring_constant_n_per_m"
-)
-
-
-class SceneAsRead(NamedTuple):
-    """What a scene file holds: scene and start (None: left to the simulation), and what a reader should know of it."""
-
-    scene: Scene
-    start: Start | None
-    notes: tuple[str, ...]
-
-
-def read_scene(path: str | os.PathLike[str]) -> SceneAsRead:
-    """Return what a scene file holds.
-
-    Raises:
-        SceneError: as `load_scene`.
-    """
-    source = os.fspath(path)
-    tables = _checked(read_toml(source), source)
-    scene = _scene_of(tables)
-    stated = {"mass_ng", "spring_constant_n_per_m"} & set(tables["cantilever"].values)
-    assumed = tables["interaction"].model == "contact" and not stated
-    return SceneAsRead(scene, _start_of(tables, scene), (f"{MASS_ASSUMED} in [cantilever].",) if assumed else ())
-
-
-def scene_of_tables(contents: Mapping[str, Any], source: str) -> Scene:
-    """Return the scene of tables as a file holds them and `scene_tables` returns them.
-
-    Args:
-        contents: the tables.
-        source: what the messages call their origin.
-
-    Raises:
-        SceneError: as `load_scene`.
-    """
-    return _scene_of(_checked(contents, source))
-
-
-@checked
-def save_scene(scene: SceneLike, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
-    """Write a scene, and a start if there is one, to a TOML file from which `load_scene` returns an equal scene.
-
-    The file names a contact's effects in the paper's order, whatever the order of its forces.
-
-    Raises:
-        OSError: if the file cannot be written.
-        TypeError: if the interaction is neither an impact law nor a contact nor None.
-        ValueError: if the scene is a batch of scenes, its contact or its drives are none that a file can hold, or the
-            start is impossible in it.
-    """
-    scene = as_scene(scene)
-    tables = scene_tables(scene)
-    if start is not None:
-        check_start(start, scene)
-        tables["start"] = {key: float(value) for key, value in start._asdict().items()}
-    write_whole(path, tomli_w.dumps(tables), named_by_user=True)
-
-
-def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
-    """Return a scene as the tables of its file, dicts of numbers; what is absent is left out.
-
-    Raises:
-        TypeError: if the interaction is neither an impact law nor a contact nor None.
-        ValueError: if the scene is a batch of scenes, or its contact or its drives are none that a file can hold.
-    """
-    return {
-        "cantilever": numbers_of(scene.cantilever, "cantilever"),
-        **drive_tables(scene),
-        "interaction": _interaction_table(scene.interaction),
-    }
-
-
-def _interaction_table(interaction: Any) -> dict[str, Any]:
-    if interaction is None:
-        return {"model": "none"}
-    if isinstance(interaction, TabulatedLaw):
-        if interaction.capture.ndim:
-            raise ValueError(
-                f"the law has shape {interaction.capture.shape}, but a scene file holds one scene: save them one by one"
-            )
-        return {"model": "law", "table": interaction.to_dict()}
-    return _law_table(interaction) if isinstance(interaction, ImpactLaw) else _contact_table(interaction)
-
-
-def _law_table(law: ImpactLaw) -> dict[str, Any]:
-    table = {"model": "law", **numbers_of(law, "interaction")}
-    if law.delay is not None:
-        table["delay"] = numbers_of(law.delay, "interaction.delay")
-        if not law.delay.corrections:
-            table["delay"]["corrections"] = False
-    return table
-
-
-def _contact_table(contact: Any) -> dict[str, Any]:
-    # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.contact.parameters import ALL_EFFECTS  # noqa: PLC0415
-    from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
-
-    if not isinstance(contact, Contact):
-        raise TypeError(f"a scene file holds an ImpactLaw or a Contact as interaction, not {type(contact).__name__}")
-    numbers = {key: number_of(value, key) for key, value in contact_parameters(contact).items()}
-    return {"model": "contact", "effects": [name for name in ALL_EFFECTS if name in contact.effects], **numbers}
-
-
-def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
-    """Check the names of tables and of their keys."""
-    for name, value in contents.items():
-        if name not in TABLES:
-            message = advise_table(name, is_table=isinstance(value, dict))
-            raise SceneError(f"{printable(source)}: {printable(name)}: {message}")
-    tables = {name: _table(source, name, value) for name, value in contents.items()}
-    for name in ("cantilever", "platform", "interaction"):
-        if name not in tables:
-            keys = ", ".join(key for key in KEYS[name] if f"{name}.{key}" not in INNER_TABLES)
-            raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {keys}")
-    model = _model_of(tables["interaction"])
-    tables["interaction"] = tables["interaction"]._replace(model=model)
-    for name in INNER_TABLES:
-        outer, _, key = name.partition(".")
-        if outer in tables and key in tables[outer].values and (outer != "interaction" or model == "law"):
-            tables[name] = _table(source, name, tables[outer].values[key])
-    for table in tables.values():
-        table.check_keys()
-    return tables
-
-
-def read_toml(source: str) -> dict[str, Any]:
-    """Return the contents of a TOML file.
-
-    Raises:
-        SceneError: if it cannot be read, or is no TOML.
-    """
-    where, text = printable(source), read_text(source)
-    try:
-        return tomllib.loads(text)
-    except ValueError as error:
-        raise SceneError(f"{where}: not TOML: {' '.join(str(error).split())}") from error
-    except RecursionError:
-        raise SceneError(f"{where}: not TOML: too many brackets within each other") from None
-
-
-def _table(source: str, name: str, value: Any) -> SceneTable:
-    if not isinstance(value, dict):
-        raise SceneError(f"{printable(source)}: {name} must be a table, [{name}], but is {in_words(value)}")
-    return SceneTable(source, name, value)
-
-
-def _model_of(table: SceneTable) -> str:
-    """Return the model, looked at first: it decides which keys are known."""
-    model = table.values.get("model")
-    if model is None:
-        table.fail('missing; add model = "law" or model = "contact", or model = "none" for a free cantilever', "model")
-    if model not in MODELS:
-        table.fail('must be "law" or "contact", or "none" for a free cantilever', "model")
-    return model
-
-
-def _scene_of(tables: dict[str, SceneTable]) -> Scene:
-    table = tables["cantilever"]
-    numbers = table.numbers(
-        required=("frequency_khz",), optional=("quality_factor", "mass_ng", "spring_constant_n_per_m")
-    )
-    cantilever = table.build(Cantilever, **numbers)
-    platform, base, force = read_drives(tables, cantilever)
-    interaction = _interaction_of(tables)
-    tables["interaction"].build(check_mass, interaction, cantilever)
-    return tables["platform"].build(Scene, cantilever, platform, interaction, base, force)
-
-
-def _interaction_of(tables: dict[str, SceneTable]) -> Any:
-    table = tables["interaction"]
-    if table.model == "none":
-        return None
-    if table.model == "contact":
-        return _contact_of(table)
-    if "file" in table.values or "table" in table.values:
-        return _tabulated(table)
-    law = table.numbers(required=("r",), optional=LAW_NUMBERS)
-    return table.build(ImpactLaw, **law, delay=_delay_of(tables.get("interaction.delay")))
-
-
-def _tabulated(table: SceneTable) -> TabulatedLaw:
-    """Return the law of a file that the table names, or that is written out in it."""
-    source = "file" if "file" in table.values else "table"
-    others = [key for key in table.values if key not in ("model", source)]
-    if others:
-        table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
-    given = table.values[source]
-    if source == "file":
-        if not isinstance(given, str):
-            table.fail(f"must be the path of a law's file, as text, but is {in_words(given)}", "file")
-        return table.build(law_beside, table.source, given)
-    if not isinstance(given, dict):
-        table.fail(f"must be a table, [interaction.table], but is {in_words(given)}", "table")
-    try:
-        return table.build(law_of_dict, given)
-    except (KeyError, TypeError) as error:
-        table.fail(f"is no law: {error}", "table")
-
-
-def _contact_of(table: SceneTable) -> "Contact":
-    # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.contact.parameters import DEFAULTS, EFFECTS  # noqa: PLC0415
-    from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
-
-    effects = table.texts("effects")
-    numbers = table.numbers(optional=tuple(DEFAULTS))
-    return table.build(make_contact, EFFECTS if effects is None else effects, numbers)
-
-
-def _delay_of(table: SceneTable | None) -> CollisionDelay | None:
-    if table is None:
-        return None
-    # what has a default may be left out
-    required = tuple(field.name for field in fields(CollisionDelay) if field.default is MISSING)
-    optional = tuple(key for key in KEYS["interaction.delay"] if key not in (*required, "corrections"))
-    numbers = table.numbers(required=required, optional=optional)
-    return table.build(CollisionDelay, **numbers, corrections=table.truth("corrections", usual=True))
-
-
-def _start_of(tables: dict[str, SceneTable], scene: Scene) -> Start | None:
-    table = tables.get("start")
-    if table is None:
-        return None
-    start = Start(**table.numbers(required=KEYS["start"]))
-    table.build(check_start, start, scene)
-    return start

@@ -28,8 +28,8 @@ KEYS = {
 }
 """For every table of a scene file the keys it may have; those of the interaction are an impact law's."""
 
-LAW_NUMBERS = tuple(key for key in KEYS["interaction"] if key in ("epsilon", "viscous_loss"))
-"""The parameters of an impact law that a file may leave out."""
+_NO_NUMBERS = ("model", "effects", "delay", "corrections", "file", "table", "second")
+"""Keys that hold something else than a number."""
 
 TABLES = tuple(name for name in KEYS if "." not in name)
 """The tables at the top of a file."""
@@ -186,8 +186,11 @@ class SceneTable(NamedTuple):
             if key not in keys_of(self.name, self.model):
                 self.fail(advise_key(self.name, key, self.model), key)
 
-    def numbers(self, *, required: tuple[str, ...] = (), optional: tuple[str, ...] = ()) -> dict[str, float]:
-        """Return the numbers that the table has under these keys.
+    def numbers(self, *required: str) -> dict[str, float]:
+        """Return all numbers that the table has, by their keys.
+
+        Args:
+            required: keys that must be there.
 
         Raises:
             SceneError: if a required one is missing or one is not a number.
@@ -195,6 +198,7 @@ class SceneTable(NamedTuple):
         for key in required:
             if key not in self.values:
                 self.fail("missing; add it", key)
+        optional = (key for key in keys_of(self.name, self.model) if key not in (*required, *_NO_NUMBERS))
         return {key: self._number(key) for key in (*required, *optional) if key in self.values}
 
     def texts(self, key: str) -> list[str] | None:
