@@ -55,7 +55,7 @@ def _why_not(failed: list[Check], compared: int) -> str:
 
 def _table(checks: list[Check]) -> Any:
     table = Table()
-    for title in ("equation", "against", "where", "points", "worst rel. difference", "in eps x condition", "passed"):
+    for title in ("equation", "against", "where", "points", "worst rel. difference", "in rounding", "passed"):
         table.add_column(title, justify="right" if title in {"points", "worst rel. difference"} else "left")
     for check in checks:
         worst = known(check.max_relative_difference, ".1e")
@@ -70,7 +70,7 @@ def _remarks(checks: list[Check]) -> list[str]:
     limits = {check.against: check.tolerance for check in reversed(checks)}
     held = (
         f"Allowed: {limits['autodiff']:g} against automatic differentiation (worse of forward and reverse); "
-        f"{limits['50 digits']:g} eps x condition number against 50 digits (eq. 8: {_orbit_limit(checks):g})."
+        f"{limits['50 digits']:g} times what rounding can do against 50 digits (eq. 8: {_orbit_limit(checks):g})."
     )
     return [
         held,

@@ -1,12 +1,9 @@
 """The equations with 50 digits in mpmath, an arbitrary-precision library that is not ours.
 
-Nothing here uses the package's physics. The float64 numbers of a state are taken as exact; the impact is the exact root
-of eq. 3 next to a float64 guess. Units as everywhere: nm, us, nm/us, rad/us.
-
-Impact times with 50 digits, to measure errors against: the closed-form flight and eq. 6 iterated in mpmath.
-
-The search for the *first* root is not repeated here: each impact is the exact root next to the computed one. Scenes
-without collision delay and ramp.
+Nothing here uses the package's physics. The float64 numbers of a state are taken as exact; an impact is the exact root
+of eq. 3 next to a float64 guess (the search for the *first* root is not repeated), found by Newton's method, and eqs. 5
+to 8 are evaluated there. `ExactMap` iterates closed-form flight and eq. 6, to measure impact times against, for scenes
+without collision delay and ramp. Units as everywhere: nm, us, nm/us, rad/us.
 """
 
 from collections.abc import Sequence
@@ -21,20 +18,6 @@ from afm_jax.impact.law import formula_of
 DIGITS = 50
 _GUARD_DIGITS = 15  # lost on the way, mostly where the closing velocity is small
 Number = Any  # mpmath makes its types at run time
-
-
-class Exact(NamedTuple):
-    """What an exact impact gives, rounded to float64.
-
-    ``arrival_us`` in us; ``flight``, ``law``, ``chained``: eqs. 5, 7 and 5+7, shape (2, 2); ``rebound``: u_out and its
-    four slopes, shape (5,).
-    """
-
-    arrival_us: float
-    flight: NDArray[np.float64]
-    law: NDArray[np.float64]
-    chained: NDArray[np.float64]
-    rebound: NDArray[np.float64]
 
 
 class System(NamedTuple):
@@ -61,41 +44,42 @@ def mpmath_or_reason() -> tuple[Any, str | None]:
     return mp, None
 
 
-def exact_impact(mp: Any, row: dict[str, Any], start: tuple[float, float], guess_us: float) -> Exact:
-    """Return the derivatives of one impact with 50 digits.
+def exact_impact(mp: Any, row: dict[str, Any], start: tuple[float, float], guess_us: float) -> dict[str, Any]:
+    """Return one impact and its derivatives, computed with 50 digits and rounded to float64.
+
+    "arrival": its time in us; "eq. 5", "eq. 7", "eqs. 5+7": shape (2, 2); "eq. 6": u_out and its four slopes.
 
     Args:
         mp: mpmath's context.
-        row: a scene's plain numbers, see `plain_rows`.
+        row: a scene's plain numbers.
         start: time in us and lab velocity just after the last impact in nm/us.
         guess_us: arrival time, right to float64.
     """
     with mp.workdps(DIGITS + _GUARD_DIGITS):
         system = system_of(mp, row)
         t1, velocity = mp.mpf(start[0]), mp.mpf(start[1])
-        arrival = _arrival(mp, system, (t1, velocity), mp.mpf(guess_us))
+        arrival = _arrival(mp, system, (t1, velocity), mp.mpf(guess_us), tolerance=mp.mpf(10) ** -DIGITS)
         flight, before = flight_matrix(mp, system, (t1, velocity), arrival)
         law = law_matrix(mp, system, arrival, before)
         approach = platform(mp, system, arrival)[1] - before
-        return Exact(
-            float(arrival), _floats(flight), _floats(law), _floats(law * flight), _rebound(mp, system, approach)
-        )
+        matrices = {"eq. 5": flight, "eq. 7": law, "eqs. 5+7": law * flight}
+        rounded = {name: _floats(matrix) for name, matrix in matrices.items()}
+        return {"arrival": float(arrival), "eq. 6": _rebound(mp, system, approach), **rounded}
 
 
-def exact_orbit(mp: Any, row: dict[str, Any], order: int, guess: tuple[float, float]) -> tuple[float, float]:
-    """Return D and T of eq. 8 on the exact (1, N) orbit next to a guessed phase in rad and V' in nm/us.
+def exact_trace(mp: Any, row: dict[str, Any], order: int, guess: tuple[float, float]) -> float:
+    """Return T of eq. 8 on the exact (1, N) orbit next to a guessed phase in rad and V' in nm/us.
 
     The orbit, without damping, viscous loss and delay, solves A Omega sin h = V' cos h, h = Omega T/2 (the flight that
     comes back to its height), and eq. 6 with V = -V'.
     """
     with mp.workdps(DIGITS + _GUARD_DIGITS):
         s = system_of(mp, row)
-        trace = _eq8_trace(mp, s, _orbit_state(mp, s, order, guess), 2 * s.Omega * order * mp.pi / s.omega)
-        return float(s.r**2), float(trace)
+        return float(_eq8_trace(mp, s, _orbit_state(mp, s, order, guess), 2 * s.Omega * order * mp.pi / s.omega))
 
 
 def exact_orbit_state(mp: Any, scene: Scene, order: int, guess: tuple[float, float]) -> tuple[Number, Number]:
-    """Return the phase in rad and V' in nm/us of the exact (1, N) orbit of a scene; see `exact_orbit`."""
+    """Return the phase in rad and V' in nm/us of the exact (1, N) orbit of a scene; see `exact_trace`."""
     with mp.workdps(DIGITS + _GUARD_DIGITS):
         return _orbit_state(mp, system_of(mp, _plain_row(scene)), order, guess)
 
@@ -158,8 +142,8 @@ def propagator(mp: Any, s: System, t: Number) -> tuple[Number, Number, Number, N
     return cosine + s.gamma * sine, sine, -(s.Omega**2) * sine, cosine - s.gamma * sine
 
 
-def _arrival(mp: Any, s: System, start: tuple[Number, Number], guess: Number) -> Number:
-    """Return the root of eq. 3 next to a guess by Newton's method, which doubles its digits at each step."""
+def _arrival(mp: Any, s: System, start: tuple[Number, Number], guess: Number, *, tolerance: Number) -> Number:
+    """Return the root of eq. 3 next to a guess by Newton's method, which doubles its digits at each step; else NaN."""
     t1, velocity = start
     height = platform(mp, s, t1)[0]
     t = guess
@@ -168,7 +152,7 @@ def _arrival(mp: Any, s: System, start: tuple[Number, Number], guess: Number) ->
         position, speed, _ = platform(mp, s, t)
         step = (p11 * height + p12 * velocity - position) / (p21 * height + p22 * velocity - speed)
         t -= step
-        if abs(step) < mp.mpf(10) ** -DIGITS:
+        if abs(step) < tolerance:
             return t
     return mp.nan
 
@@ -295,21 +279,11 @@ class ExactMap:
         mp, s = self._mp, self._system
         t1, velocity = state
         height = platform(mp, s, t1)[0]
-        t = guess
-        for _ in range(12):
-            p11, p12, p21, p22 = propagator(mp, s, t - t1)
-            position, speed, _ = platform(mp, s, t)
-            before = p21 * height + p22 * velocity
-            step = (p11 * height + p12 * velocity - position) / (before - speed)
-            t -= step
-            if abs(step) < mp.mpf(10) ** (5 - self._digits):
-                break
-        else:
-            return mp.nan, mp.nan
-        _, _, p21, p22 = propagator(mp, s, t - t1)
-        speed = platform(mp, s, t)[1]
+        time = _arrival(mp, s, state, guess, tolerance=mp.mpf(10) ** (5 - self._digits))
+        _, _, p21, p22 = propagator(mp, s, time - t1)
+        speed = platform(mp, s, time)[1]
         approach = speed - (p21 * height + p22 * velocity)
-        return t, speed + mp.sqrt(s.r**2 * approach**2 - s.c * approach - s.epsilon)
+        return time, speed + mp.sqrt(s.r**2 * approach**2 - s.c * approach - s.epsilon)
 
 
 def derivatives_by_r(scene: Scene, start: Sequence[float], guesses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,23 +1,17 @@
-"""Random states with everything that is compared at them: automatic derivatives, written formulas, their terms.
+"""Random states with everything that is compared at them: automatic derivatives, written formulas, rounding errors.
 
-Random states for the verification: a scene, a start, and an impact that follows; the hard corners on purpose.
+A state is a scene, a start just after an impact, and the impact that follows, with the hard corners on purpose. They
+are drawn in turn: ordinary; near resonance (omega/2 Omega within 1e-6 to 1e-2 of an integer); near grazing (offset and
+velocity solved such that the tip meets the platform at a chosen, small relative speed: both conditions are linear in
+them). In each of them epsilon is 0, or of any size, or just short of capturing the tip.
 
-Families, drawn in turn: ordinary; near resonance (omega/2 Omega within 1e-6 to 1e-2 of an integer); near grazing
-(offset and velocity solved such that the tip meets the platform at a chosen, small relative speed: both conditions
-are linear in them). In each of them epsilon is 0, or of any size, or just short of capturing the tip.
-
-The impact map's derivatives by automatic differentiation, forward and reverse: nothing of the written formulas.
-
-Where rounding alone decides: impacts close to capture and grazing, and how far errors grow there.
-
-The sums of the magnitudes of the terms of eqs. 5 to 8: what a difference between two ways to compute is measured in.
-
-A formula whose terms nearly cancel cannot be more exact than its terms. Every function below mirrors one of
-`afm_jax.impact.jacobian`, with each difference replaced by a sum and each factor by its magnitude; a denominator stays
-as it is. S, the sine of a difference of phases, is one of these differences: |sin a cos b| + |cos a sin b|.
+At each state stand the impact map's derivatives by automatic differentiation, forward and reverse, which use nothing of
+the written formulas; the written formulas; and how far rounding alone can move these (`written_formulas`): the sum of
+|x df/dx| over the numbers x that a formula f takes, in units of the machine epsilon.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -31,7 +25,6 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact import jacobian as formulas
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
-from afm_jax.impact.jacobian import PaperFlight
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, formula_of, squared_rebound_speed
 from afm_jax.impact.map import NextImpact, next_impact
 from afm_jax.outcomes import Outcome
@@ -171,30 +164,24 @@ def _start_for(duration: Floats, approach: Floats, system: tuple[Floats, Floats,
 
 MAX_STEPS = 500
 """Steps of the search for an impact: a batch waits for its slowest flight, and some undamped ones never come back."""
-MODES = ("forward", "reverse")
 
 
 class Automatic(NamedTuple):
     """One impact and its derivatives; the first axis of a derivative is the mode (forward, reverse).
 
-    ``arrival_us``, ``before``, ``leaving_us``, ``after``: the impact in us and nm/us. ``hit``: the tip leaves again.
-    ``approach``: u_in in nm/us. ``margin``: (r^2 u^2 - c u - epsilon)/(r^2 u^2). ``rebound``: V' - v_p(t_out) in nm/us.
-    ``flight``: d(t2, V2)/d(t1, V1'). ``law``: d(t_out, V')/d(t2, V2). ``chained``: d(t_out, V')/d(t1, V1').
-    ``slopes``: d u_out/d(u_in, r, epsilon, c).
+    ``arrival_us``: of the impact. ``hit``: the tip leaves again. ``approach``: u_in in nm/us. ``margin``:
+    (r^2 u^2 - c u - epsilon)/(r^2 u^2). ``flight``: d(t2, V2)/d(t1, V1'). ``law``: d(t_out, V')/d(t2, V2).
+    ``chained``: d(t_out, V')/d(t1, V1'). ``rebound``: u_out = V' - v_p(t_out) and d u_out/d(u_in, r, epsilon, c).
     """
 
     arrival_us: Float[Array, "..."]
-    before: Float[Array, "..."]
-    leaving_us: Float[Array, "..."]
-    after: Float[Array, "..."]
     hit: Bool[Array, "..."]
     approach: Float[Array, "..."]
     margin: Float[Array, "..."]
-    rebound: Float[Array, "..."]
     flight: Float[Array, "... 2 2 2"]
     law: Float[Array, "... 2 2 2"]
     chained: Float[Array, "... 2 2 2"]
-    slopes: Float[Array, "... 2 4"]
+    rebound: Float[Array, "... 2 5"]
 
 
 def law_step(arriving: Float[Array, " 2"], law: ImpactLaw, platform: Platform) -> Float[Array, " 2"]:
@@ -229,19 +216,17 @@ def _differentiate(scene: Scene, time: Float[Array, ""], velocity: Float[Array, 
     approach = platform.velocity(arrival) - before
     arriving = jnp.stack([arrival, before])
     parameters = jnp.stack([approach, law.r, law.epsilon, law.viscous_loss])
+    rebound = impact.velocity_after_nm_per_us - platform.velocity(impact.time_us)
+    slopes = [mode(_rebound_speed)(parameters) for mode in (jax.jacfwd, jax.jacrev)]
     return Automatic(
         arrival_us=arrival,
-        before=before,
-        leaving_us=impact.time_us,
-        after=impact.velocity_after_nm_per_us,
         hit=hit,
         approach=jnp.where(jnp.isfinite(impact.arrival_time_us), approach, jnp.nan),
         margin=squared_rebound_speed(approach, law.r, law.epsilon, law.viscous_loss) / (law.r * approach) ** 2,
-        rebound=impact.velocity_after_nm_per_us - platform.velocity(impact.time_us),
         flight=whole[:, :2],
         law=jnp.stack([mode(law_step)(arriving, law, platform) for mode in (jax.jacfwd, jax.jacrev)]),
         chained=whole[:, 2:],
-        slopes=jnp.stack([mode(_rebound_speed)(parameters) for mode in (jax.jacfwd, jax.jacrev)]),
+        rebound=jnp.stack([jnp.concatenate([rebound[None], slope]) for slope in slopes]),
     )
 
 
@@ -252,160 +237,109 @@ differentiate = jax.jit(jax.vmap(_differentiate))
 EPSILON = float(np.finfo(np.float64).eps)
 CLOSE_TO_CAPTURE = 1e-5
 CLOSE_TO_GRAZING = 1e-3
-LARGE_AMPLIFICATION = 1e6
 
 
-def is_away(scene: Scene, automatic: Automatic) -> NDArray[np.bool_]:
-    """Say which impacts are away from capture and away from grazing, each for itself."""
-    top_speed = np.asarray(scene.platform.top_speed_nm_per_us)
-    away = np.asarray(automatic.approach) > CLOSE_TO_GRAZING * top_speed
-    return away & (np.asarray(automatic.margin) > CLOSE_TO_CAPTURE)
+class Written(NamedTuple):
+    """A written formula f at an impact; arrays of shape (states, ...).
 
-
-def is_ordinary(scene: Scene, automatic: Automatic) -> NDArray[np.bool_]:
-    """Say which impacts are neither close to capture nor to grazing.
-
-    (r^2 u^2 - c u - epsilon)/(r^2 u^2) > 1e-5 and u > 1e-3 beta omega. Where both are small at once, or a delay
-    magnifies a small rebound speed, rounding alone makes more than 1e-9: the relative rounding error of u is
-    eps (|V| + beta omega)/u, that of the squared rebound speed larger by 1/margin, that of the phase after the delay by
-    omega b/u_out; a product above 1e6 counts as close too.
+    ``value``: f. ``scale``: |f| + sum |x df/dx| over scene, start time and start velocity, each number x apart, at the
+    impact time as it is: relative differences are measured in it. ``rounding``: what the error of the impact time adds
+    included; times the machine epsilon it is what rounding can do.
     """
-    approach, margin = np.asarray(automatic.approach), np.asarray(automatic.margin)
-    top_speed = np.asarray(scene.platform.top_speed_nm_per_us)
-    amplification = (np.abs(np.asarray(automatic.before)) + top_speed) / approach / margin
+
+    value: Any
+    scale: Any
+    rounding: Any
+
+
+def written_formulas(paper: bool) -> Callable[[States, Automatic], dict[str, Written]]:  # noqa: FBT001
+    """Return a function that evaluates the written formulas at a batch of impacts, as printed or with every effect.
+
+    "approach" and "squared rebound" are the numbers that vanish at grazing and at capture. The function is compiled
+    anew for every verification, so that a formula changed in between (as tests do) is the one checked.
+    """
+    compiled = jax.jit(jax.vmap(partial(_written, _as_printed if paper else _with_every_effect)))
+    chained = jax.jit(jax.vmap(formulas.map_jacobian))
+
+    def evaluate(states: States, automatic: Automatic) -> dict[str, Written]:
+        written = compiled(states, automatic.arrival_us)
+        # `map_jacobian` finds the impact itself
+        return written | {"eqs. 5+7": written["eqs. 5+7"]._replace(value=chained(*states))}
+
+    return evaluate
+
+
+def _written(of: Callable[..., dict[str, Array]], state: States, arrival: Float[Array, ""]) -> dict[str, Written]:
+    """Evaluate formulas of (state, impact time) with their sensitivities to every number in the state and to the time.
+
+    The impact time is known to its own rounding, to the tolerance of its search, and to what rounding makes of the
+    distance between tip and platform, over the closing velocity (eq. 3).
+    """
+    values = of(state, arrival)
+    slopes = jax.jacfwd(of, argnums=(0, 1))(state, arrival)
+    closing = jnp.abs(values["approach"])
+    time = (
+        jnp.abs(arrival)
+        + DEFAULT_ROOT_TOLERANCE_US / EPSILON
+        + sum_of_terms(jax.grad(_gap)(state, arrival), state) / closing
+    )
+    written = {}
+    for name, value in values.items():
+        by_state, by_time = slopes[name]
+        scale = jnp.abs(value) + sum_of_terms(by_state, state)
+        written[name] = Written(value, scale, scale + jnp.abs(by_time) * time)
+    return written
+
+
+def sum_of_terms(slopes: States, state: States) -> Array:
+    """Return sum |x df/dx| over the numbers x of a state, from the derivatives df/dx."""
+    terms = jax.tree.map(lambda slope, number: jnp.abs(slope * number), slopes, state)
+    return jax.tree.reduce(jnp.add, terms)
+
+
+def _gap(state: States, arrival: Float[Array, ""]) -> Float[Array, ""]:
+    scene, start, velocity = state
+    height, _ = scene.cantilever.propagator(arrival - start)(scene.platform.position(start), velocity)
+    return height - scene.platform.position(arrival)
+
+
+def _as_printed(state: States, arrival: Float[Array, ""]) -> dict[str, Array]:
+    """Evaluate eqs. 5 and 7 as the paper prints them, for scenes without damping, viscous loss and delay."""
+    scene, start, velocity = state
     law = formula_of(scene)
-    if law.delay is not None:
-        rebound = np.asarray(law.r) * approach * np.sqrt(np.maximum(margin, 0.0))
-        omega = np.asarray(scene.platform.angular_frequency)
-        with np.errstate(divide="ignore"):
-            amplification = amplification * (1.0 + omega * np.asarray(law.delay.lead_nm) / rebound)
-    return is_away(scene, automatic) & (amplification < LARGE_AMPLIFICATION)
+    flight = formulas.paper_flight(scene.cantilever, scene.platform, start, velocity, arrival)
+    before = _velocity_before(state, arrival)
+    printed = {"eq. 5": formulas.eq5(flight), "eq. 7": formulas.eq7(flight, before, law.r, law.epsilon)}
+    return _with_every_effect(state, arrival) | printed
 
 
-def condition_number(states: States, automatic: Automatic) -> Floats:
-    """Return by how much rounding errors of the inputs grow on the way to the derivatives: shape (states,).
-
-    The impact time t2 is known to eps (t2 + G/u) and the tolerance of its search, where G = |p11 z_p1| + |p12 V'| +
-    |z_p2| are the terms of eq. 3, which cancel, and u = v_p - V is the closing velocity. A time's error moves u by
-    M = Omega sqrt(V'^2 + Omega^2 z^2) + beta omega^2 times as much, besides the rounding eps (|V| + beta omega) of its
-    own terms: dividing by u gives the growth through the closing velocity. It shifts the phase of the platform's
-    acceleration, too: omega |tan omega t2| times as much, relatively. Through the root of eq. 6 it grows by
-    1 + 1/margin, margin = (r^2 u^2 - c u - epsilon)/(r^2 u^2), and with a delay by 1 + omega (b/u_out + t_out) in the
-    platform's phase, times 1 + |tan omega t_out| for its acceleration there; 1 is for the rounding of the result.
-    """
-    cantilever, platform = states.scene.cantilever, states.scene.platform
-    approach, top_speed = np.asarray(automatic.approach), np.asarray(platform.top_speed_nm_per_us)
-    Omega, omega = np.asarray(cantilever.angular_frequency), np.asarray(platform.angular_frequency)
-    reach = np.abs(np.asarray(platform.offset_nm)) + np.asarray(platform.amplitude_nm)
-    speed = np.sqrt(np.asarray(states.velocity) ** 2 + (Omega * reach) ** 2)
-    pull = Omega * speed + top_speed * omega
-    gap_terms = 2.0 * reach + speed / Omega
-    arrival = np.asarray(automatic.arrival_us)
-    time_error = arrival + gap_terms / approach + DEFAULT_ROOT_TOLERANCE_US / EPSILON
-    through_speed = (speed + top_speed + pull * time_error) / approach
-    through_phase = omega * np.abs(np.tan(omega * arrival)) * time_error
-    number = 1.0 + through_speed * (1.0 + 1.0 / np.asarray(automatic.margin)) + through_phase
-    law = formula_of(states.scene)
-    if law.delay is None:
-        return number
-    rebound = np.asarray(law.r) * approach * np.sqrt(np.asarray(automatic.margin))
-    leaving = np.asarray(automatic.leaving_us)
-    later = 1.0 + omega * (np.asarray(law.delay.lead_nm) / rebound + np.abs(leaving))
-    return number * later * (1.0 + np.abs(np.tan(omega * leaving)))
+def _with_every_effect(state: States, arrival: Float[Array, ""]) -> dict[str, Array]:
+    """Evaluate the formulas with damping, viscous loss and delay."""
+    scene, start, velocity = state
+    law, before = formula_of(scene), _velocity_before(state, arrival)
+    eq5 = formulas.flight_jacobian(scene.cantilever, scene.platform, start, velocity, arrival)
+    eq7 = formulas.impact_jacobian(law, scene.platform, arrival, before)
+    return {"eq. 5": eq5, "eq. 7": eq7, "eqs. 5+7": eq7 @ eq5, **_eq6(law, scene.platform.velocity(arrival) - before)}
 
 
-def eq5_terms(flight: PaperFlight, start: Float[Array, ""], impact_us: Float[Array, ""]) -> Float[Array, "2 2"]:
-    """Return the terms' sums for eq. 5."""
-    beta, omega, Omega, A, B, s1, s2, _, C, S = flight
-    closing = jnp.abs(A * Omega * S - B * Omega * C - beta * omega * s2)
-    A, B, s1, s2, C = (jnp.abs(part) for part in (A, B, s1, s2, C))
-    S = _sine_terms(Omega, start, impact_us)
-    pull = Omega**2 * (A * C + B * S) / closing
-    return jnp.array(
-        [
-            [(beta * omega * s1 * C + A * Omega * S + B * Omega * C) / closing, S / Omega / closing],
-            [beta * omega * Omega * s1 * S + pull * beta * omega * (s2 + s1 * C), C + pull * S / Omega],
-        ]
-    )
+def _velocity_before(state: States, arrival: Float[Array, ""]) -> Float[Array, ""]:
+    scene, start, velocity = state
+    return scene.cantilever.propagator(arrival - start)(scene.platform.position(start), velocity)[1]
 
 
-def flight_terms(
-    cantilever: Cantilever, platform: Platform, start: Float[Array, ""], velocity: Float[Array, ""], impact_us
-) -> Float[Array, "2 2"]:
-    """Return the terms' sums for `flight_jacobian`, the damped eq. 5.
-
-    dt2/dt1 has a 1 among them: t2 is the start plus a duration, and a damped tip forgets its start, so that dt2/dt1
-    is the little that is left of 1 plus the duration's derivative.
-    """
-    propagator = cantilever.propagator(impact_us - start)
-    position, platform_velocity = platform.position_and_velocity(start)
-    closing = jnp.abs(propagator(position, velocity)[1] - platform.velocity(impact_us))
-    p11, _, p21, p22 = (jnp.abs(part) for part in propagator)
-    ringing = cantilever.damped_angular_frequency
-    shrink = jnp.exp(-cantilever.decay_rate * (impact_us - start))
-    p12 = shrink * _sine_terms(ringing, start, impact_us) / ringing
-    position, velocity, platform_velocity = jnp.abs(position), jnp.abs(velocity), jnp.abs(platform_velocity)
-    before = p21 * position + p22 * velocity
-    pull = cantilever.angular_frequency**2 * (p11 * position + p12 * velocity) + 2.0 * cantilever.decay_rate * before
-    time_by_time, time_by_velocity = (before + p11 * platform_velocity) / closing, p12 / closing
-    return jnp.array(
-        [
-            [1.0 + time_by_time, time_by_velocity],
-            [p21 * platform_velocity + pull * (time_by_time + 1.0), p22 + pull * time_by_velocity],
-        ]
-    )
-
-
-def eq6_slopes(approach: Float[Array, ""], law: ImpactLaw) -> tuple[Float[Array, " 4"], Float[Array, " 4"]]:
-    """Return d u_out/d(u_in, r, epsilon, c) of eq. 6, and the sums of the magnitudes of their terms."""
+def _eq6(law: ImpactLaw, approach: Float[Array, ""]) -> dict[str, Array]:
+    """Return u_out of eq. 6 and d u_out/d(u_in, r, epsilon, c), shape (5,), with the approach speed and u_out^2."""
     r, c = law.r, law.viscous_loss
-    half = 0.5 / jnp.sqrt(squared_rebound_speed(approach, r, law.epsilon, c))
-    rest = [2.0 * r * approach**2 * half, -half, -approach * half]
-    slopes = jnp.stack([(2.0 * r**2 * approach - c) * half, *rest])
-    return slopes, jnp.abs(slopes).at[0].set((2.0 * r**2 * approach + c) * half)
+    square = squared_rebound_speed(approach, r, law.epsilon, c)
+    half = 0.5 / jnp.sqrt(square)
+    slopes = [(2.0 * r**2 * approach - c) * half, 2.0 * r * approach**2 * half, -half, -approach * half]
+    return {"eq. 6": jnp.stack([jnp.sqrt(square), *slopes]), "approach": approach, "squared rebound": square}
 
 
-def eq7_terms(flight: PaperFlight, velocity_before, r: Float[Array, ""], epsilon: Float[Array, ""]):
-    """Return the terms' sums for eq. 7, shape (2, 2)."""
-    relative = velocity_before + flight.beta * flight.omega * flight.s2
-    ratio = r**2 * jnp.abs(relative) / jnp.sqrt(r**2 * relative**2 - epsilon)
-    turn = flight.beta * flight.omega**2 * jnp.abs(flight.c2) * (ratio + 1.0)
-    return jnp.array([[jnp.ones_like(turn), jnp.zeros_like(turn)], [turn, ratio]])
-
-
-def impact_terms(law: ImpactLaw, platform: Platform, arrival: Float[Array, ""], before) -> Float[Array, "2 2"]:
-    """Return the terms' sums for `impact_jacobian`, eq. 7 with viscous loss and delay."""
-    approach = platform.velocity(arrival) - before
-    rebound = law.rebound_speed(approach)
-    slope = (2.0 * law.r**2 * approach + law.viscous_loss) / (2.0 * rebound)
-    delay_slope = jnp.zeros_like(slope)
-    if law.delay is not None:
-        lead, offset = jnp.abs(law.delay.lead_nm), jnp.abs(law.delay.offset_nm)
-        delay_slope = 0.2 * jnp.abs(law.delay.hertz) * approach**-1.2 + lead * slope / rebound**2
-        delay_slope = delay_slope + (lead + offset) / approach**2
-    pull_in = jnp.abs(platform.acceleration(arrival))
-    pull_out = jnp.abs(platform.acceleration(arrival + law.collision_delay(approach)))
-    time_by_time = 1.0 + delay_slope * pull_in
-    return jnp.array(
-        [[time_by_time, delay_slope], [pull_out * time_by_time + slope * pull_in, pull_out * delay_slope + slope]]
-    )
-
-
-def eq8_trace_terms(flight: PaperFlight, velocity_after: Float[Array, ""], r: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the terms' sum for the trace of eq. 8."""
-    beta, omega, Omega, _, _, _, s, c, C, S = flight
-    closing = jnp.abs(velocity_after - beta * omega * s)  # v_p - V, with V = -V'
-    ratio = jnp.abs((velocity_after - beta * omega * s) / (velocity_after + beta * omega * s))
-    s, c, C, S = (jnp.abs(part) for part in (s, c, C, S))
-    bracket = beta * omega * s * (1.0 + C) + (jnp.abs(velocity_after) + beta * omega * s * C) * r**2 * ratio
-    bracket = bracket + beta * omega**2 / Omega * c * S * (r**2 * ratio + 1.0)
-    return 1.0 + bracket / closing
-
-
-def _sine_terms(frequency: Float[Array, ""], start: Float[Array, ""], impact_us: Float[Array, ""]) -> Float[Array, ""]:
-    """Return |sin a cos b| + |cos a sin b| for the phases a, b of the flight's end and start."""
-    end, begin = frequency * impact_us, frequency * start
-    return jnp.abs(jnp.sin(end) * jnp.cos(begin)) + jnp.abs(jnp.cos(end) * jnp.sin(begin))
+def growth_of_rounding(written: dict[str, Written]) -> Floats:
+    """Return how much rounding errors grow on the way to what vanishes at grazing or capture: shape (states,)."""
+    growths = [np.asarray(written[name].rounding) / np.abs(np.asarray(written[name].value)) for name in LIMITS]
+    return np.max(growths, axis=0)
 
 
 BLOCK = 2048
@@ -414,28 +348,28 @@ serves any number of states."""
 MOST_BLOCKS = 20
 
 
-class Pair(NamedTuple):
-    """A formula's value and the sum of the magnitudes of its terms, arrays of shape (states, ...)."""
-
-    value: Any
-    terms: Any
+LIMITS = ("approach", "squared rebound")
+"""What vanishes at grazing and at capture."""
+MODES = ("forward", "reverse")
 
 
 class Sample(NamedTuple):
-    """States of one kind whose next impact exists, arrays of shape (states, ...).
+    """States of one kind; all fields but ``kind`` are arrays of shape (states, ...).
 
-    ``ordinary``: neither close to capture or grazing, nor to both at once; see `is_ordinary`. ``away``: not close to
-    one of them alone. ``condition``: see `condition_number`. ``written``: by name
-    ("eq. 5", ...) the written formula's `Pair`.
+    ``exists``: the tip meets the platform again, at ``arrival_us``, and leaves it.
+    ``automatic``, ``written``: by name ("eq. 5", ...) what automatic differentiation gives, the second axis being the
+    mode, and the written formula. ``growth``: see `growth_of_rounding`. ``ordinary``: away from capture and grazing,
+    (r^2 u^2 - c u - epsilon)/(r^2 u^2) > 1e-5 and u > 1e-3 beta omega.
     """
 
     kind: Kind
     states: States
-    automatic: Automatic
-    written: dict[str, Pair]
+    exists: NDArray[np.bool_]
+    arrival_us: Floats
+    automatic: dict[str, Any]
+    written: dict[str, Written]
+    growth: Floats
     ordinary: NDArray[np.bool_]
-    away: NDArray[np.bool_]
-    condition: Floats
 
 
 def draw_sample(random: np.random.Generator, wanted: int, kind: Kind) -> Sample:
@@ -444,106 +378,55 @@ def draw_sample(random: np.random.Generator, wanted: int, kind: Kind) -> Sample:
     Raises:
         RuntimeError: if the impact map finds far fewer impacts than there are.
     """
-    evaluate = formula_evaluator(kind)
+    evaluate = written_formulas(paper=not kind.damped)
     blocks: list[Sample] = []
     while sum(int(block.ordinary.sum()) for block in blocks) < wanted:
         if len(blocks) > MOST_BLOCKS + 3 * wanted // BLOCK:
             raise RuntimeError(f"{len(blocks) * BLOCK} random states hold fewer than {wanted} ordinary impacts")
         states = random_states(random, BLOCK, kind)
         states = with_adhesion(random, states, np.asarray(differentiate(*states).approach))
-        automatic = differentiate(*states)
-        written = evaluate(states, automatic)
-        rows = np.asarray(automatic.hit)
-        with np.errstate(all="ignore"):  # rows without an impact
-            judged = is_ordinary(states.scene, automatic), is_away(states.scene, automatic)
-            block = Sample(kind, states, automatic, written, *judged, condition_number(states, automatic))
-        blocks.append(_take(block, rows))
-    return _join(blocks)
+        sample = sample_at(states, kind, evaluate)
+        blocks.append(rows_of(sample, sample.exists))
+    return joined(blocks)
 
 
-def formula_evaluator(kind: Kind) -> Callable[[States, Automatic], dict[str, Pair]]:
-    """Return a function that evaluates the written formulas of a kind at a batch of impacts.
-
-    It is compiled anew for every verification, so that a formula changed in between (as tests do) is the one checked.
-    """
-    compiled = jax.jit(jax.vmap(_paper_formulas if not kind.damped else _general_formulas))
-    chained = jax.jit(jax.vmap(formulas.map_jacobian))
-
-    def evaluate(states: States, automatic: Automatic) -> dict[str, Pair]:
-        written = compiled(states, automatic)
-        whole = chained(*states)
-        return {name: pair._replace(value=whole) if name == "eqs. 5+7" else pair for name, pair in written.items()}
-
-    return evaluate
-
-
-def _paper_formulas(state: States, impact: Automatic) -> dict[str, Pair]:
-    """Evaluate the paper's formulas as printed at one impact."""
-    scene, time, velocity = state
-    law = formula_of(scene)
-    flight = formulas.paper_flight(scene.cantilever, scene.platform, time, velocity, impact.arrival_us)
-    terms5, terms7 = eq5_terms(flight, time, impact.arrival_us), eq7_terms(flight, impact.before, law.r, law.epsilon)
-    general = _general_formulas(state, impact)
-    return {
-        "eq. 5": Pair(formulas.eq5(flight), terms5),
-        "eq. 6": general["eq. 6"],
-        "eq. 7": Pair(formulas.eq7(flight, impact.before, law.r, law.epsilon), terms7),
-        "eqs. 5+7": Pair(terms7, terms7 @ terms5),
+def sample_at(states: States, kind: Kind, evaluate: Callable[[States, Automatic], dict[str, Written]]) -> Sample:
+    """Return what is compared at states, whether or not a next impact exists."""
+    automatic = differentiate(*states)
+    written = evaluate(states, automatic)
+    with np.errstate(all="ignore"):  # states without an impact
+        ordinary = np.asarray(automatic.approach) > CLOSE_TO_GRAZING * np.asarray(
+            states.scene.platform.top_speed_nm_per_us
+        )
+        ordinary &= np.asarray(automatic.margin) > CLOSE_TO_CAPTURE
+        growth = growth_of_rounding(written)
+    values = {
+        "eq. 5": automatic.flight,
+        "eq. 6": automatic.rebound,
+        "eq. 7": automatic.law,
+        "eqs. 5+7": automatic.chained,
     }
+    arrival = np.asarray(automatic.arrival_us)
+    return Sample(kind, states, np.asarray(automatic.hit), arrival, values, written, growth, ordinary)
 
 
-def _general_formulas(state: States, impact: Automatic) -> dict[str, Pair]:
-    """Evaluate the formulas with damping, viscous loss and delay at one impact."""
-    scene, time, velocity = state
-    law = formula_of(scene)
-    flight = scene.cantilever, scene.platform, time, velocity, impact.arrival_us
-    arriving = law, scene.platform, impact.arrival_us, impact.before
-    terms5, terms7 = flight_terms(*flight), impact_terms(*arriving)
-    return {
-        "eq. 5": Pair(formulas.flight_jacobian(*flight), terms5),
-        "eq. 6": _eq6(scene, impact),
-        "eq. 7": Pair(formulas.impact_jacobian(*arriving), terms7),
-        "eqs. 5+7": Pair(terms7, terms7 @ terms5),  # the value is `map_jacobian`'s, which finds the impact itself
-    }
+def relative_difference(value: Floats, exact: Floats, scale: Floats) -> Floats:
+    """Return |value - exact| over a scale, the largest of each state: shape (states,).
 
-
-def _eq6(scene: Scene, impact: Automatic) -> Pair:
-    """Return u_out of eq. 6 and its four slopes, shape (5,)."""
-    law = formula_of(scene)
-    square = squared_rebound_speed(impact.approach, law.r, law.epsilon, law.viscous_loss)
-    slopes, terms = eq6_slopes(impact.approach, law)
-    moving = jnp.abs(impact.after) + jnp.abs(scene.platform.velocity(impact.leaving_us))
-    return Pair(jnp.concatenate([jnp.sqrt(square)[None], slopes]), jnp.concatenate([moving[None], terms]))
-
-
-def automatic_values(sample: Sample) -> dict[str, Floats]:
-    """Return by equation what automatic differentiation gives, the second axis being the mode."""
-    automatic = sample.automatic
-    rebound = np.asarray(automatic.rebound)
-    both = np.stack([rebound, rebound], axis=1)[..., None]
-    return {
-        "eq. 5": np.asarray(automatic.flight),
-        "eq. 6": np.concatenate([both, np.asarray(automatic.slopes)], axis=-1),
-        "eq. 7": np.asarray(automatic.law),
-        "eqs. 5+7": np.asarray(automatic.chained),
-    }
-
-
-def relative_difference(value: Floats, exact: Floats, terms: Floats) -> Floats:
-    """Return |value - exact| over the terms' sum, the largest of each state: shape (states,).
-
-    Where a formula has no terms the value must be exactly its own; what is not a number counts as infinitely wrong.
+    Where the scale is 0 both must be equal; what is not a number counts as infinitely wrong.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         difference = np.abs(value - exact)
-        relative = np.where(difference == 0.0, 0.0, difference / terms)
-    return np.where(np.isnan(relative), np.inf, relative).reshape(len(value), -1).max(axis=1, initial=0.0)
+        relative = np.where(difference == 0.0, 0.0, difference / scale)
+    return np.where(np.isnan(relative), np.inf, relative).max(axis=tuple(range(1, relative.ndim)), initial=0.0)
 
 
-def _take(sample: Sample, rows: NDArray[np.bool_]) -> Sample:
+def rows_of(sample: Sample, rows: NDArray[Any]) -> Sample:
+    """Return chosen states of a sample, by a mask or by their numbers."""
     return Sample(sample.kind, *jax.tree.map(lambda array: np.asarray(array)[rows], tuple(sample[1:])))
 
 
-def _join(samples: list[Sample]) -> Sample:
-    parts = [tuple(sample[1:]) for sample in samples]
-    return Sample(samples[0].kind, *jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts))
+def joined(samples: list[Sample]) -> Sample:
+    """Return samples of one kind as one."""
+    fields = [tuple(sample[1:]) for sample in samples]
+    return Sample(samples[0].kind, *jax.tree.map(lambda *arrays: np.concatenate(arrays), *fields))
