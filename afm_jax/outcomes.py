@@ -1,10 +1,14 @@
-"""How a flight or the search for an orbit ended: an enumeration, and a sentence each.
+"""How things end, in words: enumerations with a sentence each, and rules by which a result is judged.
 
-Results carry these as integers per row, so that they pass through ``jit`` and ``vmap``;
-``Outcome(int(result.outcome)).sentence`` says it in words.
+Results carry outcomes as integers per row, so that they pass through ``jit`` and ``vmap``;
+``Outcome(int(result.outcome)).sentence`` says it in words. A verdict is a list of rules: `judge` returns the sentences
+of those that apply to what was found.
 """
 
 import enum
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 
 class Outcome(enum.IntEnum):
@@ -65,3 +69,40 @@ _COLLISION_SENTENCES = {
         "The integration did not resolve this impact: its dissipation is too strong for the steps taken."
     ),
 }
+
+
+E = TypeVar("E")
+
+
+@dataclass(frozen=True)
+class Rule(Generic[E]):
+    """A sentence that is said of a result where something is the case.
+
+    Attributes:
+        when: the cases of it that a result's evidence shows, a sentence for each; or whether it is the case at all.
+        sentence: of the evidence, and of one of these cases.
+    """
+
+    when: Callable[[E], Iterable[Any] | bool]
+    sentence: Callable[[E, Any], str]
+
+    def said_of(self, evidence: E) -> list[str]:
+        """Return what the rule says of a result: a sentence for each case."""
+        cases = self.when(evidence)
+        each = cases if isinstance(cases, Iterable) else [True] * bool(cases)
+        return [self.sentence(evidence, case) for case in each]
+
+
+def judge(rules: Sequence[Rule[E] | tuple[Rule[E], ...]], evidence: E) -> list[str]:
+    """Return the sentences of the rules that apply; among rules in brackets the first that applies speaks alone.
+
+    >>> hot = Rule(lambda kelvin: kelvin > 373.0, lambda kelvin, _: f"{kelvin:g} K: water boils.")
+    >>> warm = Rule(lambda kelvin: kelvin > 300.0, lambda *_: "It is warm.")
+    >>> judge([(hot, warm)], 400.0), judge([hot, warm], 400.0)
+    (['400 K: water boils.'], ['400 K: water boils.', 'It is warm.'])
+    """
+    sentences = []
+    for rule in rules:
+        group = (rule,) if isinstance(rule, Rule) else rule
+        sentences += next((said for said in (member.said_of(evidence) for member in group) if said), [])
+    return sentences

@@ -525,3 +525,44 @@ def with_inflated_errors(objective: Objective, model_errors: ModelErrors) -> Obj
     total = np.hypot(error, padding(model_errors.model_error, amplitude))
     used = np.asarray(rows.measured) & ~model_errors.set_aside[:, None]
     return objective.with_rows(error_nm=np.where(used, total, 1.0), measured=used)
+
+
+_MODEL_ERROR_ROUNDS = 3
+_FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
+"""Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
+
+
+def minimum_with_model_errors(stated: Objective) -> tuple[Objective, Minimum, ModelErrors, bool]:
+    """Return the minimum with the model's own error in the weights and inaccurate rows excluded, until both settle.
+
+    The last is True if hardly a row of a driven tip is left then: they are not excluded, and the law is refused.
+    """
+    minimum = minimise(stated)
+    model_errors = model_errors_of(stated, stated.problem.values(minimum.coordinates))
+    if not stated.problem.lasting:
+        return stated, minimum, model_errors, False
+    if _few_left(stated, model_errors, minimum):
+        return stated, minimum, model_errors, True
+    objective = with_inflated_errors(stated, model_errors)
+    for _ in range(_MODEL_ERROR_ROUNDS):
+        minimum = settle(objective, minimum)
+        again = model_errors_of(stated, stated.problem.values(minimum.coordinates))
+        same = np.array_equal(again.set_aside, model_errors.set_aside)
+        close = np.allclose(again.model_error, model_errors.model_error, rtol=0.02)
+        if _few_left(stated, again, minimum):
+            return stated, minimum, again, True
+        if same and close:
+            return objective, minimum, model_errors, False
+        objective, model_errors = with_inflated_errors(stated, again), again
+    return objective, settle(objective, minimum), model_errors, False
+
+
+def _few_left(stated: Objective, model_errors: ModelErrors, minimum: Minimum) -> bool:
+    """Say whether the law has an orbit on fewer than four accurate rows of a driven tip, or on fewer than a fifth."""
+    if not stated.problem.tapping:
+        return False
+    rows = stated.measurement.rows
+    hits = np.asarray(rows.measured).any(axis=1) & ~np.asarray(rows.free)
+    lost = lost_rows(stated, stated.problem.values(minimum.coordinates))
+    left = int((hits & ~lost & ~model_errors.set_aside).sum())
+    return bool(left < max(_FEWEST_LEFT, _LEAST_LEFT * hits.sum()))

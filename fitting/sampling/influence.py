@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import whole_covariance_of
 from fitting.fits.discrepancy import LawBefore
-from fitting.fits.fit import law_before, speed_range
+from fitting.fits.estimate import law_before, speed_range
 from fitting.fits.intervals import at_bound
 from fitting.fits.objective import Objective
 from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, fit_data_sets
