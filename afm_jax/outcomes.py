@@ -80,24 +80,31 @@ class Rule(Generic[E]):
 
     Attributes:
         when: the cases of it that a result's evidence shows, a sentence for each; or whether it is the case at all.
-        sentence: of the evidence, and of one of these cases.
+        sentence: what is said, with `{e.name}` for what the evidence has, and `{case}` for one of the cases; or a
+            function of evidence and case.
     """
 
     when: Callable[[E], Iterable[Any] | bool]
-    sentence: Callable[[E, Any], str]
+    sentence: str | Callable[[E, Any], str]
 
     def said_of(self, evidence: E) -> list[str]:
         """Return what the rule says of a result: a sentence for each case."""
-        cases = self.when(evidence)
+        cases, sentence = self.when(evidence), self.sentence
         each = cases if isinstance(cases, Iterable) else [True] * bool(cases)
-        return [self.sentence(evidence, case) for case in each]
+        if isinstance(sentence, str):
+            return [sentence.format(e=evidence, case=case) for case in each]
+        return [sentence(evidence, case) for case in each]
 
 
-def judge(rules: Sequence[Rule[E] | tuple[Rule[E], ...]], evidence: E) -> list[str]:
-    """Return the sentences of the rules that apply; among rules in brackets the first that applies speaks alone.
+Rules = Sequence[Rule[E] | tuple[Rule[E], ...]]
+"""Rules in the order in which they speak; of those in brackets the first that applies speaks alone."""
 
-    >>> hot = Rule(lambda kelvin: kelvin > 373.0, lambda kelvin, _: f"{kelvin:g} K: water boils.")
-    >>> warm = Rule(lambda kelvin: kelvin > 300.0, lambda *_: "It is warm.")
+
+def judge(rules: Rules[E], evidence: E) -> list[str]:
+    """Return the sentences of the rules that apply.
+
+    >>> hot = Rule(lambda kelvin: kelvin > 373.0, "{e:g} K: water boils.")
+    >>> warm = Rule(lambda kelvin: kelvin > 300.0, "It is warm.")
     >>> judge([(hot, warm)], 400.0), judge([hot, warm], 400.0)
     (['400 K: water boils.'], ['400 K: water boils.', 'It is warm.'])
     """

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from afm_jax.outcomes import Rule, judge
+from afm_jax.outcomes import Rule, Rules, judge
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
@@ -126,11 +126,6 @@ class Evidence:
         return self.tapped and any(not self.parameters[name].undetermined for name in law)
 
     @property
-    def to_be_determined(self) -> list[str]:
-        """Names of the parameters that are not determined, and must be."""
-        return [] if self.may_stay_open else self.undetermined
-
-    @property
     def pulled(self) -> dict[str, float]:
         """How far each parameter is from what was measured of it otherwise, in standard errors of that."""
         known = {name: (p.value, *p.constraint) for name, p in self.parameters.items() if p.constraint is not None}
@@ -140,6 +135,16 @@ class Evidence:
     def outliers(self) -> Bool[np.ndarray, " rows"]:
         """Which rows are far off."""
         return np.any(np.abs(np.nan_to_num(self.rows.residual)) > OUTLIER, axis=1)
+
+    @property
+    def most_outliers(self) -> float:
+        """How many outliers a robust fit may have."""
+        return max(1.0, MOST_OUTLIERS * self.rows.used.sum())
+
+    @property
+    def chi2_per_freedom(self) -> float:
+        """chi2 over the degrees of freedom."""
+        return self.chi2 / self.freedom
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
@@ -188,34 +193,22 @@ def correlation_excess(residual: Float[np.ndarray, "rows k"]) -> float:
     return float(np.sum(bounded[1:] * bounded[:-1]) / np.sqrt(others / count))
 
 
-def _one_sided(evidence: Evidence) -> float:
-    """Return by how many standard deviations some rows are off to one side; 0.0 where that is not much, or not asked.
+def _one_sided(evidence: Evidence) -> list[str]:
+    """Return that some rows are off to one side: chance gives as large residuals of either sign.
 
-    Chance gives as large residuals of either sign. A robust fit is for such rows, and those of tables whose laws
-    scatter about the predicted one are off together.
+    A robust fit is for such rows, and those of tables whose laws scatter about the predicted one are off together.
     """
-    of_row, rows = _residual_of_rows(evidence)
-    if rows <= _FEWEST_NEIGHBOURS or evidence.robust or evidence.scattering:
-        return 0.0
-    excess = float(np.sum(of_row**3) / np.sqrt(15.0 * rows))
-    return excess if abs(excess) >= _ONE_SIDED else 0.0
-
-
-def _residual_of_rows(evidence: Evidence) -> tuple[Float[np.ndarray, " rows"], int]:
-    """Return the residual of each row, all its readings together, in units of one; and how many rows have any."""
     residual = evidence.rows.residual if evidence.unwidened is None else evidence.unwidened
     count = np.isfinite(residual).sum(axis=1)
-    return np.nansum(residual, axis=1) / np.sqrt(np.maximum(count, 1)), int((count > 0).sum())
-
-
-def _rows_to_one_side(evidence: Evidence, excess: float) -> str:
-    of_row, rows = _residual_of_rows(evidence)
-    far = np.sort(np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)])
+    of_row = np.nansum(residual, axis=1) / np.sqrt(np.maximum(count, 1))
+    rows = int((count > 0).sum())
+    excess = float(np.sum(of_row**3) / np.sqrt(15.0 * max(rows, 1)))
+    if rows <= _FEWEST_NEIGHBOURS or abs(excess) < _ONE_SIDED or evidence.robust or evidence.scattering:
+        return []
+    far = np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)]
     side = "above" if excess > 0.0 else "below"
-    return (
-        f"residuals are far off to one side ({excess:+.1f} standard deviations of their cubes): predicted {side} what "
-        f"was read for {_lines(evidence, far)}"
-    )
+    said = f"residuals are far off to one side ({excess:+.1f} standard deviations of their cubes)"
+    return [f"{said}: predicted {side} what was read for {_lines(evidence, np.sort(far))}"]
 
 
 def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
@@ -233,10 +226,36 @@ def _pull_in_words(evidence: Evidence, name: str, pull: float) -> str:
     return f"{name} = {parameter.value:.5g} is {abs(pull):.1f} standard errors from the given {given:g} +- {error:.2g}"
 
 
-def _distance_in_words(distance: float) -> str:
-    if not np.isfinite(distance):
-        return "chi2 bends downwards where the search ended, which is no minimum"
-    return f"chi2 lies an estimated {distance:.2g} above its minimum"
+def _contradicted(evidence: Evidence) -> list[str]:
+    """Return by how much scaled amplitudes contradict what is known beforehand, taken together, in words."""
+    pulls = evidence.pulled
+    if evidence.error_scale is None or not pulls:
+        return []
+    improbable = chi2_tail(sum(pull**2 for pull in pulls.values()), len(pulls)) < IMPROBABLE
+    return [", ".join(f"{name} by {pull:+.1f}" for name, pull in pulls.items())] if improbable else []
+
+
+def _torn(evidence: Evidence) -> list[str]:
+    """Return what the amplitudes contradict of what was measured otherwise, in words."""
+    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.pulled.items() if abs(pull) > _TORN]
+    return ["; ".join(torn)] if torn else []
+
+
+def _not_converged(evidence: Evidence) -> list[str]:
+    """Return how far the search is from a minimum, in words."""
+    convergence = evidence.convergence
+    if convergence.converged:
+        return []
+    distance = f"chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
+    if not np.isfinite(convergence.estimated_distance):
+        distance = "chi2 bends downwards where the search ended, which is no minimum"
+    return [distance + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")]
+
+
+def _not_explained(evidence: Evidence) -> list[str]:
+    """Return on which grounds the model does not explain the data, and what may be the reason, in words."""
+    grounds = misfits(evidence)
+    return [f"{'; '.join(grounds)}. {_why_not_explained(evidence)}"] if grounds else []
 
 
 def _why_not_explained(evidence: Evidence) -> str:
@@ -284,12 +303,13 @@ def _unexplained_tables(evidence: Evidence) -> str:
     return "".join(words for _, words in sorted(named, reverse=True))
 
 
-def _disagreeing(evidence: Evidence) -> str:
+def _disagreeing(evidence: Evidence) -> list[str]:
     """Return which tables' laws are not that of the others, in words; nothing where all may have one."""
     pulls = np.array(evidence.pulls)
     far = np.flatnonzero(pulls * pulls.size < IMPROBABLE)
     named = sorted(far, key=lambda t: pulls[t])
-    return "; ".join(f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in named)
+    said = [f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in named]
+    return ["; ".join(said)] if said else []
 
 
 def value_at_bound(value: float) -> str:
@@ -358,42 +378,59 @@ _FASTEST_KHZ, _SMALLEST_NM = 2e4, 1.0
 """What no cantilever is faster than, and what amplitude impacts take at least: a bridge alone is that long."""
 
 
-def _fastest_khz(evidence: Evidence) -> float:
-    return max(table.free_frequency_khz for table in evidence.table.tables)
-
-
-def _usual_nm(evidence: Evidence) -> float:
+def _usual_nm(evidence: Evidence) -> list[float]:
+    """Return the median of the amplitudes, none where nothing was read."""
     read = evidence.rows.measured_nm[np.isfinite(evidence.rows.measured_nm)]
-    return float(np.median(read)) if read.size else _SMALLEST_NM
+    return [float(np.median(read))] if read.size else []
 
 
-def _named_limit(evidence: Evidence, name: str) -> str:
-    parameter = evidence.parameters[name]
-    low, high = parameter.interval95
-    limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
-    reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
-    return f"{name} is at its bound, {value_at_bound(parameter.value)}{reading}."
+def _limits(evidence: Evidence) -> list[str]:
+    """Return which parameters are at their bounds, and the limits that they are to be read as, in words.
+
+    Where the model does not explain the data, a bound is only where the misfit pushed the parameter.
+    """
+    found = []
+    for name, parameter in {} if misfits(evidence) else evidence.parameters.items():
+        low, high = parameter.interval95
+        if parameter.at_bound:
+            limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
+            reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
+            found.append(f"{name} is at its bound, {value_at_bound(parameter.value)}{reading}")
+    return found
 
 
-def _other_minimum(evidence: Evidence, other: tuple[dict[str, float], float]) -> str:
-    values = ", ".join(f"{name} = {value:.5g}" for name, value in other[0].items())
-    return (
-        f"Another minimum explains the data about as well (chi2 {other[1]:.1f}, here {evidence.chi2:.1f}): {values}; "
-        "the band of the law and the intervals hold both."
-    )
+def _other_minimum(evidence: Evidence) -> list[str]:
+    if evidence.other_minimum is None:
+        return []
+    values, chi2 = evidence.other_minimum
+    said = ", ".join(f"{name} = {value:.5g}" for name, value in values.items())
+    return [f"chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {said}"]
 
 
 def _open_ones(evidence: Evidence) -> list[str]:
-    """Return the names of parameters whose intervals are open to both sides, where nothing worse is known."""
+    """Return the parameters whose intervals are open to both sides, where nothing worse is known, in words."""
     # a tapping curve tells those of the delay only together; the law does not hang on each
     together = (*(DELAY_NAMES if evidence.table.tapping else ()), *evidence.undetermined)
-    if misfits(evidence) or evidence.to_be_determined:
+    if misfits(evidence) or _not_identified(evidence):
         return []
     return [
-        name
+        f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}"
         for name, parameter in evidence.parameters.items()
         if name not in together and parameter.interval95 == (None, None)
     ]
+
+
+def _not_identified(evidence: Evidence) -> list[str]:
+    """Return the parameters that the data do not determine and must, with what to measure, in words."""
+    names = [] if evidence.may_stay_open else evidence.undetermined
+    return [f"{' and '.join(names)}; {_advice(names)}"] if names else []
+
+
+def _may_be_anything(evidence: Evidence) -> list[str]:
+    """Return the parameters that taps leave open, in words; nothing where the model does not explain the data."""
+    names = evidence.undetermined if evidence.may_stay_open and not misfits(evidence) else []
+    said = f"{' and '.join(names)}, anything within their ranges explains them, and the law's band takes that in"
+    return [f"{said}; {_advice(names)}"] if names else []
 
 
 def _advice(names: list[str]) -> str:
@@ -404,45 +441,53 @@ def _held_in_words(held: Held) -> str:
     return f"{held.name} = {held.value:.4g} +- {held.error:.2g}"
 
 
-def _assumed(_: Evidence, held: list[Held]) -> str:
+def _assumed(evidence: Evidence) -> list[str]:
+    """Return what is held with errors that are assumed, and how to say them, in words."""
+    held = [held for held in evidence.held if held.assumed]
+    if not held:
+        return []
     better = f"{held[0].name}={held[0].value:.4g}+-{0.1 * held[0].error:.2g}"
-    return (
-        f"Held, with errors that are assumed: {', '.join(map(_held_in_words, held))}; law, band and intervals hang on "
-        f"them: say what is known better, like --constrain {better}."
-    )
+    said = f"{', '.join(map(_held_in_words, held))}; law, band and intervals hang on them"
+    return [f"{said}: say what is known better, like --constrain {better}"]
 
 
-def _hanging(evidence: Evidence, case: tuple[str, tuple[str, ...]]) -> str:
-    name, others = case
+def _hanging(evidence: Evidence) -> list[str]:
+    """Return each fitted parameter whose error is mostly that of what is held, in words."""
     values = {held.name: _held_in_words(held) for held in evidence.held}
-    return f"{name} hangs on what is held: {', '.join(values[other] for other in others)}."
+    return [
+        f"{name} hangs on what is held: {', '.join(values[other] for other in others)}"
+        for name, others in evidence.hanging.items()
+    ]
 
 
 def _tied_pairs(evidence: Evidence) -> list[str]:
-    """Return the pairs of parameters that are determined only together, with their correlation."""
+    """Return the pairs of parameters that are determined only together, with their correlation, in words."""
     names, matrix = list(evidence.parameters), evidence.correlations
-    return [
+    pairs = [
         f"{names[i]} and {names[j]} ({matrix[i, j]:+.3f})"
         for i in range(len(names))
         for j in range(i + 1, len(names))
         if abs(matrix[i, j]) > _TIED
     ]
+    return [", ".join(pairs)] if pairs else []
 
 
-def _excluded(evidence: Evidence) -> dict[str, Any]:
-    """Return the rows that are excluded, by the reason."""
+def _excluded(evidence: Evidence) -> list[str]:
+    """Return the rows that are excluded, for every reason, in words."""
     rows = np.flatnonzero(evidence.rows.set_aside)
     reasons = evidence.rows.reasons or (TOO_SLOW,) * len(evidence.rows.set_aside)
-    return {
-        reason: np.array([row for row in rows if reasons[row] == reason])
+    return [
+        f"{reason}: {_lines(evidence, [row for row in rows if reasons[row] == reason])}"
         for reason in dict.fromkeys(reasons[row] for row in rows)
-    }
+    ]
 
 
-def _model_error(evidence: Evidence, rows: Any) -> str:
-    worst = 100.0 * float(evidence.rows.model_error[rows].max())
+def _model_error(evidence: Evidence) -> list[str]:
+    """Return how large a model error was added to which rows, in words."""
+    rows = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
+    worst = 100.0 * float(evidence.rows.model_error[rows].max(initial=0.0))
     small = "small amplitudes" if evidence.table.tapping else "slow impacts"
-    return f"A model error of up to {worst:.1f} % was added to the errors of {small}: {_lines(evidence, rows)}."
+    return [f"{worst:.1f} % was added to the errors of {small}: {_lines(evidence, rows)}"] if rows.size else []
 
 
 def _unseen(evidence: Evidence) -> Bool[np.ndarray, " rows"]:
@@ -457,32 +502,41 @@ def _neighbours_alike(evidence: Evidence) -> bool:
     return bool(abs(evidence.autocorrelation) > 3.0 / np.sqrt(pairs) and not _correlations(evidence))
 
 
-def _robust_loss(evidence: Evidence) -> str:
-    outliers = np.flatnonzero(evidence.outliers)
-    named = f"; outliers: {_lines(evidence, outliers)}" if outliers.size else ""
+def _robust_loss(evidence: Evidence) -> list[str]:
+    """Return the goodness of a robust fit without its outliers, and which these are, in words."""
+    if not evidence.robust:
+        return []
     chi2, freedom, p_value = _without_outliers(evidence)
-    goodness = f"{chi2:.1f}/{freedom}" + (f" (probability {p_value:.2g})" if freedom > 0 else "")
-    return f"Robust loss: chi2 counts outliers linearly; without them chi2/dof = {goodness}{named}."
+    probability = f" (probability {p_value:.2g})" if freedom > 0 else ""
+    outliers = "".join(f"; outliers: {lines}" for lines in _named(evidence, evidence.outliers))
+    return [f"{chi2:.1f}/{freedom}{probability}{outliers}"]
 
 
-def _course(evidence: Evidence, case: tuple[str, list[str]]) -> str:
-    label, courses = case
-    several = f"{label}: " if len(evidence.table.labels) > 1 else ""
-    return (
-        f"{several}Residuals follow the rows ({', '.join(courses)} from the first to the last), as drifts do. If the "
-        "rows stand as they were measured, say `# rows = in order of time`: drifts are then fitted along."
-    )
+def _courses(evidence: Evidence) -> list[str]:
+    """Return which readings follow the rows of each table, in words."""
+    several = len(evidence.table.labels) > 1
+    return [
+        f"{f'{label}: ' if several else ''}Residuals follow the rows ({', '.join(courses)} from the first to the last)"
+        for label, courses in evidence.courses.items()
+    ]
 
 
 def _untold_drifts(evidence: Evidence) -> list[str]:
-    """Return the drifts along the rows that are hardly told by anything but what is assumed of them."""
-    return [
+    """Return the drifts along the rows that are hardly told by anything but what is assumed of them, in words."""
+    drifts = [
         f"{name} = {known.constraint[0]:g} +- {known.constraint[1]:g}"
         for name, known in evidence.parameters.items()
         if parameter_called(name).name in DRIFT_NAMES
         and known.constraint is not None
         and (known.standard_error or np.inf) > 0.5 * known.constraint[1]
     ]
+    return [", ".join(drifts)] if drifts else []
+
+
+def _named(evidence: Evidence, marked: Bool[np.ndarray, " rows"]) -> list[str]:
+    """Return marked rows in words; nothing where no row is marked."""
+    rows = np.flatnonzero(marked)
+    return [_lines(evidence, rows)] if rows.size else []
 
 
 def _lines(evidence: Evidence, rows: Any) -> str:
@@ -492,244 +546,151 @@ def _lines(evidence: Evidence, rows: Any) -> str:
     return f"{'line' if len(numbers) == 1 else 'lines'} {shown}"
 
 
-def _any(rows: Any) -> list[Any]:
-    """Return the numbers of marked rows as one case; none where no row is marked."""
-    numbers = np.flatnonzero(rows)
-    return [numbers] if numbers.size else []
-
-
-def _together(parts: Any) -> list[Any]:
-    """Return everything as one case; none where there is nothing."""
-    return [parts] if parts else []
-
-
-MISFITS: tuple[Rule[Evidence] | tuple[Rule[Evidence], ...], ...] = (
-    Rule(
-        lambda e: e.p_value < IMPROBABLE,
-        lambda e, _: f"chi2/dof = {e.chi2 / e.freedom:.3g} (probability {e.p_value:.1g})",
-    ),
+MISFITS: Rules[Evidence] = (
+    Rule(lambda e: e.p_value < IMPROBABLE, "chi2/dof = {e.chi2_per_freedom:.3g} (probability {e.p_value:.1g})"),
     (
         Rule(
-            lambda e: e.robust and e.outliers.sum() > max(1.0, MOST_OUTLIERS * e.rows.used.sum()),
-            lambda e, _: (
-                f"{e.outliers.sum()} of {e.rows.used.sum()} rows are off by more than {OUTLIER:g} errors, and robust "
-                f"loss is for outliers in at most one row of {1.0 / MOST_OUTLIERS:g}"
-            ),
+            lambda e: [(n, e.rows.used.sum()) for n in [e.outliers.sum()] if e.robust and n > e.most_outliers],
+            "{case[0]} of {case[1]} rows are off by more than "
+            f"{OUTLIER:g} errors, and robust loss is for outliers in at most one row of {1.0 / MOST_OUTLIERS:g}",
         ),
         Rule(
-            lambda e: [rest for rest in [_without_outliers(e)] if e.robust and rest[2] < IMPROBABLE],
-            lambda _, rest: f"without outliers chi2/dof = {rest[0] / rest[1]:.3g} (probability {rest[2]:.1g})",
+            lambda e: [
+                (chi2 / freedom, p_value)
+                for chi2, freedom, p_value in [_without_outliers(e)]
+                if e.robust and p_value < IMPROBABLE
+            ],
+            "without outliers chi2/dof = {case[0]:.3g} (probability {case[1]:.1g})",
         ),
     ),
     Rule(
         lambda e: (e.error_scale or 0.0) > LARGEST_SCALE,
-        lambda e, _: (
-            f"the amplitudes' errors would have to be {e.error_scale:.3g} times those stated, and more than "
-            f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
-            "to within that)"
-        ),
+        "the amplitudes' errors would have to be {e.error_scale:.3g} times those stated, and more than "
+        f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
+        "to within that)",
     ),
+    Rule(_contradicted, "it contradicts what is known beforehand, in standard errors: {case}"),
     Rule(
-        lambda e: (
-            e.error_scale is not None
-            and bool(e.pulled)
-            and chi2_tail(sum(pull**2 for pull in e.pulled.values()), len(e.pulled)) < IMPROBABLE
-        ),
-        lambda e, _: (
-            "it contradicts what is known beforehand, in standard errors: "
-            + ", ".join(f"{name} by {pull:+.1f}" for name, pull in e.pulled.items())
-        ),
+        lambda e: [100.0 * e.short] if e.run[1] > _LONGEST_RUN else [],
+        "residuals run together over the approach speed ({e.run[0]:.1f} standard deviations; {e.run[1]:.1f} beside a "
+        "model discrepancy of {case:.0f} % of the loss)",
     ),
-    Rule(
-        lambda e: e.run[1] > _LONGEST_RUN,
-        lambda e, _: (
-            f"residuals run together over the approach speed ({e.run[0]:.1f} standard deviations; "
-            f"{e.run[1]:.1f} beside a model discrepancy of {100.0 * e.short:.0f} % of the loss)"
-        ),
-    ),
-    Rule(lambda e: _together(_one_sided(e)), _rows_to_one_side),
-    Rule(
-        _correlations,
-        lambda _, case: f"neighbouring residuals {case[0]} are correlated ({case[1]:+.1f} standard deviations)",
-    ),
+    Rule(_one_sided, "{case}"),
+    Rule(_correlations, "neighbouring residuals {case[0]} are correlated ({case[1]:+.1f} standard deviations)"),
 )
 """Grounds on which the model does not explain the amplitudes, each a clause."""
 
-REASONS: tuple[Rule[Evidence] | tuple[Rule[Evidence], ...], ...] = (
+REASONS: Rules[Evidence] = (
     (
-        Rule(
-            lambda e: e.convergence.reason is not None,
-            lambda e, _: f"Not converged: {e.convergence.reason}.",
-        ),
-        Rule(
-            lambda e: _together(e.to_be_determined),
-            lambda _, names: (
-                f"Not identified: the amplitudes do not determine {' and '.join(names)}; {_advice(names)}."
-            ),
-        ),
-        Rule(
-            lambda e: not e.convergence.converged,
-            lambda e, _: (
-                f"Not converged: {_distance_in_words(e.convergence.estimated_distance)}"
-                f"{'' if e.convergence.outward else ', and a parameter is held at a bound it would leave'}."
-            ),
-        ),
+        Rule(lambda e: e.convergence.reason is not None, "Not converged: {e.convergence.reason}."),
+        Rule(_not_identified, "Not identified: the amplitudes do not determine {case}."),
+        Rule(_not_converged, "Not converged: {case}."),
+    ),
+    Rule(lambda e: _named(e, (e.rows.orbits == 0) & e.rows.used), "No stable orbit at the fitted law for {case}."),
+    Rule(
+        lambda e: [_lines(e, e.untabulated)] if e.untabulated else [],
+        "The table of the fitted contact's impacts misses its accuracy for {case}: the contact's numbers are too "
+        "extreme; hold some of them fixed.",
+    ),
+    Rule(_not_explained, "The model does not explain the data: {case}"),
+    Rule(
+        lambda e: e.stuck is not None,
+        "Not converged: to first order the model discrepancy would lower chi2 from {e.stuck[0]:.1f} to "
+        "{e.stuck[1]:.1f}, but computed not even a sixteenth of it does; the amplitudes are far from linear in the "
+        "law, as they are near folds: leave such rows out.",
     ),
     Rule(
-        lambda e: _any((e.rows.orbits == 0) & e.rows.used),
-        lambda e, rows: f"No stable orbit at the fitted law for {_lines(e, rows)}.",
+        _torn,
+        "The amplitudes contradict what is known beforehand: {case}. "
+        "Either that is wrong, or the model makes up for what it lacks.",
     ),
     Rule(
-        lambda e: _together(e.untabulated),
-        lambda e, rows: (
-            f"The table of the fitted contact's impacts misses its accuracy for {_lines(e, rows)}: the contact's "
-            "numbers are too extreme; hold some of them fixed."
-        ),
+        lambda e: [] if e.scattering else _disagreeing(e),
+        "The tables do not have one law: {case}; look at what is different there, leave it out, or let laws differ "
+        "from table to table (--hierarchical).",
     ),
-    Rule(
-        lambda e: _together(misfits(e)),
-        lambda e, grounds: f"The model does not explain the data: {'; '.join(grounds)}. {_why_not_explained(e)}",
-    ),
-    Rule(
-        lambda e: _together(e.stuck),
-        lambda _, chi2: (
-            f"Not converged: to first order the model discrepancy would lower chi2 from {chi2[0]:.1f} to "
-            f"{chi2[1]:.1f}, but computed not even a sixteenth of it does; the amplitudes are far from linear in the "
-            "law, as they are near folds: leave such rows out."
-        ),
-    ),
-    Rule(
-        lambda e: _together([_pull_in_words(e, name, pull) for name, pull in e.pulled.items() if abs(pull) > _TORN]),
-        lambda _, torn: (
-            f"The amplitudes contradict what is known beforehand: {'; '.join(torn)}. "
-            "Either that is wrong, or the model makes up for what it lacks."
-        ),
-    ),
-    Rule(
-        lambda e: _together("" if e.scattering else _disagreeing(e)),
-        lambda _, tables: (
-            f"The tables do not have one law: {tables}; look at what is different there, leave it out, or let laws "
-            "differ from table to table (--hierarchical)."
-        ),
-    ),
-    Rule(
-        lambda e: e.freedom <= 0,
-        lambda *_: "As many parameters as amplitudes: the goodness of fit cannot be judged.",
-    ),
-    Rule(
-        _open_ones,
-        lambda e, name: f"{name} is not identified: {e.parameters[name].interval_reason}; {helpful_measurement(name)}.",
-    ),
+    Rule(lambda e: e.freedom <= 0, "As many parameters as amplitudes: the goodness of fit cannot be judged."),
+    Rule(_open_ones, "{case}."),
 )
 """What makes a fit invalid."""
 
-WARNINGS: tuple[Rule[Evidence], ...] = (
-    Rule(_damping_warnings, lambda _, said: said),
+WARNINGS: Rules[Evidence] = (
+    Rule(_damping_warnings, "{case}"),
     Rule(
         lambda e: e.table.mass_ng is None and e.contact,
-        lambda *_: f"1 ng assumed: {NO_MASS}. Each of the contact's parameters hangs on it.",
+        f"1 ng assumed: {NO_MASS}. Each of the contact's parameters hangs on it.",
     ),
     Rule(
-        lambda e: _fastest_khz(e) > _FASTEST_KHZ,
-        lambda e, _: (
-            f"free_frequency_khz = {_fastest_khz(e):g} is more than any cantilever's: was it written in Hz for kHz?"
-        ),
+        lambda e: [f for f in [max(table.free_frequency_khz for table in e.table.tables)] if f > _FASTEST_KHZ],
+        "free_frequency_khz = {case:g} is more than any cantilever's: was it written in Hz for kHz?",
     ),
     Rule(
-        lambda e: _usual_nm(e) < _SMALLEST_NM,
-        lambda e, _: (
-            f"Amplitudes are {_usual_nm(e):.2g} nm in the median: were they written in micrometres for nanometres?"
-        ),
+        lambda e: [usual for usual in _usual_nm(e) if usual < _SMALLEST_NM],
+        "Amplitudes are {case:.2g} nm in the median: were they written in micrometres for nanometres?",
     ),
-    Rule(_repeat_warnings, lambda _, said: said),
+    Rule(_repeat_warnings, "{case}"),
+    Rule(lambda e: _disagreeing(e) if e.scattering else [], "Far from the mean law even for this scatter: {case}."),
+    Rule(_may_be_anything, "Not determined by these taps: {case}."),
     Rule(
-        lambda e: _together(_disagreeing(e) if e.scattering else ""),
-        lambda _, tables: f"Far from the mean law even for this scatter: {tables}.",
+        lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if _PULLED < abs(by) <= _TORN],
+        "{case}: check it, the loss hangs on it.",
     ),
-    Rule(
-        lambda e: _together(e.undetermined if e.may_stay_open and not misfits(e) else []),
-        lambda _, names: (
-            f"Not determined by these taps: {' and '.join(names)}, anything within their ranges explains them, and the "
-            f"law's band takes that in; {_advice(names)}."
-        ),
-    ),
-    Rule(
-        lambda e: [(name, pull) for name, pull in e.pulled.items() if _PULLED < abs(pull) <= _TORN],
-        lambda e, case: f"{_pull_in_words(e, *case)}: check it, the loss hangs on it.",
-    ),
-    Rule(
-        # where the model does not explain the data, a bound is only where the misfit pushed the parameter
-        lambda e: [name for name, known in e.parameters.items() if known.at_bound and not misfits(e)],
-        _named_limit,
-    ),
+    Rule(_limits, "{case}."),
     Rule(
         lambda e: [name for name, known in e.parameters.items() if known.did_not_move],
-        lambda _, name: f"{name} did not move from the grid point it started at.",
-    ),
-    Rule(lambda e: _together(e.other_minimum), _other_minimum),
-    Rule(
-        lambda e: _together(_tied_pairs(e)),
-        lambda _, pairs: (
-            f"Determined only together, hardly apart: {', '.join(pairs)}. The law may be sharp all the same: see its "
-            "band."
-        ),
+        "{case} did not move from the grid point it started at.",
     ),
     Rule(
-        lambda e: e.run[0] >= _RUN and e.short > 0.0,
-        lambda e, _: (
-            f"Residuals run together over the approach speed ({e.run[0]:.1f} standard deviations): the model lacks a "
-            f"shape; a model discrepancy of {100.0 * e.short:.0f} % of the loss at any speed is in law, band and "
-            "intervals."
-        ),
-    ),
-    Rule(lambda e: _together([held for held in e.held if held.assumed]), _assumed),
-    Rule(lambda e: e.hanging.items(), _hanging),
-    Rule(
-        lambda e: _excluded(e).items(),
-        lambda e, case: f"Set aside, because these impacts are {case[0]}: {_lines(e, case[1])}.",
-    ),
-    Rule(lambda e: _any(e.rows.used & (e.rows.model_error > _STATED)), _model_error),
-    Rule(
-        lambda e: _any(_unseen(e)),
-        lambda e, rows: (
-            f"No orbit was seen, though the fitted model has a steady one, for {_lines(e, rows)}: the tip may have "
-            "settled on another motion; start it otherwise, or remove the row."
-        ),
+        _other_minimum,
+        "Another minimum explains the data about as well ({case}; the band of the law and the intervals hold both.",
     ),
     Rule(
-        lambda e: _any(e.rows.orbits > 1),
-        lambda e, rows: (
-            f"Several stable orbits coexist for {_lines(e, rows)}: the one closest to the measurement was taken."
-        ),
+        _tied_pairs,
+        "Determined only together, hardly apart: {case}. The law may be sharp all the same: see its band.",
     ),
     Rule(
-        lambda e: _any(e.rows.near_fold),
-        lambda e, rows: f"Close to a fold, where errors are not linear: {_lines(e, rows)}.",
+        lambda e: [100.0 * e.short] if e.run[0] >= _RUN and e.short > 0.0 else [],
+        "Residuals run together over the approach speed ({e.run[0]:.1f} standard deviations): the model lacks a "
+        "shape; a model discrepancy of {case:.0f} % of the loss at any speed is in law, band and intervals.",
     ),
+    Rule(_assumed, "Held, with errors that are assumed: {case}."),
+    Rule(_hanging, "{case}."),
+    Rule(_excluded, "Set aside, because these impacts are {case}."),
+    Rule(_model_error, "A model error of up to {case}."),
+    Rule(
+        lambda e: _named(e, _unseen(e)),
+        "No orbit was seen, though the fitted model has a steady one, for {case}: the tip may have settled on another "
+        "motion; start it otherwise, or remove the row.",
+    ),
+    Rule(
+        lambda e: _named(e, e.rows.orbits > 1),
+        "Several stable orbits coexist for {case}: the one closest to the measurement was taken.",
+    ),
+    Rule(lambda e: _named(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
     Rule(
         _neighbours_alike,
-        lambda e, _: f"Neighbouring residuals are correlated ({e.autocorrelation:+.2f}): something systematic is left.",
+        "Neighbouring residuals are correlated ({e.autocorrelation:+.2f}): something systematic is left.",
     ),
-    Rule(lambda e: e.robust, lambda e, _: _robust_loss(e)),
+    Rule(_robust_loss, "Robust loss: chi2 counts outliers linearly; without them chi2/dof = {case}."),
     Rule(
         lambda e: e.error_scale is not None,
-        lambda e, _: (
-            f"The amplitudes' errors were scaled by {e.error_scale:.3g} so that chi2/dof = 1: whether they are of the "
-            f"right size cannot be judged, only that the scale is believable (at most {LARGEST_SCALE:g}) and that "
-            "residuals are random."
-        ),
+        "The amplitudes' errors were scaled by {e.error_scale:.3g} so that chi2/dof = 1: whether they are of the right "
+        f"size cannot be judged, only that the scale is believable (at most {LARGEST_SCALE:g}) and that residuals are "
+        "random.",
     ),
     Rule(
         lambda e: e.error_scale is None and e.p_value > 1.0 - 1e-6,
-        lambda *_: "The errors look too large: chi2 is improbably small.",
+        "The errors look too large: chi2 is improbably small.",
     ),
-    Rule(lambda e: e.courses.items(), _course),
     Rule(
-        lambda e: _together(_untold_drifts(e)),
-        lambda _, drifts: (
-            f"Hardly told by the rows, which stand in order of time, only assumed: {', '.join(drifts)}. Rows of the "
-            "free tip before and after the others tell drifts; `--constrain` takes what is known of them."
-        ),
+        _courses,
+        "{case}, as drifts do. If the rows stand as they were measured, say `# rows = in order of time`: drifts are "
+        "then fitted along.",
+    ),
+    Rule(
+        _untold_drifts,
+        "Hardly told by the rows, which stand in order of time, only assumed: {case}. Rows of the free tip before and "
+        "after the others tell drifts; `--constrain` takes what is known of them.",
     ),
 )
 """What a reader should know besides."""
