@@ -1,10 +1,14 @@
-"""How a flight or the search for an orbit ended: an enumeration, and a sentence each.
+"""How things end, in words: enumerations with a sentence each, and rules by which a result is judged.
 
-Results carry these as integers per row, so that they pass through ``jit`` and ``vmap``;
-``Outcome(int(result.outcome)).sentence`` says it in words.
+Results carry outcomes as integers per row, so that they pass through ``jit`` and ``vmap``;
+``Outcome(int(result.outcome)).sentence`` says it in words. A verdict is a list of rules: `judge` returns the sentences
+of those that apply to what was found.
 """
 
 import enum
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 
 class Outcome(enum.IntEnum):
@@ -67,3 +71,47 @@ _COLLISION_SENTENCES = {
         "The integration did not resolve this impact: its dissipation is too strong for the steps taken."
     ),
 }
+
+
+E = TypeVar("E")
+
+
+@dataclass(frozen=True)
+class Rule(Generic[E]):
+    """A sentence that is said of a result where something is the case.
+
+    Attributes:
+        when: the cases of it that a result's evidence shows, a sentence for each; or whether it is the case at all.
+        sentence: what is said, with `{e.name}` for what the evidence has, and `{case}` for one of the cases; or a
+            function of evidence and case.
+    """
+
+    when: Callable[[E], Iterable[Any] | bool]
+    sentence: str | Callable[[E, Any], str]
+
+    def said_of(self, evidence: E) -> list[str]:
+        """Return what the rule says of a result: a sentence for each case."""
+        cases, sentence = self.when(evidence), self.sentence
+        each = cases if isinstance(cases, Iterable) else [True] * bool(cases)
+        if isinstance(sentence, str):
+            return [sentence.format(e=evidence, case=case) for case in each]
+        return [sentence(evidence, case) for case in each]
+
+
+Rules = Sequence[Rule[E] | tuple[Rule[E], ...]]
+"""Rules in the order in which they speak; of those in brackets the first that applies speaks alone."""
+
+
+def judge(rules: Rules[E], evidence: E) -> list[str]:
+    """Return the sentences of the rules that apply.
+
+    >>> hot = Rule(lambda kelvin: kelvin > 373.0, "{e:g} K: water boils.")
+    >>> warm = Rule(lambda kelvin: kelvin > 300.0, "It is warm.")
+    >>> judge([(hot, warm)], 400.0), judge([hot, warm], 400.0)
+    (['400 K: water boils.'], ['400 K: water boils.', 'It is warm.'])
+    """
+    sentences = []
+    for rule in rules:
+        group = (rule,) if isinstance(rule, Rule) else rule
+        sentences += next((said for said in (member.said_of(evidence) for member in group) if said), [])
+    return sentences

@@ -21,8 +21,8 @@ from fitting.fits.comparison import Comparison as Comparison
 from fitting.fits.comparison import compare as compare
 from fitting.fits.fit import fit as fit
 from fitting.fits.result import FitResult as FitResult
-from fitting.forward import AmplitudeGradients as AmplitudeGradients
-from fitting.forward import amplitude_gradients as amplitude_gradients
+from fitting.gradients import AmplitudeGradients as AmplitudeGradients
+from fitting.gradients import amplitude_gradients as amplitude_gradients
 from fitting.instruments.curve import MeasuredCurve as MeasuredCurve
 from fitting.instruments.curve import read_curve as read_curve
 from fitting.instruments.curve import read_curves as read_curves

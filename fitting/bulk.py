@@ -18,8 +18,9 @@ from afm_jax.strict_json import plain
 from afm_jax.sweeps.axes import Axis
 from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable, plan_of
 from afm_jax.sweeps.sweep import Progress, dataset_of
-from fitting.fits.fit import fit, problem_of
+from fitting.fits.fit import fit
 from fitting.fits.result import FitResult
+from fitting.models import problem_of
 from fitting.parameters import PARAMETERS
 from fitting.sampling.bootstrap import require_valid
 from fitting.tables.table import AMPLITUDES, MEASURED, AmplitudeTable, check_quality_factor, read_table

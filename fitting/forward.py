@@ -1,14 +1,15 @@
 """From parameters to predicted amplitudes: each row's steady single-impact orbit, on the branch that was measured.
 
-A steady orbit is a root of its closing condition; by the implicit function theorem it moves smoothly with the
-parameters, except at a fold, where it meets another root and ends, and where the tip grazes the platform, at the impact
-or on the way. There, and where there is no steady orbit, the derivatives of amplitudes by parameters, forward or
-reverse, are NaN and a sentence says why.
+The model of one row is the first page: what an impact does (`impact_of`), the orbit's scene (`orbit_problem`), which of
+its steady orbits was measured (`branch_of`), and what the instrument shows of it (`shown`). A steady orbit is a root of
+its closing condition; by the implicit function theorem it moves smoothly with the parameters.
+
+Below, `linearise` and `predict` do that for all pairs of a set of parameters and a row, a fixed number at a time.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,22 +22,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
-from afm_jax.checks import checked, require_float64
 from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
-from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem, follow_root, harmless_coordinate
-from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
-from afm_jax.impact.map import NEAR_GRAZING
-from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
-from afm_jax.results import Result, public_result
+from afm_jax.impact.orbits import amplitudes, near_fold, steady_orbits
 from afm_jax.solve.lanes import in_blocks
-from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
-from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
-from fitting.tables.table import TableLike, as_table
+from fitting.models import Measurement, Problem, Rows
 
 
 class Branch(NamedTuple):
@@ -71,15 +65,15 @@ def orbit_problem(
 ) -> OrbitProblem:
     """Return the orbit's scene of one row at a set of values, for the impact that these stand for."""
     cantilever = problem.cantilever(values, measurement.cantilever)
-    amplitude = row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration", 1.0)
+    amplitude = row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration")
     if problem.tapping:
         # the free tip's amplitude, read by the same detector: in the frame of the free tip the sample moves by it
-        amplitude = amplitude / problem.nuisance(values, "tip_calibration", 1.0)
-        amplitude = amplitude * (1.0 + problem.nuisance(values, "free_amplitude_drift", 0.0) * row.time)
+        amplitude = amplitude / problem.nuisance(values, "tip_calibration")
+        amplitude = amplitude * (1.0 + problem.nuisance(values, "free_amplitude_drift") * row.time)
     if problem.drive == "base":
         ratio = row.drive_frequency_khz / cantilever.frequency_khz
         amplitude = height_of_free_deflection(amplitude, ratio, cantilever.quality_factor)
-    offset = row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0)
+    offset = row.offset_nm + problem.nuisance(values, "offset_origin_nm")
     if isinstance(impact, PulledImpact):
         offset = offset + impact.plane_nm
     return OrbitProblem(
@@ -103,18 +97,13 @@ def shown(
             base=problem.drive == "base",
         )
         height = jnp.zeros_like(height)
-    read = jnp.stack([height, amplitude]) * problem.nuisance(values, "tip_calibration", 1.0)
+    read = jnp.stack([height, amplitude]) * problem.nuisance(values, "tip_calibration")
     if row.amplitude_nm.shape[0] < 3:
         return read
     period, known = 360.0 / row.order, row.amplitude_nm[2]
-    zero = problem.nuisance(values, "phase_zero_deg", 0.0)
-    apart = phase + zero + problem.nuisance(values, "phase_drift_deg", 0.0) * row.time - known
+    zero = problem.nuisance(values, "phase_zero_deg")
+    apart = phase + zero + problem.nuisance(values, "phase_drift_deg") * row.time - known
     return jnp.append(read, known + (apart + 0.5 * period) % period - 0.5 * period)
-
-
-def nothing_shown(row: Rows) -> Float[Array, " k"]:
-    """Return what a row without an orbit is predicted as: no amplitude, and the phase that is farthest off."""
-    return jnp.append(jnp.zeros(2), row.amplitude_nm[2:] + 180.0 / row.order)
 
 
 def branch_of(orbit: OrbitProblem, row: Rows, values: Float[Array, " p"], problem: Problem) -> Branch:
@@ -149,25 +138,6 @@ def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
     )
 
 
-def branch_near(coordinate: Any) -> Branch:
-    """Return orbits that are taken to be near coordinates of shape (lanes,); NaN: there is none."""
-    # NumPy's for NumPy's: every JAX operation outside a compiled program would be compiled by itself
-    numpy: Any = np if isinstance(coordinate, np.ndarray) else jnp
-    coordinate = numpy.asarray(coordinate)
-    there = numpy.isfinite(coordinate)
-    nothing = numpy.zeros_like(there)
-    return Branch(OrbitPlace(coordinate, numpy.zeros_like(coordinate)), there, there.astype(np.int32), nothing)
-
-
-BATCH = 8
-"""Sets of parameters that `linearise` takes at once."""
-TAPPED, SEARCHED, SOLVED = 32, 128, 1024
-"""Pairs of a set and a row that one program takes: of taps, where impacts last, and where each takes a hundredth of
-that."""
-CENSORED = 3.0
-"""Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
-
-
 class Prediction(NamedTuple):
     """Predicted readings of shape (rows, k) as in `Rows`, `nothing_shown` without orbit; the rest has shape (rows,).
 
@@ -183,6 +153,43 @@ class Prediction(NamedTuple):
     coordinate: Float[Array, " rows"]
     pull_nm_per_us2: Float[Array, " rows"]
     change_nm_per_us3: Float[Array, " rows"]
+
+
+def prediction_of(
+    branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem, row: Rows, problem: Problem
+) -> Prediction:
+    """Return what is predicted for a row at a set of values, on the orbit that it is taken to be on."""
+    read = shown(amplitudes(branch.place, orbit), orbit, row, values, problem)
+    speeds = lax.stop_gradient(orbit.impact.speeds(branch.place.coordinate))
+    still = lax.stop_gradient(orbit)
+    middle = middle_of_contact(
+        still.cantilever,
+        still.platform,
+        branch.place.phase / still.platform.angular_frequency + 0.5 * speeds.delay,
+    )
+    return Prediction(
+        amplitude_nm=jnp.where(branch.exists, read, nothing_shown(row)),
+        orbits=branch.orbits,
+        near_fold=branch.near_fold,
+        approach_speed_nm_per_us=jnp.where(row.free, jnp.nan, speeds.approach),
+        coordinate=branch.place.coordinate,
+        pull_nm_per_us2=middle.acceleration,
+        change_nm_per_us3=middle.change,
+    )
+
+
+def nothing_shown(row: Rows) -> Float[Array, " k"]:
+    """Return what a row without an orbit is predicted as: no amplitude, and the phase that is farthest off."""
+    return jnp.append(jnp.zeros(2), row.amplitude_nm[2:] + 180.0 / row.order)
+
+
+BATCH = 8
+"""Sets of parameters that `linearise` takes at once."""
+TAPPED, SEARCHED, SOLVED = 32, 128, 1024
+"""Pairs of a set and a row that one program takes: of taps, where impacts last, and where each takes a hundredth of
+that."""
+CENSORED = 3.0
+"""Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
 
 
 class Linearised(NamedTuple):
@@ -222,7 +229,7 @@ def linearise(
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
     filled, impacts = filled_up(values, measurement, problem)
-    whole = _in_every_lane(filled, sets, impacts, measurement, problem, near)
+    whole = _of_pairs(filled, sets, impacts, measurement, problem, near, linearise_pairs)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
@@ -236,115 +243,6 @@ def linearise(
         jacobian=np.concatenate([flat, np.zeros((sets, rows, count)), pulls], axis=1),
         prediction=whole.prediction,
     )
-
-
-def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
-    """Compile the two large programs of `linearise`, or read them from the cache, side by side.
-
-    Args:
-        values: some values of the parameters.
-        measurement: what will be compared with.
-        problem: the model.
-    """
-    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
-    if measurement.joint is not None:
-        # one of what is driven: the program of another is compiled when it comes to it
-        drive = measurement.joint.drives[0]
-        filled, problem = filled[:, 0], replace(measurement.joint.problem, drive=drive)
-        measurement = measurement.of_drive(drive)
-    index = np.zeros(_lanes(problem), dtype=int)
-    rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
-    some, points = measurement._replace(rows=rows), filled[index]
-    nowhere = branch_near(np.full(index.shape, np.nan))
-
-    def in_thread(program: Callable[..., Any], *more: Any) -> None:
-        # what was switched on for one thread alone is not for another
-        with jax.enable_x64(True):  # noqa: FBT003
-            jax.block_until_ready(program(points, impacts, index, some, problem, *more))
-
-    with ThreadPoolExecutor(1) as pool:
-        other = pool.submit(in_thread, linearise_pairs, nowhere)
-        in_thread(located)
-        other.result()
-
-
-def _lanes(problem: Problem) -> int:
-    return TAPPED if problem.pulled else SEARCHED if problem.lasting else SOLVED
-
-
-def _in_every_lane(
-    filled: Float[np.ndarray, "batch ..."],
-    sets: int,
-    impacts: "_Impacts",
-    measurement: Measurement,
-    problem: Problem,
-    near: Float[np.ndarray, "..."] | None,
-    program: Callable[..., "_Block"] | None = None,
-) -> "_Block":
-    """Return what `_in_lanes` finds, of several tables drive by drive; slopes are by the parameters of a row's own."""
-    joint, table = measurement.joint, measurement.rows.table
-    if joint is None or table is None:
-        return _in_lanes(filled, sets, impacts, measurement, problem, near, program)
-    drives = np.array(joint.drives)[table]
-    places, blocks = [], []
-    for drive in dict.fromkeys(drives.tolist()):
-        mine = np.flatnonzero(drives == drive)
-        points = np.moveaxis(filled[:, table[mine]], 1, -2)
-        one, known = replace(joint.problem, drive=drive), None if near is None else np.asarray(near)[..., mine]
-        places.append(mine)
-        blocks.append(_in_lanes(points, sets, impacts, measurement.of_drive(drive), one, known, program))
-    order = np.argsort(np.concatenate(places))
-    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, order], *blocks)
-
-
-def _in_lanes(
-    filled: Float[np.ndarray, "batch p"] | Float[np.ndarray, "batch rows p"],
-    sets: int,
-    impacts: "_Impacts",
-    measurement: Measurement,
-    problem: Problem,
-    near: Float[np.ndarray, "..."] | None,
-    program: Callable[..., "_Block"] | None = None,
-) -> "_Block":
-    """Return what a program finds, as arrays of shape (sets, rows, ...); `filled` may differ row by row.
-
-    The program is `linearise_pairs` if none is given.
-    """
-    program = linearise_pairs if program is None else program
-    columns = jax.tree.map(np.asarray, measurement.rows)
-    filling = _filling(columns)
-    rows = columns.order.shape[0] - filling
-    known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows + filling))[:, :rows].ravel()
-    lanes = _lanes(problem)
-    blocks = []
-    for begin in range(0, sets * rows, lanes):
-        # the last block is filled up with the last pair
-        lane = np.minimum(np.arange(begin, begin + lanes), sets * rows - 1)
-        some = measurement._replace(rows=jax.tree.map(lambda column, row=lane % rows: column[row], columns))
-        index = lane // rows
-        points = filled[index] if filled.ndim == 2 else filled[index, lane % rows]
-        branch = branch_near(known[lane]) if known is not None else located(points, impacts, index, some, problem)
-        # not waited for: blocks are worked on side by side
-        blocks.append(program(points, impacts, index, some, problem, branch))
-
-    def whole(*parts):
-        found = np.concatenate([np.asarray(part) for part in parts])[: sets * rows]
-        found = found.reshape(sets, rows, *found.shape[1:])
-        return np.concatenate([found, np.repeat(found[:, -1:], filling, axis=1)], axis=1)
-
-    block: _Block = jax.tree.map(whole, *blocks)
-    for unread in (block.misfit, block.slope, block.unseen):
-        np.asarray(unread)[:, rows:] = 0.0
-    return block
-
-
-def _filling(rows: Rows) -> int:
-    """Return how many rows at the end only fill a table up: on the drive of the row before, without a reading."""
-    drives = np.stack([rows.order, rows.drive_frequency_khz, rows.drive_amplitude_nm, rows.offset_nm, rows.free])
-    filling = ~(np.any(rows.measured, axis=1) | rows.no_orbit)
-    filling[0] = False
-    filling[1:] &= (drives[:, 1:] == drives[:, :-1]).all(axis=0)
-    return int(np.argmin(filling[::-1]))
 
 
 class Predicted(NamedTuple):
@@ -386,7 +284,7 @@ def predict(
         )
         points = joint.values(values)[..., len(joint.problem.own) :]
         known = known._replace(joint=replace(joint, problem=alone))
-    block = _in_every_lane(points, len(values), _Impacts(laws, None), known, instrument, near, predict_pairs)
+    block = _of_pairs(points, len(values), _Impacts(laws, None), known, instrument, near, predict_pairs)
     return Predicted(np.asarray(block.misfit), block.prediction)
 
 
@@ -419,7 +317,7 @@ def impact_slopes(
         leaf = np.array(where(still))
         leaf[(slice(None), 0, *constant)] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
-        block = _in_every_lane(filled, 1, turned, measurement, problem, near)
+        block = _of_pairs(filled, 1, turned, measurement, problem, near, linearise_pairs)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     # of a series its constant term
@@ -435,6 +333,36 @@ def impact_slopes(
     by_offset, speed = along(lambda i: i.delay.offset_nm, -1.0)
     # the offset d shortens the delay by d/u; a free tip has no speed
     return ImpactSlopes(by_square, np.nan_to_num(speed)[:, None] * by_offset)
+
+
+def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
+    """Compile the two large programs of `linearise`, or read them from the cache, side by side.
+
+    Args:
+        values: some values of the parameters.
+        measurement: what will be compared with.
+        problem: the model.
+    """
+    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
+    if measurement.joint is not None:
+        # one of what is driven: the program of another is compiled when it comes to it
+        drive = measurement.joint.drives[0]
+        filled, problem = filled[:, 0], replace(measurement.joint.problem, drive=drive)
+        measurement = measurement.of_drive(drive)
+    index = np.zeros(_lanes(problem), dtype=int)
+    rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
+    some, points = measurement._replace(rows=rows), filled[index]
+    nowhere = branch_near(np.full(index.shape, np.nan))
+
+    def in_thread(program: Callable[..., Any], *more: Any) -> None:
+        # what was switched on for one thread alone is not for another
+        with jax.enable_x64(True):  # noqa: FBT003
+            jax.block_until_ready(program(points, impacts, index, some, problem, *more))
+
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(in_thread, linearise_pairs, nowhere)
+        in_thread(located)
+        other.result()
 
 
 class _Block(NamedTuple):
@@ -492,34 +420,105 @@ def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem
     return _Impacts(*jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values))
 
 
-class Free(NamedTuple):
-    """What an impact does to a free tip: at coordinates of shape (n,), and at capture; us and nm/us."""
-
-    speeds: Speeds
-    hertz_time: Float[Array, " n"]
-    lowest: Float[Array, ""]
-    capture_speed: Float[Array, ""]
-    """Just above capture."""
-    length: Float[Array, ""]
+def _lanes(problem: Problem) -> int:
+    return TAPPED if problem.pulled else SEARCHED if problem.lasting else SOLVED
 
 
-@jax.jit
-def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
-    """Return what an impact does to free tips; coordinates of taps are taken for those of free ones."""
-    if isinstance(impact, PulledImpact):
-        impact = impact.free
-    speeds = jax.vmap(impact.speeds)(coordinate)
-    just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
-    hertz = impact.hertz_contact
-    return Free(speeds, hertz.time(speeds.approach), impact.lowest, just_above, hertz.length_nm)
+def _of_pairs(
+    points: Float[np.ndarray, "batch ..."],
+    sets: int,
+    impacts: _Impacts,
+    measurement: Measurement,
+    problem: Problem,
+    near: Float[np.ndarray, "..."] | None,
+    program: Callable[..., _Block],
+) -> _Block:
+    """Return what a program finds for every pair of a set and a row, as arrays of shape (sets, rows, ...).
+
+    Several tables are taken drive by drive; slopes are by the parameters of a row's own table.
+
+    Args:
+        points: values of every set, or of every set and table; more sets than are asked for fill it up.
+        sets: how many sets there are.
+        impacts: of every set.
+        measurement: the rows.
+        problem: the model.
+        near: coordinates of the orbits close by for each row, or each set and row; None: they are searched for.
+        program: `linearise_pairs` or `predict_pairs`.
+    """
+    joint, table = measurement.joint, measurement.rows.table
+    if joint is None or table is None:
+        return _of_pairs_of_one_drive(points[:, None], sets, impacts, measurement, problem, near, program)
+    drives = np.array(joint.drives)[table]
+    places, blocks = [], []
+    for drive in dict.fromkeys(drives.tolist()):
+        mine = np.flatnonzero(drives == drive)
+        member, known = replace(joint.problem, drive=drive), None if near is None else np.asarray(near)[..., mine]
+        of_rows = points[:, table[mine]]
+        places.append(mine)
+        blocks.append(
+            _of_pairs_of_one_drive(of_rows, sets, impacts, measurement.of_drive(drive), member, known, program)
+        )
+    order = np.argsort(np.concatenate(places))
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, order], *blocks)
 
 
-@jax.jit
-def times_of_taps(
-    impact: PulledImpact, approach_speed: Float[Array, " n"], pull: Float[Array, " n"]
-) -> Float[Array, " n"]:
-    """Return how long taps last, in us."""
-    return jax.vmap(impact.tap)(approach_speed, pull).speeds.delay
+def _of_pairs_of_one_drive(
+    points: Float[np.ndarray, "batch rows p"],
+    sets: int,
+    impacts: _Impacts,
+    measurement: Measurement,
+    problem: Problem,
+    near: Float[np.ndarray, "..."] | None,
+    program: Callable[..., _Block],
+) -> _Block:
+    """Return what `_of_pairs` does of rows under one drive; points are those of every row, or one for all."""
+    columns = jax.tree.map(np.asarray, measurement.rows)
+    filling, whole = _filling(columns), columns.order.shape[0]
+    rows = whole - filling
+    number, row = (index.ravel() for index in np.indices((sets, rows)))
+    branch = None
+    if near is not None:
+        branch = branch_near(np.broadcast_to(np.asarray(near), (sets, whole))[:, :rows].ravel())
+    point = points[number, row if points.shape[1] > 1 else 0]
+
+    def work(lanes: Any) -> _Block:
+        point, number, of_row, branch = lanes
+        lane = measurement._replace(rows=of_row)
+        if branch is None:
+            branch = located(point, impacts, number, lane, problem)
+        return program(point, impacts, number, lane, problem, branch)
+
+    lanes = point, number, jax.tree.map(lambda column: column[row], columns), branch
+
+    def of_table(column: np.ndarray) -> np.ndarray:
+        column = column.reshape(sets, rows, *column.shape[1:])
+        return np.concatenate([column, np.repeat(column[:, -1:], filling, axis=1)], axis=1)
+
+    block = jax.tree.map(of_table, in_blocks(work, lanes, block=_lanes(problem), widths=()))
+    # rows that only fill a table up say nothing
+    for unread in (block.misfit, block.slope, block.unseen):
+        unread[:, rows:] = 0.0
+    return block
+
+
+def _filling(rows: Rows) -> int:
+    """Return how many rows at the end only fill a table up: on the drive of the row before, without a reading."""
+    drives = np.stack([rows.order, rows.drive_frequency_khz, rows.drive_amplitude_nm, rows.offset_nm, rows.free])
+    filling = ~(np.any(rows.measured, axis=1) | rows.no_orbit)
+    filling[0] = False
+    filling[1:] &= (drives[:, 1:] == drives[:, :-1]).all(axis=0)
+    return int(np.argmin(filling[::-1]))
+
+
+def branch_near(coordinate: Any) -> Branch:
+    """Return orbits that are taken to be near coordinates of shape (lanes,); NaN: there is none."""
+    # NumPy's for NumPy's: every JAX operation outside a compiled program would be compiled by itself
+    numpy: Any = np if isinstance(coordinate, np.ndarray) else jnp
+    coordinate = numpy.asarray(coordinate)
+    there = numpy.isfinite(coordinate)
+    nothing = numpy.zeros_like(there)
+    return Branch(OrbitPlace(coordinate, numpy.zeros_like(coordinate)), there, there.astype(np.int32), nothing)
 
 
 @partial(jax.jit, static_argnames="problem")
@@ -556,7 +555,7 @@ def linearise_pairs(
         branch = followed(orbit, known, row) if orbit.impact.lasts else known
 
         def predict(v, impact):
-            return _prediction(branch, v, orbit_problem(v, impact, row, measurement, problem), row, problem)
+            return prediction_of(branch, v, orbit_problem(v, impact, row, measurement, problem), row, problem)
 
         def along(e, turn):
             predicted, change = jax.jvp(predict, (point, impact), (e, turn))
@@ -602,7 +601,7 @@ def predict_pairs(
     def one(point: Float[Array, " p"], impact, row: Rows, known: Branch) -> Prediction:
         orbit = orbit_problem(point, impact, row, measurement, problem)
         branch = followed(orbit, known, row) if orbit.impact.lasts else known
-        return _prediction(branch, point, orbit, row, problem)
+        return prediction_of(branch, point, orbit, row, problem)
 
     impact, rows = jax.tree.map(lambda leaf: leaf[index], impacts.impact), measurement.rows
     prediction = jax.vmap(one)(points, impact, rows, branch)
@@ -622,183 +621,31 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
     return impact_of(values, measurement, problem), slopes
 
 
-def _prediction(
-    branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem, row: Rows, problem: Problem
-) -> Prediction:
-    read = shown(amplitudes(branch.place, orbit), orbit, row, values, problem)
-    speeds = lax.stop_gradient(orbit.impact.speeds(branch.place.coordinate))
-    still = lax.stop_gradient(orbit)
-    middle = middle_of_contact(
-        still.cantilever,
-        still.platform,
-        branch.place.phase / still.platform.angular_frequency + 0.5 * speeds.delay,
-    )
-    return Prediction(
-        amplitude_nm=jnp.where(branch.exists, read, nothing_shown(row)),
-        orbits=branch.orbits,
-        near_fold=branch.near_fold,
-        approach_speed_nm_per_us=jnp.where(row.free, jnp.nan, speeds.approach),
-        coordinate=branch.place.coordinate,
-        pull_nm_per_us2=middle.acceleration,
-        change_nm_per_us3=middle.change,
-    )
+class Free(NamedTuple):
+    """What an impact does to a free tip: at coordinates of shape (n,), and at capture; us and nm/us."""
+
+    speeds: Speeds
+    hertz_time: Float[Array, " n"]
+    lowest: Float[Array, ""]
+    capture_speed: Float[Array, ""]
+    """Just above capture."""
+    length: Float[Array, ""]
 
 
-_LOOKS = 512
-"""Times at which the gap of a flight is looked at for a graze on the way."""
-_TOUCHING = 1e-3
-"""Smallest gap on the way, in terms of the drive's amplitude, below which a flight counts as grazing."""
-
-NO_ORBIT = "there is no steady single-impact orbit at these values"
-AT_A_FOLD = "the orbit is close to a fold, where it ends and no derivative exists"
-SLOW_GRAZE = "the impact grazes the platform: its approach is slower than a thousandth of the platform's speed"
-GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change makes another impact there"
-
-
-@public_result()
-@dataclass(frozen=True)
-class AmplitudeGradients(Result):
-    """Predicted amplitudes of a table's rows, peak and lock-in, and their derivatives.
-
-    Attributes:
-        parameters: names, in the order of the last axis of the gradient.
-        predicted_nm: amplitudes in nm, shape (rows, 2); NaN where there is no orbit.
-        gradient: in nm per unit of each parameter, shape (rows, 2, p); NaN where it is refused.
-        reasons: why a row's gradient is refused, or None.
-    """
-
-    parameters: tuple[str, ...]
-    predicted_nm: Float[np.ndarray, "rows 2"]
-    gradient: Float[np.ndarray, "rows 2 p"]
-    reasons: tuple[str | None, ...]
+@jax.jit
+def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
+    """Return what an impact does to free tips; coordinates of taps are taken for those of free ones."""
+    if isinstance(impact, PulledImpact):
+        impact = impact.free
+    speeds = jax.vmap(impact.speeds)(coordinate)
+    just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
+    hertz = impact.hertz_contact
+    return Free(speeds, hertz.time(speeds.approach), impact.lowest, just_above, hertz.length_nm)
 
 
-class _Judged(NamedTuple):
-    """Amplitudes and their slopes of every row, and what speaks against the slopes."""
-
-    amplitude_nm: Float[Array, "rows 2"]
-    slope: Float[Array, "rows 2 p"]
-    exists: Bool[Array, " rows"]
-    near_fold: Bool[Array, " rows"]
-    slow: Bool[Array, " rows"]
-    touching: Bool[Array, " rows"]
-
-
-@checked
-def amplitude_gradients(
-    table: TableLike,
-    model: str,
-    values: Mapping[str, float],
-    *,
-    mode: str = "forward",
-    fixed: dict[str, float] | None = None,
-    effects: Sequence[str] = EFFECTS,
-) -> AmplitudeGradients:
-    """Return the derivatives of the amplitudes that a model predicts for a table's drives.
-
-    Where several steady orbits coexist, the one closest to the measured amplitudes counts.
-
-    Args:
-        table: the drives, and the amplitudes that tell coexisting orbits apart.
-        model: as for `fit`.
-        values: the model's parameters (for "contact" any of them) and any nuisances, by name: what is not named is the
-            table's.
-        mode: "forward" costs as much as there are parameters, "reverse" as there are amplitudes; same numbers.
-        fixed: values of the model's parameters that are not differentiated by; of a contact else the paper's.
-        effects: for "contact": the effects there are.
-
-    Raises:
-        ValueError: if there is no such model, mode or parameter, or one is missing or outside its range.
-        RuntimeError: if JAX is not set to 64-bit floats.
-    """
-    table = as_table(table)
-    require_float64()
-    if mode not in ("forward", "reverse"):
-        raise ValueError(f'`mode` must be "forward" or "reverse", but is {mode!r}')
-    problem = replace(_problem(model, values, effects, fixed), drive=table.drive)
-    measurement = measurement_of(table, problem, fixed=fixed)
-    point = jnp.asarray([float(values[name]) for name in problem.names])
-    found = in_blocks(
-        lambda rows: _judged(point, measurement._replace(rows=rows), problem, mode),
-        measurement.rows,
-        block=ROWS_PER_PROGRAM,
-        widths=(),
-    )
-    found = jax.tree.map(lambda column: column[: table.rows], found)
-    reasons = tuple(
-        _reason(*row) for row in zip(found.exists, found.near_fold, found.slow, found.touching, strict=True)
-    )
-    refused = np.array([reason is not None for reason in reasons])
-    return AmplitudeGradients(
-        parameters=problem.names,
-        predicted_nm=np.where(found.exists[:, None], found.amplitude_nm, np.nan),
-        gradient=np.where(refused[:, None, None], np.nan, found.slope),
-        reasons=reasons,
-    )
-
-
-def _problem(
-    model: str, values: Mapping[str, float], effects: Sequence[str], fixed: dict[str, float] | None
-) -> Problem:
-    """Return the parameters that are differentiated by, the model's own first."""
-    chosen = tuple(name for name in values if name in CONTACT_NAMES)
-    own = model_parameters(model, chosen if model == "contact" else None, fixed)
-    missing = [name for name in own if name not in values]
-    if missing:
-        raise ValueError(f"`values` lacks {' and '.join(missing)}, which the model {model!r} needs; add it")
-    for name, value in values.items():
-        if name not in (*own, *NUISANCE_NAMES):
-            raise ValueError(f"`values` names {name!r}: choose from {', '.join((*own, *NUISANCE_NAMES))}")
-        parameter = PARAMETERS[name]
-        if not parameter.lowest <= value <= parameter.highest:
-            raise ValueError(
-                f"`values`: {name} must lie between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
-            )
-    return Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in values), tuple(effects))
-
-
-@partial(jax.jit, static_argnames=("problem", "mode"))
-def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
-    impact = impact_of(values, measurement, problem)
-    differentiated = jax.jacfwd if mode == "forward" else jax.jacrev
-
-    def one(row: Rows):
-        orbit = orbit_problem(values, impact, row, measurement, problem)
-        branch = lax.stop_gradient(branch_of(orbit, row, values, problem))
-
-        def predicted(v):
-            orbit = orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
-            return shown(amplitudes(branch.place, orbit), orbit, row, v, problem)[:2]
-
-        slow, touching = _grazes(branch.place, orbit)
-        slope = differentiated(predicted)(values)
-        return _Judged(predicted(values), slope, branch.exists, branch.near_fold, slow, touching)
-
-    return jax.vmap(one)(measurement.rows)
-
-
-def _grazes(place: OrbitPlace, orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Say whether the impact is a graze, and whether the flight touches the platform on the way."""
-    state = orbit_state(place, orbit)
-    slow = state.speeds.approach < NEAR_GRAZING * orbit.platform.top_speed_nm_per_us
-    flight = Flight(orbit.cantilever, orbit.platform, state.flight.start_us, state.flight.start_velocity)
-    begin = jnp.maximum(-state.speeds.delay, 0.0)
-    times = begin + (state.flight.duration_us - begin) * jnp.asarray(np.linspace(0.0, 1.0, _LOOKS))
-    gap = jax.vmap(lambda time: flight_gap(time, flight))(times)
-    before, here, after = gap[:-2], gap[1:-1], gap[2:]
-    bend = before - 2.0 * here + after
-    dip = (here <= before) & (here <= after) & (bend > 0.0)
-    # the parabola through three neighbours: between two looks the flight may come closer
-    lowest = here - (after - before) ** 2 / (8.0 * jnp.where(dip, bend, 1.0))
-    return slow, jnp.any(dip & (lowest < _TOUCHING * orbit.platform.amplitude_nm))
-
-
-def _reason(exists: np.bool_, near_fold: np.bool_, slow: np.bool_, touching: np.bool_) -> str | None:
-    """Return why a row has no gradient, None if it has one."""
-    if not exists:
-        return NO_ORBIT
-    if near_fold:
-        return AT_A_FOLD
-    if slow:
-        return SLOW_GRAZE
-    return GRAZE_ON_THE_WAY if touching else None
+@jax.jit
+def times_of_taps(
+    impact: PulledImpact, approach_speed: Float[Array, " n"], pull: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """Return how long taps last, in us."""
+    return jax.vmap(impact.tap)(approach_speed, pull).speeds.delay

@@ -1,11 +1,11 @@
-"""What is fitted and what it is compared with: a model's parameters as vectors, and a table's rows as arrays.
+"""What is fitted, what is held, and what predictions are compared with, of one table or of several.
 
-The vectors are in the optimiser's coordinates and stand for a law; the rows come with the cantilever and the Gaussian
-constraints.
+`task_of` turns tables and options of a fit into a `Problem`, the parameters as vectors in the optimiser's coordinates,
+and a `Measurement`, the rows as arrays with the cantilever and the Gaussian constraints.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -15,9 +15,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.contact.parameters import EFFECTS
+from afm_jax.contact.parameters import CONTACT_PARAMETER, EFFECTS, PAPER, idle_without
 from afm_jax.impact.law import BRIDGE_NM, CollisionDelay, ImpactLaw
-from fitting.parameters import DELAY, LAW, Parameter, is_nuisance, parameter_called
+from fitting.parameters import (
+    DELAY,
+    LAW,
+    NUISANCE_NAMES,
+    Parameter,
+    is_nuisance,
+    model_parameters,
+    name_of_table,
+    parameter_called,
+)
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, check_quality_factor
 
@@ -149,10 +158,13 @@ class Problem:
             ]
         )
 
-    def nuisance(self, values: Float[Array, " p"], name: str, neutral: float) -> Float[Array, ""]:
-        """Return a nuisance, or its neutral value where it is not a parameter."""
-        return self.known(values).get(name, jnp.asarray(neutral))
+    def nuisance(self, values: Float[Array, " p"], name: str) -> Float[Array, ""]:
+        """Return a nuisance, or the value that stands for its absence where it is not a parameter."""
+        return self.known(values).get(name, jnp.asarray(_NEUTRAL[name]))
 
+
+_NEUTRAL = {name: 1.0 if name.endswith("_calibration") else 0.0 for name in NUISANCE_NAMES}
+"""What stands for the absence of a nuisance."""
 
 ROWS_PER_PROGRAM = 32
 """Rows are padded to multiples of this, so that programs by rows (gradients, a scout's fit) have few shapes."""
@@ -289,6 +301,209 @@ def _known_of_drifts(table: AmplitudeTable, given: Mapping[str, tuple[float, flo
         value, error = table.calibration.get(start, (neutral, 0.0))
         known[start] = value, float(np.hypot(error, 0.5 * np.hypot(*known[drift])))
     return known
+
+
+ASSUMED_ERROR_OF_Q = 0.05
+"""Relative standard error of a quality factor that is given without one."""
+
+
+class Task(NamedTuple):
+    """A fit to do: what is known beforehand (value and error by parameter), what is fitted, and to what."""
+
+    known: dict[str, tuple[float, float]]
+    problem: Problem
+    measurement: Measurement
+
+
+def task_of(
+    table: AmplitudeTable | SeveralTables,
+    model: str,
+    *,
+    share: Sequence[str] = (),
+    free: Sequence[str] | None = None,
+    fixed: dict[str, float] | None = None,
+    constraints: dict[str, tuple[float, float]] | None = None,
+    effects: Sequence[str] = EFFECTS,
+) -> Task:
+    """Return what a fit has to do; arguments and errors as of `fit`."""
+    options = {"free": free, "fixed": fixed, "effects": effects}
+    if isinstance(table, SeveralTables):
+        return _joint_task(table, model, share, constraints, **options)
+    known = _known_of(table, model, constraints)
+    problem = problem_of(table, model, constraints=known, **options)
+    return Task(known, problem, measurement_of(table, problem, known, held_values(problem, fixed)))
+
+
+def _known_of(
+    table: AmplitudeTable, model: str, constraints: dict[str, tuple[float, float]] | None
+) -> dict[str, tuple[float, float]]:
+    """Return everything that is known beforehand of a table's fit, the quality factor's assumed error included."""
+    known = constraints_of(table, constraints)
+    if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
+        known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
+    return known
+
+
+def problem_of(
+    table: AmplitudeTable,
+    model: str,
+    *,
+    free: Sequence[str] | None = None,
+    fixed: dict[str, float] | None = None,
+    constraints: dict[str, tuple[float, float]] | None = None,
+    effects: Sequence[str] = EFFECTS,
+) -> Problem:
+    """Return what is fitted for a table: the model's parameters, and the nuisances that are constrained.
+
+    Raises:
+        ValueError: if there is no such model or parameter, or a constraint is impossible.
+    """
+    own = model_parameters(model, None if free is None else tuple(free), fixed)
+    known = constraints_of(table, constraints)
+    for name, (value, error) in known.items():
+        if name not in (*own, *NUISANCE_NAMES):
+            raise ValueError(
+                f"the constraint on {name!r} is on no parameter: choose from {', '.join((*own, *NUISANCE_NAMES))}"
+            )
+        if not (np.isfinite(value) and 0.0 < error < np.inf):
+            raise ValueError(
+                f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
+            )
+    if "offset_origin_nm" in known and model.endswith("+delay") and not table.tapping:
+        raise ValueError(
+            "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the constraint on "
+            "offset_origin_nm out (delay_offset_nm takes it up), or fit the model 'contact'"
+        )
+    nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
+    return Problem(model, own + nuisances, tuple(effects), table.drive)
+
+
+def _joint_task(
+    tables: SeveralTables,
+    model: str,
+    share: Sequence[str],
+    constraints: dict[str, tuple[float, float]] | None,
+    **options: Any,
+) -> Task:
+    """Return what a fit of several tables has to do: one law, and nuisances that are shared or each table's own.
+
+    Raises:
+        ValueError: if there is no such nuisance to share, or the tables contradict each other on it.
+    """
+    _check_levers(tables, model)
+    each = [_known_of(table, model, constraints) for table in tables.tables]
+    there = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
+    shared = _shared(share, there)
+    _check_shared(tables, each, shared)
+    several = {name: pair for name, pair in each[0].items() if name in shared}
+    # what is each table's own may differ by what a delay takes up in common
+    own = problem_of(tables.tables[0], model, constraints=several, **options).own
+    for table, known in zip(tables.tables, each, strict=True):
+        checked = {name: pair for name, pair in known.items() if name != "offset_origin_nm"}
+        problem_of(replace(table, calibration={}), model, constraints=checked, **options)
+    tables.check_different()
+    differing = {name for name in _HEADS if len({getattr(table, name) for table in tables.tables}) > 1}
+    local = (*own, *(name for name in NUISANCE_NAMES if name in (*there, *differing)))
+    known = {name: pair for name, pair in each[0].items() if name in (*own, *shared)}
+    names, place, held = _places(tables, each, local, [*own, *shared])
+    for label, told in zip(tables.labels, each, strict=True):
+        by_name = {name_of_table(name, label): pair for name, pair in told.items()}
+        known |= {name: by_name[name] for name in names if name in by_name}
+    drives = tuple(table.drive for table in tables.tables)
+    problem = Problem(model, tuple(names), tuple(options["effects"]), tables.drive)
+    alone = replace(problem, names=local, drive=drives[0])
+    parts = [measurement_of(table, alone, known, held_values(alone, options["fixed"])) for table in tables.tables]
+    joint = Joint(alone, tuple(part.cantilever for part in parts), drives, place, held)
+    return Task(known, problem, joint_measurement(tables, parts, problem, joint, known))
+
+
+_HEADS = ("free_frequency_khz", "quality_factor")
+"""Nuisances that are held at what each table says where nothing says their errors."""
+
+
+def _places(
+    tables: SeveralTables,
+    each: Sequence[Mapping[str, tuple[float, float]]],
+    local: Sequence[str],
+    common: Sequence[str],
+) -> tuple[list[str], Int[np.ndarray, "tables p"], Float[np.ndarray, "tables p"]]:
+    """Return the names of all that is fitted, and where each table's parameters are among them or held; see `Joint`.
+
+    Args:
+        tables: the tables.
+        each: what is known beforehand of each.
+        local: names of the parameters of one table.
+        common: names of those that all have in common.
+    """
+    names, size = [*common], (len(tables.labels), len(local))
+    place, held = np.full(size, -1), np.zeros(size)
+    for t, (table, label) in enumerate(zip(tables.tables, tables.labels, strict=True)):
+        for i, name in enumerate(local):
+            if name in common:
+                place[t, i] = names.index(name)
+            elif name in each[t]:
+                place[t, i] = len(names)
+                names.append(name_of_table(name, label))
+            else:
+                held[t, i] = getattr(table, name) if name in _HEADS else _NEUTRAL[name]
+    return names, place, held
+
+
+def _shared(share: Sequence[str], there: Sequence[str]) -> list[str]:
+    """Return the nuisances that several tables share.
+
+    Raises:
+        ValueError: if there is no such nuisance.
+    """
+    for name in share:
+        if name not in (*NUISANCE_NAMES, "all"):
+            raise ValueError(f"`share` must be chosen from {', '.join(NUISANCE_NAMES)} and all, but one is {name!r}")
+        if name not in (*there, "all"):
+            raise ValueError(f"`share` names {name}, but no table gives it with an error; state it, or leave it out")
+    return [name for name in there if "all" in share or name in share]
+
+
+_ONE_LEVER = 0.01
+"""Share by which the frequencies of levers may differ that taps of one are those of the others."""
+
+
+def _check_levers(tables: SeveralTables, model: str) -> None:
+    """Check that one table of taps serves all tables, where the model asks for it.
+
+    Raises:
+        ValueError: if it does not.
+    """
+    if model != "contact" or not any(table.tapping for table in tables.tables):
+        return
+    if not tables.tapping:
+        raise ValueError(
+            "the model 'contact' takes tables of a driven cantilever (# drive = force or base) or of a driven sample, "
+            "not both at a time: fit each kind by itself"
+        )
+    frequencies = [table.free_frequency_khz for table in tables.tables]
+    if max(frequencies) > (1.0 + _ONE_LEVER) * min(frequencies):
+        raise ValueError(
+            "the model 'contact' takes tables of driven cantilevers of one free frequency at a time, but there are "
+            f"{min(frequencies):g} and {max(frequencies):g} kHz: fit each cantilever by itself"
+        )
+
+
+def _check_shared(tables: SeveralTables, each: Sequence[dict[str, tuple[float, float]]], shared: Sequence[str]) -> None:
+    """Check that tables say the same of what they share.
+
+    Raises:
+        ValueError: if they do not.
+    """
+    for name in shared:
+        for known, label in zip(each, tables.labels, strict=True):
+            if known.get(name) != each[0].get(name):
+                said = [
+                    f"{where} {'says nothing of it' if pair is None else 'says {:g} +- {:g}'.format(*pair)}"
+                    for where, pair in ((tables.labels[0], each[0].get(name)), (label, known.get(name)))
+                ]
+                raise ValueError(
+                    f"{name} is shared, but {', and '.join(said)}; say it once (`constraints`), or do not share it"
+                )
 
 
 def measurement_of(
@@ -497,3 +712,69 @@ def tip_work(rows: Rows, cantilever: Cantilever, drive: str) -> Complex[np.ndarr
         free = free / np.abs(1.0 - gamma)
         height = height - gamma * free
     return gamma * (height + free) * np.conj(height)
+
+
+class Held(NamedTuple):
+    """A parameter that is held.
+
+    Attributes:
+        name: of the parameter.
+        value: at which it is held.
+        error: its standard error.
+        assumed: nobody has said the error.
+    """
+
+    name: str
+    value: float
+    error: float
+    assumed: bool
+
+
+def split_held(
+    own: tuple[str, ...], fixed: Mapping[str, float] | None, constraints: Mapping[str, tuple[float, float]] | None
+) -> tuple[dict[str, float], dict[str, tuple[float, float]], dict[str, float]]:
+    """Return what a fit of the contact holds, what is known of what it fits, and what is known of what it holds.
+
+    Args:
+        own: the parameters that are fitted.
+        fixed: values at which others are held.
+        constraints: value and standard error of what is known of any.
+
+    Returns:
+        The values, those of the constraints among them; the other constraints; the standard errors that are said.
+
+    Raises:
+        ValueError: if a parameter is held at two values, or a constraint on one is impossible.
+    """
+    values, others, errors = dict(fixed or {}), {}, {}
+    for name, (value, error) in (constraints or {}).items():
+        if name not in CONTACT_PARAMETER or name in own:
+            others[name] = (value, error)
+            continue
+        if not (np.isfinite(value) and 0.0 < error < np.inf):
+            raise ValueError(
+                f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
+            )
+        if values.get(name, value) != value:
+            raise ValueError(f"{name} is held at {values[name]:g} (`fixed`) and known as {value:g}: say one of the two")
+        values[name], errors[name] = value, error
+    return values, others, errors
+
+
+def held_of(
+    own: tuple[str, ...], effects: tuple[str, ...], fixed: Mapping[str, float], errors: Mapping[str, float]
+) -> tuple[Held, ...]:
+    """Return all parameters of a contact that are not fitted and mean something with its effects."""
+    values = PAPER | dict(fixed)
+    return tuple(
+        Held(name, float(values[name]), errors.get(name, known.error_at(values[name])), name not in errors)
+        for name, known in CONTACT_PARAMETER.items()
+        if name not in own and not idle_without(name, effects)
+    )
+
+
+def held_values(problem: Problem, fixed: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the values at which parameters are held: of taps on a contact all that they are varied about."""
+    if not problem.pulled:
+        return dict(fixed or {})
+    return {one.name: one.value for one in held_of(problem.own, problem.effects, fixed or {}, {})}

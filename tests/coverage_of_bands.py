@@ -23,10 +23,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.fits.fit import find_fit, fit, law_with_band, summarise
+from fitting.fits.estimate import ModelLaw, law_with_band
+from fitting.fits.fit import find_fit, fit, summarise
 from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.result import FittedLaw
 from fitting.simulated.experiment import with_noise
@@ -88,7 +90,13 @@ def measured(truth: ContactTruth, table: AmplitudeTable, model: str) -> Measured
     objective = found.objective.following(values)
     own = covariance(objective, values, ~at_bound(objective, values))
     used = np.where(result.rows.used, result.rows.approach_speed_nm_per_us, np.nan)
-    word = law_with_band(objective.problem, objective.measurement, values, own, used)
+    law = ModelLaw(objective.problem, objective.measurement, values, own)
+    word = law_with_band(
+        law.at,
+        used,
+        lasting=objective.problem.lasting,
+        formula=objective.problem.law(jnp.asarray(values), objective.measurement.fixed),
+    )
     if not (result.valid and np.isfinite(used).any()):
         return Measured(truth.number, False, *(np.full(5, np.nan).tolist()))  # noqa: FBT003
     speeds = np.geomspace(max(SLOWEST, np.nanmin(used)), min(FASTEST, np.nanmax(used)), _SPEEDS)

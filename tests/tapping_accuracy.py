@@ -28,10 +28,10 @@ from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
 from afm_jax.least_squares import covariance_of
-from fitting.fits.fit import fit, problem_of
+from fitting.fits.fit import fit
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
-from fitting.models import measurement_of
+from fitting.models import measurement_of, problem_of
 from fitting.report.words import interval_in_words
 from fitting.simulated.experiment import with_noise
 from fitting.tables.table import AmplitudeTable

@@ -24,8 +24,8 @@ from fitting.fits.discrepancy import (
     system_of,
     with_runs,
 )
-from fitting.fits.loss import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, nearest_of, scaled
 from fitting.fits.objective import Objective
+from fitting.fits.result import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, nearest_of, scaled
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE

@@ -9,10 +9,9 @@ from afm_jax import ImpactLaw
 from afm_jax.cli.values import example_path
 from fitting import fit, read_table
 from fitting.examples.make_amplitudes import TRUTH, example_table
-from fitting.fits.fit import problem_of
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
-from fitting.models import measurement_of
+from fitting.models import measurement_of, problem_of
 from fitting.report.report import summary
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (

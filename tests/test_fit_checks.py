@@ -9,11 +9,11 @@ from scipy.optimize import least_squares
 
 from afm_jax.strict_json import strict_json
 from fitting import fit
-from fitting.fits.fit import find_fit, problem_of, summarise
+from fitting.fits.fit import find_fit, summarise
 from fitting.fits.intervals import check_minimum, covariance
 from fitting.fits.objective import FINE, PLAIN, Objective, polish
 from fitting.fits.result import FitResult
-from fitting.models import measurement_of
+from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import example_amplitudes, example_fit, standard_errors_of, values_of
 from tests.strict_reading import strictly

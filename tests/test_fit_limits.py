@@ -14,10 +14,10 @@ from afm_jax.impact.closure import OrbitPlace
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit
-from fitting.fits.fit import find_fit, problem_of, summarise
+from fitting.fits.fit import find_fit, summarise
 from fitting.fits.objective import Objective
 from fitting.forward import branch_of, impact_of, orbit_problem
-from fitting.models import measurement_of
+from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,

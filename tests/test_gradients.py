@@ -9,16 +9,15 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.law import ImpactLaw
 from fitting import amplitude_gradients
-from fitting.forward import (
+from fitting.forward import BATCH, linearise
+from fitting.gradients import (
     AT_A_FOLD,
-    BATCH,
     GRAZE_ON_THE_WAY,
     NO_ORBIT,
     SLOW_GRAZE,
     AmplitudeGradients,
     _grazes,
     _reason,
-    linearise,
 )
 from fitting.models import Problem, measurement_of
 from fitting.tables.table import AmplitudeTable

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS
-from fitting.fits.discrepancy import Held, HeldEffect, ModelDiscrepancy, held_of, split_held, step_of
-from fitting.models import Problem
+from fitting.fits.discrepancy import HeldEffect, ModelDiscrepancy, step_of
+from fitting.models import Held, Problem, held_of, split_held
 from tests.test_discrepancy import LEFT_OUT, VALUES, rows
 
 OWN = ("relative_humidity", "modulus_gpa")

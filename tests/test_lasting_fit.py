@@ -8,11 +8,10 @@ import pytest
 import afm_jax as afm
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
-from fitting.fits.fit import problem_of
 from fitting.fits.minimum import model_errors_of, with_inflated_errors
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
-from fitting.models import measurement_of
+from fitting.models import measurement_of, problem_of
 from fitting.simulated.experiment import simulate_experiment
 from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment

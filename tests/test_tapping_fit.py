@@ -13,11 +13,11 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.least_squares import Box, distance
 from fitting.examples import make_tapping_curve
-from fitting.fits.fit import fit, problem_of
+from fitting.fits.fit import fit
 from fitting.fits.intervals import Places
 from fitting.fits.minimum import Minimum, settle
 from fitting.fits.objective import Objective
-from fitting.models import measurement_of, reach_of, rows_of, tip_work
+from fitting.models import measurement_of, problem_of, reach_of, rows_of, tip_work
 from fitting.tables.table import AmplitudeTable, read_table
 from tests.tapping_accuracy import (
     FEW_SHARES,

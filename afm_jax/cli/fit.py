@@ -10,7 +10,8 @@ from afm_jax.cli.session import Session, prepare_folder
 from afm_jax.cli.values import example_path, tables_with
 from afm_jax.words import text_table
 from fitting.fits.comparison import compare, rivals
-from fitting.fits.fit import Found, find_fit, summarise_in_units
+from fitting.fits.estimate import Found
+from fitting.fits.fit import find_fit, summarise_in_units
 from fitting.fits.result import FitResult
 from fitting.report.report import summary, write_report
 from fitting.sampling.bootstrap import bootstrap

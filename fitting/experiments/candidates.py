@@ -10,7 +10,7 @@ from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.prior import Prior, size_of
 from fitting.fits.discrepancy import ModelDiscrepancy, rows_of_fit, step_of
-from fitting.fits.fit import member_after, speed_range
+from fitting.fits.estimate import member_after, speed_range
 from fitting.fits.minimum import model_errors_of, padding
 from fitting.fits.objective import BATCH, Objective
 from fitting.forward import ImpactSlopes

@@ -20,8 +20,7 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw, closest_delay, law_of_dict
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
-from fitting.fits.loss import closest_loss, nearness, rebound_by_formula
-from fitting.fits.result import FitResult
+from fitting.fits.result import FitResult, closest_loss, nearness, rebound_by_formula
 from fitting.models import Problem
 from fitting.parameters import (
     DELAY_NAMES,

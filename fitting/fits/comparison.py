@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.results import Result, public_result
-from fitting.fits.fit import Found, find_fit, summarise, tables_of
+from fitting.fits.estimate import Found
+from fitting.fits.fit import find_fit, summarise, tables_of
 from fitting.fits.minimum import ModelErrors, settle, with_inflated_errors
 from fitting.fits.result import FitResult
 from fitting.parameters import CONTACT_NAMES, LAWS, MODELS, model_parameters

@@ -29,13 +29,13 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
-from afm_jax.contact.parameters import CONTACT_PARAMETER, PAPER, idle_without
+from afm_jax.contact.parameters import PAPER
 from afm_jax.least_squares import covariance_of
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.minimum import ModelErrors, padding
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER, ROBUST, Objective
 from fitting.forward import ImpactSlopes, Predicted, free_impacts, impact_at, impact_slopes
-from fitting.models import Problem
+from fitting.models import Held, Problem
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE, PARAMETERS, parameter_called
 
 LOSS_SPEED_SQUARED = 110.0, 60.0
@@ -63,22 +63,6 @@ _TOGETHER, _APART = 2.0, 1.0 / 16.0
 """Variance of the mean and of the difference of peak and lock-in of a slow row (times root 2), over that of each."""
 
 
-class Held(NamedTuple):
-    """A parameter that is held.
-
-    Attributes:
-        name: of the parameter.
-        value: at which it is held.
-        error: its standard error.
-        assumed: nobody has said the error.
-    """
-
-    name: str
-    value: float
-    error: float
-    assumed: bool
-
-
 class HeldEffect(NamedTuple):
     """What one standard error of a held parameter does to the squared rebound speed and to the delay.
 
@@ -96,49 +80,6 @@ class HeldEffect(NamedTuple):
         """Return both at approach speeds in nm/us."""
         place = np.log(speeds)
         return np.stack([np.interp(place, self.log_speed, part) for part in (self.square, self.late)])
-
-
-def split_held(
-    own: tuple[str, ...], fixed: Mapping[str, float] | None, constraints: Mapping[str, tuple[float, float]] | None
-) -> tuple[dict[str, float], dict[str, tuple[float, float]], dict[str, float]]:
-    """Return what a fit of the contact holds, what is known of what it fits, and what is known of what it holds.
-
-    Args:
-        own: the parameters that are fitted.
-        fixed: values at which others are held.
-        constraints: value and standard error of what is known of any.
-
-    Returns:
-        The values, those of the constraints among them; the other constraints; the standard errors that are said.
-
-    Raises:
-        ValueError: if a parameter is held at two values, or a constraint on one is impossible.
-    """
-    values, others, errors = dict(fixed or {}), {}, {}
-    for name, (value, error) in (constraints or {}).items():
-        if name not in CONTACT_PARAMETER or name in own:
-            others[name] = (value, error)
-            continue
-        if not (np.isfinite(value) and 0.0 < error < np.inf):
-            raise ValueError(
-                f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
-            )
-        if values.get(name, value) != value:
-            raise ValueError(f"{name} is held at {values[name]:g} (`fixed`) and known as {value:g}: say one of the two")
-        values[name], errors[name] = value, error
-    return values, others, errors
-
-
-def held_of(
-    own: tuple[str, ...], effects: tuple[str, ...], fixed: Mapping[str, float], errors: Mapping[str, float]
-) -> tuple[Held, ...]:
-    """Return all parameters of a contact that are not fitted and mean something with its effects."""
-    values = PAPER | dict(fixed)
-    return tuple(
-        Held(name, float(values[name]), errors.get(name, known.error_at(values[name])), name not in errors)
-        for name, known in CONTACT_PARAMETER.items()
-        if name not in own and not idle_without(name, effects)
-    )
 
 
 _HELD_POINTS, _HELD_NEAREST = 96, 1.1
@@ -189,13 +130,6 @@ def effects_of_held(
                 found.append(HeldEffect(one, np.log(u[there]), change[0, there], change[1, there]))
                 break
     return tuple(found)
-
-
-def held_values(problem: Problem, fixed: Mapping[str, float] | None) -> dict[str, float]:
-    """Return the values at which parameters are held: of taps on a contact all that they are varied about."""
-    if not problem.pulled:
-        return dict(fixed or {})
-    return {one.name: one.value for one in held_of(problem.own, problem.effects, fixed or {}, {})}
 
 
 def seen_in_taps(

@@ -1,8 +1,9 @@
-"""The minimum of chi2: screened, polished from the best starts, and again where the errors are only relative.
+"""The minimum of chi2: screened, polished from the best starts, and again with the model's own errors in the weights.
 
 The screening is a coarse grid over what a model's parameters can be. Where a law has no orbit on a row that was
 measured, chi2 is a plateau there: nothing tells a minimisation which way the orbit lies. The laws around the minimum
-are then asked for these rows alone, and the minimisation goes on from the best ones.
+are then asked for these rows alone, and the minimisation goes on from the best ones. Two minimisers do it: Optax's
+L-BFGS for all starts side by side (`polish`), and damped Gauss-Newton steps between bounds (`descended`).
 
 Slow impacts are more than a law of impacts describes; rows where it is too far off are excluded. What is left out grows
 with the share of the drive's cycle that a leaving tip takes to lose its energy, s = omega L/w (L: the length over which
@@ -28,143 +29,6 @@ from fitting.forward import Linearised, free_impacts, impact_at, times_of_taps
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, tip_work
 from fitting.parameters import PARAMETERS, Parameter
 
-_GRID_PER_PARAMETER = {1: 96, 2: 16}
-_SPREAD_POINTS = 64
-"""Points of a low-discrepancy sequence, where a grid would have too many; half as many of taps, which take long."""
-_FEW_STARTS = 4
-"""Of these, how many are polished of taps."""
-
-
-def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
-    """Return the values to start from, a grid or a sequence over the `starts` of the model's parameters.
-
-    Nuisances stay where they were measured.
-    """
-    own = problem.own
-    if measurement.joint is not None:
-        measurement = measurement._replace(rows=measurement.of_drive(problem.drive).rows)
-
-    def started(name: str, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        return _range(PARAMETERS[name], measurement, problem, place)
-
-    if len(own) in _GRID_PER_PARAMETER and not problem.lasting:
-        count = _GRID_PER_PARAMETER[len(own)]
-        mesh = np.meshgrid(*(started(name, np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
-        columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
-    else:
-        places = _spread(_SPREAD_POINTS // (1 + problem.pulled), len(own))
-        columns = {name: started(name, place) for name, place in zip(own, places.T, strict=True)}
-    count = len(columns[own[0]])
-    known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
-    return np.stack([columns.get(name, np.full(count, known[name])) for name in problem.names], axis=1)
-
-
-def _spread(count: int, dimensions: int) -> Float[np.ndarray, "count dimensions"]:
-    """Return the additive recurrence of Kronecker whose steps are powers of the generalised golden ratio (Roberts)."""
-    ratio = 2.0
-    for _ in range(60):
-        # x^(d+1) = x + 1
-        ratio = (1.0 + ratio) ** (1.0 / (dimensions + 1))
-    steps = ratio ** -np.arange(1.0, dimensions + 1.0)
-    return np.mod(0.5 + np.outer(np.arange(1, count + 1), steps), 1.0)
-
-
-_STARTS_OF_LOSS = 0.03, 2.0
-"""Range of the starts of a loss of a driven tip, in terms of what its readings say."""
-_USUAL_SPEED = 0.2
-"""Approach speed of a tip that taps above resonance, about, over the speed of the free tip."""
-
-
-def _lost_squared(measurement: Measurement, problem: Problem) -> tuple[float, float] | None:
-    """Return the loss u_in^2 - u_out^2 that amplitude and phase of a driven tip amount to, and a usual speed.
-
-    In nm^2/us^2 and nm/us, roughly: the first harmonic's energy, at the middle of the rows; None if nothing is lost.
-    """
-    rows, cantilever = measurement.rows, measurement.cantilever
-    lost = -2.0 * np.pi * float(cantilever.angular_frequency) ** 2 * np.imag(tip_work(rows, cantilever, problem.drive))
-    lost = lost[np.isfinite(lost) & (lost > 0.0) & ~np.asarray(rows.free)]
-    top = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
-    return (float(np.median(lost)), _USUAL_SPEED * float(np.median(top))) if lost.size else None
-
-
-def _range(
-    parameter: Parameter, measurement: Measurement, problem: Problem, place: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
-    """Return the values that places between 0 and 1 of a parameter's starting range stand for."""
-    rows = measurement.rows
-    if problem.tapping and parameter.drive_power:
-        lost = _lost_squared(measurement, problem)
-        if lost is not None:
-            low, high = np.array(_STARTS_OF_LOSS) * lost[0] / lost[1] ** (2.0 - parameter.drive_power)
-            return parameter.reference + parameter.sign * low * (high / low) ** place
-    drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
-    scale = np.array([drive.min(), drive.max()]) ** parameter.drive_power
-    scale *= float(np.asarray(measurement.cantilever.mass_ng)) ** parameter.mass_power
-    low, high = np.array(parameter.starts) * scale
-    if parameter.width or parameter.even:
-        return low + (high - low) * place
-    start = low * (high / low) ** place
-    return parameter.reference + parameter.sign * start if parameter.sign else start
-
-
-_STEPS = (0.01, 0.03, 0.1, 0.3)
-"""How far around a minimum laws are tried, in the optimiser's coordinates; those of losses relative to themselves."""
-
-
-def lost_rows(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " rows"]:
-    """Say on which rows something was measured that the law has no orbit for.
-
-    Args:
-        objective: its orbits are searched for.
-        values: of the law.
-    """
-    measured = np.asarray(objective.measurement.rows.measured).any(axis=1)
-    return measured & (np.asarray(objective.searching().at_values(values[None]).prediction.orbits)[0] == 0)
-
-
-def recovered(
-    objective: Objective, coordinates: Float[np.ndarray, " p"], lost: Bool[np.ndarray, " rows"]
-) -> Float[np.ndarray, " p"] | None:
-    """Return a minimum from which fewer orbits are missing, None if the laws around have no more of them.
-
-    Args:
-        objective: of all rows.
-        coordinates: the minimum.
-        lost: rows without orbit there.
-    """
-    around = _beside(objective, coordinates)
-    found = (
-        np.asarray(objective.searching().of_rows(lost).at_values(objective.problem.values(around)).prediction.orbits)
-        > 0
-    )
-    if not found.any():
-        return None
-    # the closest ones come first
-    best = around[np.argsort(-found.sum(axis=1), kind="stable")[:BATCH]]
-    follower = objective.following_each(objective.problem.values(best))
-    ends = polish(follower, best, SOFT, settled=ROUGH).coordinates
-    follower = objective.following_each(objective.problem.values(ends))
-    ends = polish(follower, ends, PLAIN, settled=FINE).coordinates
-    chi2 = np.sum(objective.searching().residual(objective.problem.values(ends)) ** 2, axis=1)
-    return ends[lowest(chi2)]
-
-
-def _beside(objective: Objective, coordinates: Float[np.ndarray, " p"]) -> Float[np.ndarray, "sets p"]:
-    """Return coordinates to either side of a point along every parameter of the law, close ones first."""
-    problem = objective.problem
-    sets = []
-    for step in _STEPS:
-        for index, parameter in enumerate(problem.parameters[: len(problem.own)]):
-            for side in (-step, step):
-                moved = coordinates.copy()
-                moved[index] += side * (coordinates[index] if parameter.sign else 1.0)
-                sets.append(moved)
-    return np.array(sets)
-
-
-_ROUNDS = 4
-_STEPS_PER_SEARCH = 15
-
 
 @dataclass(frozen=True)
 class Minimum:
@@ -181,6 +45,69 @@ class Minimum:
     start: Float[np.ndarray, " p"]
     ends: Float[np.ndarray, "starts p"]
     chi2: Float[np.ndarray, " starts"]
+
+
+@dataclass(frozen=True)
+class ModelErrors:
+    """How far a model's picture holds for each row.
+
+    Attributes:
+        model_error: relative error of the amplitude that the picture itself has, shape (rows,).
+        slow_error: the part of it that slow impacts have, without that of the delay law.
+        reasons: why rows are not used, empty for the others, shape (rows,).
+    """
+
+    model_error: Float[np.ndarray, " rows"]
+    slow_error: Float[np.ndarray, " rows"]
+    reasons: Shaped[np.ndarray, " rows"]
+
+    @property
+    def set_aside(self) -> Bool[np.ndarray, " rows"]:
+        """Rows that are not used."""
+        return self.reasons != ""
+
+
+_MODEL_ERROR_ROUNDS = 3
+
+
+_FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
+"""Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
+
+
+def minimum_with_model_errors(stated: Objective) -> tuple[Objective, Minimum, ModelErrors, bool]:
+    """Return the minimum with the model's own error in the weights and inaccurate rows excluded, until both settle.
+
+    The last is True if hardly a row of a driven tip is left then: they are not excluded, and the law is refused.
+    """
+    minimum = minimise(stated)
+    model_errors = model_errors_of(stated, stated.problem.values(minimum.coordinates))
+    if not stated.problem.lasting:
+        return stated, minimum, model_errors, False
+    if _few_left(stated, model_errors, minimum):
+        return stated, minimum, model_errors, True
+    objective = with_inflated_errors(stated, model_errors)
+    for _ in range(_MODEL_ERROR_ROUNDS):
+        minimum = settle(objective, minimum)
+        again = model_errors_of(stated, stated.problem.values(minimum.coordinates))
+        same = np.array_equal(again.set_aside, model_errors.set_aside)
+        close = np.allclose(again.model_error, model_errors.model_error, rtol=0.02)
+        if _few_left(stated, again, minimum):
+            return stated, minimum, again, True
+        if same and close:
+            return objective, minimum, model_errors, False
+        objective, model_errors = with_inflated_errors(stated, again), again
+    return objective, settle(objective, minimum), model_errors, False
+
+
+def _few_left(stated: Objective, model_errors: ModelErrors, minimum: Minimum) -> bool:
+    """Say whether the law has an orbit on fewer than four accurate rows of a driven tip, or on fewer than a fifth."""
+    if not stated.problem.tapping:
+        return False
+    rows = stated.measurement.rows
+    hits = np.asarray(rows.measured).any(axis=1) & ~np.asarray(rows.free)
+    lost = lost_rows(stated, stated.problem.values(minimum.coordinates))
+    left = int((hits & ~lost & ~model_errors.set_aside).sum())
+    return bool(left < max(_FEWEST_LEFT, _LEAST_LEFT * hits.sum()))
 
 
 def minimise(objective: Objective) -> Minimum:
@@ -223,6 +150,12 @@ def _with_own_nuisances(objective: Objective, found: Minimum) -> Minimum:
     return settle(objective, begun) if objective.problem.lasting else _polished(objective, best[None], begun.start)
 
 
+_ROUNDS = 4
+
+
+_STEPS_PER_SEARCH = 15
+
+
 def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Float[np.ndarray, "starts p"]:
     """Polish every start softly: orbits are followed, and searched for again now and then, for they come and go."""
     for _ in range(_ROUNDS):
@@ -248,6 +181,19 @@ def _whole(
     return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
 
 
+def settle(objective: Objective, minimum: Minimum) -> Minimum:
+    """Polish again until the orbits that are found at the minimum are the ones that were followed to it."""
+    for _ in range(_ROUNDS):
+        values = objective.problem.values(minimum.coordinates)
+        follower = objective.following(values)
+        end = _plainly(follower, minimum.coordinates[None])
+        chi2 = float(np.sum(objective.searching().residual(objective.problem.values(end.coordinates)) ** 2))
+        minimum = replace(minimum, coordinates=end.coordinates[0], chi2=np.append(chi2, minimum.chi2[1:]))
+        if abs(chi2 - end.objective[0]) < 1e-6 * (1.0 + chi2):
+            break
+    return minimum
+
+
 _MOST_STEPS = 150
 
 
@@ -269,17 +215,14 @@ def _plainly(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Pol
     return found if polished is None or np.any(end.chi2 < polished.objective - FINE) else polished
 
 
-def settle(objective: Objective, minimum: Minimum) -> Minimum:
-    """Polish again until the orbits that are found at the minimum are the ones that were followed to it."""
-    for _ in range(_ROUNDS):
-        values = objective.problem.values(minimum.coordinates)
-        follower = objective.following(values)
-        end = _plainly(follower, minimum.coordinates[None])
-        chi2 = float(np.sum(objective.searching().residual(objective.problem.values(end.coordinates)) ** 2))
-        minimum = replace(minimum, coordinates=end.coordinates[0], chi2=np.append(chi2, minimum.chi2[1:]))
-        if abs(chi2 - end.objective[0]) < 1e-6 * (1.0 + chi2):
-            break
-    return minimum
+def _polished(
+    objective: Objective, starts: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "..."]
+) -> Minimum:
+    """Polish plainly and keep the best; `origins` are the starts' grid points, or the one that is already known."""
+    final = polish(objective, starts, PLAIN, settled=FINE)
+    winner = lowest(final.objective)
+    start = origins if origins.ndim == 1 else origins[winner]
+    return Minimum(final.coordinates[winner], start, objective.problem.values(final.coordinates), final.objective)
 
 
 def _thinned(objective: Objective, most: int) -> Objective:
@@ -327,67 +270,205 @@ def rescale_errors(objective: Objective, minimum: Minimum, parameters: int) -> t
     return objective, minimum, total
 
 
-def _polished(
-    objective: Objective, starts: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "..."]
-) -> Minimum:
-    """Polish plainly and keep the best; `origins` are the starts' grid points, or the one that is already known."""
-    final = polish(objective, starts, PLAIN, settled=FINE)
-    winner = lowest(final.objective)
-    start = origins if origins.ndim == 1 else origins[winner]
-    return Minimum(final.coordinates[winner], start, objective.problem.values(final.coordinates), final.objective)
+_GRID_PER_PARAMETER = {1: 96, 2: 16}
+
+
+_SPREAD_POINTS = 64
+"""Points of a low-discrepancy sequence, where a grid would have too many; half as many of taps, which take long."""
+
+
+_FEW_STARTS = 4
+"""Of these, how many are polished of taps."""
+
+
+def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
+    """Return the values to start from, a grid or a sequence over the `starts` of the model's parameters.
+
+    Nuisances stay where they were measured.
+    """
+    own = problem.own
+    if measurement.joint is not None:
+        measurement = measurement._replace(rows=measurement.of_drive(problem.drive).rows)
+
+    def started(name: str, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return _range(PARAMETERS[name], measurement, problem, place)
+
+    if len(own) in _GRID_PER_PARAMETER and not problem.lasting:
+        count = _GRID_PER_PARAMETER[len(own)]
+        mesh = np.meshgrid(*(started(name, np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
+        columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
+    else:
+        places = _spread(_SPREAD_POINTS // (1 + problem.pulled), len(own))
+        columns = {name: started(name, place) for name, place in zip(own, places.T, strict=True)}
+    count = len(columns[own[0]])
+    known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
+    return np.stack([columns.get(name, np.full(count, known[name])) for name in problem.names], axis=1)
+
+
+def _spread(count: int, dimensions: int) -> Float[np.ndarray, "count dimensions"]:
+    """Return the additive recurrence of Kronecker whose steps are powers of the generalised golden ratio (Roberts)."""
+    ratio = 2.0
+    for _ in range(60):
+        # x^(d+1) = x + 1
+        ratio = (1.0 + ratio) ** (1.0 / (dimensions + 1))
+    steps = ratio ** -np.arange(1.0, dimensions + 1.0)
+    return np.mod(0.5 + np.outer(np.arange(1, count + 1), steps), 1.0)
+
+
+_STARTS_OF_LOSS = 0.03, 2.0
+"""Range of the starts of a loss of a driven tip, in terms of what its readings say."""
+
+
+_USUAL_SPEED = 0.2
+"""Approach speed of a tip that taps above resonance, about, over the speed of the free tip."""
+
+
+def _lost_squared(measurement: Measurement, problem: Problem) -> tuple[float, float] | None:
+    """Return the loss u_in^2 - u_out^2 that amplitude and phase of a driven tip amount to, and a usual speed.
+
+    In nm^2/us^2 and nm/us, roughly: the first harmonic's energy, at the middle of the rows; None if nothing is lost.
+    """
+    rows, cantilever = measurement.rows, measurement.cantilever
+    lost = -2.0 * np.pi * float(cantilever.angular_frequency) ** 2 * np.imag(tip_work(rows, cantilever, problem.drive))
+    lost = lost[np.isfinite(lost) & (lost > 0.0) & ~np.asarray(rows.free)]
+    top = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
+    return (float(np.median(lost)), _USUAL_SPEED * float(np.median(top))) if lost.size else None
+
+
+def _range(
+    parameter: Parameter, measurement: Measurement, problem: Problem, place: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Return the values that places between 0 and 1 of a parameter's starting range stand for."""
+    rows = measurement.rows
+    if problem.tapping and parameter.drive_power:
+        lost = _lost_squared(measurement, problem)
+        if lost is not None:
+            low, high = np.array(_STARTS_OF_LOSS) * lost[0] / lost[1] ** (2.0 - parameter.drive_power)
+            return parameter.reference + parameter.sign * low * (high / low) ** place
+    drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
+    scale = np.array([drive.min(), drive.max()]) ** parameter.drive_power
+    scale *= float(np.asarray(measurement.cantilever.mass_ng)) ** parameter.mass_power
+    low, high = np.array(parameter.starts) * scale
+    if parameter.width or parameter.even:
+        return low + (high - low) * place
+    start = low * (high / low) ** place
+    return parameter.reference + parameter.sign * start if parameter.sign else start
+
+
+def lost_rows(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " rows"]:
+    """Say on which rows something was measured that the law has no orbit for.
+
+    Args:
+        objective: its orbits are searched for.
+        values: of the law.
+    """
+    measured = np.asarray(objective.measurement.rows.measured).any(axis=1)
+    return measured & (np.asarray(objective.searching().at_values(values[None]).prediction.orbits)[0] == 0)
+
+
+def recovered(
+    objective: Objective, coordinates: Float[np.ndarray, " p"], lost: Bool[np.ndarray, " rows"]
+) -> Float[np.ndarray, " p"] | None:
+    """Return a minimum from which fewer orbits are missing, None if the laws around have no more of them.
+
+    Args:
+        objective: of all rows.
+        coordinates: the minimum.
+        lost: rows without orbit there.
+    """
+    around = _beside(objective, coordinates)
+    found = (
+        np.asarray(objective.searching().of_rows(lost).at_values(objective.problem.values(around)).prediction.orbits)
+        > 0
+    )
+    if not found.any():
+        return None
+    # the closest ones come first
+    best = around[np.argsort(-found.sum(axis=1), kind="stable")[:BATCH]]
+    follower = objective.following_each(objective.problem.values(best))
+    ends = polish(follower, best, SOFT, settled=ROUGH).coordinates
+    follower = objective.following_each(objective.problem.values(ends))
+    ends = polish(follower, ends, PLAIN, settled=FINE).coordinates
+    chi2 = np.sum(objective.searching().residual(objective.problem.values(ends)) ** 2, axis=1)
+    return ends[lowest(chi2)]
+
+
+_STEPS = (0.01, 0.03, 0.1, 0.3)
+"""How far around a minimum laws are tried, in the optimiser's coordinates; those of losses relative to themselves."""
+
+
+def _beside(objective: Objective, coordinates: Float[np.ndarray, " p"]) -> Float[np.ndarray, "sets p"]:
+    """Return coordinates to either side of a point along every parameter of the law, close ones first."""
+    problem = objective.problem
+    sets = []
+    for step in _STEPS:
+        for index, parameter in enumerate(problem.parameters[: len(problem.own)]):
+            for side in (-step, step):
+                moved = coordinates.copy()
+                moved[index] += side * (coordinates[index] if parameter.sign else 1.0)
+                sets.append(moved)
+    return np.array(sets)
 
 
 BASE, GROWTH, SLOW = 0.0005, 0.012, 0.016
 """Relative model error of fast impacts, its growth with s^3, and its value at 1.5 times the capture speed."""
+
+
 TAPPED, IN_FRAME = 0.0012, 1e-4
 """Growth of that of a driven tip, and its error in the frame of the free tip, over the amplitude there: what the law's
 parameters do not make up for (full contacts of tips of 12, 20 and 100 nm, 3 and 10 % above resonance)."""
+
+
 _OF_TAPS, _LONG_TAPS = 7e-4, 230.0
 """Error of amplitudes of taps that leaves their phases the 0.005 degrees by which full simulations differ; and, where
 the lever hardly pulls, over the eighth power of the share of a period that a tap lasts: four contacts have 0.03 degrees
 at 0.27 and 0.4 at 0.34."""
+
+
 DELAY_US = 1.5e-4
 """Error of the delay law in us."""
+
+
 LONGEST = 1.4
 """s beyond which a row is set aside."""
+
+
 NEAREST = 1.35
 """Approach speed in terms of the capture speed below which a row is set aside."""
+
+
 _CRAWLING, _MOST_LOST = 2.5, 0.05
 """The same for rows that the law has no steady orbit for, their speed told from the amplitude, and for driven tips; and
 the share of those without at most: that close to where orbits end, a hair of the law decides whether there is one."""
+
+
 _PULLED = 1.2
 """Pull times Hertz time over the approach speed from which the rows of a driven tip are set aside. Six full contacts
 3 % above resonance are predicted as well there as under little pull."""
+
+
 _MOST_IRREGULAR = 0.2
 """Share of the rows of a driven tip at most that are taken not to be one impact a period."""
+
+
 _TURNED = 0.125
 """Error of the phase in rad over the relative error of the amplitude: what the tip loses fixes the phase."""
+
+
 TOO_SLOW = "too slow for a law of impacts"
+
+
 TOO_PULLED = "under too strong a pull of the lever (more than 1.2 times what turns the tip round)"
+
+
 IRREGULAR = "not one a period"
+
+
 NO_TAPS = "not steady taps, one a period, of the fitted contact"
+
+
 ATTRACTED = "none: the sample only draws the tip"
 """Why rows are set aside."""
-
-
-@dataclass(frozen=True)
-class ModelErrors:
-    """How far a model's picture holds for each row.
-
-    Attributes:
-        model_error: relative error of the amplitude that the picture itself has, shape (rows,).
-        slow_error: the part of it that slow impacts have, without that of the delay law.
-        reasons: why rows are not used, empty for the others, shape (rows,).
-    """
-
-    model_error: Float[np.ndarray, " rows"]
-    slow_error: Float[np.ndarray, " rows"]
-    reasons: Shaped[np.ndarray, " rows"]
-
-    @property
-    def set_aside(self) -> Bool[np.ndarray, " rows"]:
-        """Rows that are not used."""
-        return self.reasons != ""
 
 
 def padding(share: Float[np.ndarray, " rows"], readings: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, "rows k"]:

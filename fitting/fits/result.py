@@ -1,8 +1,12 @@
-"""What a fit found, and everything that went into it."""
+"""What a fit gives: parameters, the law with its band, what impacts take of it, rows, and everything that went in.
+
+Energies, r and delta with their intervals (`Loss`) are the quantities that people ask for.
+"""
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +20,6 @@ from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
-from fitting.fits.loss import Loss
 from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
@@ -61,163 +64,6 @@ class FittedParameter:
             error = max(error, abs(other.value - self.value) / TWO_SIDED_95 + other.standard_error)
         reason = self.interval_reason or other.interval_reason
         return replace(self, standard_error=error, interval95=ends, interval_reason=reason)
-
-
-@jax.jit
-def _tabulated(
-    speeds: Float[Array, " rows"],
-    rebound: Float[Array, " rows"],
-    late: Float[Array, " rows"] | None,
-    capture: Float[Array, ""],
-    delay: CollisionDelay | None,
-    changes: tuple[Float[Array, "m 2 rows"], Float[Array, " m"]] | None,
-) -> TabulatedLaw:
-    known: dict[str, Any] = {"capture_speed_nm_per_us": capture, "delay": delay}
-    if changes is None:
-        return TabulatedLaw(speeds, rebound, late, **known)
-    of_rows, of_capture = changes
-    return TabulatedLaw.with_errors(
-        speeds,
-        rebound,
-        late,
-        rebound_changes=of_rows[:, 0],
-        delay_changes=None if late is None else of_rows[:, 1],
-        capture_changes=of_capture,
-        **known,
-    )
-
-
-_TOGETHER = 8
-"""Unknowns are filled up to a multiple of this, so that laws have few shapes and programs."""
-
-
-def table_of_law(
-    speeds: Float[np.ndarray, " points"],
-    rebound: Float[np.ndarray, " points"],
-    late: Float[np.ndarray, " points"] | None,
-    *,
-    capture_speed_nm_per_us: float,
-    delay: CollisionDelay | None,
-    errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]] | None = None,
-) -> TabulatedLaw:
-    """Return a law as the table that a scene takes, by one compiled program.
-
-    Args:
-        speeds: approach speeds in nm/us, four of which at least leave.
-        rebound: speeds in nm/us, 0 where the tip is captured.
-        late: delays in us; None: impacts are instantaneous.
-        capture_speed_nm_per_us: of the law, kept between the fastest tip that is captured and the slowest that leaves.
-        delay: the formula that the delay is written beside; None: the closest one.
-        errors: changes of rebound speeds and delays, and of the capture speed, with independent unknowns of unit
-            variance; None: nothing is known of them.
-    """
-    leaves = rebound > 0.0
-    u, w = speeds[leaves], np.minimum(rebound, speeds)[leaves]
-    captured = speeds[~leaves][-1] if not leaves.all() else 0.0
-    capture = np.clip(capture_speed_nm_per_us, captured, (1.0 - 1e-9) * u[0])
-    changes, count = None, 0
-    if errors is not None:
-        of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
-        count = of_capture.size
-        spare = -count % _TOGETHER
-        changes = np.pad(np.moveaxis(of_rows, 2, 0), ((0, spare), (0, 0), (0, 0))).transpose(0, 2, 1)
-        changes = np.ascontiguousarray(changes), np.pad(of_capture, (0, spare))
-    law = _tabulated(u, w, None if late is None else late[leaves], capture, None if late is None else delay, changes)
-    if law.deviations is None:
-        return law
-    return eqx.tree_at(
-        lambda law: law.deviations, law, {name: np.asarray(one)[:count] for name, one in law.deviations.items()}
-    )
-
-
-def fewest_unknowns(
-    of_rows: Float[np.ndarray, "points 2 m"], of_capture: Float[np.ndarray, " m"]
-) -> tuple[Float[np.ndarray, "points 2 k"], Float[np.ndarray, " k"]]:
-    """Return changes with fewer independent unknowns that have the same covariance, to 3 parts in 1000 of every error.
-
-    What is not known of the capture speed (NaN) is left out.
-    """
-    flat = np.append(of_rows.reshape(-1, of_rows.shape[2]), np.nan_to_num(of_capture)[None], axis=0)
-    size = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
-    left, strength, _ = np.linalg.svd(flat / size, full_matrices=False)
-    parts = left * strength
-    missing = np.sqrt(np.maximum(np.cumsum((parts**2)[:, ::-1], axis=1)[:, ::-1], 0.0)).max(axis=0)
-    kept = (size * parts)[:, : max(int(np.sum(missing > _LEAST_PART)), 1)]
-    return kept[:-1].reshape(*of_rows.shape[:2], -1), kept[-1]
-
-
-_LEAST_PART = 3e-3
-"""Share of an error below which unknowns are left out."""
-
-
-class FittedLaw(TabulatedLaw):
-    """The impact law that a fit found, with its discrepancy: a law for scenes, and its points with a 95 % band.
-
-    The points go from 0.8 times the slowest to 1.2 times the fastest speed that the rows reached; beyond them the law
-    is `extrapolated`. `sample` draws laws that are as uncertain. NaN: nothing is known of the band.
-
-    Attributes:
-        approach_speed_nm_per_us: u_in at the points.
-        rebound_speed_nm_per_us: u_out; 0 where the tip is captured.
-        rebound_low_nm_per_us: lower end of its pointwise 95 % band.
-        rebound_high_nm_per_us: upper end.
-        collision_delay_us: the delay; 0 if impacts are instantaneous.
-        delay_low_us: lower end of its band.
-        delay_high_us: upper end.
-    """
-
-    approach_speed_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
-    rebound_speed_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
-    rebound_low_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
-    rebound_high_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
-    collision_delay_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
-    delay_low_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
-    delay_high_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
-
-    def __init__(  # noqa: PLR0913
-        self,
-        speeds: Float[np.ndarray, " points"],
-        rebound: Float[np.ndarray, " points"],
-        late: Float[np.ndarray, " points"],
-        *,
-        capture_speed_nm_per_us: float,
-        delay: CollisionDelay | None,
-        lasting: bool,
-        errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]],
-        mass_ng: float | None,
-        origin: str,
-    ):
-        """Make the law of its points; arguments as of `table_of_law`.
-
-        Errors are NaN where nothing is known of them.
-        """
-        table = table_of_law(
-            speeds,
-            rebound,
-            late if lasting else None,
-            capture_speed_nm_per_us=capture_speed_nm_per_us,
-            delay=delay,
-            errors=errors if np.isfinite(errors[0]).all() else None,
-        )
-        for part in dataclasses.fields(TabulatedLaw):
-            setattr(self, part.name, getattr(table, part.name))
-        self.mass_ng, self.origin = None if mass_ng is None else jnp.asarray(mass_ng), Origin(origin)
-        width = TWO_SIDED_95 * np.linalg.norm(errors[0], axis=2)
-        self.approach_speed_nm_per_us = speeds
-        self.rebound_speed_nm_per_us, self.collision_delay_us = map(np.asarray, _points(table, speeds))
-        self.rebound_low_nm_per_us = np.maximum(self.rebound_speed_nm_per_us - width[:, 0], 0.0)
-        self.rebound_high_nm_per_us = self.rebound_speed_nm_per_us + width[:, 0]
-        self.delay_low_us = self.collision_delay_us - width[:, 1]
-        self.delay_high_us = self.collision_delay_us + width[:, 1]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the law as fit.json has it: its points with units in their names, and all that makes it again."""
-        return super().to_dict() | {name: plain(getattr(self, name)) for name in FittedLaw.__annotations__}
-
-
-@jax.jit
-def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, Array]:
-    return law.rebound_speed(speeds), law.collision_delay(speeds)
 
 
 @dataclass(frozen=True)
@@ -291,6 +137,116 @@ class Scatter:
     value: float
     interval95: tuple[float, float | None]
     unit: str
+
+
+@dataclass(frozen=True)
+class WithInterval:
+    """A value and the ends of its 95 % interval, None where no error is known."""
+
+    value: float
+    interval95: tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class EnergyLost:
+    """What an impact takes at an approach speed in nm/us, with its 95 % band; None: its mass is not known."""
+
+    approach_speed_nm_per_us: float
+    energy_aj: WithInterval | None
+    energy_ev: WithInterval | None
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What impacts take: energies at three speeds that were measured, and what the printed parameters say.
+
+    Attributes:
+        energies: at three speeds, of the law.
+        energies_reason: why they are not known; None where they are.
+        r: the fit's parameter; None of a model without.
+        epsilon_nm2_per_us2: likewise.
+        delta_aj: energy lost to adhesion, m epsilon/2.
+        delta_ev: in electron volts.
+        formula_off: largest distance of the formula with the printed parameters from the law, over the measured speeds,
+            relative to the rebound speed; None of a model without a formula.
+        formula_off_at_nm_per_us: approach speed where it is that far.
+        capture_speed_nm_per_us: of the law, extrapolated.
+    """
+
+    energies: tuple[EnergyLost, ...]
+    energies_reason: str | None
+    r: WithInterval | None
+    epsilon_nm2_per_us2: WithInterval | None
+    delta_aj: WithInterval | None
+    delta_ev: WithInterval | None
+    formula_off: float | None
+    formula_off_at_nm_per_us: float | None
+    capture_speed_nm_per_us: WithInterval
+
+
+class FittedLaw(TabulatedLaw):
+    """The impact law that a fit found, with its discrepancy: a law for scenes, and its points with a 95 % band.
+
+    The points go from 0.8 times the slowest to 1.2 times the fastest speed that the rows reached; beyond them the law
+    is `extrapolated`. `sample` draws laws that are as uncertain. NaN: nothing is known of the band.
+
+    Attributes:
+        approach_speed_nm_per_us: u_in at the points.
+        rebound_speed_nm_per_us: u_out; 0 where the tip is captured.
+        rebound_low_nm_per_us: lower end of its pointwise 95 % band.
+        rebound_high_nm_per_us: upper end.
+        collision_delay_us: the delay; 0 if impacts are instantaneous.
+        delay_low_us: lower end of its band.
+        delay_high_us: upper end.
+    """
+
+    approach_speed_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    rebound_speed_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    rebound_low_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    rebound_high_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    collision_delay_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    delay_low_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    delay_high_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+
+    def __init__(  # noqa: PLR0913
+        self,
+        speeds: Float[np.ndarray, " points"],
+        rebound: Float[np.ndarray, " points"],
+        late: Float[np.ndarray, " points"],
+        *,
+        capture_speed_nm_per_us: float,
+        delay: CollisionDelay | None,
+        lasting: bool,
+        errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]],
+        mass_ng: float | None,
+        origin: str,
+    ):
+        """Make the law of its points; arguments as of `table_of_law`.
+
+        Errors are NaN where nothing is known of them.
+        """
+        table = table_of_law(
+            speeds,
+            rebound,
+            late if lasting else None,
+            capture_speed_nm_per_us=capture_speed_nm_per_us,
+            delay=delay,
+            errors=errors if np.isfinite(errors[0]).all() else None,
+        )
+        for part in dataclasses.fields(TabulatedLaw):
+            setattr(self, part.name, getattr(table, part.name))
+        self.mass_ng, self.origin = None if mass_ng is None else jnp.asarray(mass_ng), Origin(origin)
+        width = TWO_SIDED_95 * np.linalg.norm(errors[0], axis=2)
+        self.approach_speed_nm_per_us = speeds
+        self.rebound_speed_nm_per_us, self.collision_delay_us = map(np.asarray, _points(table, speeds))
+        self.rebound_low_nm_per_us = np.maximum(self.rebound_speed_nm_per_us - width[:, 0], 0.0)
+        self.rebound_high_nm_per_us = self.rebound_speed_nm_per_us + width[:, 0]
+        self.delay_low_us = self.collision_delay_us - width[:, 1]
+        self.delay_high_us = self.collision_delay_us + width[:, 1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the law as fit.json has it: its points with units in their names, and all that makes it again."""
+        return super().to_dict() | {name: plain(getattr(self, name)) for name in FittedLaw.__annotations__}
 
 
 @public_result(picture="fitting.report.plots:rows_figure", rows="parameters")
@@ -386,3 +342,210 @@ class FitResult(Result):
             if self.tables
             else {}
         )
+
+
+@jax.jit
+def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, Array]:
+    return law.rebound_speed(speeds), law.collision_delay(speeds)
+
+
+@jax.jit
+def _tabulated(
+    speeds: Float[Array, " rows"],
+    rebound: Float[Array, " rows"],
+    late: Float[Array, " rows"] | None,
+    capture: Float[Array, ""],
+    delay: CollisionDelay | None,
+    changes: tuple[Float[Array, "m 2 rows"], Float[Array, " m"]] | None,
+) -> TabulatedLaw:
+    known: dict[str, Any] = {"capture_speed_nm_per_us": capture, "delay": delay}
+    if changes is None:
+        return TabulatedLaw(speeds, rebound, late, **known)
+    of_rows, of_capture = changes
+    return TabulatedLaw.with_errors(
+        speeds,
+        rebound,
+        late,
+        rebound_changes=of_rows[:, 0],
+        delay_changes=None if late is None else of_rows[:, 1],
+        capture_changes=of_capture,
+        **known,
+    )
+
+
+_TOGETHER = 8
+"""Unknowns are filled up to a multiple of this, so that laws have few shapes and programs."""
+
+
+def table_of_law(
+    speeds: Float[np.ndarray, " points"],
+    rebound: Float[np.ndarray, " points"],
+    late: Float[np.ndarray, " points"] | None,
+    *,
+    capture_speed_nm_per_us: float,
+    delay: CollisionDelay | None,
+    errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]] | None = None,
+) -> TabulatedLaw:
+    """Return a law as the table that a scene takes, by one compiled program.
+
+    Args:
+        speeds: approach speeds in nm/us, four of which at least leave.
+        rebound: speeds in nm/us, 0 where the tip is captured.
+        late: delays in us; None: impacts are instantaneous.
+        capture_speed_nm_per_us: of the law, kept between the fastest tip that is captured and the slowest that leaves.
+        delay: the formula that the delay is written beside; None: the closest one.
+        errors: changes of rebound speeds and delays, and of the capture speed, with independent unknowns of unit
+            variance; None: nothing is known of them.
+    """
+    leaves = rebound > 0.0
+    u, w = speeds[leaves], np.minimum(rebound, speeds)[leaves]
+    captured = speeds[~leaves][-1] if not leaves.all() else 0.0
+    capture = np.clip(capture_speed_nm_per_us, captured, (1.0 - 1e-9) * u[0])
+    changes, count = None, 0
+    if errors is not None:
+        of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
+        count = of_capture.size
+        spare = -count % _TOGETHER
+        changes = np.pad(np.moveaxis(of_rows, 2, 0), ((0, spare), (0, 0), (0, 0))).transpose(0, 2, 1)
+        changes = np.ascontiguousarray(changes), np.pad(of_capture, (0, spare))
+    law = _tabulated(u, w, None if late is None else late[leaves], capture, None if late is None else delay, changes)
+    if law.deviations is None:
+        return law
+    return eqx.tree_at(
+        lambda law: law.deviations, law, {name: np.asarray(one)[:count] for name, one in law.deviations.items()}
+    )
+
+
+def fewest_unknowns(
+    of_rows: Float[np.ndarray, "points 2 m"], of_capture: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "points 2 k"], Float[np.ndarray, " k"]]:
+    """Return changes with fewer independent unknowns that have the same covariance, to 3 parts in 1000 of every error.
+
+    What is not known of the capture speed (NaN) is left out.
+    """
+    flat = np.append(of_rows.reshape(-1, of_rows.shape[2]), np.nan_to_num(of_capture)[None], axis=0)
+    size = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+    left, strength, _ = np.linalg.svd(flat / size, full_matrices=False)
+    parts = left * strength
+    missing = np.sqrt(np.maximum(np.cumsum((parts**2)[:, ::-1], axis=1)[:, ::-1], 0.0)).max(axis=0)
+    kept = (size * parts)[:, : max(int(np.sum(missing > _LEAST_PART)), 1)]
+    return kept[:-1].reshape(*of_rows.shape[:2], -1), kept[-1]
+
+
+_LEAST_PART = 3e-3
+"""Share of an error below which unknowns are left out."""
+
+
+EV_PER_AJ = 1.0 / 0.1602176634
+"""Electron volts in an attojoule (exact in SI)."""
+
+
+def interval_of(value: float, error: float, lowest: float = -np.inf, highest: float = np.inf) -> WithInterval:
+    """Return a value with its 95 % interval, cut off where nothing can be."""
+    if not np.isfinite(error):
+        return WithInterval(value, (None, None))
+    reach = TWO_SIDED_95 * error
+    return WithInterval(value, (float(max(value - reach, lowest)), float(min(value + reach, highest))))
+
+
+def scaled(known: WithInterval, factor: float) -> WithInterval:
+    """Return a value and its interval in another unit."""
+    low, high = (None if end is None else end * factor for end in known.interval95)
+    return WithInterval(known.value * factor, (low, high))
+
+
+NO_MASS = "the table gives neither mass_ng nor spring_constant_n_per_m"
+
+
+def energy_lost(speed: float, rebound: float, error: float, mass_ng: float | None) -> EnergyLost:
+    """Return the energy that an impact takes; its interval ends at 0, for a sample at rest gives none.
+
+    Args:
+        speed: approach speed in nm/us.
+        rebound: rebound speed.
+        error: standard error of that.
+        mass_ng: of the tip; None: not known.
+    """
+    if mass_ng is None:
+        return EnergyLost(speed, None, None)
+    taken = interval_of(0.5 * mass_ng * (speed**2 - rebound**2), mass_ng * rebound * error, lowest=0.0)
+    return EnergyLost(speed, taken, scaled(taken, EV_PER_AJ))
+
+
+def rebound_by_formula(values: Mapping[str, float], speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return u_out of the formula of a law's parameters at approach speeds in nm/us; 0 where the tip is captured."""
+    square = (values.get("r", 1.0) * speeds) ** 2 - values.get("viscous_loss", 0.0) * speeds
+    return np.sqrt(np.maximum(square - values.get("epsilon", 0.0), 0.0))
+
+
+class Nearness(NamedTuple):
+    """How near formulas of a family come to a law: the largest distance, relative to the rebound speed, and where."""
+
+    off: float
+    at_nm_per_us: float
+
+
+def nearness(
+    speeds: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], formula: Float[np.ndarray, " n"]
+) -> Nearness:
+    """Return how far rebound speeds of a formula are from those of a law, 0 where the tip is captured."""
+    off = np.where(rebound > 0.0, np.abs(formula / np.where(rebound > 0.0, rebound, 1.0) - 1.0), 0.0)
+    worst = int(np.argmax(off))
+    return Nearness(float(off[worst]), float(speeds[worst]))
+
+
+_COLUMNS = {"r": 2, "viscous_loss": 1, "epsilon": 0}
+"""Powers of the speed: u_in^2 - u_out^2 = (1 - r^2) u^2 + c u + epsilon, each term a loss."""
+
+
+def closest_loss(
+    family: Sequence[str],
+    speeds: Float[np.ndarray, " n"],
+    rebound: Float[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"],
+    fixed: Mapping[str, float],
+) -> dict[str, float]:
+    """Return the parameters of the formula closest to a law from anywhere, to first order; no loss is negative.
+
+    Least squares in u_out^2 over 2 u_out of the law, a problem without other minima. `closest_member` polishes from
+    parameters close by, with errors.
+
+    Args:
+        family: of r, viscous_loss and epsilon those that are looked for.
+        speeds: approach speeds in nm/us.
+        rebound: of the law, all positive.
+        weight: of each.
+        fixed: values of others of them.
+    """
+    from scipy.optimize import nnls  # noqa: PLC0415 (half a second that most fits do not need)
+
+    if not family:
+        return {}
+    lost = speeds**2 - rebound**2
+    for name in [name for name in _COLUMNS if name in fixed]:
+        lost = lost - (1.0 - fixed[name] ** 2 if name == "r" else fixed[name]) * speeds ** _COLUMNS[name]
+    steep = 0.5 * weight / rebound
+    matrix = steep[:, None] * np.stack([speeds ** _COLUMNS[name] for name in family], axis=1)
+    scale = np.linalg.norm(matrix, axis=0)
+    size, _ = nnls(matrix / scale, steep * lost)
+    terms = zip(family, (size / scale).tolist(), strict=True)
+    return {name: max(1.0 - term, 0.0) ** 0.5 if name == "r" else term for name, term in terms}
+
+
+def nearest_of(
+    family: Sequence[str],
+    speeds: Float[np.ndarray, " n"],
+    rebound: Float[np.ndarray, " n"],
+    half_width: Float[np.ndarray, " n"],
+) -> Nearness:
+    """Return how near the laws of a family of losses come to a law, in rebound speeds over the half-width of its band.
+
+    Args:
+        family: of r, viscous_loss and epsilon those that the family has.
+        speeds: approach speeds in nm/us.
+        rebound: of the law.
+        half_width: of its band.
+    """
+    free = (rebound > 0.0) & (half_width > 0.0)
+    u, w = speeds[free], rebound[free]
+    return nearness(u, w, rebound_by_formula(closest_loss(family, u, w, 1.0 / half_width[free], {}), u))

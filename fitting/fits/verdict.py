@@ -4,21 +4,24 @@ A fit is valid only if what is left of the amplitudes passes an absolute test, w
 chi2 by its probability; with a robust loss the share of outliers, and chi2 without them by its probability; with scaled
 errors the scale, and what is known of the parameters; always that neighbouring residuals are not correlated, neither in
 the table's order (a drift, a sweep the model does not follow) nor over the approach speed (a wrong law).
+
+The rules are the three lists at the end: `MISFITS`, `REASONS` and `WARNINGS`.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from fitting.fits.discrepancy import Held
+from afm_jax.outcomes import Rule, Rules, judge
 from fitting.fits.intervals import Convergence
-from fitting.fits.loss import NO_MASS
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
-from fitting.fits.result import FittedParameter, FittedRows
-from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, parameter_called
+from fitting.fits.result import NO_MASS, FittedParameter, FittedRows
+from fitting.models import ASSUMED_ERROR_OF_Q, Held
+from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import ERRORS_OF_REPEATS, AmplitudeTable
 
@@ -52,8 +55,6 @@ _NO_TAPS = (
     "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what "
     "is known of it (--fix tip_radius_nm=20, for example), or leave out rows that are not one impact a period."
 )
-ASSUMED_ERROR_OF_Q = 0.05
-"""Relative standard error of a quality factor that is given without one."""
 _AT_BOUND = 0.005
 _PULLED, _TORN = 2.0, 3.0
 """Distance from what is known of a quantity, in its standard errors, from which it is named, and not believed."""
@@ -91,9 +92,9 @@ class Evidence:
     scattering: bool = False
     """Laws were allowed to differ from table to table."""
     run: tuple[float, float] = (0.0, 0.0)
-    """Standard deviations by which residuals run together over the speed, and by which beside what that added."""
-    unbent: Float[np.ndarray, "rows k"] | None = None
-    """Residuals of the rows without that, where it was added: it goes after outliers."""
+    """Standard deviations by which residuals run together over the speed, and by which beside the discrepancy added."""
+    unwidened: Float[np.ndarray, "rows k"] | None = None
+    """Residuals of the rows without the discrepancy that was added for runs: that goes after outliers."""
     held: tuple[Held, ...] = ()
     """What a fit of the contact holds, with its errors."""
     hanging: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -105,116 +106,50 @@ class Evidence:
     None: those of the rows."""
     stuck: tuple[float, float] | None = None
     """chi2 that no part of the step with the model discrepancy lowers, and what the step takes it to to first order."""
+    courses: dict[str, list[str]] = field(default_factory=dict)
+    """Which readings of a table follow its rows, whose order nothing says, by the table's label."""
 
     @property
     def refusal(self) -> str:
         """Why hardly a row is one that the model can be read off."""
         return _NO_TAPS if self.tapped else _REFUSED
 
+    @property
+    def undetermined(self) -> list[str]:
+        """Names of the parameters that the data do not determine, not even to first order."""
+        return [name for name, parameter in self.parameters.items() if parameter.undetermined]
+
+    @property
+    def may_stay_open(self) -> bool:
+        """Whether what is not determined need not be: of a contact's taps, unless nothing is."""
+        law = [name for name in self.parameters if not is_nuisance(name)]
+        return self.tapped and any(not self.parameters[name].undetermined for name in law)
+
+    @property
+    def pulled(self) -> dict[str, float]:
+        """How far each parameter is from what was measured of it otherwise, in standard errors of that."""
+        known = {name: (p.value, *p.constraint) for name, p in self.parameters.items() if p.constraint is not None}
+        return {name: (value - given) / error for name, (value, given, error) in known.items()}
+
+    @property
+    def outliers(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows are far off."""
+        return np.any(np.abs(np.nan_to_num(self.rows.residual)) > OUTLIER, axis=1)
+
+    @property
+    def most_outliers(self) -> float:
+        """How many outliers a robust fit may have."""
+        return max(1.0, MOST_OUTLIERS * self.rows.used.sum())
+
+    @property
+    def chi2_per_freedom(self) -> float:
+        """chi2 over the degrees of freedom."""
+        return self.chi2 / self.freedom
+
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
     """Return what makes a fit invalid, and its warnings; each a sentence."""
-    return [evidence.refusal] if evidence.refused else _reasons(evidence), _warnings(evidence)
-
-
-def _reasons(evidence: Evidence) -> list[str]:
-    reasons = []
-    convergence = evidence.convergence
-    undetermined = [] if _may_stay_open(evidence) else _undetermined(evidence)
-    if convergence.reason is not None:
-        reasons.append(f"Not converged: {convergence.reason}.")
-    elif undetermined:
-        reasons.append(
-            f"Not identified: the amplitudes do not determine {' and '.join(undetermined)}; "
-            f"{'; '.join(dict.fromkeys(helpful_measurement(name) for name in undetermined))}."
-        )
-    elif not convergence.converged:
-        reasons.append(
-            ("Not converged: " + _distance_in_words(convergence.estimated_distance))
-            + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")
-            + "."
-        )
-    missing = np.flatnonzero((evidence.rows.orbits == 0) & evidence.rows.used)
-    if missing.size:
-        reasons.append(f"No stable orbit at the fitted law for {_rows_in_words(evidence.table, missing)}.")
-    if evidence.untabulated:
-        where = _rows_in_words(evidence.table, np.array(evidence.untabulated))
-        reasons.append(
-            f"The table of the fitted contact's impacts misses its accuracy for {where}: the contact's numbers are too "
-            "extreme; hold some of them fixed."
-        )
-    misfit = misfits(evidence)
-    if misfit:
-        reasons.append(f"The model does not explain the data: {'; '.join(misfit)}. {_why_not_explained(evidence)}")
-    reasons += [*_no_way_down(evidence), *_contradictions(evidence), *_different_laws(evidence)]
-    if evidence.freedom <= 0:
-        reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
-    # a tapping curve tells those of the delay only together; the law does not hang on each
-    together = (*(DELAY_NAMES if evidence.table.tapping else ()), *_undetermined(evidence))
-    for name in (name for name in evidence.parameters if name not in together):
-        parameter = evidence.parameters[name]
-        if parameter.interval95 == (None, None) and not misfit and not undetermined:
-            reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
-    return reasons
-
-
-def _distance_in_words(distance: float) -> str:
-    if not np.isfinite(distance):
-        return "chi2 bends downwards where the search ended, which is no minimum"
-    return f"chi2 lies an estimated {distance:.2g} above its minimum"
-
-
-def _no_way_down(evidence: Evidence) -> list[str]:
-    """Return what says that the model discrepancy was not found: no part of the step to it lowers chi2, computed."""
-    if evidence.stuck is None:
-        return []
-    begin, expected = evidence.stuck
-    said = (
-        "Not converged: to first order the model discrepancy would lower chi2 from "
-        f"{begin:.1f} to {expected:.1f}, but computed not even a sixteenth of it does; the amplitudes are far from "
-        "linear in the law, as they are near folds: leave such rows out."
-    )
-    return [said]
-
-
-def _undetermined(evidence: Evidence) -> list[str]:
-    return [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
-
-
-def _may_stay_open(evidence: Evidence) -> bool:
-    """Say whether what is not determined need not be: of a contact's taps, unless nothing is."""
-    own = [name for name in evidence.parameters if not is_nuisance(name)]
-    return evidence.tapped and any(not evidence.parameters[name].undetermined for name in own)
-
-
-def _different_laws(evidence: Evidence) -> list[str]:
-    disagreeing = _disagreeing(evidence)
-    if not disagreeing or evidence.scattering:
-        return []
-    advice = "look at what is different there, leave it out, or let laws differ from table to table (--hierarchical)"
-    return [f"The tables do not have one law: {disagreeing}; {advice}."]
-
-
-def _disagreeing(evidence: Evidence) -> str:
-    """Return which tables' laws are not that of the others, in words; nothing where all may have one."""
-    pulls = np.array(evidence.pulls)
-    far = np.flatnonzero(pulls * pulls.size < IMPROBABLE)
-    named = sorted(far, key=lambda t: pulls[t])
-    return "; ".join(f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in named)
-
-
-def _contradictions(evidence: Evidence) -> list[str]:
-    """Return what says that the amplitudes contradict what was measured otherwise."""
-    torn = [_pull_in_words(evidence, name, pull) for name, pull in _pulls(evidence).items() if abs(pull) > _TORN]
-    if not torn:
-        return []
-    said = "; ".join(torn)
-    return [
-        (
-            f"The amplitudes contradict what is known beforehand: {said}. "
-            "Either that is wrong, or the model makes up for what it lacks."
-        )
-    ]
+    return [evidence.refusal] if evidence.refused else judge(REASONS, evidence), judge(WARNINGS, evidence)
 
 
 def misfits(evidence: Evidence) -> list[str]:
@@ -222,97 +157,7 @@ def misfits(evidence: Evidence) -> list[str]:
 
     The parameters' errors and intervals are not looked at.
     """
-    if evidence.refused:
-        return [evidence.refusal]
-    found = []
-    if evidence.p_value < IMPROBABLE:
-        found.append(f"chi2/dof = {evidence.chi2 / evidence.freedom:.3g} (probability {evidence.p_value:.1g})")
-    if evidence.robust:
-        found += _robust_misfits(evidence)
-    if evidence.error_scale is not None:
-        found += _scaled_misfits(evidence)
-    if evidence.run[1] > _LONGEST_RUN:
-        found.append(
-            f"residuals run together over the approach speed ({evidence.run[0]:.1f} standard deviations; "
-            f"{evidence.run[1]:.1f} beside a model discrepancy of {100.0 * evidence.short:.0f} % of the loss)"
-        )
-    # rows of tables whose laws scatter about the predicted one are off together
-    if not (evidence.robust or evidence.scattering):
-        found += _one_sided(evidence)
-    return found + [
-        f"neighbouring residuals {where} are correlated ({excess:+.1f} standard deviations)"
-        for where, excess in _correlations(evidence)
-    ]
-
-
-def _one_sided(evidence: Evidence) -> list[str]:
-    """Return that some rows are off to one side, in words: chance gives as large residuals of either sign."""
-    residual = evidence.rows.residual if evidence.unbent is None else evidence.unbent
-    count = np.isfinite(residual).sum(axis=1)
-    of_row = np.nansum(residual, axis=1) / np.sqrt(np.maximum(count, 1))
-    rows = int((count > 0).sum())
-    if rows <= _FEWEST_NEIGHBOURS:
-        return []
-    excess = float(np.sum(of_row**3) / np.sqrt(15.0 * rows))
-    if abs(excess) < _ONE_SIDED:
-        return []
-    far = np.sort(np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)])
-    side = "above" if excess > 0.0 else "below"
-    said = f"residuals are far off to one side ({excess:+.1f} standard deviations of their cubes)"
-    return [f"{said}: predicted {side} what was read for {_rows_in_words(evidence.table, far)}"]
-
-
-def _robust_misfits(evidence: Evidence) -> list[str]:
-    outliers = _outliers(evidence)
-    count, used = int(outliers.sum()), int(evidence.rows.used.sum())
-    if count > max(1.0, MOST_OUTLIERS * used):
-        bound = f"robust loss is for outliers in at most one row of {1.0 / MOST_OUTLIERS:g}"
-        return [f"{count} of {used} rows are off by more than {OUTLIER:g} errors, and {bound}"]
-    chi2, freedom, p_value = _without_outliers(evidence)
-    if p_value < IMPROBABLE:
-        return [f"without outliers chi2/dof = {chi2 / freedom:.3g} (probability {p_value:.1g})"]
-    return []
-
-
-def _scaled_misfits(evidence: Evidence) -> list[str]:
-    found = []
-    scale, pulls = evidence.error_scale or 1.0, _pulls(evidence)
-    if scale > LARGEST_SCALE:
-        found.append(
-            f"the amplitudes' errors would have to be {scale:.3g} times those stated, and more than "
-            f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
-            "to within that)"
-        )
-    if pulls and chi2_tail(sum(pull**2 for pull in pulls.values()), len(pulls)) < IMPROBABLE:
-        moved = ", ".join(f"{name} by {pull:+.1f}" for name, pull in pulls.items())
-        found.append(f"it contradicts what is known beforehand, in standard errors: {moved}")
-    return found
-
-
-def _pulls(evidence: Evidence) -> dict[str, float]:
-    """Return how far each parameter is from what was measured of it, in standard errors of that."""
-    known = {name: (p.value, *p.constraint) for name, p in evidence.parameters.items() if p.constraint is not None}
-    return {name: (value - given) / error for name, (value, given, error) in known.items()}
-
-
-def _pull_in_words(evidence: Evidence, name: str, pull: float) -> str:
-    parameter = evidence.parameters[name]
-    given, error = parameter.constraint or (float("nan"), float("nan"))
-    return f"{name} = {parameter.value:.5g} is {abs(pull):.1f} standard errors from the given {given:g} +- {error:.2g}"
-
-
-def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
-    """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
-    residual, pulls = evidence.rows.residual, _pulls(evidence)
-    inside = residual[np.abs(residual) <= OUTLIER]
-    freedom = inside.size + len(pulls) - len(evidence.parameters)
-    chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
-    return chi2, freedom, chi2_tail(chi2, freedom) if freedom > 0 else float("nan")
-
-
-def _outliers(evidence: Evidence, scale: float = 1.0) -> Bool[np.ndarray, " rows"]:
-    """Return which rows are far off; ``scale``: of the errors that residuals are in, over those that count here."""
-    return np.any(scale * np.abs(np.nan_to_num(evidence.rows.residual)) > OUTLIER, axis=1)
+    return [evidence.refusal] if evidence.refused else judge(MISFITS, evidence)
 
 
 def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
@@ -348,13 +193,79 @@ def correlation_excess(residual: Float[np.ndarray, "rows k"]) -> float:
     return float(np.sum(bounded[1:] * bounded[:-1]) / np.sqrt(others / count))
 
 
+def _one_sided(evidence: Evidence) -> list[str]:
+    """Return that some rows are off to one side: chance gives as large residuals of either sign.
+
+    A robust fit is for such rows, and those of tables whose laws scatter about the predicted one are off together.
+    """
+    residual = evidence.rows.residual if evidence.unwidened is None else evidence.unwidened
+    count = np.isfinite(residual).sum(axis=1)
+    of_row = np.nansum(residual, axis=1) / np.sqrt(np.maximum(count, 1))
+    rows = int((count > 0).sum())
+    excess = float(np.sum(of_row**3) / np.sqrt(15.0 * max(rows, 1)))
+    if rows <= _FEWEST_NEIGHBOURS or abs(excess) < _ONE_SIDED or evidence.robust or evidence.scattering:
+        return []
+    far = np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)]
+    side = "above" if excess > 0.0 else "below"
+    said = f"residuals are far off to one side ({excess:+.1f} standard deviations of their cubes)"
+    return [f"{said}: predicted {side} what was read for {_lines(evidence, np.sort(far))}"]
+
+
+def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
+    """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
+    residual, pulls = evidence.rows.residual, evidence.pulled
+    inside = residual[np.abs(residual) <= OUTLIER]
+    freedom = inside.size + len(pulls) - len(evidence.parameters)
+    chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
+    return chi2, freedom, chi2_tail(chi2, freedom) if freedom > 0 else float("nan")
+
+
+def _pull_in_words(evidence: Evidence, name: str, pull: float) -> str:
+    parameter = evidence.parameters[name]
+    given, error = parameter.constraint or (float("nan"), float("nan"))
+    return f"{name} = {parameter.value:.5g} is {abs(pull):.1f} standard errors from the given {given:g} +- {error:.2g}"
+
+
+def _contradicted(evidence: Evidence) -> list[str]:
+    """Return by how much scaled amplitudes contradict what is known beforehand, taken together, in words."""
+    pulls = evidence.pulled
+    if evidence.error_scale is None or not pulls:
+        return []
+    improbable = chi2_tail(sum(pull**2 for pull in pulls.values()), len(pulls)) < IMPROBABLE
+    return [", ".join(f"{name} by {pull:+.1f}" for name, pull in pulls.items())] if improbable else []
+
+
+def _torn(evidence: Evidence) -> list[str]:
+    """Return what the amplitudes contradict of what was measured otherwise, in words."""
+    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.pulled.items() if abs(pull) > _TORN]
+    return ["; ".join(torn)] if torn else []
+
+
+def _not_converged(evidence: Evidence) -> list[str]:
+    """Return how far the search is from a minimum, in words."""
+    convergence = evidence.convergence
+    if convergence.converged:
+        return []
+    distance = f"chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
+    if not np.isfinite(convergence.estimated_distance):
+        distance = "chi2 bends downwards where the search ended, which is no minimum"
+    return [distance + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")]
+
+
+def _not_explained(evidence: Evidence) -> list[str]:
+    """Return on which grounds the model does not explain the data, and what may be the reason, in words."""
+    grounds = misfits(evidence)
+    return [f"{'; '.join(grounds)}. {_why_not_explained(evidence)}"] if grounds else []
+
+
 def _why_not_explained(evidence: Evidence) -> str:
     worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
     far = np.argsort(-worst)[: max(1, len(worst) // 20)]
     names = evidence.parameters
-    tail = f"farthest off: {_unexplained_tables(evidence)}{_rows_in_words(evidence.table, np.sort(far))}"
+    tail = f"farthest off: {_unexplained_tables(evidence)}{_lines(evidence, np.sort(far))}"
     # counting outliers less helps where the others are well explained: not if most are off, or off together
-    few = 2 * _outliers(evidence, evidence.error_scale or 1.0).sum() <= evidence.rows.used.sum()
+    scaled = (evidence.error_scale or 1.0) * np.abs(np.nan_to_num(evidence.rows.residual))
+    few = 2 * np.any(scaled > OUTLIER, axis=1).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
         tail += " (if only a few are wrong: --robust)"
     if evidence.contact_share > _LONG_CONTACT:
@@ -392,6 +303,15 @@ def _unexplained_tables(evidence: Evidence) -> str:
     return "".join(words for _, words in sorted(named, reverse=True))
 
 
+def _disagreeing(evidence: Evidence) -> list[str]:
+    """Return which tables' laws are not that of the others, in words; nothing where all may have one."""
+    pulls = np.array(evidence.pulls)
+    far = np.flatnonzero(pulls * pulls.size < IMPROBABLE)
+    named = sorted(far, key=lambda t: pulls[t])
+    said = [f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in named]
+    return ["; ".join(said)] if said else []
+
+
 def value_at_bound(value: float) -> str:
     """Return the value of a parameter at its bound in words: that of a loss is 0 or 1, not 3e-15."""
     return f"{value:z.0f}" if abs(value - round(value)) < _AT_BOUND else f"{value:.4g}"
@@ -403,26 +323,6 @@ def helpful_measurement(name: str) -> str:
         parameter_called(name).advice
         or "measure at other drives, orders or offsets too, or hold it fixed at a known value"
     )
-
-
-def _warnings(evidence: Evidence) -> list[str]:
-    return [
-        *_damping_warnings(evidence),
-        *_mass_warnings(evidence),
-        *_unit_warnings(evidence),
-        *_repeat_warnings(evidence),
-        *_table_warnings(evidence),
-        *_parameter_warnings(evidence),
-        *_pair_warnings(evidence),
-        *_run_warnings(evidence),
-        *_held_warnings(evidence),
-        *_row_warnings(evidence),
-    ]
-
-
-def _table_warnings(evidence: Evidence) -> list[str]:
-    disagreeing = _disagreeing(evidence) if evidence.scattering else ""
-    return [f"Far from the mean law even for this scatter: {disagreeing}."] if disagreeing else []
 
 
 def _damping_warnings(evidence: Evidence) -> list[str]:
@@ -438,28 +338,24 @@ def _damping_warnings(evidence: Evidence) -> list[str]:
     return [f"{', '.join(labels)}: {said}" for said, labels in warnings.items()]
 
 
-def _mass_warnings(evidence: Evidence) -> list[str]:
-    """Return what there is to say of a contact's tip whose mass is not known: its forces act on it."""
-    if evidence.table.mass_ng is not None or not evidence.contact:
-        return []
-    return [f"1 ng assumed: {NO_MASS}. Each of the contact's parameters hangs on it."]
-
-
-_FASTEST_KHZ, _SMALLEST_NM = 2e4, 1.0
-"""What no cantilever is faster than, and what amplitude impacts take at least: a bridge alone is that long."""
-
-
-def _unit_warnings(evidence: Evidence) -> list[str]:
-    """Return what there is to say of frequencies and amplitudes that no measurement of impacts has."""
-    said = []
-    fastest = max(table.free_frequency_khz for table in evidence.table.tables)
-    if fastest > _FASTEST_KHZ:
-        said.append(f"free_frequency_khz = {fastest:g} is more than any cantilever's: was it written in Hz for kHz?")
-    read = evidence.rows.measured_nm[np.isfinite(evidence.rows.measured_nm)]
-    usual = float(np.median(read)) if read.size else _SMALLEST_NM
-    if usual < _SMALLEST_NM:
-        said.append(f"Amplitudes are {usual:.2g} nm in the median: were they written in micrometres for nanometres?")
-    return said
+def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:
+    """Return what there is to say of a table's quality factor, which was fitted along or not; "" for nothing."""
+    if along is not None:
+        assumed = (table.quality_factor or 0.0, ASSUMED_ERROR_OF_Q * (table.quality_factor or 0.0))
+        if table.quality_factor_error is not None or along.constraint != assumed:
+            return ""
+        given, error = assumed
+        return (
+            f"quality_factor = {given:g} is given without an error: {100.0 * ASSUMED_ERROR_OF_Q:g} % was assumed "
+            f"({given:g} +- {error:.3g}). The loss hangs on it: state it, like `# quality_factor = {given:g} +- 1`."
+        )
+    if table.quality_factor is None or table.quality_factor_error is not None:
+        return ""
+    known = f"quality_factor = {table.quality_factor:g}"
+    return (
+        f"{known} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: "
+        f"`# {known} +- 1` lets the intervals show it."
+    )
 
 
 def _repeat_warnings(evidence: Evidence) -> list[str]:
@@ -478,154 +374,323 @@ def _repeat_warnings(evidence: Evidence) -> list[str]:
     ]
 
 
-def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:
-    """Return what there is to say of a table's quality factor, which was fitted along or not; "" for nothing."""
-    if along is not None:
-        assumed = (table.quality_factor or 0.0, ASSUMED_ERROR_OF_Q * (table.quality_factor or 0.0))
-        if table.quality_factor_error is not None or along.constraint != assumed:
-            return ""
-        given, error = assumed
-        return (
-            f"quality_factor = {given:g} is given without an error: {100.0 * ASSUMED_ERROR_OF_Q:g} % was assumed "
-            f"({given:g} +- {error:.3g}). The loss hangs on it: state it, like `# quality_factor = {given:g} +- 1`."
-        )
-    if table.quality_factor is None:
-        return ""
-    if table.quality_factor_error is None:
-        known = f"quality_factor = {table.quality_factor:g}"
-        return (
-            f"{known} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: "
-            f"`# {known} +- 1` lets the intervals show it."
-        )
-    return ""
+_FASTEST_KHZ, _SMALLEST_NM = 2e4, 1.0
+"""What no cantilever is faster than, and what amplitude impacts take at least: a bridge alone is that long."""
 
 
-def _parameter_warnings(evidence: Evidence) -> list[str]:
-    warnings = []
-    explained = not misfits(evidence)
-    undetermined = _undetermined(evidence)
-    if explained and undetermined and _may_stay_open(evidence):
-        advice = "; ".join(dict.fromkeys(helpful_measurement(name) for name in undetermined))
-        warnings.append(
-            f"Not determined by these taps: {' and '.join(undetermined)}, anything within their ranges explains them, "
-            f"and the law's band takes that in; {advice}."
-        )
-    for name, pull in _pulls(evidence).items():
-        if _PULLED < abs(pull) <= _TORN:
-            warnings.append(f"{_pull_in_words(evidence, name, pull)}: check it, the loss hangs on it.")
-    for name, parameter in evidence.parameters.items():
+def _usual_nm(evidence: Evidence) -> list[float]:
+    """Return the median of the amplitudes, none where nothing was read."""
+    read = evidence.rows.measured_nm[np.isfinite(evidence.rows.measured_nm)]
+    return [float(np.median(read))] if read.size else []
+
+
+def _limits(evidence: Evidence) -> list[str]:
+    """Return which parameters are at their bounds, and the limits that they are to be read as, in words.
+
+    Where the model does not explain the data, a bound is only where the misfit pushed the parameter.
+    """
+    found = []
+    for name, parameter in {} if misfits(evidence) else evidence.parameters.items():
         low, high = parameter.interval95
-        # Where the model does not explain the data, a bound is only where the misfit pushed the parameter.
-        if parameter.at_bound and explained:
+        if parameter.at_bound:
             limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
             reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
-            warnings.append(f"{name} is at its bound, {value_at_bound(parameter.value)}{reading}.")
-        if parameter.did_not_move:
-            warnings.append(f"{name} did not move from the grid point it started at.")
-    if evidence.other_minimum is not None:
-        found, chi2 = evidence.other_minimum
-        values = ", ".join(f"{name} = {value:.5g}" for name, value in found.items())
-        warnings.append(
-            f"Another minimum explains the data about as well (chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {values}; "
-            "the band of the law and the intervals hold both."
-        )
-    return warnings
+            found.append(f"{name} is at its bound, {value_at_bound(parameter.value)}{reading}")
+    return found
 
 
-def _held_warnings(evidence: Evidence) -> list[str]:
-    """Return what is held and how well it is taken to be known, and what hangs on it."""
-    values = {one.name: f"{one.name} = {one.value:.4g} +- {one.error:.2g}" for one in evidence.held}
-    assumed = [values[one.name] for one in evidence.held if one.assumed]
-    warnings = []
-    if assumed:
-        example = next(one for one in evidence.held if one.assumed)
-        known = f"{example.name}={example.value:.4g}+-{0.1 * example.error:.2g}"
-        said = f"Held, with errors that are assumed: {', '.join(assumed)}; law, band and intervals hang on them"
-        warnings.append(f"{said}: say what is known better, like --constrain {known}.")
-    for name, others in evidence.hanging.items():
-        warnings.append(f"{name} hangs on what is held: {', '.join(values[other] for other in others)}.")
-    return warnings
-
-
-def _run_warnings(evidence: Evidence) -> list[str]:
-    run, short = evidence.run[0], 100.0 * evidence.short
-    if run < _RUN or not short:
+def _other_minimum(evidence: Evidence) -> list[str]:
+    if evidence.other_minimum is None:
         return []
-    said = f"Residuals run together over the approach speed ({run:.1f} standard deviations): the model lacks a shape"
-    return [f"{said}; a model discrepancy of {short:.0f} % of the loss at any speed is in law, band and intervals."]
+    values, chi2 = evidence.other_minimum
+    said = ", ".join(f"{name} = {value:.5g}" for name, value in values.items())
+    return [f"chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {said}"]
 
 
-def _pair_warnings(evidence: Evidence) -> list[str]:
-    names = list(evidence.parameters)
-    pairs = [
-        f"{names[i]} and {names[j]} ({evidence.correlations[i, j]:+.3f})"
-        for i in range(len(names))
-        for j in range(i + 1, len(names))
-        if abs(evidence.correlations[i, j]) > _TIED
-    ]
-    if not pairs:
+def _open_ones(evidence: Evidence) -> list[str]:
+    """Return the parameters whose intervals are open to both sides, where nothing worse is known, in words."""
+    # a tapping curve tells those of the delay only together; the law does not hang on each
+    together = (*(DELAY_NAMES if evidence.table.tapping else ()), *evidence.undetermined)
+    if misfits(evidence) or _not_identified(evidence):
         return []
     return [
-        f"Determined only together, hardly apart: {', '.join(pairs)}. The law may be sharp all the same: see its band."
+        f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}"
+        for name, parameter in evidence.parameters.items()
+        if name not in together and parameter.interval95 == (None, None)
     ]
 
 
-def _row_warnings(evidence: Evidence) -> list[str]:
-    warnings = []
-    aside = np.flatnonzero(evidence.rows.set_aside)
+def _not_identified(evidence: Evidence) -> list[str]:
+    """Return the parameters that the data do not determine and must, with what to measure, in words."""
+    names = [] if evidence.may_stay_open else evidence.undetermined
+    return [f"{' and '.join(names)}; {_advice(names)}"] if names else []
+
+
+def _may_be_anything(evidence: Evidence) -> list[str]:
+    """Return the parameters that taps leave open, in words; nothing where the model does not explain the data."""
+    names = evidence.undetermined if evidence.may_stay_open and not misfits(evidence) else []
+    said = f"{' and '.join(names)}, anything within their ranges explains them, and the law's band takes that in"
+    return [f"{said}; {_advice(names)}"] if names else []
+
+
+def _advice(names: list[str]) -> str:
+    return "; ".join(dict.fromkeys(helpful_measurement(name) for name in names))
+
+
+def _held_in_words(held: Held) -> str:
+    return f"{held.name} = {held.value:.4g} +- {held.error:.2g}"
+
+
+def _assumed(evidence: Evidence) -> list[str]:
+    """Return what is held with errors that are assumed, and how to say them, in words."""
+    held = [held for held in evidence.held if held.assumed]
+    if not held:
+        return []
+    better = f"{held[0].name}={held[0].value:.4g}+-{0.1 * held[0].error:.2g}"
+    said = f"{', '.join(map(_held_in_words, held))}; law, band and intervals hang on them"
+    return [f"{said}: say what is known better, like --constrain {better}"]
+
+
+def _hanging(evidence: Evidence) -> list[str]:
+    """Return each fitted parameter whose error is mostly that of what is held, in words."""
+    values = {held.name: _held_in_words(held) for held in evidence.held}
+    return [
+        f"{name} hangs on what is held: {', '.join(values[other] for other in others)}"
+        for name, others in evidence.hanging.items()
+    ]
+
+
+def _tied_pairs(evidence: Evidence) -> list[str]:
+    """Return the pairs of parameters that are determined only together, with their correlation, in words."""
+    names, matrix = list(evidence.parameters), evidence.correlations
+    pairs = [
+        f"{names[i]} and {names[j]} ({matrix[i, j]:+.3f})"
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(matrix[i, j]) > _TIED
+    ]
+    return [", ".join(pairs)] if pairs else []
+
+
+def _excluded(evidence: Evidence) -> list[str]:
+    """Return the rows that are excluded, for every reason, in words."""
+    rows = np.flatnonzero(evidence.rows.set_aside)
     reasons = evidence.rows.reasons or (TOO_SLOW,) * len(evidence.rows.set_aside)
-    for reason in dict.fromkeys(reasons[row] for row in aside):
-        named = np.array([row for row in aside if reasons[row] == reason])
-        warnings.append(f"Set aside, because these impacts are {reason}: {_rows_in_words(evidence.table, named)}.")
-    inaccurate = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
-    if inaccurate.size:
-        worst = 100.0 * float(evidence.rows.model_error[inaccurate].max())
-        small = "small amplitudes" if evidence.table.tapping else "slow impacts"
-        warnings.append(
-            f"A model error of up to {worst:.1f} % was added to the errors of {small}: "
-            f"{_rows_in_words(evidence.table, inaccurate)}."
-        )
+    return [
+        f"{reason}: {_lines(evidence, [row for row in rows if reasons[row] == reason])}"
+        for reason in dict.fromkeys(reasons[row] for row in rows)
+    ]
+
+
+def _model_error(evidence: Evidence) -> list[str]:
+    """Return how large a model error was added to which rows, in words."""
+    rows = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
+    worst = 100.0 * float(evidence.rows.model_error[rows].max(initial=0.0))
+    small = "small amplitudes" if evidence.table.tapping else "slow impacts"
+    return [f"{worst:.1f} % was added to the errors of {small}: {_lines(evidence, rows)}"] if rows.size else []
+
+
+def _unseen(evidence: Evidence) -> Bool[np.ndarray, " rows"]:
+    """Return on which rows no orbit was seen, though the model has a steady one."""
     unseen = np.zeros(evidence.table.rows) if evidence.table.no_orbit is None else evidence.table.no_orbit
-    contradicted = np.flatnonzero((unseen > 0) & (evidence.rows.orbits > 0))
-    if contradicted.size:
-        warnings.append(
-            f"No orbit was seen, though the fitted model has a steady one, for "
-            f"{_rows_in_words(evidence.table, contradicted)}: the tip may have settled on another motion; start it "
-            "otherwise, or remove the row."
-        )
-    several = np.flatnonzero(evidence.rows.orbits > 1)
-    if several.size:
-        warnings.append(
-            f"Several stable orbits coexist for {_rows_in_words(evidence.table, several)}: the one closest to the "
-            "measurement was taken."
-        )
-    folds = np.flatnonzero(evidence.rows.near_fold)
-    if folds.size:
-        warnings.append(f"Close to a fold, where errors are not linear: {_rows_in_words(evidence.table, folds)}.")
+    return (unseen > 0) & (evidence.rows.orbits > 0)
+
+
+def _neighbours_alike(evidence: Evidence) -> bool:
+    """Say whether neighbouring residuals are correlated, though not so much that the fit is not valid."""
     pairs = max(int(np.isfinite(evidence.rows.residual).sum()) - 2, 1)
-    if abs(evidence.autocorrelation) > 3.0 / np.sqrt(pairs) and not _correlations(evidence):
-        warnings.append(
-            f"Neighbouring residuals are correlated ({evidence.autocorrelation:+.2f}): something systematic is left."
-        )
-    if evidence.robust:
-        outliers = np.flatnonzero(_outliers(evidence))
-        named = f"; outliers: {_rows_in_words(evidence.table, outliers)}" if outliers.size else ""
-        chi2, freedom, p_value = _without_outliers(evidence)
-        goodness = f"{chi2:.1f}/{freedom}" + (f" (probability {p_value:.2g})" if freedom > 0 else "")
-        warnings.append(f"Robust loss: chi2 counts outliers linearly; without them chi2/dof = {goodness}{named}.")
-    if evidence.error_scale is not None:
-        warnings.append(
-            f"The amplitudes' errors were scaled by {evidence.error_scale:.3g} so that chi2/dof = 1: whether they are "
-            f"of the right size cannot be judged, only that the scale is believable (at most {LARGEST_SCALE:g}) and "
-            "that residuals are random."
-        )
-    elif evidence.p_value > 1.0 - 1e-6:
-        warnings.append("The errors look too large: chi2 is improbably small.")
-    return warnings
+    return bool(abs(evidence.autocorrelation) > 3.0 / np.sqrt(pairs) and not _correlations(evidence))
 
 
-def _rows_in_words(table: AmplitudeTable | SeveralTables, rows: np.ndarray) -> str:
+def _robust_loss(evidence: Evidence) -> list[str]:
+    """Return the goodness of a robust fit without its outliers, and which these are, in words."""
+    if not evidence.robust:
+        return []
+    chi2, freedom, p_value = _without_outliers(evidence)
+    probability = f" (probability {p_value:.2g})" if freedom > 0 else ""
+    outliers = "".join(f"; outliers: {lines}" for lines in _named(evidence, evidence.outliers))
+    return [f"{chi2:.1f}/{freedom}{probability}{outliers}"]
+
+
+def _courses(evidence: Evidence) -> list[str]:
+    """Return which readings follow the rows of each table, in words."""
+    several = len(evidence.table.labels) > 1
+    return [
+        f"{f'{label}: ' if several else ''}Residuals follow the rows ({', '.join(courses)} from the first to the last)"
+        for label, courses in evidence.courses.items()
+    ]
+
+
+def _untold_drifts(evidence: Evidence) -> list[str]:
+    """Return the drifts along the rows that are hardly told by anything but what is assumed of them, in words."""
+    drifts = [
+        f"{name} = {known.constraint[0]:g} +- {known.constraint[1]:g}"
+        for name, known in evidence.parameters.items()
+        if parameter_called(name).name in DRIFT_NAMES
+        and known.constraint is not None
+        and (known.standard_error or np.inf) > 0.5 * known.constraint[1]
+    ]
+    return [", ".join(drifts)] if drifts else []
+
+
+def _named(evidence: Evidence, marked: Bool[np.ndarray, " rows"]) -> list[str]:
+    """Return marked rows in words; nothing where no row is marked."""
+    rows = np.flatnonzero(marked)
+    return [_lines(evidence, rows)] if rows.size else []
+
+
+def _lines(evidence: Evidence, rows: Any) -> str:
     """Return 'line 7' or 'lines 7, 9, 12 and 3 more' of the table's file; 'line B.csv:7' of several."""
-    numbers = table.row_names[rows].tolist()
+    numbers = evidence.table.row_names[np.asarray(rows)].tolist()
     shown = ", ".join(numbers[:6]) + (f" and {len(numbers) - 6} more" if len(numbers) > 6 else "")
     return f"{'line' if len(numbers) == 1 else 'lines'} {shown}"
+
+
+MISFITS: Rules[Evidence] = (
+    Rule(lambda e: e.p_value < IMPROBABLE, "chi2/dof = {e.chi2_per_freedom:.3g} (probability {e.p_value:.1g})"),
+    (
+        Rule(
+            lambda e: [(n, e.rows.used.sum()) for n in [e.outliers.sum()] if e.robust and n > e.most_outliers],
+            "{case[0]} of {case[1]} rows are off by more than "
+            f"{OUTLIER:g} errors, and robust loss is for outliers in at most one row of {1.0 / MOST_OUTLIERS:g}",
+        ),
+        Rule(
+            lambda e: [
+                (chi2 / freedom, p_value)
+                for chi2, freedom, p_value in [_without_outliers(e)]
+                if e.robust and p_value < IMPROBABLE
+            ],
+            "without outliers chi2/dof = {case[0]:.3g} (probability {case[1]:.1g})",
+        ),
+    ),
+    Rule(
+        lambda e: (e.error_scale or 0.0) > LARGEST_SCALE,
+        "the amplitudes' errors would have to be {e.error_scale:.3g} times those stated, and more than "
+        f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
+        "to within that)",
+    ),
+    Rule(_contradicted, "it contradicts what is known beforehand, in standard errors: {case}"),
+    Rule(
+        lambda e: [100.0 * e.short] if e.run[1] > _LONGEST_RUN else [],
+        "residuals run together over the approach speed ({e.run[0]:.1f} standard deviations; {e.run[1]:.1f} beside a "
+        "model discrepancy of {case:.0f} % of the loss)",
+    ),
+    Rule(_one_sided, "{case}"),
+    Rule(_correlations, "neighbouring residuals {case[0]} are correlated ({case[1]:+.1f} standard deviations)"),
+)
+"""Grounds on which the model does not explain the amplitudes, each a clause."""
+
+REASONS: Rules[Evidence] = (
+    (
+        Rule(lambda e: e.convergence.reason is not None, "Not converged: {e.convergence.reason}."),
+        Rule(_not_identified, "Not identified: the amplitudes do not determine {case}."),
+        Rule(_not_converged, "Not converged: {case}."),
+    ),
+    Rule(lambda e: _named(e, (e.rows.orbits == 0) & e.rows.used), "No stable orbit at the fitted law for {case}."),
+    Rule(
+        lambda e: [_lines(e, e.untabulated)] if e.untabulated else [],
+        "The table of the fitted contact's impacts misses its accuracy for {case}: the contact's numbers are too "
+        "extreme; hold some of them fixed.",
+    ),
+    Rule(_not_explained, "The model does not explain the data: {case}"),
+    Rule(
+        lambda e: e.stuck is not None,
+        "Not converged: to first order the model discrepancy would lower chi2 from {e.stuck[0]:.1f} to "
+        "{e.stuck[1]:.1f}, but computed not even a sixteenth of it does; the amplitudes are far from linear in the "
+        "law, as they are near folds: leave such rows out.",
+    ),
+    Rule(
+        _torn,
+        "The amplitudes contradict what is known beforehand: {case}. "
+        "Either that is wrong, or the model makes up for what it lacks.",
+    ),
+    Rule(
+        lambda e: [] if e.scattering else _disagreeing(e),
+        "The tables do not have one law: {case}; look at what is different there, leave it out, or let laws differ "
+        "from table to table (--hierarchical).",
+    ),
+    Rule(lambda e: e.freedom <= 0, "As many parameters as amplitudes: the goodness of fit cannot be judged."),
+    Rule(_open_ones, "{case}."),
+)
+"""What makes a fit invalid."""
+
+WARNINGS: Rules[Evidence] = (
+    Rule(_damping_warnings, "{case}"),
+    Rule(
+        lambda e: e.table.mass_ng is None and e.contact,
+        f"1 ng assumed: {NO_MASS}. Each of the contact's parameters hangs on it.",
+    ),
+    Rule(
+        lambda e: [f for f in [max(table.free_frequency_khz for table in e.table.tables)] if f > _FASTEST_KHZ],
+        "free_frequency_khz = {case:g} is more than any cantilever's: was it written in Hz for kHz?",
+    ),
+    Rule(
+        lambda e: [usual for usual in _usual_nm(e) if usual < _SMALLEST_NM],
+        "Amplitudes are {case:.2g} nm in the median: were they written in micrometres for nanometres?",
+    ),
+    Rule(_repeat_warnings, "{case}"),
+    Rule(lambda e: _disagreeing(e) if e.scattering else [], "Far from the mean law even for this scatter: {case}."),
+    Rule(_may_be_anything, "Not determined by these taps: {case}."),
+    Rule(
+        lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if _PULLED < abs(by) <= _TORN],
+        "{case}: check it, the loss hangs on it.",
+    ),
+    Rule(_limits, "{case}."),
+    Rule(
+        lambda e: [name for name, known in e.parameters.items() if known.did_not_move],
+        "{case} did not move from the grid point it started at.",
+    ),
+    Rule(
+        _other_minimum,
+        "Another minimum explains the data about as well ({case}; the band of the law and the intervals hold both.",
+    ),
+    Rule(
+        _tied_pairs,
+        "Determined only together, hardly apart: {case}. The law may be sharp all the same: see its band.",
+    ),
+    Rule(
+        lambda e: [100.0 * e.short] if e.run[0] >= _RUN and e.short > 0.0 else [],
+        "Residuals run together over the approach speed ({e.run[0]:.1f} standard deviations): the model lacks a "
+        "shape; a model discrepancy of {case:.0f} % of the loss at any speed is in law, band and intervals.",
+    ),
+    Rule(_assumed, "Held, with errors that are assumed: {case}."),
+    Rule(_hanging, "{case}."),
+    Rule(_excluded, "Set aside, because these impacts are {case}."),
+    Rule(_model_error, "A model error of up to {case}."),
+    Rule(
+        lambda e: _named(e, _unseen(e)),
+        "No orbit was seen, though the fitted model has a steady one, for {case}: the tip may have settled on another "
+        "motion; start it otherwise, or remove the row.",
+    ),
+    Rule(
+        lambda e: _named(e, e.rows.orbits > 1),
+        "Several stable orbits coexist for {case}: the one closest to the measurement was taken.",
+    ),
+    Rule(lambda e: _named(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
+    Rule(
+        _neighbours_alike,
+        "Neighbouring residuals are correlated ({e.autocorrelation:+.2f}): something systematic is left.",
+    ),
+    Rule(_robust_loss, "Robust loss: chi2 counts outliers linearly; without them chi2/dof = {case}."),
+    Rule(
+        lambda e: e.error_scale is not None,
+        "The amplitudes' errors were scaled by {e.error_scale:.3g} so that chi2/dof = 1: whether they are of the right "
+        f"size cannot be judged, only that the scale is believable (at most {LARGEST_SCALE:g}) and that residuals are "
+        "random.",
+    ),
+    Rule(
+        lambda e: e.error_scale is None and e.p_value > 1.0 - 1e-6,
+        "The errors look too large: chi2 is improbably small.",
+    ),
+    Rule(
+        _courses,
+        "{case}, as drifts do. If the rows stand as they were measured, say `# rows = in order of time`: drifts are "
+        "then fitted along.",
+    ),
+    Rule(
+        _untold_drifts,
+        "Hardly told by the rows, which stand in order of time, only assumed: {case}. Rows of the free tip before and "
+        "after the others tell drifts; `--constrain` takes what is known of them.",
+    ),
+)
+"""What a reader should know besides."""

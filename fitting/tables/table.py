@@ -99,51 +99,40 @@ CALIBRATION = tuple(key for key, setting in SETTINGS.items() if setting.error ==
 """Keys that must have an error: without one there is nothing uncertain about them."""
 
 
-@dataclass(frozen=True)
-class Header:
-    """What the comment lines say; the names and units are those of ``AmplitudeTable``."""
-
-    drive: str
-    rows_in_order_of_time: bool
-    free_frequency_khz: float
-    free_frequency_error_khz: float | None
-    quality_factor: float | None
-    quality_factor_error: float | None
-    mass_ng: float | None
-    spring_constant_n_per_m: float | None
-    spring_constant_error_n_per_m: float | None
-    calibration: dict[str, tuple[float, float]]
-    remarks: tuple[str, ...]
+ERROR_OF = {
+    "free_frequency_khz": "free_frequency_error_khz",
+    "quality_factor": "quality_factor_error",
+    "spring_constant_n_per_m": "spring_constant_error_n_per_m",
+}
+"""Numbers of the cantilever that may come with a standard error, and what that is called."""
+_CANTILEVER = ("free_frequency_khz", "quality_factor", "mass_ng", "spring_constant_n_per_m")
 
 
-def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
-    """Read the comment lines of a table.
+def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> dict[str, Any]:
+    """Return what the comment lines of a table say, by the names of `AmplitudeTable`.
 
     Args:
         comments: line number and text (without the number sign, stripped) of each.
         faults: where the faults are noted; with any, the result is not to be used.
     """
-    numbers, remarks = settings_in(comments, SETTINGS, faults)
-    if "free_frequency_khz" not in numbers:
+    settings, remarks = settings_in(comments, SETTINGS, faults)
+    if "free_frequency_khz" not in settings:
         example = SETTINGS["free_frequency_khz"].line
         faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
-    drive, _ = numbers.get("drive", (0.0, None))
-    frequency, frequency_error = numbers.get("free_frequency_khz", (float("nan"), None))
-    quality_factor, quality_factor_error = numbers.get("quality_factor", (float("nan"), None))
-    spring, spring_error = numbers.get("spring_constant_n_per_m", (None, None))
-    return Header(
-        drive="" if np.isnan(drive) else DRIVES[int(drive)],
-        rows_in_order_of_time="rows" in numbers,
-        free_frequency_khz=frequency,
-        free_frequency_error_khz=frequency_error,
-        quality_factor=None if np.isinf(quality_factor) else quality_factor,
-        quality_factor_error=quality_factor_error,
-        mass_ng=numbers.get("mass_ng", (None, None))[0],
-        spring_constant_n_per_m=spring,
-        spring_constant_error_n_per_m=spring_error,
-        calibration={key: (numbers[key][0], numbers[key][1] or 0.0) for key in CALIBRATION if key in numbers},
-        remarks=remarks,
-    )
+    drive, _ = settings.get("drive", (0.0, None))
+    header: dict[str, Any] = {
+        "drive": "" if np.isnan(drive) else DRIVES[int(drive)],
+        "rows_in_order_of_time": "rows" in settings,
+        "free_frequency_khz": float("nan"),
+        "calibration": {key: (settings[key][0], settings[key][1] or 0.0) for key in CALIBRATION if key in settings},
+        "remarks": remarks,
+    }
+    for name in _CANTILEVER:
+        if name in settings:
+            value, error = settings[name]
+            header[name] = None if np.isinf(value) else value
+            header |= {ERROR_OF[name]: error} if name in ERROR_OF else {}
+    return header
 
 
 _ORDER = Column("order", needed="order", required=True, integer=True)
@@ -639,18 +628,14 @@ def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], form: Form, fault
 
 
 def _check_header(table: AmplitudeTable, faults: Faults) -> None:
-    for key, error in (
-        ("free_frequency_khz", table.free_frequency_error_khz),
-        ("quality_factor", table.quality_factor_error),
-        ("mass_ng", None),
-        ("spring_constant_n_per_m", table.spring_constant_error_n_per_m),
-    ):
-        value = getattr(table, key)
-        if value is None or (key == "quality_factor" and np.isnan(value)):
+    for name in _CANTILEVER:
+        value = getattr(table, name)
+        if value is None or (name == "quality_factor" and np.isnan(value)):
             continue
-        fault = fault_in_number(SETTINGS[key], value, error)
+        error = getattr(table, ERROR_OF[name]) if name in ERROR_OF else None
+        fault = fault_in_number(SETTINGS[name], value, error)
         if fault is not None:
-            faults.add(f"{key} {fault}")
+            faults.add(f"{name} {fault}")
     damped = table.quality_factor is not None and not np.isnan(table.quality_factor)
     if not damped and table.quality_factor_error is not None:
         faults.add("quality_factor_error stands without quality_factor; give both or none")
@@ -735,7 +720,7 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     check_not_empty(comments, rows, faults)
     header = parse_comments(comments, faults)
     found = faults.count
-    form = FORMS.get(header.drive)
+    form = FORMS.get(header["drive"])
     if form is None:
         # which columns there must be is not known
         faults.raise_any()
@@ -759,11 +744,11 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     repeats = fill_errors_of_repeats(columns, required(columns), MEASURED)
     check_rows(columns, lines, faults, unreadable)
     faults.raise_any()
-    header = replace(header, remarks=(*header.remarks, *repeats))
+    header["remarks"] = (*header["remarks"], *repeats)
     arrays: dict[str, Any] = dict(columns)
     if "order" in columns:
         arrays["order"] = columns["order"].astype(np.int64)
-    return AmplitudeTable(**arrays, **vars(header), source=source, lines=lines)
+    return AmplitudeTable(**arrays, **header, source=source, lines=lines)
 
 
 @checked
@@ -813,31 +798,23 @@ def in_other_units(table: AmplitudeTable) -> list[tuple[str, AmplitudeTable]]:
     return found
 
 
-def _or_inf(quality_factor: float | None) -> float:
-    return float("inf") if quality_factor is None else quality_factor
-
-
-def _own_mass(table: AmplitudeTable) -> float | None:
-    """Return the mass, None where the spring constant says the same."""
-    spring = table.spring_constant_n_per_m
-    same = spring is not None and table.mass_ng == effective_mass_ng(spring, table.free_frequency_khz)
-    return None if same else table.mass_ng
+def _setting_line(name: str, value: float, error: float | None) -> str:
+    return f"# {name} = {float(value)!r}" + ("" if error is None else f" +- {float(error)!r}")
 
 
 def csv_of(table: AmplitudeTable) -> str:
     """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
-    known = [
-        ("free_frequency_khz", table.free_frequency_khz, table.free_frequency_error_khz),
-        ("quality_factor", _or_inf(table.quality_factor), table.quality_factor_error),
-        ("mass_ng", _own_mass(table), None),
-        ("spring_constant_n_per_m", table.spring_constant_n_per_m, table.spring_constant_error_n_per_m),
-        *((name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration),
-    ]
+    spring = table.spring_constant_n_per_m
+    of_spring = None if spring is None else effective_mass_ng(spring, table.free_frequency_khz)
     lines = [f"# drive = {table.drive}"] if table.tapping else []
-    for name, value, error in known:
-        if value is not None and not np.isnan(value):
-            tail = "" if error is None else f" +- {float(error)!r}"
-            lines.append(f"# {name} = {'none' if np.isinf(value) else repr(float(value))}{tail}")
+    for name in _CANTILEVER:
+        value, error = getattr(table, name), getattr(table, ERROR_OF[name]) if name in ERROR_OF else None
+        if name == "quality_factor" and value is None:
+            lines.append("# quality_factor = none")
+        # the spring constant says its mass
+        elif value is not None and not np.isnan(value) and not (name == "mass_ng" and value == of_spring):
+            lines.append(_setting_line(name, value, error))
+    lines += [_setting_line(name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration]
     lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
     lines += [f"# {remark}" for remark in table.remarks]
     names = [name for name in table.form.names if getattr(table, name) is not None]

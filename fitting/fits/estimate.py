@@ -1,0 +1,742 @@
+"""From a minimum to an estimate: one linear step to the law with the model discrepancy, its errors and predictions.
+
+At the minimum of chi2 the model is taken at its word. Where impacts last, `estimate_of` adds what the model leaves out
+(`discrepancy`), as unknowns with priors beside the parameters: as much of the linear step as lowers chi2, computed and
+not linearised, leads to the law. Of several tables it also says how far each one's law is from that of the others.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.impact.lasting_impact import PulledImpact
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
+from fitting.fits.discrepancy import (
+    ClosestMember,
+    Descended,
+    LawAfter,
+    LawBefore,
+    LinearStep,
+    ModelDiscrepancy,
+    StepRows,
+    StepSystem,
+    closest_member,
+    containing,
+    descending_part,
+    effects_of_held,
+    law_after,
+    longest_run,
+    root_of,
+    rows_of_fit,
+    seen_in_taps,
+    step_of,
+    system_of,
+    with_runs,
+)
+from fitting.fits.intervals import Convergence, at_bound, check_minimum, covariance
+from fitting.fits.minimum import ATTRACTED, Minimum, ModelErrors
+from fitting.fits.objective import ROBUST, Objective, soft_square
+from fitting.fits.result import (
+    EV_PER_AJ,
+    NO_MASS,
+    FittedLaw,
+    FittedParameter,
+    FittedRows,
+    Loss,
+    WithInterval,
+    energy_lost,
+    interval_of,
+    nearness,
+    rebound_by_formula,
+    scaled,
+    table_of_law,
+)
+from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
+from fitting.forward import AnyImpact, Linearised, Predicted, impact_at, predict
+from fitting.models import Held, Measurement, Problem, readings_of
+from fitting.tables.several import SeveralTables
+from fitting.tables.table import AmplitudeTable
+
+
+@dataclass(frozen=True)
+class Found:
+    """A minimum before it is summarised.
+
+    Attributes:
+        stated: the objective with the errors as stated.
+        objective: with the errors as used: the model's own added, rows excluded.
+        minimum: of it.
+        model_errors: of the rows.
+        settings: every option of the fit.
+        refused: hardly a row of the table is one that a law of impacts can be read off.
+    """
+
+    stated: Objective
+    objective: Objective
+    minimum: Minimum
+    model_errors: ModelErrors
+    settings: dict[str, Any]
+    refused: bool = False
+
+
+class AtMinimum(NamedTuple):
+    """What the model says at a minimum, taken at its word.
+
+    Attributes:
+        table: the table that is fitted, or all of several.
+        found: the minimum.
+        objective: follows each row's orbit from where it is at the minimum: from here on orbits move only a little.
+        values: of the parameters.
+        free: which of them are not at their bound.
+        convergence: what the checks of the minimum found.
+        linear: residuals, slopes and predictions there, with every orbit searched for.
+        residual: of the readings, plain, row by row.
+        chi2: the sum of squares.
+        covariance: of the values.
+        rows: measured and predicted amplitudes.
+        speeds: approach speeds in nm/us of the rows that are used, NaN elsewhere.
+    """
+
+    table: AmplitudeTable | SeveralTables
+    found: Found
+    objective: Objective
+    values: Float[np.ndarray, " p"]
+    free: Bool[np.ndarray, " p"]
+    convergence: Convergence
+    linear: Linearised
+    residual: Float[np.ndarray, "rows k"]
+    chi2: float
+    covariance: Float[np.ndarray, "p p"]
+    rows: FittedRows
+    speeds: Float[np.ndarray, " rows"]
+
+    @property
+    def problem(self) -> Problem:
+        """The model and its parameters."""
+        return self.objective.problem
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Every option of the fit."""
+        return self.found.settings
+
+    @property
+    def constraints(self) -> dict[str, tuple[float, float]]:
+        """What is known beforehand: value and standard error by parameter."""
+        return dict(self.settings["constraints"])
+
+    @property
+    def scattering(self) -> bool:
+        """Whether the laws of several tables may differ from table to table."""
+        return bool(self.settings.get("hierarchical"))
+
+    @property
+    def data(self) -> int:
+        """How many numbers are compared: readings, rows without orbit, and what is known beforehand."""
+        rows = self.found.objective.measurement.rows
+        return int(np.asarray(rows.measured).sum()) + int(np.asarray(rows.no_orbit).sum()) + len(self.constraints)
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom."""
+        return self.data - len(self.values)
+
+    @property
+    def free_law(self) -> list[str]:
+        """Names of the law's parameters that are not at their bound."""
+        return [name for name, free in zip(self.problem.own, self.free, strict=False) if free]
+
+    def law(
+        self, covariance: Float[np.ndarray, "k k"], after: tuple[LinearStep, ModelDiscrepancy] | None
+    ) -> "ModelLaw":
+        """Return the law after a step from the minimum, with a covariance of its parameters."""
+        return ModelLaw(self.problem, self.objective.measurement, self.values, covariance, after)
+
+
+class Estimate(NamedTuple):
+    """The law, values and errors of a fit, with the model discrepancy where there is one.
+
+    Attributes:
+        at: the minimum that the step was taken from.
+        values: of the parameters of the model's formula that is closest to the law.
+        covariance: of these, with what the formula leaves out.
+        chi2: with the model discrepancy.
+        rows: measured and predicted amplitudes of the law.
+        independent_residual: residuals without the most likely remainders that rows have in common.
+        after: the step, as much of it as lowers chi2, and the discrepancy that it leads to; None: there is none.
+        step_rows: the rows as the step sees them.
+        stuck: chi2 that no part of the step lowers, and what the whole step takes it to to first order; None elsewhere.
+        runs: what was found of residuals that run together over the speed.
+        contact_share: largest share of a drive's period that the tip is in contact.
+        tables: what several tables say of one another.
+    """
+
+    at: AtMinimum
+    values: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    chi2: float
+    rows: FittedRows
+    independent_residual: Float[np.ndarray, "rows k"]
+    after: tuple[LinearStep, ModelDiscrepancy] | None = None
+    step_rows: StepRows | None = None
+    stuck: tuple[float, float] | None = None
+    runs: "Runs | None" = None
+    contact_share: float = 0.0
+    tables: "TablesCompared | None" = None
+
+    @property
+    def law(self) -> "ModelLaw":
+        """The law with its errors."""
+        return self.at.law(self.covariance, self.after)
+
+    @property
+    def formula(self) -> ImpactLaw | None:
+        """The model's formula that is closest to the law after the step; None of a contact, which has none."""
+        problem, fixed = self.at.problem, self.at.objective.measurement.fixed
+        if problem.model == "contact":
+            return None
+        return problem.law(jnp.asarray(self.at.values if self.after is None else self.values), fixed)
+
+
+class Runs(NamedTuple):
+    """Residuals that run together over the approach speed, and what was added to the discrepancy for them.
+
+    Attributes:
+        before: by how many standard deviations they do.
+        beside: by how many beside what that added to the discrepancy.
+        residual: of the readings without that addition.
+    """
+
+    before: float
+    beside: float
+    residual: Float[np.ndarray, "rows k"]
+
+
+class TablesCompared(NamedTuple):
+    """What several tables that were fitted together say of one another.
+
+    Attributes:
+        pulls: of each on the law.
+        between: the scatter of the law's free parameters; None: laws do not scatter, or it is not determined.
+        departures: of each table's law from the mean; None likewise.
+        departing: how residuals change with departures of the most likely size, and of a cautious one; none likewise.
+    """
+
+    pulls: list[Pull]
+    between: Between | None = None
+    departures: Float[np.ndarray, "tables l"] | None = None
+    departing: tuple[Float[np.ndarray, "readings m"], ...] = ()
+
+
+def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> Estimate:
+    """Return the law, values and errors that a minimum stands for, with the model discrepancy where impacts last."""
+    at = at_minimum(table, found)
+    estimate = Estimate(at, at.values, at.covariance, at.chi2, at.rows, at.rows.residual)
+    rows = _rows_to_step_from(at)
+    if rows is None:
+        return estimate
+    discrepancy, runs = _discrepancy_of(at, rows)
+    system = system_of(rows, discrepancy)
+    tables = _compare_tables(at, system)
+    used = np.isfinite(at.speeds)
+    # of the Hertz time, in us and kHz
+    contact_share = float(np.max(1e-3 * rows.hertz_time[: used.size][used] * table.drive_frequency_khz[used]))
+    estimate = estimate._replace(step_rows=rows, runs=runs, tables=tables, contact_share=contact_share)
+    departing = () if tables is None else tables.departing
+    if not (at.problem.lasting or departing):
+        return estimate
+    step, *cautious = (step_of(rows, discrepancy, at.free, sizes) for sizes in departing or (None,))
+    step = step._replace(covariance=(*cautious, step)[0].covariance)
+    system = system.with_unknowns(departing[0] if departing else None)
+    part = descending_part(step, system, lambda parts: _predicted_after(at, parts, discrepancy))
+    return _after_step(estimate, part, discrepancy, system)
+
+
+def at_minimum(table: AmplitudeTable | SeveralTables, found: Found) -> AtMinimum:
+    """Return what the model says at a minimum: residuals, slopes, covariance, and whether it is a minimum."""
+    searching = found.objective
+    values = searching.problem.values(found.minimum.coordinates)
+    objective = searching.following(values)
+    free = ~at_bound(objective, values)
+    convergence = check_minimum(objective, found.minimum.coordinates, free)
+    linear = searching.at_values(values[None])
+    residual = searching.misfit(linear)
+    rows = _rows_at(table, found, linear, residual)
+    return AtMinimum(
+        table=table,
+        found=found,
+        objective=objective,
+        values=values,
+        free=free,
+        convergence=convergence,
+        linear=linear,
+        residual=residual,
+        chi2=float(np.sum(np.asarray(linear.residual)[0] ** 2)),
+        covariance=covariance(objective, values, free),
+        rows=rows,
+        speeds=np.where(rows.used, rows.approach_speed_nm_per_us, np.nan),
+    )
+
+
+def _rows_at(
+    table: AmplitudeTable | SeveralTables, found: Found, linear: Linearised, residual: Float[np.ndarray, "rows k"]
+) -> FittedRows:
+    """Return the rows of a table beside what the model predicts for them at the minimum."""
+    count, columns = table.rows, found.objective.measurement.rows
+    prediction: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0, :count], linear.prediction)
+    used, exists = np.asarray(columns.measured)[:count], prediction.orbits > 0
+    read, stated = readings_of(table)[0], np.asarray(found.stated.measurement.rows.measured)[:count]
+    reasons = found.model_errors.reasons[:count].copy()
+    reasons[np.isfinite(read).any(axis=1) & ~stated.any(axis=1)] = ATTRACTED
+    predicted = np.where(exists[:, None], prediction.amplitude_nm, np.nan)
+    measured = np.where(used | (reasons != "")[:, None], read, np.nan)
+    error = np.where(used, np.asarray(columns.error_nm)[:count], np.nan)
+    phases = {}
+    if measured.shape[1] > 2:
+        phases = {
+            "predicted_phase_deg": predicted[:, 2],
+            "measured_phase_deg": measured[:, 2],
+            "phase_error_deg": error[:, 2],
+        }
+    return FittedRows(
+        predicted_nm=predicted[:, :2],
+        measured_nm=measured[:, :2],
+        residual=np.where(used, residual[:count], np.nan),
+        error_nm=error[:, :2],
+        model_error=found.model_errors.model_error[:count],
+        used=np.asarray(used.any(axis=1)),
+        set_aside=(reasons != "").astype(bool),
+        approach_speed_nm_per_us=np.where(exists, prediction.approach_speed_nm_per_us, np.nan),
+        orbits=prediction.orbits,
+        near_fold=prediction.near_fold,
+        reasons=tuple(reasons.tolist()),
+        **phases,
+    )
+
+
+def _rows_to_step_from(at: AtMinimum) -> StepRows | None:
+    """Return the rows as the linear step sees them; None where there is nothing to step to.
+
+    There is nothing for instantaneous laws of one table, for a law that is refused, and without finite slopes.
+    """
+    joint = at.found.objective.measurement.joint
+    if not (at.problem.lasting or joint) or at.found.refused or not np.isfinite(at.speeds).any():
+        return None
+    scale = at.settings["error_scale"] or 1.0
+    rows = rows_of_fit(at.found.stated, at.objective, at.values, at.found.model_errors, scale)
+    return rows if all(np.isfinite(part).all() for part in (rows.residual, rows.jacobian, *rows.slopes)) else None
+
+
+def _discrepancy_of(at: AtMinimum, rows: StepRows) -> tuple[ModelDiscrepancy, Runs | None]:
+    """Return what the model leaves out at its fitted values, wider where residuals run together over the speed."""
+    problem, values = at.problem, at.settings["fixed"] | dict(zip(at.problem.names, at.values.tolist(), strict=True))
+    mass = float(at.found.stated.measurement.cantilever.mass_ng)
+    discrepancy = ModelDiscrepancy(problem, values, speed_range(at.speeds), mass)
+    if problem.model == "contact":
+        held = tuple(Held(*one) for one in at.settings.get("held", ()))
+        effects = effects_of_held(held, values, problem.effects, mass, discrepancy.speeds)
+        if problem.pulled:
+            effects = seen_in_taps(effects, at.objective, at.values)
+        discrepancy = replace(discrepancy, held=effects)
+    if not problem.lasting or problem.pulled or at.scattering:
+        return discrepancy, None
+    before = longest_run(rows, discrepancy, at.free)
+    residual = step_of(rows, discrepancy, at.free).residual
+    discrepancy = with_runs(discrepancy, before)
+    beside = longest_run(rows, discrepancy, at.free) if discrepancy.short else before
+    return discrepancy, Runs(before, beside, residual)
+
+
+def _compare_tables(at: AtMinimum, system: StepSystem) -> TablesCompared | None:
+    """Return the pulls of several tables on the law and the scatter of their laws; None of one table."""
+    measurement = at.found.objective.measurement
+    joint, table = measurement.joint, measurement.rows.table
+    if joint is None or table is None:
+        return None
+    free = np.append(at.free, np.ones(system.jacobian.shape[1] - at.free.size, dtype=bool))
+    own = len(at.problem.own)
+    parts = parts_of(system, table, joint.place, free, own)
+    if not at.scattering:
+        return TablesCompared(pulls_of(parts))
+    unit = departures_of(system, table, parts.law, np.ones(parts.law.size))
+    between = scatter_between(parts_of(system, table, joint.place, free, own, unit))
+    if not np.isfinite(between.value).all():
+        return TablesCompared(pulls_of(parts))
+    departing = tuple(departures_of(system, table, parts.law, size) for size in (between.value, between.cautious))
+    parts = parts_of(system, table, joint.place, free, own, departing[0])
+    departed = parts.solved()[1][-departing[0].shape[1] :].reshape(len(joint.drives), -1)
+    return TablesCompared(pulls_of(parts), between, departed * between.value, departing)
+
+
+def _after_step(estimate: Estimate, part: Descended, discrepancy: ModelDiscrepancy, system: StepSystem) -> Estimate:
+    """Return the estimate with law, values, errors and predictions after the part of a step that lowers chi2."""
+    at, step, count = estimate.at, part.step, estimate.at.table.rows
+    member = _closest_member(at, step, discrepancy)
+    if member is None:
+        names = len(at.values)
+        member = ClosestMember(step.values[:names], step.covariance[:names, :names])
+    misfit: Any = part.predicted.misfit[0]
+    chi2 = system.chi2(step, misfit.ravel())
+    if at.found.objective.robust:
+        chi2 = float(np.sum(soft_square(np.append(misfit, system.rest(step)), ROBUST)))
+    used = np.isfinite(at.rows.residual)
+    prediction: Any = jax.tree.map(lambda leaf: np.asarray(leaf)[0, :count], part.predicted.prediction)
+    exists = prediction.orbits > 0
+    readings = np.where(exists[:, None], prediction.amplitude_nm, np.nan)
+    rows = replace(
+        at.rows,
+        residual=np.where(used, misfit[:count], np.nan),
+        predicted_nm=readings[:, :2],
+        predicted_phase_deg=None if at.rows.predicted_phase_deg is None else readings[:, 2],
+        approach_speed_nm_per_us=np.where(exists, prediction.approach_speed_nm_per_us, np.nan),
+        orbits=np.where(exists, at.rows.orbits, 0),
+    )
+    independent = system.alone(misfit.ravel())[0].reshape(misfit.shape)[:count]
+    return estimate._replace(
+        values=member.values,
+        covariance=member.covariance,
+        chi2=chi2,
+        rows=rows,
+        independent_residual=np.where(used, independent, np.nan),
+        after=(step, discrepancy),
+        stuck=part.stuck,
+    )
+
+
+def _closest_member(at: AtMinimum, step: LinearStep, discrepancy: ModelDiscrepancy) -> ClosestMember | None:
+    speeds = at.speeds[np.isfinite(at.speeds)]
+    return member_after(step, discrepancy, at.objective.measurement, at.values, speeds, at.free)
+
+
+def _predicted_after(at: AtMinimum, parts: list[LinearStep], discrepancy: ModelDiscrepancy) -> Predicted:
+    """Return what the laws after parts of the step predict, with the instrument after it."""
+    measurement, problem = at.objective.measurement, at.problem
+    values = np.array([part.values[: len(problem.names)] for part in parts])
+    if problem.pulled or not problem.lasting:
+        # taps are no law of the free tip's speed, and instantaneous laws have no discrepancy
+        shape = measurement.rows.measured.shape
+        predictions = []
+        for point, part in zip(values, parts, strict=True):
+            there = measurement._replace(fixed=discrepancy.fixed_after(part, measurement.fixed))
+            plain = Objective(there, problem, near=at.objective.near).at_values(point[None])
+            misfit = plain.residual[:, : shape[0] * shape[1]].reshape(1, *shape)
+            predictions.append(Predicted(misfit, plain.prediction))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *predictions)
+    laws = [_tabulated_after(at, part, discrepancy) for part in parts]
+    speeds: Any = at.linear.prediction.approach_speed_nm_per_us[0]
+    exists = (np.asarray(at.linear.prediction.orbits)[0] > 0) & np.isfinite(speeds)
+    safe = jnp.asarray(np.where(exists, speeds, 100.0))
+    near = [np.where(exists, np.asarray(coordinates(law, safe)), np.nan) for law in laws]
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
+    return predict(values, stacked, measurement, problem, np.array(near))
+
+
+def _tabulated_after(at: AtMinimum, step: LinearStep, discrepancy: ModelDiscrepancy) -> TabulatedLaw:
+    """Return the law after a step as the table that predictions are made of."""
+    speeds, points = points_of_law(at.law(at.covariance, (step, discrepancy)).at, at.speeds)
+    delay = None
+    if at.problem.model != "contact":
+        member = _closest_member(at, step, discrepancy)
+        values = step.values[: len(at.values)] if member is None else member.values
+        delay = at.problem.law(jnp.asarray(values), at.objective.measurement.fixed).delay
+    return table_of_law(speeds, *points.law, capture_speed_nm_per_us=points.capture, delay=delay)
+
+
+_MUCH = 0.25
+"""Share of a parameter's variance that comes of a held one from which it is said to hang on that."""
+
+
+def hanging_on_held(estimate: Estimate) -> dict[str, tuple[str, ...]]:
+    """Return which held parameters' errors are much of each fitted one's, by the fitted one's name."""
+    hanging: dict[str, tuple[str, ...]] = {}
+    if estimate.after is None or estimate.step_rows is None:
+        return hanging
+    at, discrepancy, whole = estimate.at, estimate.after[1], np.diag(estimate.covariance)
+    for effect in discrepancy.held:
+        rest = replace(discrepancy, held=tuple(other for other in discrepancy.held if other is not effect))
+        without = np.diag(step_of(estimate.step_rows, rest, at.free).covariance)
+        for i, name in enumerate(at.problem.own):
+            if np.isfinite(whole[i]) and whole[i] - without[i] > _MUCH * whole[i]:
+                hanging[name] = (*hanging.get(name, ()), effect.held.name)
+    return hanging
+
+
+_KINDS = (("peak amplitude", ""), ("lock-in amplitude", ""), ("phase", "degrees"))
+"""What is read, and its unit if it does not drift by a share."""
+_FOLLOWING = 4.0
+"""Standard errors of a course of the residuals along the rows beyond which it is no chance."""
+
+
+def courses_along_rows(at: AtMinimum) -> dict[str, list[str]]:
+    """Return which readings of a table follow its rows, and by how much from the first to the last, by its label.
+
+    Only tables that say nothing of the order of their rows are looked at.
+    """
+    rows, courses = at.found.objective.measurement.rows, {}
+    count, kinds = at.residual.shape
+    predicted = np.asarray(at.linear.prediction.amplitude_nm)[0]
+    scale, first = np.sqrt(max(1.0, at.chi2 / max(at.freedom, 1))), 0
+    for table, label in zip(at.table.tables, at.table.labels, strict=True):
+        mine, first = np.arange(first, first + table.rows), first + table.rows
+        if table.rows_in_order_of_time:
+            continue
+        for kind, (name, unit) in zip(range(kinds), _KINDS, strict=False):
+            size = 1.0 if unit else np.abs(predicted[mine, kind])
+            course = np.linspace(-0.5, 0.5, table.rows) * size / np.asarray(rows.error_nm)[mine, kind]
+            along = np.zeros((count, kinds))
+            along[mine, kind] = np.where(np.asarray(rows.measured)[mine, kind], course, 0.0)
+            slope, sigmas = _slope_along(at, along.ravel())
+            if abs(sigmas) > _FOLLOWING * scale:
+                drift = f"{slope:+.2g} {unit}" if unit else f"{100.0 * slope:+.2g} %"
+                courses.setdefault(label, []).append(f"{name} {drift}")
+    return courses
+
+
+def _slope_along(at: AtMinimum, along: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return how far readings follow a course that the parameters leave them, and that in standard errors."""
+    residual = np.nan_to_num(np.asarray(at.linear.residual)[0])
+    column = np.append(along, np.zeros(residual.size - along.size))
+    slopes = np.nan_to_num(np.asarray(at.linear.jacobian)[0])
+    slopes = slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
+    basis, size, _ = np.linalg.svd(slopes, full_matrices=False)
+    basis = basis[:, size > 1e-10 * max(size[0], 1e-300)]
+    apart = column - basis @ (basis.T @ column)
+    length = float(apart @ apart)
+    if length <= 1e-6 * float(column @ column):
+        return 0.0, 0.0
+    slope = -float(apart @ residual) / length
+    return slope, slope * np.sqrt(length)
+
+
+AtSpeeds = Callable[[Float[np.ndarray, " n"]], LawAfter]
+"""A law with its errors, of approach speeds in nm/us."""
+
+
+class ModelLaw(NamedTuple):
+    """The law of a model at fitted values, after the step to the model discrepancy if there is one.
+
+    Attributes:
+        problem: the model.
+        measurement: gives the contact's fixed parameters.
+        values: fitted values.
+        covariance: of the values, or of those after the step; infinite entries give an open band (NaN).
+        after: the step from these values, and the discrepancy; None: the model is taken at its word.
+    """
+
+    problem: Problem
+    measurement: Measurement
+    values: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "k k"]
+    after: tuple[LinearStep, ModelDiscrepancy] | None = None
+
+    def at(self, speeds: Float[np.ndarray, " n"]) -> LawAfter:
+        """Return the law at approach speeds in nm/us."""
+        before = law_before(self.problem, self.measurement, self.values, speeds)
+        if self.after is None:
+            root = root_of(self.covariance)[: before.slope.shape[2]]
+            return LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
+        step, discrepancy = self.after
+        moved = law_before(self.problem, self.measurement, step.values[: len(self.problem.names)], speeds)
+        law = law_after(step, discrepancy, speeds, before, moved)
+        if np.all(np.isfinite(self.covariance)):
+            return law
+        return law._replace(
+            factor=np.full_like(law.factor, np.nan), capture_factor=np.full_like(law.capture_factor, np.nan)
+        )
+
+
+def holding(law: ModelLaw, other: ModelLaw | None) -> AtSpeeds:
+    """Return a law whose band holds that of another one too, which may as well be the true one."""
+    return law.at if other is None else lambda speeds: containing(law.at(speeds), other.at(speeds))
+
+
+def law_with_band(
+    law: AtSpeeds,
+    approach_speeds: Float[np.ndarray, " rows"],
+    *,
+    lasting: bool,
+    formula: ImpactLaw | None,
+    mass_ng: float | None = None,
+    origin: str = "",
+) -> FittedLaw:
+    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
+
+    Args:
+        law: with its errors.
+        approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
+        lasting: impacts take time.
+        formula: of the model's family, whose delay is the one that the law's is written beside; None: the closest one.
+        mass_ng: of the tip; None: not known.
+        origin: what the law comes from, in words.
+    """
+    speeds, points = points_of_law(law, approach_speeds)
+    return FittedLaw(
+        speeds,
+        *points.law,
+        capture_speed_nm_per_us=points.capture,
+        delay=None if formula is None else formula.delay,
+        lasting=lasting,
+        errors=(np.moveaxis(points.factor, 0, 1), points.capture_factor),
+        mass_ng=mass_ng,
+        origin=origin,
+    )
+
+
+_POINTS, _FEWEST_POINTS = 121, 4
+
+
+def points_of_law(
+    law: AtSpeeds, approach_speeds: Float[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, " points"], LawAfter]:
+    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach in nm/us, and beyond its capture.
+
+    Args:
+        law: with its errors.
+        approach_speeds: of the rows, NaN where a row has none.
+    """
+    slow, fast = speed_range(approach_speeds)
+    speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
+    points = law(speeds)
+    if np.count_nonzero(points.law[0] > 0.0) < _FEWEST_POINTS:
+        # a law that captures nearly all of these tips
+        speeds = np.geomspace(0.8 * slow, 3.0 * max(points.capture, fast), _POINTS)
+        points = law(speeds)
+    return speeds, points
+
+
+def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, float]:
+    """Return slowest and fastest of the known speeds; 1.25 and 83 nm/us where there is none."""
+    known = approach_speeds[np.isfinite(approach_speeds)]
+    return (float(known.min()), float(known.max())) if known.size else (1.25, 250.0 / 3.0)
+
+
+def loss_of(
+    law: AtSpeeds,
+    measured: tuple[float, float],
+    mass_ng: float | None,
+    parameters: Mapping[str, FittedParameter],
+    formula: Mapping[str, float] | None,
+) -> Loss:
+    """Return what impacts take: energies at measured speeds, and what the printed parameters say.
+
+    Args:
+        law: with its errors.
+        measured: slowest and fastest approach in nm/us.
+        mass_ng: of the tip; None: not known.
+        parameters: of the fit.
+        formula: values of the model's formula, those that are held included; None: it has none.
+    """
+    three = np.geomspace(*measured, 3)
+    # two digits, and within what was measured
+    three = np.clip([float(f"{speed:.2g}") for speed in three], *measured)
+    points = law(np.resize(three, _POINTS))
+    error = np.linalg.norm(points.factor[0], axis=1)
+    energies = [
+        energy_lost(float(u), float(w), float(e), mass_ng)
+        for u, w, e in zip(three, points.law[0, :3], error[:3], strict=True)
+    ]
+    r, epsilon = (
+        WithInterval(known.value, known.interval95) if known is not None else None
+        for known in (parameters.get("r"), parameters.get("epsilon"))
+    )
+    delta = None if epsilon is None or mass_ng is None else scaled(epsilon, 0.5 * mass_ng)
+    off = None
+    if formula is not None:
+        speeds = np.geomspace(*measured, _POINTS)
+        off = nearness(speeds, law(speeds).law[0], rebound_by_formula(formula, speeds))
+    return Loss(
+        energies=tuple(dict.fromkeys(energies)),
+        energies_reason=NO_MASS if mass_ng is None else None,
+        r=r,
+        epsilon_nm2_per_us2=epsilon,
+        delta_aj=delta,
+        delta_ev=None if delta is None else scaled(delta, EV_PER_AJ),
+        formula_off=None if off is None else off.off,
+        formula_off_at_nm_per_us=None if off is None else off.at_nm_per_us,
+        capture_speed_nm_per_us=interval_of(points.capture, float(np.linalg.norm(points.capture_factor)), lowest=0.0),
+    )
+
+
+def member_after(
+    step: LinearStep,
+    discrepancy: ModelDiscrepancy,
+    measurement: Measurement,
+    values: Float[np.ndarray, " p"],
+    speeds: Float[np.ndarray, " n"],
+    free: Bool[np.ndarray, " p"],
+    *,
+    computed: bool = True,
+) -> ClosestMember | None:
+    """Return the model's law that is closest to the law after a step; None where the step is all there is.
+
+    Args:
+        step: the step.
+        discrepancy: by the model.
+        measurement: gives the contact's fixed parameters.
+        values: from which the step was taken.
+        speeds: approach speeds in nm/us of the rows that are used.
+        free: which of the values are not at their bound.
+        computed: the law after the step is computed; False: to first order.
+    """
+    problem = discrepancy.problem
+    if problem.model == "contact" or not problem.lasting:
+        return None
+    # one program for rows of any number up to that of a law's points
+    filled = np.append(speeds, np.full(-speeds.size % _POINTS, speeds[-1]))
+
+    def law_at(point: Float[np.ndarray, " p"]) -> LawBefore:
+        whole = law_before(problem, measurement, point, filled)
+        return whole._replace(law=whole.law[:, : speeds.size], slope=whole.slope[:, : speeds.size])
+
+    moved = law_at(step.values[: len(problem.names)]) if computed else None
+    return closest_member(step, discrepancy, speeds, law_at(values), free, moved)
+
+
+def law_before(
+    problem: Problem, measurement: Measurement, values: Float[np.ndarray, " p"], speeds: Float[np.ndarray, " n"]
+) -> LawBefore:
+    """Return the law of a model's values at approach speeds in nm/us, with its slopes by the values."""
+    impact, slopes = impact_at(values, measurement, problem)
+    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
+    count = speeds.size
+    return LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
+
+
+@jax.jit
+def law_and_slope(
+    impact: AnyImpact, slopes: AnyImpact, speeds: Float[Array, " n"]
+) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
+    """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
+
+    The last column is that of the capture speed, twice.
+
+    Args:
+        impact: what is fitted.
+        slopes: its derivatives by the parameters, along a first axis.
+        speeds: in nm/us.
+    """
+
+    def law(impact):
+        if isinstance(impact, Law):
+            capture = jnp.full((2, 1), impact.capture_speed_nm_per_us)
+            leaving = jnp.stack([impact.rebound_speed(speeds), impact.collision_delay(speeds)])
+            return jnp.concatenate([leaving, capture], axis=1)
+        impact = impact.free if isinstance(impact, PulledImpact) else impact
+        leaving = jax.vmap(impact.speeds)(speeds)
+        # below the table the contact captures
+        free = speeds > impact.lowest
+        there = jnp.stack([jnp.where(free, leaving.rebound, 0.0), jnp.where(free, leaving.delay, 0.0)])
+        return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
+
+    return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
+
+
+@jax.jit
+def coordinates(law: Law, speeds: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return the coordinates of orbits at approach speeds in nm/us."""
+    return law.coordinate(speeds)
