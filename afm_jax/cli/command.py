@@ -152,14 +152,18 @@ def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **
         row.check(session, options)
     if row.computes:
         session.start_computing(*row.programs(options))
+    scene = None
     if SCENE in row.options:
-        options["scene"] = _loaded(options)
+        scene = options["scene"] = _loaded(options)
     module, _, name = row.runs.partition(":")
     function = getattr(import_module(module), name)
-    with _naming(options.get("scene")):
+    with _naming(scene):
         output = function(session, **options)
-    if output is not None:
-        hand_out(session, output if output.impact_speeds is None else _saying_if_extrapolated(output, options["scene"]))
+    if output is None:
+        return
+    if output.impact_speeds is not None and scene is not None:
+        output = _saying_if_extrapolated(output, scene)
+    hand_out(session, output)
 
 
 def hand_out(session: Session, output: Output) -> None:
@@ -209,6 +213,6 @@ def _naming(scene: NamedScene | None) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        if not isinstance(scene, NamedScene) or is_inner(error) or str(error).startswith(scene.name):
+        if scene is None or is_inner(error) or str(error).startswith(scene.name):
             raise
         raise ValueError(f"{scene.name}: {error}") from error
