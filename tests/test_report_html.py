@@ -194,7 +194,7 @@ def test_every_input_is_in_the_page():
 def test_odd_rows_are_marked_and_say_why():
     root = read_page(page_of(with_odd_rows()))
     remarks = [row[-1] for row in table_of(root, "Amplitudes in nm")[1:]]
-    assert remarks[0].startswith("set aside: this impact is too slow")
+    assert remarks[0].startswith("excluded: this impact is too slow")
     assert remarks[1] == "2 stable orbits, the closest taken; close to a fold; more than 3 errors off"
     assert remarks[2] == "no stable orbit at the fitted law"
     assert remarks[3] == "nothing steady seen, though an orbit is predicted"
@@ -263,7 +263,7 @@ def test_text_names_only_strong_correlations_of_many_parameters():
 def test_pictures_show_the_delay_and_the_rows_set_aside():
     figure = rows_figure(with_odd_rows())
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    for label in ("measured, set aside", "no stable orbit predicted", "no orbit seen, one predicted"):
+    for label in ("measured, excluded", "no stable orbit predicted", "no orbit seen, one predicted"):
         assert label in labels
     assert figure.axes[0].yaxis.get_major_formatter()(200.0, 0) == "200", "amplitudes are plain numbers"
     fit = made_fit("law+delay")

@@ -28,6 +28,92 @@ _RIDGE = 1e-9
 the first points, which alone determine nothing, can be compared."""
 
 
+_PACKAGES = ("afm-jax", "jax", "numpy")
+
+
+@checked
+def design(  # noqa: PLR0913
+    prior: Prior | FitResult,
+    drives: Drives,
+    *,
+    points: int = 8,
+    noise: float = 0.01,
+    interest: Sequence[str] | None = None,
+    criterion: str = "D",
+    amplitudes: str = "both",
+    largest_nm: float | None = None,
+    phase_noise_deg: float = PHASE_NOISE_DEG,
+) -> Design:
+    """Choose the drives to measure next, and forecast how well the parameters will then be known.
+
+    The forecast is the Fisher information: derivatives of the predicted amplitudes by every parameter at the prior
+    values, by automatic differentiation through the orbits; of laws with a delay the errors contain what the model
+    leaves out, as those of a fit. Every drive is chosen once. A drive is left out where the
+    prior has no steady single-impact orbit, or several, or is not sure of it, and where a fit would exclude its row.
+
+    Args:
+        prior: from `prior_of_values`, or a fit whose measurements are to be added to.
+        drives: what can be driven, from `drive_grid`.
+        points: how many to choose.
+        noise: standard error of an amplitude relative to it (0.01 stands for 1 %).
+        interest: the parameters to be known well, all others being unknown too; None: those of the law.
+        criterion: "D": the smallest volume of their joint confidence region; "A": the smallest sum of their variances,
+            each relative to the parameter (to the loss 1 - r for r).
+        amplitudes: what is read of each point: "peak", "lockin" or "both"; of a cantilever that is driven itself always
+            the lock-in amplitude and the lag.
+        largest_nm: peak amplitude that the instrument takes (of a cantilever that is driven itself the free one); None:
+            any.
+        phase_noise_deg: standard error of a lag in degrees.
+
+    Returns:
+        The points in the order of their use, with expected readings and errors; see `Design`.
+
+    Raises:
+        ValueError: if an option is impossible.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    require_float64()
+    prior = prior_of_fit(prior) if isinstance(prior, FitResult) else prior
+    wanted = _interest(prior, interest)
+    _check_options(points, noise, criterion, amplitudes, largest_nm, phase_noise_deg)
+    largest = np.inf if largest_nm is None else float(largest_nm)
+    candidates = candidates_of(
+        prior, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
+    )
+    measure = _criterion(prior, candidates, wanted, criterion)
+    usable, each = np.flatnonzero(candidates.usable), candidates.information
+    chosen = usable[choose_points(prior.information, each[usable], points, measure)]
+    reached = prior.information + each[chosen].sum(axis=0)
+    errors = forecast(prior, candidates, chosen, float(noise), phase_noise_deg)
+    reasons, warnings = judge_design(prior, candidates, chosen, reached, errors[-1], wanted, points)
+    return Design(
+        prior=prior,
+        interest=wanted,
+        criterion=criterion,
+        noise=float(noise),
+        candidates=candidates,
+        chosen=chosen,
+        errors=errors,
+        gain=_gain(measure, reached, candidates),
+        valid=not reasons,
+        reasons=reasons,
+        warnings=warnings,
+        settings={
+            "points": points,
+            "noise": noise,
+            "interest": list(wanted),
+            "criterion": criterion,
+            "amplitudes": amplitudes,
+            "largest_nm": largest_nm,
+            "phase_noise_deg": phase_noise_deg if prior.problem.tapping else None,
+            "drive": prior.problem.drive,
+            "uncertainty": prior.uncertainty,
+            "drives": len(drives.order),
+        },
+        versions={name: version_of(name) for name in _PACKAGES},
+    )
+
+
 class Criterion(NamedTuple):
     """How good an information matrix is for the parameters that matter; more is better.
 
@@ -229,92 +315,6 @@ def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"], *, tappin
                     f"{share:.0%} of the points are at the {word} {what}, {end:g} nm: a wider range may be better."
                 )
     return warnings
-
-
-_PACKAGES = ("afm-jax", "jax", "numpy")
-
-
-@checked
-def design(  # noqa: PLR0913
-    prior: Prior | FitResult,
-    drives: Drives,
-    *,
-    points: int = 8,
-    noise: float = 0.01,
-    interest: Sequence[str] | None = None,
-    criterion: str = "D",
-    amplitudes: str = "both",
-    largest_nm: float | None = None,
-    phase_noise_deg: float = PHASE_NOISE_DEG,
-) -> Design:
-    """Choose the drives to measure next, and forecast how well the parameters will then be known.
-
-    The forecast is the Fisher information: derivatives of the predicted amplitudes by every parameter at the prior
-    values, by automatic differentiation through the orbits; of laws with a delay the errors contain what the model
-    leaves out, as those of a fit. Every drive is chosen once. A drive is left out where the
-    prior has no steady single-impact orbit, or several, or is not sure of it, and where a fit would set its row aside.
-
-    Args:
-        prior: from `prior_of_values`, or a fit whose measurements are to be added to.
-        drives: what can be driven, from `drive_grid`.
-        points: how many to choose.
-        noise: standard error of an amplitude relative to it (0.01 stands for 1 %).
-        interest: the parameters to be known well, all others being unknown too; None: those of the law.
-        criterion: "D": the smallest volume of their joint confidence region; "A": the smallest sum of their variances,
-            each relative to the parameter (to the loss 1 - r for r).
-        amplitudes: what is read of each point: "peak", "lockin" or "both"; of a cantilever that is driven itself always
-            the lock-in amplitude and the lag.
-        largest_nm: peak amplitude that the instrument takes (of a cantilever that is driven itself the free one); None:
-            any.
-        phase_noise_deg: standard error of a lag in degrees.
-
-    Returns:
-        The points in the order of their use, with expected readings and errors; see `Design`.
-
-    Raises:
-        ValueError: if an option is impossible.
-        RuntimeError: if JAX is not set to 64-bit floats.
-    """
-    require_float64()
-    prior = prior_of_fit(prior) if isinstance(prior, FitResult) else prior
-    wanted = _interest(prior, interest)
-    _check_options(points, noise, criterion, amplitudes, largest_nm, phase_noise_deg)
-    largest = np.inf if largest_nm is None else float(largest_nm)
-    candidates = candidates_of(
-        prior, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
-    )
-    measure = _criterion(prior, candidates, wanted, criterion)
-    usable, each = np.flatnonzero(candidates.usable), candidates.information
-    chosen = usable[choose_points(prior.information, each[usable], points, measure)]
-    reached = prior.information + each[chosen].sum(axis=0)
-    errors = forecast(prior, candidates, chosen, float(noise), phase_noise_deg)
-    reasons, warnings = judge_design(prior, candidates, chosen, reached, errors[-1], wanted, points)
-    return Design(
-        prior=prior,
-        interest=wanted,
-        criterion=criterion,
-        noise=float(noise),
-        candidates=candidates,
-        chosen=chosen,
-        errors=errors,
-        gain=_gain(measure, reached, candidates),
-        valid=not reasons,
-        reasons=reasons,
-        warnings=warnings,
-        settings={
-            "points": points,
-            "noise": noise,
-            "interest": list(wanted),
-            "criterion": criterion,
-            "amplitudes": amplitudes,
-            "largest_nm": largest_nm,
-            "phase_noise_deg": phase_noise_deg if prior.problem.tapping else None,
-            "drive": prior.problem.drive,
-            "uncertainty": prior.uncertainty,
-            "drives": len(drives.order),
-        },
-        versions={name: version_of(name) for name in _PACKAGES},
-    )
 
 
 def _interest(prior: Prior, interest: Sequence[str] | None) -> tuple[str, ...]:

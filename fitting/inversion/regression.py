@@ -35,6 +35,88 @@ Formula = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Of approach speed, rebound speed and delay; works on complex numbers."""
 
 
+_SLOW = 2.5
+"""Rows below this multiple of sqrt(epsilon) are excluded: there the contact is no short event any more."""
+_POINTS = 120
+_DECIDED = 6.0
+"""Difference of chi2 from which a law with as many coefficients is called better."""
+_IMPROBABLE = 1e-3
+_PLAIN = {"viscous": "a viscous loss, linear in the speed", "restitution": "a coefficient of restitution"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Laws:
+    """The regressions, with the rows marked that entered them, and the speeds of the curves."""
+
+    rows: InvertedRows
+    speeds: Float[np.ndarray, " points"]
+    laws: dict[str, RegressedLaw]
+    delay: RegressedLaw | None
+    preferred: str | None
+    verdict: str
+
+
+def regressed_laws(rows: InvertedRows) -> Laws:
+    """Return the laws regressed on rows: both of the loss, and the delay's.
+
+    Rows slower than 2.5 sqrt(epsilon), epsilon from a first regression, are excluded and named.
+
+    Args:
+        rows: inverted rows; those with `regressed` off are left out.
+    """
+    rows = _without_slow(rows)
+    used = rows.regressed
+    impacts = rows.impact[used]
+    if used.sum() < 3:
+        verdict = "no law is regressed: it takes three rows with amplitude and phase"
+        return Laws(rows=rows, speeds=np.zeros(0), laws={}, delay=None, preferred=None, verdict=verdict)
+    speeds = np.geomspace(impacts[:, 0].min(), impacts[:, 0].max(), _POINTS)
+    found = {model: _regression(rows, loss, terms) for model, terms in LOSS_TERMS.items()}
+    if not all(np.all(np.isfinite(one.covariance)) for one in found.values()):
+        verdict = "no law is regressed: the rows have one approach speed"
+        return Laws(rows=rows, speeds=speeds, laws={}, delay=None, preferred=None, verdict=verdict)
+    laws = {model: _loss_law(model, found[model], rows.shared_names, speeds) for model in found}
+    preferred, verdict = _verdict(laws)
+    rebound = laws[preferred or "viscous"].curve
+    delays = None
+    if used.sum() > len(DELAY_TERMS):
+        regression = _regression(rows, delay, DELAY_TERMS)
+        if np.all(np.isfinite(regression.covariance)):
+            delays = _delay_law(regression, rows.shared_names, speeds, rebound)
+    return Laws(rows=rows, speeds=speeds, laws=laws, delay=delays, preferred=preferred, verdict=verdict)
+
+
+def distance_from(law: Law, table: AmplitudeTable, rows: InvertedRows, reading: ResonanceReading) -> LawDistance:
+    """Return how far inverted rows are from a law that is known otherwise, the errors of both taken together.
+
+    Args:
+        law: a formula or a table.
+        table: what was inverted.
+        rows: its rows.
+        reading: the paper's reading of it, for a table without phases.
+
+    Raises:
+        TableError: if the law is known at none of the rows' approach speeds.
+    """
+    u, w, _ = rows.impact[rows.inverted].T
+    reached = u if u.size else reading.approach_speed_nm_per_us
+    if np.all(law.extrapolated(reached) | law.captures(reached)):
+        raise TableError(
+            f"{described(law)}, says nothing about {table.source}, whose impacts come at {np.min(reached):.4g} to "
+            f"{np.max(reached):.4g} nm/us; give a law of these speeds"
+        )
+    inside = ~np.asarray(law.extrapolated(u) | law.captures(u))
+    rebound, slope = np.asarray(law.rebound_speed(u)), np.asarray(law.rebound_slope(u))
+    # of squares, which are all but linear in the speed
+    slopes = np.stack([-2.0 * rebound * slope, 2.0 * w], axis=1)
+    variance = np.einsum("ni,nij,nj->n", slopes, rows.covariance[rows.inverted][:, :2, :2], slopes)
+    variance += np.sum(np.einsum("ni,nis->ns", slopes, rows.shared[rows.inverted][:, :2]) ** 2, axis=1)
+    variance += (2.0 * rebound * errors_of(law, u)[0]) ** 2
+    pulls = (np.abs(w**2 - rebound**2) / np.sqrt(variance))[inside]
+    median = float(np.median(pulls)) if pulls.size else None
+    return LawDistance(int(inside.sum()), median, extrapolation_of(law, u))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Regression:
     """A target regressed on terms; all arrays of the terms' number.
@@ -176,64 +258,13 @@ def _with_slopes(formula: Formula, impacts: Float[np.ndarray, "rows 3"]) -> tupl
     return np.real(formula(*impacts.T)), np.stack(slopes, axis=1)
 
 
-_SLOW = 2.5
-"""Rows below this multiple of sqrt(epsilon) are set aside: there the contact is no short event any more."""
-_POINTS = 120
-_DECIDED = 6.0
-"""Difference of chi2 from which a law with as many coefficients is called better."""
-_IMPROBABLE = 1e-3
-_PLAIN = {"viscous": "a viscous loss, linear in the speed", "restitution": "a coefficient of restitution"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Laws:
-    """The regressions, with the rows marked that entered them, and the speeds of the curves."""
-
-    rows: InvertedRows
-    speeds: Float[np.ndarray, " points"]
-    laws: dict[str, RegressedLaw]
-    delay: RegressedLaw | None
-    preferred: str | None
-    verdict: str
-
-
-def regressed_laws(rows: InvertedRows) -> Laws:
-    """Return the laws regressed on rows: both of the loss, and the delay's.
-
-    Rows slower than 2.5 sqrt(epsilon), epsilon from a first regression, are set aside and named.
-
-    Args:
-        rows: inverted rows; those with `regressed` off are left out.
-    """
-    rows = _without_slow(rows)
-    used = rows.regressed
-    impacts = rows.impact[used]
-    if used.sum() < 3:
-        verdict = "no law is regressed: it takes three rows with amplitude and phase"
-        return Laws(rows=rows, speeds=np.zeros(0), laws={}, delay=None, preferred=None, verdict=verdict)
-    speeds = np.geomspace(impacts[:, 0].min(), impacts[:, 0].max(), _POINTS)
-    found = {model: _regression(rows, loss, terms) for model, terms in LOSS_TERMS.items()}
-    if not all(np.all(np.isfinite(one.covariance)) for one in found.values()):
-        verdict = "no law is regressed: the rows have one approach speed"
-        return Laws(rows=rows, speeds=speeds, laws={}, delay=None, preferred=None, verdict=verdict)
-    laws = {model: _loss_law(model, found[model], rows.shared_names, speeds) for model in found}
-    preferred, verdict = _verdict(laws)
-    rebound = laws[preferred or "viscous"].curve
-    delays = None
-    if used.sum() > len(DELAY_TERMS):
-        regression = _regression(rows, delay, DELAY_TERMS)
-        if np.all(np.isfinite(regression.covariance)):
-            delays = _delay_law(regression, rows.shared_names, speeds, rebound)
-    return Laws(rows=rows, speeds=speeds, laws=laws, delay=delays, preferred=preferred, verdict=verdict)
-
-
 def _regression(rows: InvertedRows, target: Formula, terms: Mapping[str, Formula]) -> Regression:
     used = rows.regressed
     return regress(target, terms, rows.impact[used], rows.covariance[used], rows.shared[used])
 
 
 def _without_slow(rows: InvertedRows) -> InvertedRows:
-    """Return the rows with slow ones set aside, where enough are left."""
+    """Return the rows with slow ones excluded from the laws, where enough remain."""
     if rows.regressed.sum() < 4:
         return rows
     epsilon = float(_regression(rows, loss, LOSS_TERMS["viscous"]).value[0])
@@ -307,7 +338,7 @@ def _law(
 
 
 def _verdict(laws: dict[str, RegressedLaw]) -> tuple[str | None, str]:
-    """Return the model that chi2 prefers, None where it does not tell, and the same in words."""
+    """Return the model that chi2 prefers, None where it does not tell, and a sentence that says so."""
     best, other = sorted(laws.values(), key=lambda law: law.chi2)
     numbers = f"chi2 {best.chi2:.1f} against {other.chi2:.1f}, {best.degrees_of_freedom} degrees of freedom each"
     if other.chi2 - best.chi2 < _DECIDED:
@@ -316,34 +347,3 @@ def _verdict(laws: dict[str, RegressedLaw]) -> tuple[str | None, str]:
     if best.p_value < _IMPROBABLE:
         verdict += "; but neither law explains them"
     return best.model, verdict
-
-
-def distance_from(law: Law, table: AmplitudeTable, rows: InvertedRows, reading: ResonanceReading) -> LawDistance:
-    """Return how far inverted rows are from a law that is known otherwise, the errors of both taken together.
-
-    Args:
-        law: a formula or a table.
-        table: what was inverted.
-        rows: its rows.
-        reading: the paper's reading of it, for a table without phases.
-
-    Raises:
-        TableError: if the law is known at none of the rows' approach speeds.
-    """
-    u, w, _ = rows.impact[rows.inverted].T
-    reached = u if u.size else reading.approach_speed_nm_per_us
-    if np.all(law.extrapolated(reached) | law.captures(reached)):
-        raise TableError(
-            f"{described(law)}, says nothing about {table.source}, whose impacts come at {np.min(reached):.4g} to "
-            f"{np.max(reached):.4g} nm/us; give a law of these speeds"
-        )
-    inside = ~np.asarray(law.extrapolated(u) | law.captures(u))
-    rebound, slope = np.asarray(law.rebound_speed(u)), np.asarray(law.rebound_slope(u))
-    # of squares, which are all but linear in the speed
-    slopes = np.stack([-2.0 * rebound * slope, 2.0 * w], axis=1)
-    variance = np.einsum("ni,nij,nj->n", slopes, rows.covariance[rows.inverted][:, :2, :2], slopes)
-    variance += np.sum(np.einsum("ni,nis->ns", slopes, rows.shared[rows.inverted][:, :2]) ** 2, axis=1)
-    variance += (2.0 * rebound * errors_of(law, u)[0]) ** 2
-    pulls = (np.abs(w**2 - rebound**2) / np.sqrt(variance))[inside]
-    median = float(np.median(pulls)) if pulls.size else None
-    return LawDistance(int(inside.sum()), median, extrapolation_of(law, u))

@@ -306,7 +306,7 @@ def _points(axes: Axes, result: Inversion, values: np.ndarray, errors: np.ndarra
     rows = result.rows
     for chosen, face, label in (
         (rows.inverted & rows.regressed, DARK, "rows"),
-        (rows.inverted & ~rows.regressed, "none", "rows set aside"),
+        (rows.inverted & ~rows.regressed, "none", "rows excluded"),
     ):
         if chosen.any():
             axes.errorbar(

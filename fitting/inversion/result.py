@@ -236,7 +236,7 @@ class Inversion(Result):
         laws: the regressions of the loss, by model; empty where rows do not determine one.
         delay: the delay law, or None.
         preferred: the model that chi2 prefers, or None where it does not tell.
-        verdict: the same in words.
+        verdict: which law the rows prefer, in words.
         resonance: the paper's own reading of the rows on resonance.
         beside: a law that is known otherwise, if one was given.
         distance: how far the rows are from it; None without one.

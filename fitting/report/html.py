@@ -376,7 +376,7 @@ def _rows(result: FitResult) -> Table:
     remarks = [_row_remarks(rows, i, unseen=bool(unseen[i])) for i in shown]
     caption = (
         "Amplitudes in nm, ± with the model's own error, residuals in standard errors. "
-        "Shaded: set aside, or otherwise to be looked at"
+        "Shaded: excluded, or otherwise to be looked at"
     )
     return Table(
         caption,
@@ -394,16 +394,16 @@ def _left_out(count: int, where: str) -> str:
     return f"The first {_MOST_ROWS} of {count} rows; all of them are in {where}, written beside this page."
 
 
-def _why_aside(rows: FittedRows, i: int) -> str:
+def _why_excluded(rows: FittedRows, i: int) -> str:
     reason = rows.reasons[i] if rows.reasons else TOO_SLOW
     said = "this impact is too slow for the law to describe it" if reason == TOO_SLOW else reason
-    return f"set aside: {said}"
+    return f"excluded: {said}"
 
 
 def _row_remarks(rows: FittedRows, i: int, *, unseen: bool) -> str:
     exists = rows.orbits[i] > 0
     said = (
-        (rows.set_aside[i], _why_aside(rows, i)),
+        (rows.set_aside[i], _why_excluded(rows, i)),
         (unseen and exists, "nothing steady seen, though an orbit is predicted"),
         (unseen and not exists, "nothing steady seen, as predicted"),
         (not unseen and not exists, "no stable orbit at the fitted law"),

@@ -18,7 +18,7 @@ ALARM = "#B00020"
 SMALL = 8
 _WIDTH_INCHES, DPI = 10.0, 120.0
 _KINDS = ("peak", "lock-in", "phase")
-_ASIDE = "#999999"
+_EXCLUDED = "#999999"
 _ROW_AXIS = "drive frequency (kHz), for each order N to scale; rows of one frequency beside each other"
 _HEIGHT = "height of the sample over the tip's rest position (nm)"
 _MUCH = 5.0
@@ -146,7 +146,7 @@ def models_figure(compared: Comparison) -> Figure:
 
 
 def draw_amplitudes(axes: Axes, result: FitResult) -> None:
-    """Draw each row's measured amplitudes with their prediction; rows set aside or without an orbit are marked."""
+    """Draw each row's measured amplitudes with their prediction; rows excluded or without an orbit are marked."""
     ranking, places = _row_axis(result)
     for kind in range(2):
         _draw_readings(axes, result, kind, result.rows.measured_nm[:, kind], result.rows.predicted_nm[:, kind])
@@ -179,9 +179,9 @@ def _draw_readings(axes: Axes, result: FitResult, kind: int, measured: np.ndarra
     axes.plot(places, fitted, "o", ms=4, mfc="none", color=COLOURS[kind], label=f"{_KINDS[kind]}, measured")
     axes.plot(places, predicted, "_", ms=8, mew=1.6, color=COLOURS[kind], label=f"{_KINDS[kind]}, predicted")
     if (aside & np.isfinite(measured)).any():
-        label = "measured, set aside"
+        label = "measured, excluded"
         once = None if label in axes.get_legend_handles_labels()[1] else label
-        axes.plot(places[aside], measured[aside], "x", ms=6, mew=1.4, color=_ASIDE, label=once)
+        axes.plot(places[aside], measured[aside], "x", ms=6, mew=1.4, color=_EXCLUDED, label=once)
 
 
 def draw_residuals(axes: Axes, result: FitResult) -> None:
@@ -275,7 +275,7 @@ def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray, places: np
     missing = result.rows.orbits[ranking] == 0
     for rows, colour, label in (
         (missing & ~seen, ALARM, "no stable orbit predicted"),
-        (seen & missing, _ASIDE, "no orbit, as predicted"),
+        (seen & missing, _EXCLUDED, "no orbit, as predicted"),
         (seen & ~missing, "black", "no orbit seen, one predicted"),
     ):
         for count, place in enumerate(places[rows].tolist()):

@@ -33,7 +33,7 @@ class Refit(NamedTuple):
 def objective_of(result: FitResult) -> Refit:
     """Return the objective that a fit ended with: its rows, errors, constraints, effects and loss.
 
-    Rows that were set aside stay so, and errors contain the model's error and the scale that the fit gave them.
+    Excluded rows stay excluded, and errors contain the model's error and the scale that the fit gave them.
 
     Args:
         result: from `fitting.fit`.

@@ -249,7 +249,7 @@ class SimulatedExperiment(Result):
 
     Attributes:
         table: with noise, as an instrument gives it.
-        exact: the same rows and errors without noise.
+        exact: the table's rows and errors without noise.
         left_out: a sentence for every drive that is not in the table: no steady (1, N) orbit, and why.
     """
 
