@@ -97,6 +97,8 @@ def test_the_ledger_closes_with_drag_alone_and_the_slowest_tip_is_captured():
     threshold = float(capture_speed(contact))
     result = collide(contact, threshold * np.array([0.999, 1.001, 2.0, 20.0]))
     assert result.captured.tolist() == [True, False, False, False]
+    # there is no liquid bridge that could hold it
+    assert "a dry contact's attraction" in CollisionOutcome(int(result.outcome[0])).sentence
     lost = 0.5 * (result.approach_speed_nm_per_us**2 - result.rebound_speed_nm_per_us**2)
     np.testing.assert_allclose(result.viscous_loss_aj[1:], lost[1:], rtol=1e-9)
 

@@ -191,6 +191,10 @@ def collision(
     return result._replace(approach_speed_nm_per_us=approach_speed, outcome=outcome), resolved
 
 
+_Pair = tuple[Float[Array, "..."], Float[Array, "..."]]
+"""Of approach and retraction, or of the outer and the inner end of one."""
+
+
 class Parts(NamedTuple):
     """The three parts of a collision that forms the junction."""
 
@@ -237,29 +241,41 @@ def three_parts(
         end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
         retract = cross(way_through(tip, gaps_out, solid.energy_aj, margin_of(end, pull_out), inward=False))
 
+    resolved = _few_steps_suffice(tip, (approach, solid, retract), start, (pull_in, pull_out), setting)
+    return Parts(approach, solid, retract, tip.ends_nm, resolved)
+
+
+def _few_steps_suffice(
+    tip: Driven,
+    parts: tuple[Passage, JunctionWay, Passage],
+    start: Float[Array, "..."],
+    pulls_aj: _Pair,
+    setting: Setting,
+) -> Bool[Array, "..."]:
+    """Say whether a setting's few steps resolve a collision of a free tip.
+
+    They do where dissipation is small against the energies along the way, no repulsion almost stops the tip inside the
+    bridge, and it is not close to capture.
+    """
+    approach, solid, retract = parts
     # at an end that pulls, a slow tip's drag must be small against the pull for the substitution of the gap to hold
     calm_in, calm_out = (
-        (pull <= 0.0) | (tip.bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass) <= 0.1 * pull)
-        for (gap, _), pull in ((gaps_in, pull_in), (gaps_out, pull_out))
+        (pull <= 0.0)
+        | (tip.bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / tip.mass_ng) <= 0.1 * pull)
+        for gap, pull in zip((tip.forms_nm, tip.ends_nm), pulls_aj, strict=True)
     )
-    # Few steps are enough where dissipation is small against the energies along the way and no repulsion almost stops
-    # the tip inside the bridge.
-    least = jnp.minimum(start + jnp.maximum(pull_in, 0.0), approach.energy_aj)
+    least = jnp.minimum(start + jnp.maximum(pulls_aj[0], 0.0), approach.energy_aj)
     spent = _MOST_SPENT[setting.rule]
     easy_in = (approach.dissipated_aj < spent * least) & (approach.energy_aj > 0.1 * start) & calm_in
     easy_out = (retract.dissipated_aj < spent * solid.energy_aj) & calm_out
     # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
     energy_left = jnp.where(solid.energy_aj > 0.0, retract.energy_aj, solid.energy_aj)
     clear = (energy_left > _NEAR_CAPTURE[1] * start) | (energy_left < _NEAR_CAPTURE[0] * start)
-    return Parts(approach, solid, retract, tip.ends_nm, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
-
-
-_Pair = tuple[Any, Any]
-"""Of the way in and the way out."""
+    return easy_in & clear & (easy_out | (solid.energy_aj <= 0.0))
 
 
 def _parts_in_a_loop(
-    tip: Driven, start: Float[Array, "..."], gaps_nm: _Pair, pulls_aj: _Pair, setting: Setting
+    tip: Driven, start: Float[Array, "..."], gaps_nm: tuple[_Pair, _Pair], pulls_aj: _Pair, setting: Setting
 ) -> tuple[Passage, JunctionWay, Passage]:
     """Return approach, junction and retraction by one program in a loop, since three copies of it compile for long.
 

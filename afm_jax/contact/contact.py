@@ -1,14 +1,16 @@
-"""A contact: the liquid bridge's forces, the junction's, and the gaps at which the bridge forms and breaks.
+"""A contact: forces over a gap, a solid contact, and the gaps at which the bridge forms and breaks.
 
-The liquid bridge as its crossings need it: potential and damping, with everything computed once that can be.
+`Contact` holds the parameters; `Bridge` is what is computed from them once, for many evaluations of potential and
+damping.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.checks import as_parameter, check_kind, check_parameter, is_traced, readable
@@ -25,7 +27,7 @@ from afm_jax.contact.forces.force import (
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
 from afm_jax.contact.forces.solid import CoreRepulsion, VanDerWaals
-from afm_jax.contact.parameters import ALL_EFFECTS, DEFAULTS, DRY_EFFECTS, EFFECTS, PAPER, REQUIRED_EFFECTS
+from afm_jax.contact.parameters import ALL_EFFECTS, DEFAULTS, EFFECTS, PAPER, REQUIRED_EFFECTS
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 
@@ -236,6 +238,13 @@ FORCES = {
 _NAMES = {force: name for name, force in FORCES.items()} | {Jkr: "jkr", Dmt: "dmt", Hertz: "hertz"}
 
 
+_DRY_SOLIDS = {
+    "hertz": (("hertz",), "Hertz's contact has no other forces; take 'dmt'"),
+    "dmt": (("van_der_waals", "viscous", "dmt"), "there is no liquid bridge"),
+}
+"""The solid contact of each kind of dry contact: the effects that go with it, and why others do not."""
+
+
 def _check_solid(forces: ForceSum, junction: Jkr | Dmt | Hertz) -> None:
     """Raise where the forces do not go together with the solid contact."""
     for term in forces.terms:
@@ -258,20 +267,13 @@ def check_effects(effects: Sequence[str]) -> None:
             raise ValueError(f"`effects` must be chosen from {', '.join(ALL_EFFECTS)}, but one is {name!r}")
     if len(set(effects)) < len(effects):
         raise ValueError("`effects` must not name an effect twice")
-    solid = next((name for name in ("hertz", "dmt") if name in effects), None)
-    allowed = {"hertz": ("hertz",), "dmt": DRY_EFFECTS[:-1]}.get(solid or "", EFFECTS)
+    solid = next((name for name in _DRY_SOLIDS if name in effects), None)
+    allowed, reason = _DRY_SOLIDS[solid] if solid else (EFFECTS, "")
     for name in effects:
+        if name not in allowed and solid:
+            raise ValueError(f"`effects` cannot hold {name!r} with {solid!r}: {reason}")
         if name not in allowed:
-            raise ValueError(
-                f"`effects` cannot hold {name!r} with {solid!r}: "
-                + (
-                    "Hertz's contact has no other forces; take 'dmt'"
-                    if solid == "hertz"
-                    else "there is no liquid bridge"
-                )
-                if solid
-                else "`effects` with 'van_der_waals' must hold 'dmt': it is the attraction of a dry contact"
-            )
+            raise ValueError("`effects` with 'van_der_waals' must hold 'dmt': it is the attraction of a dry contact")
     if solid:
         return
     for name, reason in REQUIRED_EFFECTS.items():
@@ -280,29 +282,30 @@ def check_effects(effects: Sequence[str]) -> None:
 
 
 class Bridge(eqx.Module):
-    """The forces of a bridge, reduced to their coefficients.
+    """The forces of a bridge as functions of the gap alone.
 
-    A force's parameters enter thousands of evaluations of its potential; what depends on them alone is computed here.
-    ``spans``: whether there is a gap between where the contact begins and where the solids meet. ``arrow``: -1 where
-    time runs backwards, so that drag gives the energy that it takes; None: it does not.
+    A force's parameters enter thousands of evaluations of its potential; what depends on them alone is computed once.
+
+    Attributes:
+        potentials: of the static forces, in aJ.
+        dampings: of the dissipative forces, in nN us/nm.
+        spans: whether there is a gap between where the contact begins and where the solids meet.
+        arrow: -1 where time runs backwards, so that drag gives the energy that it takes; None: it does not.
     """
 
-    static_kinds: tuple[type[StaticForce], ...] = eqx.field(static=True)
-    static: tuple[tuple[Float[Array, "..."], ...], ...]
-    dissipative_kinds: tuple[type[DissipativeForce], ...] = eqx.field(static=True)
-    dissipative: tuple[tuple[Float[Array, "..."], ...], ...]
+    potentials: tuple[Callable[[Array], Array], ...]
+    dampings: tuple[Callable[[Array], Array], ...]
     spans: bool = eqx.field(static=True, default=True)
     arrow: Float[Array, "..."] | float | None = None
 
     @property
     def conserves(self) -> bool:
         """Whether there is no dissipative force."""
-        return not self.dissipative_kinds
+        return not self.dampings
 
     def potential(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the potential of all static forces in aJ at a gap in nm."""
-        terms = zip(self.static_kinds, self.static, strict=True)
-        return sum((kind.potential_of(parts, gap) for kind, parts in terms), start=jnp.zeros_like(gap))
+        return sum((potential(gap) for potential in self.potentials), start=jnp.zeros_like(gap))
 
     def force(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the force of all static forces in nN at a gap in nm."""
@@ -314,8 +317,7 @@ class Bridge(eqx.Module):
 
     def damping(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the damping of all dissipative forces in nN us/nm at a gap in nm."""
-        terms = zip(self.dissipative_kinds, self.dissipative, strict=True)
-        total = sum((kind.damping_of(parts, gap) for kind, parts in terms), start=jnp.zeros_like(gap))
+        total = sum((damping(gap) for damping in self.dampings), start=jnp.zeros_like(gap))
         return total if self.arrow is None else self.arrow * total
 
     def reversed(self) -> "Bridge":
@@ -329,15 +331,13 @@ def bridge_of(contact: Contact) -> Bridge:
     Raises:
         TypeError: if a force is neither static nor dissipative.
     """
+    potentials, dampings = [], []
     for term in contact.forces.terms:
-        if not isinstance(term, StaticForce | DissipativeForce):
+        # partial functions that are trees of their coefficients
+        if isinstance(term, StaticForce):
+            potentials.append(Partial(type(term).potential_of, term.coefficients()))
+        elif isinstance(term, DissipativeForce):
+            dampings.append(Partial(type(term).damping_of, term.coefficients()))
+        else:
             raise TypeError(f"{type(term).__name__} must be a StaticForce or a DissipativeForce to be part of a bridge")
-    static = [term for term in contact.forces.terms if isinstance(term, StaticForce)]
-    dissipative = [term for term in contact.forces.terms if isinstance(term, DissipativeForce)]
-    return Bridge(
-        static_kinds=tuple(type(term) for term in static),
-        static=tuple(term.coefficients() for term in static),
-        dissipative_kinds=tuple(type(term) for term in dissipative),
-        dissipative=tuple(term.coefficients() for term in dissipative),
-        spans=contact.spans,
-    )
+    return Bridge(tuple(potentials), tuple(dampings), contact.spans)

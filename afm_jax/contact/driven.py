@@ -84,16 +84,6 @@ class Driven(NamedTuple):
     """Its stiffness; None: it has none."""
 
     @property
-    def load_scale_nn(self) -> Float[Array, "..."]:
-        """The unit of the junction's load in nN."""
-        return self.solid.load_scale_nn
-
-    @property
-    def depth_scale_nm(self) -> Float[Array, "..."]:
-        """The unit of the junction's depth in nm."""
-        return self.solid.depth_scale_nm
-
-    @property
     def ends_nm(self) -> Float[Array, "..."]:
         """Gap at which contact ends: where the bridge breaks, or the junction where that outlives the bridge."""
         return jnp.maximum(self.breaks_nm, self.junction.breaks_gap_nm)
@@ -147,7 +137,7 @@ class Driven(NamedTuple):
 
     def gap_of_root(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the gap in nm at s = sqrt(A)."""
-        return self.junction.shift_nm - self.depth_scale_nm * self.solid.depth(s)
+        return self.junction.shift_nm - self.solid.depth_scale_nm * self.solid.depth(s)
 
     def gap(self, x: Float[Array, "..."], phase: Int[Array, "..."]) -> Float[Array, "..."]:
         """Return the gap in nm, from s in the junction."""
@@ -174,9 +164,9 @@ class Driven(NamedTuple):
 
     def _junction_rates(self, state: ContactState, s: Float[Array, "..."]) -> ContactState:
         slope = self.solid.depth_slope(s)
-        force = self.load_scale_nn * self.solid.load(s)
+        force = self.solid.load_scale_nn * self.solid.load(s)
         acceleration = self.acceleration(self.gap_of_root(s), state.gap_rate, state.time_us, force)
-        return ContactState(-state.gap_rate / self.depth_scale_nm, slope * acceleration, slope, jnp.zeros_like(s))
+        return ContactState(-state.gap_rate / self.solid.depth_scale_nm, slope * acceleration, slope, jnp.zeros_like(s))
 
 
 def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surface) -> Driven:

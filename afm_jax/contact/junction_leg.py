@@ -84,7 +84,7 @@ def _sums(weights: Array, time_slope: Array, gap: Array, speed: Array) -> tuple[
 
 
 def _mean_pull(tip: Driven, pull: Array, s: Array, turn: Array) -> Array:
-    """Return the mean over the depth of what a bent lever does, between s and the turning point: it is linear there."""
+    """Return the mean of g between s and the turning point under a bent lever, whose pull is linear in the gap."""
     middle = 0.5 * (tip.gap_of_root(s) + tip.gap_of_root(turn))
     return pull - tip.lever_stiffness_n_per_m * tip.inverse_mass * middle
 
@@ -117,7 +117,7 @@ def stretch_in_junction(
     missing = level - tip.solid.work(s)
     moving = missing > 0.0
     speed = _speed_scale(tip) * jnp.sqrt(jnp.where(moving, missing, 1.0))
-    path = tip.depth_scale_nm * (turn - end) * bend * tip.solid.depth_slope(s)
+    path = tip.solid.depth_scale_nm * (turn - end) * bend * tip.solid.depth_slope(s)
     time_slope = jnp.where(moving, path / speed, 0.0)
     return Stretch(cumulative @ time_slope, tip.gap_of_root(s), jnp.where(moving, speed, 0.0), weights @ time_slope)
 
@@ -129,15 +129,15 @@ def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetti
     fold = jnp.full_like(form, solid.fold)
     level = solid.work(form) + state.gap_rate**2 / _unit(driven)
     turn = turning_root(solid, level)
-    others = driven.acceleration(driven.gap_of_root(form), state.gap_rate, state.time_us, jnp.zeros_like(turn))
+    g = driven.acceleration(driven.gap_of_root(form), state.gap_rate, state.time_us, jnp.zeros_like(turn))
     for _ in range(2):
-        turn = _turn_under(driven, form, level, others, turn)
-    inward = _iterated(_Half(driven, form, pressing=True), level, state.time_us, (turn, others), setting)
+        turn = _turn_under(driven, form, level, g, turn)
+    inward = _iterated(_Half(driven, form, pressing=True), level, state.time_us, (turn, g), setting)
     turn, at_turn = inward.turn, inward.time_us
-    others = driven.acceleration(driven.gap_of_root(turn), jnp.zeros_like(turn), at_turn, jnp.zeros_like(turn))
-    outward = _iterated(_Half(driven, fold, pressing=False), level, at_turn, (turn, others), setting)
+    g = driven.acceleration(driven.gap_of_root(turn), jnp.zeros_like(turn), at_turn, jnp.zeros_like(turn))
+    outward = _iterated(_Half(driven, fold, pressing=False), level, at_turn, (turn, g), setting)
     work, depth = (of(turn) - of(fold) for of in (solid.work, solid.depth))
-    leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.depth_scale_nm * outward.mean * depth)
+    leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.solid.depth_scale_nm * outward.mean * depth)
     return Leg(
         state=ContactState(
             x=driven.junction.breaks_gap_nm + jnp.zeros_like(turn),
@@ -178,7 +178,7 @@ def _speed_scale(driven: Driven) -> Array:
 
 
 class _Along(NamedTuple):
-    """Places between the turning point and the other end of a half."""
+    """Points between the turning point and the other end of a half."""
 
     s: Array
     y: Array
@@ -199,10 +199,10 @@ class _Half(NamedTuple):
     pressing: bool = True
 
     def along(self, turn: Array, points: Array, means: Array | None = None) -> _Along:
-        """Return the places at nodes of y, with means of g, or with those of a steady pull, if there is one."""
+        """Return the points at nodes of y, under means of g; None: those of a steady pull, if there is one."""
         apart = turn > self.end
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, turn - self.end, 1.0)), 0.0)
-        twice = 2.0 * self.driven.depth_scale_nm
+        twice = 2.0 * self.driven.solid.depth_scale_nm
         y = reach * points
         s = turn - y * y
         work_slope, depth_slope = self.driven.solid.mean_slopes(turn, s)
@@ -237,7 +237,7 @@ def _iterated(
         guess: s at the turning point, to be improved on the way to it, and the mean of g.
         setting: numbers of nodes and iterations, and what is allowed.
     """
-    driven, twice = half.driven, 2.0 * half.driven.depth_scale_nm
+    driven, twice = half.driven, 2.0 * half.driven.solid.depth_scale_nm
     nodes = setting.pressing if half.pressing else setting.releasing
     turn, mean = guess
     points, weights, cumulative = nodes_along(nodes, turn)
@@ -253,9 +253,9 @@ def _iterated(
         at = half.along(turn, points, means)
         moment = begin_us + jnp.tensordot(passing, at.time_slope, axes=1)
         rate = -at.y * at.over_y if half.pressing else at.y * at.over_y
-        others = driven.acceleration(driven.gap_of_root(at.s), rate, moment, jnp.zeros_like(rate))
+        g = driven.acceleration(driven.gap_of_root(at.s), rate, moment, jnp.zeros_like(rate))
         # in the mean over the depth every node counts by its slope
-        total = jnp.tensordot(averages, others * at.slope, axes=1)
+        total = jnp.tensordot(averages, g * at.slope, axes=1)
         mean = total[-1] / mean_depth_slope(turn, half.end)
         after = _turn_under(driven, half.end, level, mean, turn) if half.pressing else turn
         return after, total[:-1] / mean_depth_slope(turn, at.s), means, mean
@@ -269,8 +269,8 @@ def _iterated(
 
 
 def _turn_under(driven: Driven, form: Array, level: Array, mean: Array, turn: Array) -> Array:
-    """Return the turning point, improved by a step of Newton's method, under a mean of the other forces."""
-    unit, twice, solid = _unit(driven), 2.0 * driven.depth_scale_nm, driven.solid
+    """Return s at the turning point, improved by a step of Newton's method, under a mean of g."""
+    unit, twice, solid = _unit(driven), 2.0 * driven.solid.depth_scale_nm, driven.solid
     excess = unit * (solid.work(turn) - level) + twice * mean * (solid.depth(turn) - solid.depth(form))
     return turn - excess / (solid.depth_slope(turn) * (unit * solid.load(turn) + twice * mean))
 
@@ -294,4 +294,4 @@ def _to_fold(
     rate = jnp.sqrt(jnp.where(moving, kinetic, 1.0))
     time_slope = jnp.where(moving, solid.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
     scale = _speed_scale(tip)
-    return _sums(weights, reach * time_slope * (tip.depth_scale_nm / scale), tip.gap_of_root(s), scale * rate)
+    return _sums(weights, reach * time_slope * (tip.solid.depth_scale_nm / scale), tip.gap_of_root(s), scale * rate)

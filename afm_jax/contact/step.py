@@ -284,8 +284,8 @@ def inverse_junction_step(driven: Driven, state: ContactState) -> Float[Array, "
     """
     s, curve = state.x, driven.solid
     energy = 0.5 * driven.mass_ng * state.gap_rate**2 / curve.energy_scale_aj
-    elastic = curve.bend(s) * driven.load_scale_nn * driven.inverse_mass / driven.depth_scale_nm
-    passing = 3.0 * state.gap_rate / (driven.depth_scale_nm * curve.reach(s, energy))
+    elastic = curve.bend(s) * curve.load_scale_nn * driven.inverse_mass / curve.depth_scale_nm
+    passing = 3.0 * state.gap_rate / (curve.depth_scale_nm * curve.reach(s, energy))
     return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_frequency(driven) * curve.depth_slope(s)) ** 2)
 
 
