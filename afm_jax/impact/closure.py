@@ -50,7 +50,7 @@ _SAME = 1e-7
 
 
 class OrbitProblem(NamedTuple):
-    """A (1, N) orbit's scene: the order N is a floating-point number, so that it can be batched."""
+    """What single-impact orbits are orbits of; the order N is a floating-point number, so that it can be batched."""
 
     cantilever: Cantilever
     platform: Platform
@@ -312,34 +312,36 @@ ones the condition jumps: to either side of that there may be an orbit, and betw
 
 
 class OrbitRoots(NamedTuple):
-    """Roots of the closing condition.
-
-    ``place`` and ``found``, one a slot; ``complete``: there were no more roots than slots.
-    """
+    """Roots of the closing condition, one a slot."""
 
     place: OrbitPlace
     found: Bool[Array, " slots"]
+    """Which slots hold a root."""
     complete: Bool[Array, ""]
+    """Whether there were no more roots than slots."""
 
 
 def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
-    """Return all places of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere.
+    """Return coordinate and phase of all orbits in a fixed number of slots, ascending in speed, without derivatives.
 
     Args:
         problem: what orbits are of.
         scan: how closely the condition is scanned where there is a delay; without one there are 4 slots.
+
+    Returns:
+        The roots; a slot without one has a coordinate that is harmless to compute with.
     """
     problem = lax.stop_gradient(problem)
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
     coordinate, found, complete = _quartic_roots(problem) if _is_quartic(problem) else _scanned_roots(problem, scan)
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
     if problem.impact.lasts:
-        place, there = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
-    else:
-        place, there = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
-    found = found & driven & there
-    if problem.impact.lasts:
+        place, closes = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
+        found = found & driven & closes
         found = found & ~_seen_before(place.coordinate, found)
+    else:
+        place, regular = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
+        found = found & driven & regular
     return OrbitRoots(OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
 
 
@@ -366,7 +368,7 @@ def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[Orbit
 
 
 class _Coordinates(NamedTuple):
-    """Roots of the scalar condition: coordinates, which of them are some, and whether those are all."""
+    """Roots of the scalar condition: coordinates, which slots hold one, and whether those are all."""
 
     coordinate: Float[Array, " slots"]
     found: Bool[Array, " slots"]
@@ -387,6 +389,7 @@ def _quartic_roots(problem: OrbitProblem) -> _Coordinates:
 
 
 def _scale(problem: OrbitProblem) -> Float[Array, ""]:
+    """Return the unit in nm/us of distances from capture: the drive's top speed, or where adhesion counts."""
     return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.reach)
 
 
@@ -418,6 +421,7 @@ def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
 
 
 def _sampled(grid: Float[Array, " points"], problem: OrbitProblem) -> _Samples:
+    """Return the residual at coordinates."""
     speeds, system = jax.vmap(closure, in_axes=(0, None))(grid, problem)
     value = jax.vmap(lambda system: system.residual)(system)
     if isinstance(problem.impact, PulledImpact):
@@ -467,7 +471,7 @@ def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, "
 
 
 class _Brackets(NamedTuple):
-    """Ends of intervals and the residuals there; which of them are some."""
+    """Ends of intervals, the residuals at both, and which slots hold an interval."""
 
     left: Float[Array, " n"]
     right: Float[Array, " n"]
