@@ -139,7 +139,7 @@ def _is_real(value: Any) -> bool:
             # a list of traced numbers, or of unequal length, which JAX knows better
             return isinstance(value, list | tuple)
     if dtype.kind == "O" and isinstance(value, list | tuple):
-        return all(is_traced(one) or _is_real(one) for one in value)
+        return all(is_traced(element) or _is_real(element) for element in value)
     # JAX's own narrow numbers are of no kind that NumPy knows
     return dtype.kind in "fiu" or "float" in dtype.name
 
@@ -171,8 +171,8 @@ def checked(function: Function) -> Function:
     def call(*arguments: Any, **named: Any) -> Any:
         if not hints:
             several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-            for name, one in signature.parameters.items():
-                hints[name] = Any if one.kind in several else _resolved(one.annotation, function)
+            for name, parameter in signature.parameters.items():
+                hints[name] = Any if parameter.kind in several else _resolved(parameter.annotation, function)
         try:
             given = signature.bind(*arguments, **named).arguments
         except TypeError:
@@ -221,7 +221,7 @@ def _misfit(kind: Any, value: Any) -> str:
 
 
 def _misfit_of_one(kind: Any, parts: tuple[Any, ...], value: Any) -> str:  # noqa: PLR0911
-    """Return the same for an annotation that is no choice: a class with what is in its brackets."""
+    """Return what a value must be that is not of a class, with what stands in its brackets; nothing where it is."""
     if kind is type(None):
         return "" if value is None else "None"
     simple = _SIMPLE.get(kind)
@@ -232,7 +232,7 @@ def _misfit_of_one(kind: Any, parts: tuple[Any, ...], value: Any) -> str:  # noq
     if kind is Callable or kind is collections.abc.Callable:
         return "" if callable(value) else "a function"
     if hasattr(kind, "array_type"):
-        return "" if _is_array(value) or _is_real(value) else "an array of real numbers"
+        return "" if is_array(value) or _is_real(value) else "an array of real numbers"
     if kind in (list, tuple, collections.abc.Sequence):
         return _misfit_of_several(kind, parts, value)
     if kind in (dict, collections.abc.Mapping):
@@ -251,21 +251,22 @@ def _with_article(name: str) -> str:
 
 
 def _misfit_of_several(kind: Any, parts: tuple[Any, ...], value: Any) -> str:
-    """Return the same for a list or a tuple, and what is in it."""
-    if isinstance(value, str) or not (isinstance(value, collections.abc.Sequence) or _is_array(value)):
+    """Return what a value must be that is no list or tuple of such elements; nothing where it is."""
+    if isinstance(value, str) or not (isinstance(value, collections.abc.Sequence) or is_array(value)):
         return "a list"
     if kind is tuple and Ellipsis not in parts:
         if len(value) != len(parts):
             return f"{len(parts)} values"
         pairs = zip(parts, value, strict=True)
     else:
-        pairs = ((parts[0] if parts else Any, one) for one in value)
+        pairs = ((parts[0] if parts else Any, element) for element in value)
     # a number that is none is of the right kind: what takes the list says what it must be
-    inner = next((must for part, one in pairs if (must := _misfit(part, one)) and not _is_nan(one)), "")
+    inner = next((must for part, each in pairs if (must := _misfit(part, each)) and not _is_nan(each)), "")
     return f"a list, each {inner}" if inner else ""
 
 
-def _is_array(value: Any) -> bool:
+def is_array(value: Any) -> bool:
+    """Say whether a value is an array of NumPy or JAX, or one number of NumPy; neither needs to be loaded for it."""
     return hasattr(value, "dtype") and hasattr(value, "shape")
 
 
@@ -318,7 +319,7 @@ def readable(self: Any) -> str:
 
 
 def _number(value: Any) -> str:
-    if _is_array(value) and not isinstance(value, np.ndarray) and not is_traced(value):
+    if is_array(value) and not isinstance(value, np.ndarray) and not is_traced(value):
         return repr(np.asarray(value).item()) if value.ndim == 0 else np.array2string(np.asarray(value), separator=", ")
     return repr(value)
 

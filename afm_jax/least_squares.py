@@ -19,7 +19,7 @@ class Searches(NamedTuple):
     chi2: Float[np.ndarray, " sets"]
 
 
-Look = Callable[[Float[np.ndarray, "some p"], Int[np.ndarray, " some"]], Searches]
+Evaluate = Callable[[Float[np.ndarray, "some p"], Int[np.ndarray, " some"]], Searches]
 """Of places and the searches that they belong to: what is there."""
 
 
@@ -41,11 +41,11 @@ class Box(NamedTuple):
         return self._replace(fixed=self.fixed[some])
 
 
-def descended(look: Look, start: Searches, box: Box, *, settled: float, most: int) -> Searches:
+def descended(evaluate: Evaluate, start: Searches, box: Box, *, settled: float, most: int) -> Searches:
     """Return where searches end that go down from their starts, each as long as it has not arrived.
 
     Args:
-        look: evaluates places of some of the searches.
+        evaluate: evaluates places of some of the searches.
         start: of every search.
         box: where they may go; a parameter at a bound stays there while the sum falls towards the outside.
         settled: estimated distance of the sum of squares to its minimum at which a search has arrived.
@@ -60,9 +60,9 @@ def descended(look: Look, start: Searches, box: Box, *, settled: float, most: in
         some = Searches(*(leaf[active] for leaf in state))
         step = _step(some, box.of(active), damping[active])
         trial = some.place + np.clip(step, -box.longest, box.longest)
-        found = look(np.clip(trial, box.lowest, box.highest), active)
-        better = found.chi2 <= some.chi2
-        for leaf, new in zip(state, found, strict=True):
+        trials = evaluate(np.clip(trial, box.lowest, box.highest), active)
+        better = trials.chi2 <= some.chi2
+        for leaf, new in zip(state, trials, strict=True):
             leaf[active[better]] = new[better]
         less = np.maximum(0.1 * damping[active], _SMALLEST_DAMPING)
         damping[active] = np.where(better, less, np.maximum(30.0 * damping[active], 1e-3))

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, data
 
 import numpy as np
 
-from afm_jax.saved import fields_of, is_abstract, is_array, is_record, save
+from afm_jax.checks import is_array
+from afm_jax.saved import fields_of, is_abstract, is_record, save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -134,7 +135,7 @@ def text_of(self: Any) -> str:
 
 
 def html_of(self: Any) -> str:
-    """Return the same as HTML, for notebooks."""
+    """Return a result as an HTML table for notebooks: a row a field, arrays by their range, outcomes in words."""
     cells = "".join(
         f"<tr><td style='text-align:left'><code>{html.escape(name)}</code></td>"
         f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
@@ -297,13 +298,17 @@ def _in_words(value: Any, words: type[enum.IntEnum] | None) -> str:  # noqa: PLR
 
 
 def _record_in_words(record: Any) -> str:
-    own = dict(fields_of(record))
-    error = own.get("standard_error")
-    if "value" in own:
-        return _in_words(own["value"], None) + (f" +- {error:.2g}" if isinstance(error, float) else "")
-    if all(isinstance(item, str | bool | int | float | None) or getattr(item, "ndim", 1) == 0 for item in own.values()):
-        return f"{type(record).__name__}({', '.join(f'{name} {_in_words(item, None)}' for name, item in own.items())})"
-    return f"{type(record).__name__} of {', '.join(own)}"
+    values = dict(fields_of(record))
+    error = values.get("standard_error")
+    if "value" in values:
+        return _in_words(values["value"], None) + (f" +- {error:.2g}" if isinstance(error, float) else "")
+    if all(
+        isinstance(item, str | bool | int | float | None) or getattr(item, "ndim", 1) == 0 for item in values.values()
+    ):
+        return (
+            f"{type(record).__name__}({', '.join(f'{name} {_in_words(item, None)}' for name, item in values.items())})"
+        )
+    return f"{type(record).__name__} of {', '.join(values)}"
 
 
 def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> str:
@@ -318,21 +323,21 @@ def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> st
     if flat.dtype.kind == "b":
         return f"{shape}{flat.sum()} of {flat.size} yes"
     size = np.abs(flat) if flat.dtype.kind == "c" else flat
-    known = size[np.isfinite(size)]
-    ends = "none known" if not known.size else f"{_one(known.min().item())} to {_one(known.max().item())}"
-    unknown = flat.size - known.size
-    return f"{shape}{ends}" + (f", {unknown} not known" if unknown and known.size else "")
+    finite = size[np.isfinite(size)]
+    ends = "none known" if not finite.size else f"{_one(finite.min().item())} to {_one(finite.max().item())}"
+    unknown = flat.size - finite.size
+    return f"{shape}{ends}" + (f", {unknown} not known" if unknown and finite.size else "")
 
 
 def _outcomes_in_words(flat: np.ndarray, words: type[enum.IntEnum]) -> str:
-    known = {int(each) for each in words}
+    numbers_of_words = {int(each) for each in words}
     if flat.size == 1:
         number = int(flat[0])
-        if number not in known:
+        if number not in numbers_of_words:
             return str(number)
         return getattr(words(number), "sentence", words(number).name.lower().replace("_", " "))
     numbers, counts = np.unique(flat, return_counts=True)
-    names = [words(int(n)).name.lower().replace("_", " ") if int(n) in known else str(n) for n in numbers]
+    names = [words(int(n)).name.lower().replace("_", " ") if int(n) in numbers_of_words else str(n) for n in numbers]
     return ", ".join(f"{count} {name}" for name, count in zip(names, counts.tolist(), strict=True)) or "nothing"
 
 

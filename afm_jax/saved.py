@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from afm_jax.checks import checked
+from afm_jax.checks import checked, is_array
 from afm_jax.strict_json import strict_json
 from afm_jax.version import __version__
 from afm_jax.whole_files import read_whole, write_whole
@@ -38,16 +38,17 @@ FIT_FORMAT, FIT_FORMAT_VERSION = "afm-jax fit", 2
 """Of a fit's fit.json; the version is raised when a key changes its meaning or goes."""
 
 
-def why_no_fit(found: Any) -> str | None:
+def why_no_fit(contents: Any) -> str | None:
     """Return what is wrong with JSON that should be a fit's, of the version that is known here; None: nothing."""
-    if not isinstance(found, dict) or found.get("format") != FIT_FORMAT:
+    if not isinstance(contents, dict) or contents.get("format") != FIT_FORMAT:
         return "is no fit; give the fit.json of `afm-jax fit --out`"
-    if found.get("format_version") != FIT_FORMAT_VERSION:
-        return (
-            f"has format_version {found.get('format_version')}, but {FIT_FORMAT_VERSION} is known here; write it anew: "
-            "afm-jax fit TABLE.csv --model MODEL --out FOLDER"
-        )
-    return None
+    version = contents.get("format_version")
+    if version == FIT_FORMAT_VERSION:
+        return None
+    return (
+        f"has format_version {version}, but {FIT_FORMAT_VERSION} is known here; write it anew: "
+        "afm-jax fit TABLE.csv --model MODEL --out FOLDER"
+    )
 
 
 def fields_of(record: Any) -> Iterator[tuple[str, Any]]:
@@ -64,11 +65,6 @@ def is_tuple(value: Any) -> bool:
 def is_record(value: Any) -> bool:
     """Say whether a value has named fields."""
     return is_tuple(value) or (dataclasses.is_dataclass(value) and not isinstance(value, type))
-
-
-def is_array(value: Any) -> bool:
-    """Say whether a value is an array of NumPy or JAX, or one number of NumPy; neither needs to be loaded for it."""
-    return hasattr(value, "dtype") and hasattr(value, "shape")
 
 
 def is_abstract(value: Any) -> bool:

@@ -70,13 +70,13 @@ def known(value: SupportsFloat | None, form: str = ".3g") -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:{form}}"
 
 
-def percent(share: float) -> str:
-    """Return a share in per cent with two significant digits.
+def percent(fraction: float) -> str:
+    """Return a fraction in per cent with two significant digits.
 
     >>> percent(0.0031)
     '0.31 %'
     """
-    return f"{float(f'{100.0 * share:.2g}'):g} %"
+    return f"{float(f'{100.0 * fraction:.2g}'):g} %"
 
 
 def counted(number: int, what: str) -> str:

@@ -30,10 +30,11 @@ from afm_jax.impact.lasting_impact import speeds_of_impact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law
 from afm_jax.impact.map import NextImpact, iterate_map
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.contact_motion import follow_contacts
 from afm_jax.motion.peaks import peaks_between_contacts, peaks_of_flights
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.settle import is_stuck
-from afm_jax.motion.simulate import _contact, simulate
+from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.presets import PRESETS, preset
 from afm_jax.scenefile.scenefile import load_scene
@@ -158,7 +159,7 @@ def contact_accuracy(
 
 
 def _runner(setting: DrivenSetting, contacts: int) -> Callable[..., Simulation]:
-    return partial(_contact, rows=contacts, setting=setting, rounds=ROUNDS, reverse=False)
+    return partial(follow_contacts, max_contacts=contacts, setting=setting, max_rounds=ROUNDS)
 
 
 def _departure(found: Simulation, contacts: int) -> Array:

@@ -368,8 +368,8 @@ def check_steady_response(cantilever: Cantilever, tones: tuple[Tone, ...], name:
     """
     free, quality = cantilever.frequency_khz, cantilever.quality_factor
     for tone in tones:
-        known = not any(is_traced(value) for value in (free, quality, tone.frequency_khz) if value is not None)
-        if not known or _is_known_zero(tone.amplitude):
+        concrete = not any(is_traced(value) for value in (free, quality, tone.frequency_khz) if value is not None)
+        if not concrete or _is_known_zero(tone.amplitude):
             continue
         undamped = quality is None or np.isinf(np.asarray(quality))
         distance = np.abs(np.asarray(tone.frequency_khz) - np.asarray(free))

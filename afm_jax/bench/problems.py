@@ -19,9 +19,8 @@ from afm_jax.contact.settings import DrivenSetting, QuickSetting
 from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.law import MOST_KNOTS, ImpactLaw, TabulatedLaw
 from afm_jax.impact.map import iterate_batch
-from afm_jax.motion.contact_motion import cross
+from afm_jax.motion.contact_motion import cross, follow_contacts
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
-from afm_jax.motion.simulate import _contact
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.presets import FREE_FREQUENCY_KHZ, drive_frequency_khz, figure2_scene
 
@@ -155,9 +154,8 @@ def batch_run(setting: DrivenSetting, rows: int) -> Callable[[Scene, State, Arra
 
     def run(scene: Scene, starts: State, until_us: Array) -> Simulation:
         def one(start: State, until: Array) -> Simulation:
-            return _contact(
-                scene, scene.platform, None, start, until, rows=rows, setting=setting, rounds=ROUNDS, reverse=False
-            )
+            world = (scene, scene.platform, None, start, until)
+            return follow_contacts(*world, max_contacts=rows, setting=setting, max_rounds=ROUNDS)
 
         return jax.vmap(one)(starts, until_us)
 

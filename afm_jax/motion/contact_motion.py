@@ -19,20 +19,39 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.bridge_leg import go_in, go_out
-from afm_jax.contact.driven import ContactState, Driven, Leg
+from afm_jax.contact.driven import ContactState, Driven, Leg, driven_by
 from afm_jax.contact.junction import Phase
 from afm_jax.contact.junction_leg import go_through_junction
 from afm_jax.contact.settings import DrivenSetting, QuickSetting
 from afm_jax.contact.step import TipInContact, advance, inverse_junction_step
 from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.motion.record import ContactKind, MotionOutcome
+from afm_jax.motion.record import (
+    ContactDetail,
+    ContactKind,
+    Contacts,
+    MotionOutcome,
+    Simulation,
+    State,
+    contacts_in_lab,
+    to_gap,
+    to_lab,
+)
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import repeat_for
 
 _ROUNDS = 8
 """Rounds between two checks whether all tips have arrived at the end."""
 _FLIGHT_STEPS = 2000
+_ROUNDS_PER_CONTACT = 4
+_SPARE_ROUNDS = 64
+_HELD_ROUNDS_PER_CONTACT, _LEAST_HELD_ROUNDS = 256, 1 << 16
+"""Far more rounds than any motion takes that comes to an end: for every contact there is room for, and at least."""
+_TRIALS_BACKWARDS = 40
+"""Trial steps of a round when all of them are run and kept for the reverse pass."""
 _LEGS_AT_ONCE, _TRIALS_AT_ONCE = 256, 64
 """Tips of a batch that go through legs together, and that try steps in time together."""
 _TRIALS = 4
@@ -85,16 +104,57 @@ class ContactTip(NamedTuple):
     rounds: Int[Array, ""]
 
 
-def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int) -> ContactTip:
-    """Return a tip at its start: free above the gap where the bridge forms, in the bridge below it.
+@partial(jax.jit, static_argnames=("max_contacts", "setting", "max_rounds", "reverse"))
+def follow_contacts(  # noqa: PLR0913
+    scene: Scene,
+    surface: Platform | Surface,
+    response: Surface | None,
+    start: State,
+    until: Float[Array, ""],
+    *,
+    max_contacts: int,
+    setting: DrivenSetting,
+    max_rounds: int | None = None,
+    reverse: bool = False,
+) -> Simulation:
+    """Return a scene with a contact followed in time.
 
     Args:
-        driven: the equation of motion.
-        time_us: of the start.
-        gap_nm: at the start.
-        rate: of the gap, in nm/us.
-        rows: contacts there is room for.
+        scene: its interaction is a `Contact`.
+        surface: what the free tip sees (`surface_of`).
+        response: the steady response to drives of base and tip, or None.
+        start: the tip at the start, in the lab, outside the sample.
+        until: time of the end in us.
+        max_contacts: rows for contacts.
+        setting: how finely contacts are resolved.
+        max_rounds: most rounds; None: more than any motion takes, in reverse mode four for every contact.
+        reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
     """
+    if reverse:
+        # legs tell by NaN that they do not hold, which reverse derivatives would spread
+        setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS, agreement=None)
+    if max_rounds is None and reverse:
+        max_rounds = _ROUNDS_PER_CONTACT * max_contacts + _SPARE_ROUNDS
+    elif max_rounds is None:
+        max_rounds = max(_HELD_ROUNDS_PER_CONTACT * max_contacts, _LEAST_HELD_ROUNDS)
+    driven = driven_by(scene.interaction, scene.cantilever, surface)
+    begun = _at_start(driven, start.time_us, *to_gap(surface, response, start), rows=max_contacts)
+    end = _at_end(driven, begun, until, setting, rounds=max_rounds, reverse=reverse)
+    state, phase = end.tip.state, end.tip.phase
+    row = ContactRow(*jnp.moveaxis(end.rows, -1, 0))
+    return Simulation(
+        start=start,
+        contacts=_contacts(row, scene, surface, response, driven),
+        count=jnp.minimum(end.contacts, max_contacts),
+        final=to_lab(surface, response, state.time_us, driven.gap(state.x, phase), state.gap_rate),
+        phase=phase,
+        held=end.outcome == MotionOutcome.HELD,
+        outcome=end.outcome,
+    )
+
+
+def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, rows: int) -> ContactTip:
+    """Return a tip at its start: free above the gap where the bridge forms, in the bridge below it."""
     sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & (gap_nm > driven.junction.forms_gap_nm)
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START)
     outcome = jnp.where(driven.junction.exists, outcome, MotionOutcome.NO_JUNCTION)
@@ -113,19 +173,10 @@ def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int)
     )
 
 
-def follow(
+def _at_end(
     driven: Driven, start: ContactTip, until_us: Array, setting: DrivenSetting, *, rounds: int, reverse: bool
 ) -> ContactTip:
-    """Return a tip at the end of the simulation.
-
-    Args:
-        driven: the equation of motion.
-        start: the tip at its start.
-        until_us: the end.
-        setting: how finely contacts are resolved.
-        rounds: most rounds.
-        reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
-    """
+    """Return a tip after so many rounds, or as soon as it is done."""
     blocks = -(-rounds // _ROUNDS)
     advance_round = partial(_round, driven, until_us=until_us, setting=setting, reverse=reverse)
 
@@ -269,7 +320,7 @@ def legs_through(
     )
     solid = go_through_junction(driven, tip.state, quick)
     waits = at_junction(driven, tip) & active
-    # where nothing acts outside the junction, the way out has no length
+    # where nothing acts outside the junction, the retraction has no length
     goes_out = (driven.junction.breaks_gap_nm < driven.breaks_nm) | (not driven.bridge.spans)
     breaks = takes(solid, waits & goes_out)
     # one for which the leg does not hold is told how far to go in time, and waits no longer
@@ -356,20 +407,20 @@ def _repetition(
     """Return whether a contact that a tip has left is to be computed again in finer steps, and what it ended with."""
     if setting.agreement is None:
         return jnp.zeros_like(has_left), repeats
-    came, left, before = lax.stop_gradient((arrival, tip.state, repeats))
-    gaps = came.x + left.x
-    # without a bridge the way is that into the sample and back
+    arrived, departed, previous = lax.stop_gradient((arrival, tip.state, repeats))
+    gaps = arrived.x + departed.x
+    # without a bridge the path leads into the sample and out again
     gaps = jnp.where(gaps > 0.0, gaps, -2.0 * tip.deepest_gap_nm)
-    lasts = (left.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * gaps
-    slowed = setting.magnified * left.gap_rate**2 < came.gap_rate**2
+    lasts = (departed.time_us - arrived.time_us) * jnp.abs(arrived.gap_rate) > _LASTS_LONG * gaps
+    slowed = setting.magnified * departed.gap_rate**2 < arrived.gap_rate**2
     differs = jnp.maximum(
-        jnp.abs(left.gap_rate - before.departure_rate),
-        10.0 * jnp.abs(left.time_us - before.departure_us) * jnp.abs(left.gap_rate),
-    ) > _LESS * setting.agreement * jnp.abs(left.gap_rate)
+        jnp.abs(departed.gap_rate - previous.departure_rate),
+        10.0 * jnp.abs(departed.time_us - previous.departure_us) * jnp.abs(departed.gap_rate),
+    ) > _LESS * setting.agreement * jnp.abs(departed.gap_rate)
     magnified = slowed | lasts | (tip.junctions != 1)
     again = has_left & jnp.where(repeats.times == 0, magnified, differs & (repeats.times < _MOST_REPEATS))
     over = repeats._replace(times=jnp.where(has_left, 0, repeats.times))
-    return again, _where(again, Repeats(repeats.times + 1, left.time_us, left.gap_rate), over)
+    return again, _where(again, Repeats(repeats.times + 1, departed.time_us, departed.gap_rate), over)
 
 
 def _row(tip: TipInContact, arrival: ContactState, *, held: Array) -> Float[Array, " columns"]:
@@ -391,3 +442,30 @@ def _row(tip: TipInContact, arrival: ContactState, *, held: Array) -> Float[Arra
         viscous_loss_aj=state.viscous_loss_aj,
     )
     return jnp.stack(row)
+
+
+def _contacts(
+    row: ContactRow, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
+) -> Contacts:
+    """Return the rows as contacts in the lab."""
+    junction = driven.junction
+    has_left, touched = row.kind == ContactKind.IMPACT, row.junctions > 0.0
+    bridge = jnp.where(has_left, junction.bridge_hysteresis_aj, 0.0)
+    solid = row.junctions * junction.junction_hysteresis_aj
+    depth = junction.shift_nm - jnp.where(touched, row.deepest_gap_nm, 0.0)
+    force = jnp.where(touched, scene.interaction.solid.force(depth), 0.0)
+    detail = ContactDetail(
+        junctions=row.junctions.astype(jnp.int32),
+        junction_forms_us=row.junction_forms_us,
+        junction_breaks_us=row.junction_breaks_us,
+        time_in_junction_us=row.time_in_junction_us,
+        deepest_gap_nm=row.deepest_gap_nm,
+        peak_force_nn=jnp.maximum(force, 0.0),
+        bridge_hysteresis_aj=bridge,
+        junction_hysteresis_aj=solid,
+        viscous_loss_aj=row.viscous_loss_aj,
+    )
+    arrival = State(row.arrival_us, row.arrival_gap_nm, row.arrival_rate)
+    departure = State(row.departure_us, row.departure_gap_nm, row.departure_rate)
+    lost = bridge + solid + row.viscous_loss_aj
+    return contacts_in_lab(surface, response, row.kind, arrival, departure, lost, detail)

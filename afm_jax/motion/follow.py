@@ -88,7 +88,7 @@ def follow_in_pieces(
         if outcome not in _GOES_ON or (length == to_end and not (full and goes_on)):
             return
         if goes_on:
-            state, stretch = place_after(motion, row), 1.0
+            state, stretch = state_after(motion, row), 1.0
         else:
             stretch = math.ceil(to_end / piece_us) if stuck else 2.0 * stretch
 
@@ -102,7 +102,7 @@ def where_to_go_on(motion: Simulation) -> tuple[int | None, bool]:
     return None, bool(flying)
 
 
-def place_after(motion: Simulation, row: int | None) -> State:
+def state_after(motion: Simulation, row: int | None) -> State:
     """Return the tip at its departure from a contact (its row), or at the end of the motion (None)."""
     rows = motion.contacts
     if row is None:

@@ -107,7 +107,7 @@ class Observables(NamedTuple):
         float, Observable("phase at the drive's frequency omega", lambda m: m.height.at_drive.phase_deg)
     ]
     mean_height_nm: Annotated[float, Observable("mean height", lambda m: m.height.mean)]
-    contact_share: Annotated[float, Observable("share of time in contact", lambda m: m.in_contact_us / m.span_us)]
+    contact_share: Annotated[float, Observable("fraction of time in contact", lambda m: m.in_contact_us / m.span_us)]
     time_in_contact_us: Annotated[
         float,
         Observable("time in contact of a response period", lambda m: m.in_contact_us / m.cycles * m.periods),

@@ -12,7 +12,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.impact.orbits import FlightEnds, peak_amplitude
 from afm_jax.motion.record import ContactKind, Simulation
-from afm_jax.motion.trajectory import DensePath, Flights, Trajectory, flights_of, fly
+from afm_jax.motion.trajectory import DensePath, Trajectory, flights_of, fly
 
 _REFINEMENTS = 4
 _REFINED = 33
@@ -76,7 +76,7 @@ def _largest_in_flights(scene: Scene, simulation: Simulation, from_us: float, to
     inside = end > begin
     if not inside.any():
         return -np.inf
-    position, velocity = fly(scene, Flights(*(column[inside] for column in flights)), begin[inside][None, :])
+    position, velocity = fly(scene, flights.where(inside), begin[inside][None, :])
     return float(peaks_of_flights(scene, begin[inside], position[0], velocity[0], end[inside]).max())
 
 

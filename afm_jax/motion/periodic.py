@@ -124,13 +124,13 @@ def _orbit_of(scene: Scene, near: State, periods: int, run: Run) -> Orbit | None
         return np.stack([ends_in_flight(motion) for motion in motions], axis=1)
 
     omega = float(scene.cantilever.angular_frequency)
-    found = close_periods(ends, _column(near), np.zeros(1, int), angular_frequency=omega, reach=_NEAR)
-    if not found.closed[0] or not found.contraction[0] < _ATTRACTS:
+    periods_closed = close_periods(ends, _column(near), np.zeros(1, int), angular_frequency=omega, reach=_NEAR)
+    if not periods_closed.closed[0] or not periods_closed.contraction[0] < _ATTRACTS:
         return None
-    start = State(near.time_us, *(jnp.asarray(part) for part in found.starts[1:, 0]))
+    start = State(near.time_us, *(jnp.asarray(part) for part in periods_closed.starts[1:, 0]))
     motion = run(start, duration)
-    contraction = float(found.contraction[0])
-    return Orbit(start, duration, periods, int(motion.count), contraction, found.slopes[0], motion)
+    contraction = float(periods_closed.contraction[0])
+    return Orbit(start, duration, periods, int(motion.count), contraction, periods_closed.slopes[0], motion)
 
 
 def _column(state: State) -> Float[np.ndarray, "3 1"]:
@@ -187,10 +187,10 @@ def close_periods(
         return LinearisedRows(gap / size, (slopes - np.eye(2)) / size[:, :, None], list(slopes))
 
     roots = newton_rows(linearised, starts[1:].T, _CLOSING)
-    slopes = np.array([np.full((2, 2), np.nan) if known is None else known for known in roots.details])
-    known = np.isfinite(slopes).all(axis=(1, 2))
+    slopes = np.array([np.full((2, 2), np.nan) if slope is None else slope for slope in roots.details])
+    finite = np.isfinite(slopes).all(axis=(1, 2))
     contraction = np.full(len(rows), np.inf)
-    contraction[known] = np.abs(np.linalg.eigvals(slopes[known])).max(axis=1)
+    contraction[finite] = np.abs(np.linalg.eigvals(slopes[finite])).max(axis=1)
     ending = np.concatenate([starts[:1], roots.x.T])
     closed = roots.converged & (_apart(starts, ending, angular_frequency) <= reach)
     return ClosedPeriods(ending, closed, contraction, slopes)

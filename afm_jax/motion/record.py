@@ -14,38 +14,26 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
+from afm_jax.outcomes import OutcomeInWords
 from afm_jax.results import Result, ResultTuple, public_result
 
 
-class MotionOutcome(enum.IntEnum):
+class MotionOutcome(OutcomeInWords):
     """How a simulation ended."""
 
-    FINISHED = 0
-    HELD = 1
-    CONTACT_LIMIT = 2
-    STEP_LIMIT = 3
-    INVALID_START = 4
-    NO_JUNCTION = 5
-    UNRESOLVED = 6
-
-    @property
-    def sentence(self) -> str:
-        """What happened, in words."""
-        return _SENTENCES[self]
-
-
-_SENTENCES = {
-    MotionOutcome.FINISHED: "The motion was followed to the end of its duration.",
-    MotionOutcome.HELD: "The motion was followed to the end of its duration; the sample holds the tip there.",
-    MotionOutcome.CONTACT_LIMIT: "The motion has more contacts than there is room for: raise max_contacts.",
-    MotionOutcome.STEP_LIMIT: "The motion took more steps than it was given (max_rounds), or a search did not end.",
-    MotionOutcome.INVALID_START: "The start is not finite, or inside the sample.",
-    MotionOutcome.NO_JUNCTION: "With these parameters no junction forms: force and stiffness are equal nowhere.",
-    MotionOutcome.UNRESOLVED: (
-        "An integration step left the range of the forces, or close to capture a law's delay put the tip inside the "
-        "sample; the motion is not trusted beyond."
-    ),
-}
+    FINISHED = 0, "The motion was followed to the end of its duration."
+    HELD = 1, "The motion was followed to the end of its duration; the sample holds the tip there."
+    CONTACT_LIMIT = 2, "The motion has more contacts than there is room for: raise max_contacts."
+    STEP_LIMIT = 3, "The motion took more steps than it was given (max_rounds), or a search did not end."
+    INVALID_START = 4, "The start is not finite, or inside the sample."
+    NO_JUNCTION = 5, "With these parameters no junction forms: force and stiffness are equal nowhere."
+    UNRESOLVED = (
+        6,
+        (
+            "An integration step left the range of the forces, or close to capture a law's delay put the tip inside "
+            "the sample; the motion is not trusted beyond."
+        ),
+    )
 
 
 class ContactKind(enum.IntEnum):

@@ -26,7 +26,7 @@ _BOTH = 2.0
 """Two departures are as far apart as both together are from the motion they tend to."""
 ROUNDING = 1e-8
 """Distance below which a block has arrived, its rate being rounding; not of the tolerance, lest slow motion passes."""
-_LAST_SHARE = 0.2
+_LAST_FRACTION = 0.2
 
 
 class Repetition(NamedTuple):
@@ -273,17 +273,17 @@ def last_fifth(first_us: float, last_us: float, drive: DrivePeriod, periods: int
         periods: N, drive periods in a response period.
     """
     span, response = last_us - first_us, periods * drive.period_us
-    whole = int(_LAST_SHARE * span / response)
+    whole = int(_LAST_FRACTION * span / response)
     if whole == 0:
         whole = int(span >= response)
-    return Window(last_us - (whole * response if whole else _LAST_SHARE * span), last_us, periods, whole)
+    return Window(last_us - (whole * response if whole else _LAST_FRACTION * span), last_us, periods, whole)
 
 
 def _likely_order(simulation: Simulation, period_us: float, *, stuck: bool) -> int:
     """Return the nearest integer to the mean number of drive periods between contacts, over the last fifth of them."""
     rows = simulation.contacts
     times = np.asarray(rows.departure_time_us)[np.asarray(rows.kind) == ContactKind.IMPACT]
-    some = times[-max(5, int(_LAST_SHARE * len(times))) :]
+    some = times[-max(5, int(_LAST_FRACTION * len(times))) :]
     if stuck or len(some) < 2:
         return 1
     return max(1, round(float(some[-1] - some[0]) / (len(some) - 1) / period_us))

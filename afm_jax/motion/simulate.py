@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,38 +15,27 @@ from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, is_traced, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import Driven, driven_by
-from afm_jax.contact.junction import explain_missing_junction, find_junction
-from afm_jax.contact.settings import DrivenSetting, driven_setting_of
+from afm_jax.contact.junction import Phase, explain_missing_junction, find_junction
+from afm_jax.contact.settings import driven_setting_of
 from afm_jax.impact.law import Law
-from afm_jax.motion.contact_motion import ContactRow, begin, follow
-from afm_jax.motion.law_motion import follow_free, follow_law
+from afm_jax.motion.contact_motion import follow_contacts
+from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import (
-    ContactDetail,
-    ContactKind,
     Contacts,
     MotionOutcome,
     Simulation,
     State,
-    contacts_in_lab,
     to_gap,
-    to_lab,
 )
 from afm_jax.solve.lanes import power_of_two
 
 DEFAULT_ACCURACY = 1e-9
-_ROUNDS_PER_CONTACT = 4
-_SPARE_ROUNDS = 64
-_HELD_ROUNDS_PER_CONTACT, _LEAST_HELD_ROUNDS = 256, 1 << 16
-"""Far more rounds than any motion takes that comes to an end: for every contact there is room for, and at least."""
 _CONTACTS_PER_PERIOD = 4.0
 _MORE_ROOM = 4
 _MOST_CONTACTS = 1 << 20
 """Contacts for which room is made unasked: with a resolved contact 100 MB."""
 _LEAST_ROOM = 64
 """Rows made unasked are a power of two from here on: few shapes, so that few programs are compiled."""
-_TRIALS_BACKWARDS = 40
-"""Trial steps of a round when all of them are run and kept for the way back."""
 
 
 @checked
@@ -94,24 +82,33 @@ def simulate(  # noqa: PLR0913
     scene = as_scene(scene)
     require_float64(scene)
     check_parameter("duration_us", duration_us, "positive")
-    _check_sizes(start, duration_us, max_contacts=max_contacts, max_rounds=max_rounds)
+    for name, value in (("duration_us", duration_us), *zip(State._fields, start, strict=True)):
+        check_scalar(name, value)
+    for name, count in (("max_contacts", max_contacts), ("max_rounds", max_rounds)):
+        if count is not None:
+            check_count(name, count)
     setting = driven_setting_of(accuracy, method)
     surface, response = surface_of(scene)
     dtype = scene.cantilever.frequency_khz.dtype
-    begin_at = State(*(jnp.asarray(value, dtype) for value in start))
-    until = begin_at.time_us + jnp.asarray(duration_us, dtype)
-    world = (scene, surface, response, begin_at, until)
+    begin = State(*(jnp.asarray(value, dtype) for value in start))
+    world = (scene, surface, response, begin, begin.time_us + jnp.asarray(duration_us, dtype))
     if scene.interaction is None:
-        return follow_free(*world)
-    follow_with = _follower(world, setting, max_rounds, reverse=reverse)
+        return _follow_free(*world)
+    if isinstance(scene.interaction, Law):
+        follow = partial(follow_law, *world, reverse=reverse)
+    elif isinstance(scene.interaction, Contact):
+        _check_contact(scene, surface, response, begin)
+        follow = partial(follow_contacts, *world, setting=setting, max_rounds=max_rounds, reverse=reverse)
+    else:
+        kind = type(scene.interaction).__name__
+        raise TypeError(f"the interaction must be an ImpactLaw, a Contact or None, not {kind}")
     try:
         if max_contacts is not None:
-            simulation = follow_with(max_contacts)
+            simulation = follow(max_contacts=max_contacts)
         else:
             room = _room(scene, surface, duration_us)
             # in reverse mode every round is run, needed or not
-            rows = room if reverse else max(_LEAST_ROOM, power_of_two(room))
-            simulation = _with_room(follow_with, rows)
+            simulation = _with_room(follow, room if reverse else max(_LEAST_ROOM, power_of_two(room)))
     except TypeError as error:
         # JAX's own, where reverse derivatives through its loop are differentiated once more
         if reverse or "NoneType" not in str(error):
@@ -120,44 +117,41 @@ def simulate(  # noqa: PLR0913
     return simulation if reverse else jax.tree.map(_only_forwards, simulation)
 
 
-def _follower(
-    world: tuple[Any, ...], setting: DrivenSetting, max_rounds: int | None, *, reverse: bool
-) -> Callable[[int], Simulation]:
-    """Return the function that follows a scene with room for some contacts.
+@jax.jit
+def _follow_free(
+    scene: Scene, surface: Platform | Surface, response: Surface | None, start: State, until: Float[Array, ""]
+) -> Simulation:
+    """Return a free tip at the end of a simulation, in closed form; no contacts.
 
-    Raises:
-        TypeError: if the interaction is neither a law nor a contact.
-        ValueError: if the contact has no junction, or the start is inside the sample.
+    Args:
+        scene: the scene.
+        surface: what its tip sees; not met.
+        response: the steady response to drives of base and tip, or None.
+        start: the tip at the start, in the lab.
+        until: time of the end in us.
     """
-    scene, surface, response, start, _ = world
-    if isinstance(scene.interaction, Law):
-        return lambda room: follow_law(*world, max_contacts=room, reverse=reverse)
-    if not isinstance(scene.interaction, Contact):
-        kind = type(scene.interaction).__name__
-        raise TypeError(f"the interaction must be an ImpactLaw, a Contact or None, not {kind}")
-    _check_contact(scene, surface, response, start)
-    if reverse:
-        # legs tell by NaN that they do not hold, which reverse derivatives would spread
-        setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS, agreement=None)
-
-    def follow_contacts(room: int) -> Simulation:
-        rounds = max_rounds if max_rounds is not None else _rounds(room, reverse=reverse)
-        return _contact(*world, rows=room, setting=setting, rounds=rounds, reverse=reverse)
-
-    return follow_contacts
-
-
-def _check_sizes(start: State, duration_us: ArrayLike, **counts: int | None) -> None:
-    """Check that start and duration are of one scene, and that there is room for something.
-
-    Raises:
-        ValueError: if not.
-    """
-    for name, value in (("duration_us", duration_us), *zip(State._fields, start, strict=True)):
-        check_scalar(name, value)
-    for name, count in counts.items():
-        if count is not None:
-            check_count(name, count)
+    del surface
+    position, velocity = start.position_nm, start.velocity_nm_per_us
+    if response is not None:
+        steady, rate = response.position_and_velocity(start.time_us)
+        position, velocity = position - steady, velocity - rate
+    position, velocity = scene.cantilever.propagator(until - start.time_us)(position, velocity)
+    if response is not None:
+        steady, rate = response.position_and_velocity(until)
+        position, velocity = position + steady, velocity + rate
+    none = jnp.zeros((0,), position.dtype)
+    count = jnp.zeros((), jnp.int32)
+    sane = jnp.isfinite(position) & jnp.isfinite(velocity)
+    outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START).astype(jnp.int32)
+    return Simulation(
+        start=start,
+        contacts=Contacts(none.astype(jnp.int32), *[none] * 9, detail=None),
+        count=count,
+        final=State(until, position, velocity),
+        phase=jnp.full_like(count, Phase.DRY),
+        held=jnp.zeros((), bool),
+        outcome=outcome,
+    )
 
 
 _forwards = Primitive("forwards")
@@ -186,21 +180,14 @@ def _only_forwards(part: Array) -> Array:
     return _forwards.bind(part) if is_traced(part) and jnp.issubdtype(part.dtype, jnp.floating) else part
 
 
-def _rounds(room: int, *, reverse: bool) -> int:
-    """Return the most rounds of a motion with room for some contacts."""
-    if reverse:
-        return _ROUNDS_PER_CONTACT * room + _SPARE_ROUNDS
-    return max(_HELD_ROUNDS_PER_CONTACT * room, _LEAST_HELD_ROUNDS)
-
-
-def _with_room(follow_with: Callable[[int], Simulation], room: int) -> Simulation:
+def _with_room(follow: Callable[..., Simulation], room: int) -> Simulation:
     """Return a motion with room for all its contacts: as long as there is too little, followed again with more."""
-    simulation = follow_with(room)
+    simulation = follow(max_contacts=room)
     while room < _MOST_CONTACTS and not is_traced(simulation.outcome):
         if not bool(jnp.any(simulation.outcome == MotionOutcome.CONTACT_LIMIT)):
             break
         room = min(_MORE_ROOM * room, _MOST_CONTACTS)
-        simulation = follow_with(room)
+        simulation = follow(max_contacts=room)
     return simulation
 
 
@@ -230,60 +217,3 @@ def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface 
             f"the start is inside the sample: the gap is {gap:.6g} nm, but must be above "
             f"{float(junction.forms_gap_nm):.6g} nm, where the junction forms; raise `position_nm`"
         )
-
-
-@partial(jax.jit, static_argnames=("rows", "setting", "rounds", "reverse"))
-def _contact(  # noqa: PLR0913
-    scene: Scene,
-    surface: Platform | Surface,
-    response: Surface | None,
-    start: State,
-    until: Float[Array, ""],
-    *,
-    rows: int,
-    setting: DrivenSetting,
-    rounds: int,
-    reverse: bool,
-) -> Simulation:
-    driven = driven_by(scene.interaction, scene.cantilever, surface)
-    gap, rate = to_gap(surface, response, start)
-    begun = begin(driven, start.time_us, gap, rate, rows)
-    end = follow(driven, begun, until, setting, rounds=rounds, reverse=reverse)
-    state, phase = end.tip.state, end.tip.phase
-    table = ContactRow(*jnp.moveaxis(end.rows, -1, 0))
-    return Simulation(
-        start=start,
-        contacts=_contacts(table, scene, surface, response, driven),
-        count=jnp.minimum(end.contacts, rows),
-        final=to_lab(surface, response, state.time_us, driven.gap(state.x, phase), state.gap_rate),
-        phase=phase,
-        held=end.outcome == MotionOutcome.HELD,
-        outcome=end.outcome,
-    )
-
-
-def _contacts(
-    row: ContactRow, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
-) -> Contacts:
-    """Return the rows as contacts in the lab."""
-    junction = driven.junction
-    has_left, touched = row.kind == ContactKind.IMPACT, row.junctions > 0.0
-    bridge = jnp.where(has_left, junction.bridge_hysteresis_aj, 0.0)
-    solid = row.junctions * junction.junction_hysteresis_aj
-    depth = junction.shift_nm - jnp.where(touched, row.deepest_gap_nm, 0.0)
-    force = jnp.where(touched, scene.interaction.solid.force(depth), 0.0)
-    detail = ContactDetail(
-        junctions=row.junctions.astype(jnp.int32),
-        junction_forms_us=row.junction_forms_us,
-        junction_breaks_us=row.junction_breaks_us,
-        time_in_junction_us=row.time_in_junction_us,
-        deepest_gap_nm=row.deepest_gap_nm,
-        peak_force_nn=jnp.maximum(force, 0.0),
-        bridge_hysteresis_aj=bridge,
-        junction_hysteresis_aj=solid,
-        viscous_loss_aj=row.viscous_loss_aj,
-    )
-    arrival = State(row.arrival_us, row.arrival_gap_nm, row.arrival_rate)
-    departure = State(row.departure_us, row.departure_gap_nm, row.departure_rate)
-    lost = bridge + solid + row.viscous_loss_aj
-    return contacts_in_lab(surface, response, row.kind, arrival, departure, lost, detail)

@@ -104,30 +104,30 @@ _GIVE = "give a fit.json of `afm-jax fit --out`, a law.json of `afm-jax collide 
 
 def _of_json(text: str) -> tuple[TabulatedLaw, Mapping[str, Any]]:
     try:
-        found = json.loads(text)
+        contents = json.loads(text)
     except ValueError as error:
         raise ValueError(f"line {getattr(error, 'lineno', 1)} is no JSON; {_GIVE}") from error
     except RecursionError:
         raise ValueError(f"has too many brackets within each other; {_GIVE}") from None
-    kind = found.get("format") if isinstance(found, dict) else None
+    kind = contents.get("format") if isinstance(contents, dict) else None
     if kind not in (FORMAT, FIT_FORMAT):
         raise ValueError(f"holds no law; {_GIVE}")
-    law, mend = found, "write it anew with `afm-jax collide --make-law --out DIR`"
+    law, mend = contents, "write it anew with `afm-jax collide --make-law --out DIR`"
     if kind == FIT_FORMAT:
-        wrong = why_no_fit(found)
+        wrong = why_no_fit(contents)
         if wrong is not None:
             raise ValueError(wrong)
-        if not found.get("valid"):
+        if not contents.get("valid"):
             raise ValueError("the fit is not valid, so that its law means nothing; give a valid one")
-        law, mend = found.get("law"), "fit again with `afm-jax fit TABLE --out DIR`"
+        law, mend = contents.get("law"), "fit again with `afm-jax fit TABLE --out DIR`"
         if not isinstance(law, dict) or not isinstance(law.get("numbers"), dict):
             raise ValueError(f"is a fit without a law; {mend}")
-    elif found.get("format_version") != FORMAT_VERSION:
+    elif contents.get("format_version") != FORMAT_VERSION:
         raise ValueError(
-            f"has format_version {found.get('format_version')}, but {FORMAT_VERSION} is known here; {mend}"
+            f"has format_version {contents.get('format_version')}, but {FORMAT_VERSION} is known here; {mend}"
         )
     try:
-        return law_of_dict(law), found if kind == FIT_FORMAT else {}
+        return law_of_dict(law), contents if kind == FIT_FORMAT else {}
     except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
         # an entry of another kind than is written there
         raise ValueError(f"its law is damaged; {mend}") from error
@@ -155,8 +155,8 @@ def _of_csv(text: str) -> TabulatedLaw:
             raise ValueError(f"line {number} has {len(cells)} values for {len(names)} columns")
         stays = "captured" in names and cells[names.index("captured")].strip().lower() == "true"
         for kind, place, unit in columns:
-            left = stays and kind != "approach_speed" and not cells[place].strip()
-            values[kind].append(0.0 if left else _number(cells[place], names[place], number) * unit)
+            empty = stays and kind != "approach_speed" and not cells[place].strip()
+            values[kind].append(0.0 if empty else _number(cells[place], names[place], number) * unit)
     numbers = {key: _setting(key, settings[key]) for key in _NUMBERS if key in settings}
     law = _law_of_columns({kind: np.array(column) for kind, column in values.items()}, numbers, settings)
     return _as_corrected(law, settings.get("corrections", "true"))
@@ -239,8 +239,8 @@ def _kind_of(name: str) -> tuple[str | None, str]:
     if any(name == kind for kind in _COLUMNS):
         usual = "nm_per_us" if _COLUMNS[name] is _SPEED_UNITS else "us"
         raise ValueError(f"column {name}: the unit is missing; use {name}_{usual}")
-    known = re.match(r"(approach|rebound)_speed(_error)?_|collision_delay(_error)?_", name)
-    if known:
+    quantity = re.match(r"(approach|rebound)_speed(_error)?_|collision_delay(_error)?_", name)
+    if quantity:
         units = _SPEED_UNITS if "speed" in name else _TIME_UNITS
         raise ValueError(f"column {printable(name)}: the unit is not known; use one of {', '.join(units)}")
     if name.startswith((*_BANDS, *_COLLIDED)):

@@ -87,30 +87,30 @@ def parameter_values(scene: Scene) -> dict[str, float]:
     Raises:
         ValueError: if it is none that a file can hold.
     """
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for table, contents in scene_tables(scene).items():
-        _collect(table, contents, found)
+        _collect(table, contents, values)
     free = float(scene.cantilever.frequency_khz)
-    for path in [path for path in found if path.endswith(".frequency_khz") and not path.startswith("cantilever")]:
-        found[path.replace("frequency_khz", "reduced_frequency")] = found[path] / (2.0 * free)
+    for path in [path for path in values if path.endswith(".frequency_khz") and not path.startswith("cantilever")]:
+        values[path.replace("frequency_khz", "reduced_frequency")] = values[path] / (2.0 * free)
     for name, drive in (("base", scene.base), ("force", scene.force)):
         if drive is not None:
             per_free = float(drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive)))
             if per_free > 0.0:
-                found[f"{name}.free_amplitude_nm"] = float(drive.tones[0].amplitude) / per_free
-    return found
+                values[f"{name}.free_amplitude_nm"] = float(drive.tones[0].amplitude) / per_free
+    return values
 
 
-def _collect(table: str, contents: dict[str, Any], found: dict[str, float]) -> None:
+def _collect(table: str, contents: dict[str, Any], values: dict[str, float]) -> None:
     for key, value in contents.items():
         if key == "table":
             # of a law: its errors' unknowns, in standard deviations
             unknowns = len(value.get("deviations", {}).get("capture", []))
-            found.update((f"{table}.unknown_{number}", 0.0) for number in range(1, unknowns + 1))
+            values.update((f"{table}.unknown_{number}", 0.0) for number in range(1, unknowns + 1))
         elif isinstance(value, dict):
-            _collect(f"{table}.{key}", value, found)
+            _collect(f"{table}.{key}", value, values)
         elif isinstance(value, float):
-            found[f"{table}.{key}"] = value
+            values[f"{table}.{key}"] = value
 
 
 def check_ranges(scene: Scene, *ranges: ParameterRange) -> None:
@@ -119,12 +119,12 @@ def check_ranges(scene: Scene, *ranges: ParameterRange) -> None:
     Raises:
         ValueError: if not; one line that names what exists, or what is wrong with an end.
     """
-    known = parameter_values(scene)
+    values = parameter_values(scene)
     for given in ranges:
-        if given.path not in known:
-            nearest = difflib.get_close_matches(given.path, known, n=1)
+        if given.path not in values:
+            nearest = difflib.get_close_matches(given.path, values, n=1)
             meant = f"did you mean {nearest[0]}? " if nearest else ""
-            raise ValueError(f"the scene has no parameter `{given.path}`; {meant}it has {', '.join(known)}")
+            raise ValueError(f"the scene has no parameter `{given.path}`; {meant}it has {', '.join(values)}")
     places = [_leaf_path(given.path) for given in ranges]
     if len(set(places)) < len(places):
         raise ValueError(f"the ranges {' and '.join(map(str, ranges))} change the same parameter: give two different")
@@ -167,10 +167,10 @@ def scene_family(scene: SceneLike, *paths: str) -> Callable[..., Scene]:
         ValueError: if the scene lacks one, with what it has.
     """
     scene = as_scene(scene)
-    known = parameter_values(scene)
+    existing = parameter_values(scene)
     for path in paths:
-        if path not in known:
-            raise ValueError(f"the scene has no parameter `{path}`; it has {', '.join(known)}")
+        if path not in existing:
+            raise ValueError(f"the scene has no parameter `{path}`; it has {', '.join(existing)}")
     if len(set(paths)) < len(paths):
         raise ValueError(f"a parameter is named twice: {', '.join(paths)}")
     of_contact = [path for path in paths if path.startswith("interaction.") and _is_contact(scene)]

@@ -81,9 +81,9 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     stems = {_stem(name): name for name in keys}
     if plain in stems and plain not in allowed:
         return f"the unit is missing; use {stems[plain]}"
-    known = allowed.get(plain, stems.get(_stem(plain)))
-    if known is not None:
-        return f"unknown key; use {known}"
+    meant = allowed.get(plain, stems.get(_stem(plain)))
+    if meant is not None:
+        return f"unknown key; use {meant}"
     others = [other for other in MODELS if other != model and plain in keys_of("interaction", other)]
     if table == "interaction" and others:
         whose = "a free cantilever" if model == "none" else f"a {model}"

@@ -21,7 +21,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.follow import place_after, where_to_go_on
+from afm_jax.motion.follow import state_after, where_to_go_on
 from afm_jax.motion.observe import observe
 from afm_jax.motion.periodic import close_periods, ends_in_flight
 from afm_jax.motion.record import MotionOutcome, Simulation, State
@@ -231,7 +231,7 @@ def _judged(scene: Scene, found: Simulation, order: int) -> _Verdict:
     verdict = settled(scene, found, tolerance=_TOLERANCE)
     if not verdict.settled:
         row, goes_on = where_to_go_on(found)
-        return _Verdict(f"not settled: {verdict.reason}", goes_on=place_after(found, row) if goes_on else None)
+        return _Verdict(f"not settled: {verdict.reason}", goes_on=state_after(found, row) if goes_on else None)
     if verdict.stuck or (verdict.contacts, verdict.periods) != (1, order):
         return _Verdict(verdict.reason)
     seen = observe(scene, found, verdict=verdict)
