@@ -29,7 +29,7 @@ from afm_jax.impact.closure import OrbitPlace, OrbitProblem, follow_root, harmle
 from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
 from afm_jax.impact.orbits import amplitudes, near_fold, steady_orbits
-from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.lanes import filled, in_blocks
 from fitting.models import Measurement, Problem, Rows
 
 
@@ -228,8 +228,8 @@ def linearise(
     values = np.asarray(values)
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
-    filled, impacts = filled_up(values, measurement, problem)
-    whole = _of_pairs(filled, sets, impacts, measurement, problem, near, linearise_pairs)
+    batch, impacts = batch_of(values, measurement, problem)
+    whole = _of_pairs(batch, sets, impacts, measurement, problem, near, linearise_pairs)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
@@ -310,14 +310,14 @@ def impact_slopes(
     The derivatives are those along a direction in which the impact itself is changed, put where those by the first
     parameter would be.
     """
-    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
+    batch, impacts = batch_of(np.asarray(values)[None], measurement, problem)
     still = jax.tree.map(lambda leaf: np.zeros(leaf.shape), impacts.slopes)
 
     def along(where: Callable[[Any], Any], turn: float, *constant: Any) -> tuple[np.ndarray, np.ndarray]:
         leaf = np.array(where(still))
         leaf[(slice(None), 0, *constant)] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
-        block = _of_pairs(filled, 1, turned, measurement, problem, near, linearise_pairs)
+        block = _of_pairs(batch, 1, turned, measurement, problem, near, linearise_pairs)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     # of a series its constant term
@@ -343,15 +343,15 @@ def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: 
         measurement: what will be compared with.
         problem: the model.
     """
-    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
+    batch, impacts = batch_of(np.asarray(values)[None], measurement, problem)
     if measurement.joint is not None:
         # one of what is driven: the program of another is compiled when it comes to it
         drive = measurement.joint.drives[0]
-        filled, problem = filled[:, 0], replace(measurement.joint.problem, drive=drive)
+        batch, problem = batch[:, 0], replace(measurement.joint.problem, drive=drive)
         measurement = measurement.of_drive(drive)
     index = np.zeros(_lanes(problem), dtype=int)
     rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
-    some, points = measurement._replace(rows=rows), filled[index]
+    some, points = measurement._replace(rows=rows), batch[index]
     nowhere = branch_near(np.full(index.shape, np.nan))
 
     def in_thread(program: Callable[..., Any], *more: Any) -> None:
@@ -385,28 +385,28 @@ class _Impacts(NamedTuple):
         return jax.tree.map(lambda leaf: np.asarray(leaf)[0], self)
 
 
-def filled_up(
+def batch_of(
     values: Float[np.ndarray, "sets p"], measurement: Measurement, problem: Problem
 ) -> tuple[Float[np.ndarray, "batch ..."], _Impacts]:
     """Return sets of values, filled up to `BATCH`, and their impacts; of several tables the values of each."""
-    filled = np.concatenate([values, np.repeat(values[-1:], BATCH - len(values), axis=0)])
-    points = filled
+    batch = filled(values, BATCH)
+    points = batch
     if measurement.joint is not None:
         # an impact knows no nuisances
-        problem, filled = measurement.joint.problem, measurement.joint.values(filled)
-        measurement, points = measurement.of_drive(problem.drive), filled[:, 0]
+        problem, batch = measurement.joint.problem, measurement.joint.values(batch)
+        measurement, points = measurement.of_drive(problem.drive), batch[:, 0]
     # an impact knows no rows: one program for tables of every size
     rowless = measurement._replace(rows=jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows))
     # a table of taps takes long, and a fit mostly asks for one: each by itself
     parts = [points[i : i + 1] for i in range(len(values))] if problem.pulled else [points]
-    found = [jax.tree.map(np.asarray, impacts_of(part, rowless, problem)) for part in parts]
-    found += [found[-1]] * (BATCH - sum(len(part) for part in parts))
-    return filled, jax.tree.map(lambda *leaves: np.concatenate(leaves), *found) if found[1:] else found[0]
+    impacts = [jax.tree.map(np.asarray, impacts_of(part, rowless, problem)) for part in parts]
+    whole = jax.tree.map(lambda *leaves: filled(np.concatenate(leaves), BATCH), *impacts)
+    return batch, whole
 
 
 def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:
     """Return the law, or the table of the contact, at one set of values, with its slopes, by the shared program."""
-    impact, slopes = filled_up(np.asarray(values)[None], measurement, problem)[1].first()
+    impact, slopes = batch_of(np.asarray(values)[None], measurement, problem)[1].first()
     if measurement.joint is None:
         return _Impacts(impact, slopes)
     # the parameters of the law come first in every table, and nuisances change no impact

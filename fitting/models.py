@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import CONTACT_PARAMETER, EFFECTS, PAPER, idle_without
 from afm_jax.impact.law import BRIDGE_NM, CollisionDelay, ImpactLaw
+from afm_jax.solve.lanes import filled
 from fitting.parameters import (
     DELAY,
     LAW,
@@ -600,7 +601,7 @@ def joint_measurement(
 
     rows = Rows(**{name: whole(name) for name in Rows._fields if name != "table"}, table=tables.number)
     spare = -tables.rows % ROWS_PER_PROGRAM
-    rows = jax.tree.map(lambda column: np.concatenate([column, np.repeat(column[-1:], spare, axis=0)]), rows)
+    rows = jax.tree.map(lambda column: filled(column, tables.rows + spare), rows)
     for unread in (rows.measured, rows.no_orbit):
         unread[tables.rows :] = False
     value, error = _constraint_columns(problem, known)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.impact.lasting_impact import PulledImpact
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
+from afm_jax.solve.lanes import filled
 from fitting.fits.discrepancy import (
     ClosestMember,
     Descended,
@@ -687,10 +688,10 @@ def member_after(
     if problem.model == "contact" or not problem.lasting:
         return None
     # one program for rows of any number up to that of a law's points
-    filled = np.append(speeds, np.full(-speeds.size % _POINTS, speeds[-1]))
+    whole_speeds = filled(speeds, speeds.size + -speeds.size % _POINTS)
 
     def law_at(point: Float[np.ndarray, " p"]) -> LawBefore:
-        whole = law_before(problem, measurement, point, filled)
+        whole = law_before(problem, measurement, point, whole_speeds)
         return whole._replace(law=whole.law[:, : speeds.size], slope=whole.slope[:, : speeds.size])
 
     moved = law_at(step.values[: len(problem.names)]) if computed else None

@@ -1,4 +1,4 @@
-"""The optimiser: screen a coarse grid, polish the best starts with optax's L-BFGS, then trust none of it (checks.py).
+"""The objective, chi2 of a table and a model, and its minimisation from several starts at once by Optax's L-BFGS.
 
 Compilation is what a fit from the command line waits for, so one program alone contains the forward model: residuals
 with their Jacobian for a handful of parameter sets at once (`forward.linearise`). The screening, the polish, the checks
@@ -13,6 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.solve.lanes import filled
 from fitting.forward import BATCH, Linearised, linearise
 from fitting.models import Measurement, Problem
 from fitting.parameters import is_of_one_table
@@ -287,7 +288,7 @@ def _lbfgs(
     """Return optax's L-BFGS step of every set and its new state; no state: the first step."""
     count = len(z)
     # always as many sets: one program
-    z, gradient = (np.concatenate([part, np.repeat(part[-1:], BATCH - count, axis=0)]) for part in (z, gradient))
+    z, gradient = filled(z, BATCH), filled(gradient, BATCH)
     # optax mixes integers of 32 and 64 bits, which strict promotion would refuse.
     with jax.numpy_dtype_promotion("standard"):
         before = jax.tree.map(np.asarray, _init(z)) if state is None else state
@@ -313,7 +314,7 @@ def _choose(accepted: Bool[np.ndarray, " sets"], new: optax.OptState, old: optax
     """Return the new optimiser state where a step was accepted, the old one elsewhere."""
 
     def one(new_leaf, old_leaf):
-        chosen = np.append(accepted, np.repeat(accepted[-1:], len(new_leaf) - len(accepted)))
+        chosen = filled(accepted, len(new_leaf))
         return np.where(chosen.reshape((-1,) + (1,) * (new_leaf.ndim - 1)), new_leaf, old_leaf)
 
     return jax.tree.map(one, new, old)
