@@ -13,7 +13,7 @@ from afm_jax.bench.impacts import all_cores, lane_states, one_core, sequence_err
 from afm_jax.bench.problems import chaotic_scene, regular_scene, settled_starts
 from afm_jax.bench.scipy_impacts import scipy_impacts
 from afm_jax.bench.timing import run_in_own_process
-from afm_jax.cli.bench import AIMED_BATCH, COLUMNS, aim_sentence, aims
+from afm_jax.cli.bench import AIMED_BATCH, PARTS, aim_of, aim_sentence, map_aims
 from afm_jax.verify.fifty_digits import ExactMap, reference_error
 from tests.answers import answer, table
 from tests.run_here import run_here
@@ -23,7 +23,7 @@ from tests.run_here import run_here
 def test_one_core_measures_what_it_says():
     rows = one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)["rows"]
     for row in rows:
-        assert set(row) <= set(COLUMNS)
+        assert set(row) <= set(PARTS[0].columns)
         assert row["impacts_per_second"] == pytest.approx(1e6 / row["microseconds_per_impact"], rel=1e-12)
     maps = [row for row in rows if row["what"].startswith("next_impact")]
     assert [(row["scene"], row["batch"], row["block"]) for row in maps] == [
@@ -122,7 +122,7 @@ def test_starts_are_the_same_for_every_batch():
 def test_aims_are_judged_and_not_invented():
     plain = {"what": "next_impact iterated", "batch": AIMED_BATCH, "impacts_per_second": 2e6, "error_us": 1e-14}
     rows = [plain, {"what": "reverse gradient", "ratio_to_plain": 3.0}]
-    judged = {aim["aim"].split(",")[0]: aim for aim in aims(rows)}
+    judged = {aim["aim"].split(",")[0]: aim for aim in (aim_of(*each) for each in map_aims(rows))}
     assert [aim["met"] for aim in judged.values()] == [False, True, None, True]
     assert aim_sentence(judged["impacts per second"]).endswith("2e+06 reached, not met")
     assert aim_sentence(judged["one forward derivative"]).endswith("not measured in this run")
@@ -136,7 +136,7 @@ def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: 
     assert payload["contact_rows"] == []
     assert not (tmp_path / "bench_contact.csv").exists()
     rows = table(tmp_path / "bench.csv")
-    assert tuple(rows[0]) == tuple(COLUMNS)
+    assert tuple(rows[0]) == PARTS[0].columns
     assert len(rows) == len(payload["rows"])
 
 

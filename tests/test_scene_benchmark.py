@@ -15,7 +15,7 @@ from afm_jax.bench import timing as own_process
 from afm_jax.bench.problems import batch_run, bouncing_starts, single_contacts, spread_starts
 from afm_jax.bench.scenes import REFERENCE, aims, contact_errors
 from afm_jax.bench.scipy_contacts import diffrax_driven_contact, scipy_driven_contact
-from afm_jax.cli.bench import SCENE_COLUMNS
+from afm_jax.cli.bench import PARTS
 from afm_jax.cli.main import main
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.scenefile.presets import contact_scene
@@ -192,7 +192,7 @@ def test_command_writes_its_table_and_judges(tmp_path: Path, monkeypatch: pytest
     assert result.exit_code == 0, result.stderr
     assert "13.0%" in result.stdout
     assert "at most 1 wanted, 1.5 reached, not met" in result.stdout
-    assert (tmp_path / "bench_scenes.csv").read_text("utf-8").splitlines()[0] == ",".join(SCENE_COLUMNS)
+    assert (tmp_path / "bench_scenes.csv").read_text("utf-8").splitlines()[0] == ",".join(PARTS[2].columns)
     payload = json.loads((tmp_path / "bench.json").read_text("utf-8"))
     assert payload["scene_rows"] == ROWS
     assert payload["scene_reference_error_us"] == 1e-12

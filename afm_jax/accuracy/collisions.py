@@ -7,7 +7,6 @@ control, and in time, where gap and rate are the state, the phase is frozen, and
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import diffrax
@@ -17,10 +16,16 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from afm_jax.bench.collisions import COARSER_REFERENCE, REFERENCE, speeds_of
-from afm_jax.bench.integrators import title
-from afm_jax.bench.scipy_contacts import scipy_collision
-from afm_jax.bench.timing import compiled_for, progress, time_compiled
+from afm_jax.bench.collisions import (
+    COARSER_REFERENCE,
+    REFERENCE,
+    collide_contestant,
+    errors_against,
+    integrator_contestant,
+    speeds_of,
+)
+from afm_jax.bench.study import Contestant, Row, measured, named, timed
+from afm_jax.bench.timing import compiled_for
 from afm_jax.contact.bridge_leg import Passage, Way, nothing_spent, way_rates
 from afm_jax.contact.collide import Collision, batch_of, capture_speed, collision_of, three_parts
 from afm_jax.contact.contact import Contact
@@ -92,7 +97,6 @@ def pass_in_time(way: Way, solver: str, tolerance: Float[Array, ""]) -> Passage:
     return Passage(left, solution.ts[-1], way.total_aj - way.end_potential_aj - left)
 
 
-Row = dict[str, Any]
 Outputs = dict[str, Float[np.ndarray, " tips"]]
 
 _NEAR_CAPTURE = 1.001
@@ -133,65 +137,66 @@ def collide_accuracy(
     """
     bound = float(capture_speed(Contact.paper()))
     speeds = jnp.concatenate([jnp.asarray([_NEAR_CAPTURE * bound]), speeds_of(batch)])
-    reference = _outputs(_by_setting(REFERENCE), speeds)
-    rows = [
-        *_settings(accuracies, speeds, reference, repetitions),
-        *_fixed_steps(solvers["gap"], steps, speeds, reference, repetitions),
-    ]
-    for variable, names in solvers.items():
-        for solver in names:
-            rows += _adaptive((variable, solver), tolerances, speeds, reference, repetitions)
+    reference = _outputs(lambda contact, at: batch_of(contact, 1.0, at, REFERENCE), speeds)
     # one program tells how far the reference is converged and what SciPy should find
-    every_speed = jnp.concatenate([speeds, jnp.asarray(integrators[1])])
-    coarser = batch_of(Contact.paper(), 1.0, every_speed, COARSER_REFERENCE)
-    rebound, delay = (np.asarray(part, float) for part in (coarser.rebound_speed_nm_per_us, coarser.collision_delay_us))
-    tips = slice(1, speeds.size)
-    reference_error = max(
-        np.max(np.abs(rebound[tips] / reference["rebound"][1:] - 1.0)),
-        np.max(np.abs(delay[tips] - reference["delay"][1:])),
+    methods, tips = integrators
+    coarser = batch_of(Contact.paper(), 1.0, jnp.concatenate([speeds, jnp.asarray(tips)]), COARSER_REFERENCE)
+    of_batch, of_tips = (jax.tree.map(lambda part, rows=rows: part[rows], coarser) for rows in _parts(speeds.size))
+    exact = of_batch._replace(
+        rebound_speed_nm_per_us=reference["rebound"][1:], collision_delay_us=reference["delay"][1:]
     )
-    methods, tips_of = integrators
-    rows += _integrators(methods, tips_of, tolerances, (rebound[speeds.size :], delay[speeds.size :]))
-    return {"rows": rows, "reference_error": float(reference_error)}
 
-
-def _settings(accuracies: Sequence[float], speeds: Array, reference: Outputs, repetitions: int) -> Iterator[Row]:
-    for method, settings in SETTINGS.items():
-        for accuracy in (level for level in settings if level in accuracies):
+    def contestants() -> Iterator[Contestant]:
+        for method, settings in SETTINGS.items():
+            levels = [accuracy for accuracy in settings if accuracy in accuracies]
             # one setting shows what 32 bits leave; more would show the same
-            for precision in ("float64", "float32") if accuracy == 1e-6 else ("float64",):
-                name = {"method": f"collide, {method}", "variable": "gap", "setting": f"accuracy {accuracy:g}"}
-                row = _row(name, _by_setting(settings[accuracy]), speeds.astype(precision), reference, repetitions)
-                yield row | {"precision": precision, "accuracy": accuracy}
+            for precision, chosen in (("float64", levels), ("float32", [level for level in levels if level == 1e-6])):
+                yield _collide(method, chosen, speeds.astype(precision), reference, repetitions)
+        for solver in (name for name in solvers["gap"] if name != _IMPLICIT):
+            yield _fixed_steps(solver, steps, speeds, reference, repetitions)
+        for variable, names in solvers.items():
+            for solver in names:
+                yield from _adaptive((variable, solver), tolerances, speeds, reference, repetitions)
+        told = {"variable": "time", "precision": "float64", "slope_error": None}
+        for method in methods:
+            yield integrator_contestant(method, tolerances, tips, of_tips)._replace(column="tolerance", told=told)
+
+    rows = list(measured("accuracy: collisions", contestants(), unknown=("microseconds_per_impact", "rebound_error")))
+    for row in rows:
+        row.pop("median_microseconds_per_impact", None)
+    return {"rows": rows, "reference_error": max(errors_against(of_batch, exact))}
 
 
-def _fixed_steps(
-    solvers: Sequence[str], steps: Sequence[int], speeds: Array, reference: Outputs, repetitions: int
-) -> Iterator[Row]:
-    for solver in (name for name in solvers if name != _IMPLICIT):
-        for count in steps:
-            name = {"method": f"{solver}, fixed steps", "variable": "gap", "setting": f"{count} + {count} steps"}
-            setting = Setting("steps", count, count, 16, solver=solver)
-            yield _row(name, _by_setting(setting), speeds, reference, repetitions) | {"precision": "float64"}
+def _parts(size: int) -> tuple[slice, slice]:
+    """Return which of the speeds are the batch's, without the one near capture, and which are single tips'."""
+    return slice(1, size), slice(size, None)
 
 
-def _by_setting(setting: Setting) -> Callable[[Contact, Array], Collision]:
-    return lambda contact, speeds: batch_of(contact, 1.0, speeds, setting)
+def _collide(
+    method: str, accuracies: Sequence[float], speeds: Array, reference: Outputs, repetitions: int
+) -> Contestant:
+    contestant = collide_contestant(
+        method, accuracies, speeds[1:], repetitions, lambda run, _: _errors(_outputs(run, speeds), reference)
+    )
+    return contestant._replace(column="accuracy", told={"variable": "gap", "precision": str(speeds.dtype)})
 
 
-def _row(
-    name: Row, run: Callable[[Contact, Array], Collision], speeds: Array, reference: Outputs, repetitions: int
-) -> Row:
-    progress("accuracy: " + ", ".join(name.values()))
-    contact = jax.tree.map(lambda leaf: leaf.astype(speeds.dtype), Contact.paper())
-    timed = speeds[1:]
-    timing, _ = time_compiled(compiled_for(run, contact, timed), contact, timed, repetitions=repetitions)
-    return {
-        **name,
-        "microseconds_per_impact": 1e6 * timing.best_s / timed.size,
-        "compile_s": timing.compile_s,
-        **_errors(_outputs(run, speeds), reference),
-    }
+def _fixed_steps(solver: str, steps: Sequence[int], speeds: Array, reference: Outputs, repetitions: int) -> Contestant:
+    contact, timed_speeds = Contact.paper(), speeds[1:]
+
+    def measure(count: int) -> Row:
+        setting = Setting("steps", count, count, 16, solver=solver)
+
+        def run(contact: Contact, speeds: Array) -> Collision:
+            return batch_of(contact, 1.0, speeds, setting)
+
+        compiled = compiled_for(run, contact, timed_speeds)
+        row, _ = timed(compiled, contact, timed_speeds, repetitions=repetitions, events=timed_speeds.size)
+        return row | _errors(_outputs(run, speeds), reference)
+
+    settings = {f"{count} + {count} steps": count for count in steps}
+    told = {"variable": "gap", "precision": "float64"}
+    return Contestant(f"{solver}, fixed steps", settings, measure, told=told)
 
 
 def _outputs(run: Callable[[Contact, Array], Collision], speeds: Array) -> Outputs:
@@ -230,44 +235,35 @@ def _errors(found: Outputs, reference: Outputs) -> Row:
 
 def _adaptive(
     kind: tuple[str, str], tolerances: Sequence[float], speeds: Array, reference: Outputs, repetitions: int
-) -> list[Row]:
-    """Measure an adaptive solver; its tolerance is an argument of one program, so that none is compiled twice."""
+) -> Iterator[Contestant]:
+    """Give an adaptive solver; its tolerance is an argument of one program, so that none is compiled twice."""
     variable, solver = kind
     if solver == _IMPLICIT:
         # two hundred times slower here: a few tips and loose tolerances show it
         tolerances = [tolerance for tolerance in tolerances if tolerance >= 1e-5]
         speeds, reference = speeds[:_FEW], {key: part[:_FEW] for key, part in reference.items()}
     if not tolerances:
-        return []
+        return
     # of static forces alone: the viscosity, by which slopes are taken, has no part in it
-    place, run = find_junction(Contact.paper()), adaptive_collisions(variable, solver)
     contact = Contact.paper()
+    junction, run = find_junction(contact), adaptive_collisions(variable, solver)
     # one tip that a loose tolerance keeps near capture would hold up all lanes
-    timed = speeds[1:]
-    compiled = compiled_for(run, contact, place, timed, jnp.asarray(tolerances[0]))
+    timed_speeds = speeds[1:]
+    compiled = compiled_for(run, contact, junction, timed_speeds, jnp.asarray(tolerances[0]))
 
-    @partial(jax.jit, compiler_options=_UNHURRIED)
-    def slopes(junction, tolerance):
+    def outputs(junction: Junction, tolerance: Array) -> dict[str, Array]:
         return values_and_slopes(lambda contact, speeds: run(contact, junction, speeds, tolerance), speeds)
 
-    rows = []
-    for tolerance in tolerances:
-        progress(f"accuracy: {solver}, adaptive in the {variable}, {tolerance:g}")
-        timing, _ = time_compiled(compiled, contact, place, timed, jnp.asarray(tolerance), repetitions=repetitions)
-        found = {key: np.asarray(part) for key, part in slopes(place, jnp.asarray(tolerance)).items()}
-        rows.append(
-            {
-                "method": f"{solver}, adaptive",
-                "variable": variable,
-                "setting": f"tolerance {tolerance:g}",
-                "precision": "float64",
-                "tolerance": tolerance,
-                "microseconds_per_impact": 1e6 * timing.best_s / timed.size,
-                "compile_s": timing.compile_s,
-                **_errors(found, reference),
-            }
-        )
-    return rows
+    slopes = jax.jit(outputs, compiler_options=_UNHURRIED)
+
+    def measure(tolerance: float) -> Row:
+        arguments = (contact, junction, timed_speeds, jnp.asarray(tolerance))
+        row, _ = timed(compiled, *arguments, repetitions=repetitions, events=timed_speeds.size)
+        found = {key: np.asarray(part) for key, part in slopes(junction, jnp.asarray(tolerance)).items()}
+        return row | _errors(found, reference)
+
+    told = {"variable": variable, "precision": "float64"}
+    yield Contestant(f"{solver}, adaptive", named("tolerance", tolerances), measure, "tolerance", told)
 
 
 def adaptive_collisions(variable: str, solver: str) -> Callable[[Contact, Junction, Array, Array], Collision]:
@@ -281,39 +277,6 @@ def adaptive_collisions(variable: str, solver: str) -> Callable[[Contact, Juncti
         return collision_of(contact, junction, speed, mass, parts)
 
     return jax.vmap(one, in_axes=(None, None, 0, None))
-
-
-def _integrators(
-    methods: Sequence[str],
-    speeds: Sequence[float],
-    tolerances: Sequence[float],
-    expected: tuple[np.ndarray, np.ndarray],
-) -> list[Row]:
-    contact = Contact.paper()
-    expected_rebound, expected_delay = expected
-    rows = []
-    for method in methods:
-        for tolerance in tolerances:
-            progress(f"accuracy: {title(method)}, {tolerance:g}")
-            name = {"method": title(method), "variable": "time", "setting": f"tolerance {tolerance:g}"}
-            row = {**name, "precision": "float64", "tolerance": tolerance, "slope_error": None}
-            try:
-                runs = [scipy_collision(contact, speed, method=method, rtol=tolerance) for speed in speeds]
-            except (ValueError, ModuleNotFoundError) as failure:
-                rows.append(row | {"microseconds_per_impact": None, "rebound_error": None, "reason": str(failure)})
-                continue
-            rebound = np.array([run.rebound_speed_nm_per_us for run in runs])
-            delay = np.array([run.collision_delay_us for run in runs])
-            rows.append(
-                row
-                | {
-                    "microseconds_per_impact": 1e6 * float(np.mean([run.seconds for run in runs])),
-                    "rebound_error": float(np.max(np.abs(rebound / expected_rebound - 1.0))),
-                    "delay_error_us": float(np.max(np.abs(delay - expected_delay))),
-                    "evaluations_per_impact": float(np.mean([run.evaluations for run in runs])),
-                }
-            )
-    return rows
 
 
 def cheapest_collision(rows: Sequence[Row], accuracy: float) -> Row | None:

@@ -4,16 +4,20 @@ Runs in a process of its own on one core (`run_in_own_process`). Errors are achi
 impact from the computed state before each, near-grazing ones apart: there a time has fewer digits whatever computes it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
+from jaxtyping import Array
 from numpy.typing import NDArray
 
+from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.impacts import ImpactErrors, lane_states, sequence_errors, single_errors
-from afm_jax.bench.integrators import title
+from afm_jax.bench.integrators import EVENT, title
 from afm_jax.bench.problems import (
     BenchmarkScene,
     Starts,
@@ -24,15 +28,19 @@ from afm_jax.bench.problems import (
     settled_starts,
 )
 from afm_jax.bench.scipy_impacts import scipy_impacts
-from afm_jax.bench.timing import compiled_for, progress, time_compiled
+from afm_jax.bench.study import Contestant, Row, measured, named, timed
+from afm_jax.bench.timing import compiled_for
 from afm_jax.checks import float32_allowed
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
+from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import iterate_batch
 from afm_jax.outcomes import Outcome
 from afm_jax.verify.fifty_digits import reference_error
 
-Row = dict[str, Any]
-
+COST = ("microseconds_per_impact", "error_us")
+PRECISIONS = ("float64", "float32")
+_LONGEST_PERIODS = 10.0
+"""Drive periods that Diffrax follows a tip to its next impact."""
 _MISSED_BY_US = 1e-2
 """An impact found later than this was not the first; no contestant's error is as large."""
 
@@ -67,11 +75,14 @@ def map_accuracy(
     doubts = []
     for case in (regular_scene(), grazing_scene(), high_order_scene()):
         starts = slow_ones_first(case, settled_starts(case.scene, batch), impacts, lanes)
-        for precision in ("float64", "float32"):
-            progress(f"accuracy: {case.name} scene, {precision}")
-            rows += map_rows(case, starts, precision, root_tolerances_us, (impacts, lanes, repetitions))
-        progress(f"accuracy: {case.name} scene, SciPy")
-        rows += [integrator_row(case, starts, tolerance, impacts) for tolerance in scipy_tolerances]
+        sizes = (impacts, lanes, repetitions)
+        contestants = (
+            *(map_contestant(case, starts, precision, root_tolerances_us, sizes) for precision in PRECISIONS),
+            integrator_contestant(case, starts, "DOP853", scipy_tolerances, impacts),
+        )
+        for row in measured(f"accuracy: {case.name} scene", contestants, unknown=COST):
+            del row["setting"]
+            rows.append({"scene": case.name, **row})
         if not case.chaotic:
             doubts.append(doubt_of_reference(case, starts, impacts))
     return {
@@ -112,10 +123,10 @@ def _fastest(scene: str, rows: Sequence[Row], wanted_error_us: float) -> Row:
     return {"scene": scene, **{name: None if best is None else best[name] for name in names}}
 
 
-def map_rows(
+def map_contestant(
     case: BenchmarkScene, starts: Starts, precision: str, tolerances: Sequence[float], sizes: tuple[int, int, int]
-) -> list[Row]:
-    """Measure the map at every root tolerance; sizes: impacts, lanes and repetitions as `map_accuracy`'s."""
+) -> Contestant:
+    """Return the impact map with root tolerances as settings; sizes: impacts, lanes and repetitions."""
     impacts, lanes, repetitions = sizes
     scene = cast(case.scene, precision)
     starts = jax.tree.map(lambda part: part.astype(precision), starts)
@@ -126,25 +137,22 @@ def map_rows(
 
     with float32_allowed():
         compiled = compiled_for(run, scene, starts, dtype(tolerances[0]))
-    rows = []
-    for tolerance in tolerances:
-        timing, result = time_compiled(compiled, scene, starts, dtype(tolerance), repetitions=repetitions)
+    tips = starts.time_us.shape[0]
+
+    def measure(tolerance: float) -> Row:
+        row, result = timed(compiled, scene, starts, dtype(tolerance), repetitions=repetitions, events=impacts * tips)
+        del row["median_microseconds_per_impact"]
         errors = single_errors(case, starts, result, lanes=lanes)
-        states = [lane_states(starts, result, lane) for lane in range(min(lanes, starts.time_us.shape[0]))]
-        whole = None if case.chaotic else float(np.max([sequence_errors(case, lane) for lane in states]))
-        rows.append(
-            {
-                "scene": case.name,
-                "method": f"next_impact {precision}",
-                "tolerance": tolerance,
-                "microseconds_per_impact": 1e6 * timing.best_s / (impacts * starts.time_us.shape[0]),
-                "compile_s": timing.compile_s,
-                **_error_columns(errors),
-                "lost_impacts": impacts * len(states) - len(errors.ordinary) - len(errors.near_grazing),
-                "sequence_error_us": whole,
-            }
-        )
-    return rows
+        states = [lane_states(starts, result, lane) for lane in range(min(lanes, tips))]
+        return row | {
+            **_error_columns(errors),
+            "lost_impacts": impacts * len(states) - len(errors.ordinary) - len(errors.near_grazing),
+            "sequence_error_us": None
+            if case.chaotic
+            else float(np.max([sequence_errors(case, lane) for lane in states])),
+        }
+
+    return Contestant(f"next_impact {precision}", named("root tolerance", tolerances, " us"), measure, "tolerance")
 
 
 def _error_columns(errors: ImpactErrors) -> Row:
@@ -158,23 +166,86 @@ def _error_columns(errors: ImpactErrors) -> Row:
     }
 
 
-def integrator_row(case: BenchmarkScene, starts: Starts, tolerance: float, impacts: int, method: str = "DOP853") -> Row:
-    """Measure a general-purpose integrator on the first tip: columns as `map_accuracy`'s."""
-    row: Row = {"scene": case.name, "method": title(method), "tolerance": tolerance}
+def integrator_contestant(
+    case: BenchmarkScene, starts: Starts, method: str, tolerances: Sequence[float], impacts: int
+) -> Contestant:
+    """Return a general-purpose integrator that follows the first tip, with its tolerances as settings."""
     start = (float(starts.time_us[0]), float(starts.velocity_nm_per_us[0]))
-    try:
+
+    def measure(tolerance: float) -> Row:
         run = scipy_impacts(case.scene, start, impacts, tolerance=tolerance, method=method)
-    except (ValueError, ModuleNotFoundError) as failure:
-        return row | {"microseconds_per_impact": None, "error_us": None, "reason": str(failure)}
-    single = BenchmarkScene(case.name, case.scene, chaotic=True)
-    errors = sequence_errors(single, run.states)
-    return row | {
-        "microseconds_per_impact": 1e6 * run.seconds / impacts,
-        **_error_columns(ImpactErrors(errors, errors[:0])),
-        "sequence_error_us": None if case.chaotic else float(sequence_errors(case, run.states)[0]),
-        "evaluations_per_impact": run.evaluations / impacts,
-        "missed_impacts": _missed(case, run.states),
-    }
+        errors = sequence_errors(case._replace(chaotic=True), run.states)
+        return {
+            "microseconds_per_impact": 1e6 * run.seconds / impacts,
+            **_error_columns(ImpactErrors(errors, errors[:0])),
+            "sequence_error_us": None if case.chaotic else float(sequence_errors(case, run.states)[0]),
+            "evaluations_per_impact": run.evaluations / impacts,
+            "missed_impacts": _missed(case, run.states),
+        }
+
+    return Contestant(title(method), named("tolerance", tolerances), measure, "tolerance")
+
+
+def event_contestant(
+    case: BenchmarkScene, starts: Starts, tolerances: Sequence[float], impacts: int, repetitions: int
+) -> Contestant:
+    """Return Diffrax's own events, begun again after each impact: what a user of Diffrax would write."""
+    next_one = diffrax_impact(case.scene)
+
+    def run(time: Array, velocity: Array, tolerance: Array) -> Array:
+        def step(state: Array, _: None) -> tuple[Array, Array]:
+            after = next_one(state, tolerance)
+            return after, after
+
+        return jax.lax.scan(step, jnp.stack([time, velocity]), None, length=impacts)[1]
+
+    first = (starts.time_us[0], starts.velocity_nm_per_us[0])
+    compiled = compiled_for(run, *first, jnp.asarray(tolerances[0]))
+
+    def measure(tolerance: float) -> Row:
+        row, after = timed(compiled, *first, jnp.asarray(tolerance), repetitions=repetitions, events=impacts)
+        states = np.vstack([[float(part) for part in first], np.asarray(after)])
+        errors = sequence_errors(case._replace(chaotic=True), states)
+        return row | {"error_us": float(np.max(errors))}
+
+    return Contestant(EVENT, named("tolerance", tolerances), measure, "tolerance")
+
+
+def diffrax_impact(scene: Scene) -> Callable[[Array, Array], Array]:
+    """Return the function from time and velocity after an impact, and a tolerance, to those after the next."""
+    law, cantilever, platform = impact_law_of(scene), scene.cantilever, scene.platform
+    period = platform.period_us
+
+    def motion(time: Any, state: Any, args: Any) -> Any:
+        del time, args
+        return state[1], cantilever.acceleration(*state)
+
+    def gap(t: Any, y: Any, args: Any, **extra: Any) -> Any:
+        del args, extra
+        return y[0] - platform.position(t)
+
+    def next_impact(start: Array, tolerance: Array) -> Array:
+        time, velocity = start
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(motion),
+            diffrax.Dopri8(),
+            time,
+            time + _LONGEST_PERIODS * period,
+            None,
+            (platform.position(time), velocity),
+            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, dtmax=period / 3.0),
+            # downwards alone: it leaves with a gap of 0
+            event=diffrax.Event(gap, optimistix.Newton(1e-14, 1e-14), direction=False),
+            adjoint=diffrax.ForwardMode(),
+            throw=False,
+        )
+        assert solution.ts is not None  # noqa: S101 (for the type checker: the end is saved)
+        assert solution.ys is not None  # noqa: S101
+        arrival, before = solution.ts[-1], solution.ys[1][-1]
+        speed = platform.velocity(arrival)
+        return jnp.stack([arrival, speed + law.rebound_speed(speed - before)])
+
+    return next_impact
 
 
 def _missed(case: BenchmarkScene, states: NDArray[np.float64]) -> int:

@@ -8,54 +8,51 @@ this package's?), reason (where there is no error); and `references`: of each pr
 measured against, and how well that is known.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jaxtyping import Array
 from scipy.optimize import root
 
 from afm_jax.accuracy.collisions import adaptive_collisions, collide_accuracy, values_and_slopes
-from afm_jax.accuracy.impacts import doubt_of_reference, integrator_row, map_rows, slow_ones_first
+from afm_jax.accuracy.impacts import (
+    COST,
+    PRECISIONS,
+    diffrax_impact,
+    doubt_of_reference,
+    event_contestant,
+    integrator_contestant,
+    map_contestant,
+    slow_ones_first,
+)
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.collisions import COARSER_REFERENCE, REFERENCE, speeds_of
-from afm_jax.bench.impacts import sequence_errors
 from afm_jax.bench.integrators import EVENT, title
-from afm_jax.bench.problems import (
-    BenchmarkScene,
-    Starts,
-    batch_run,
-    bouncing_starts,
-    regular_scene,
-    settled_starts,
-    single_contacts,
-)
+from afm_jax.bench.problems import batch_run, bouncing_starts, regular_scene, settled_starts, single_contacts
 from afm_jax.bench.scenes import DRIVE_AMPLITUDE_NM, HIGH_ORDER, contact_errors
-from afm_jax.bench.scipy_contacts import scipy_collision, scipy_rows
+from afm_jax.bench.scipy_contacts import contact_contestants, scipy_collision
 from afm_jax.bench.scipy_impacts import scipy_impacts
-from afm_jax.bench.timing import compiled_for, progress, time_compiled
+from afm_jax.bench.study import RIVALS, Contestant, Row, measured, named, timed
+from afm_jax.bench.timing import compiled_for, progress
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.parameters import PAPER
 from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting
-from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.verify.fifty_digits import exact_orbit_state, mpmath_or_reason
 
-Row = dict[str, Any]
 Study = dict[str, Any]
-_LONGEST_PERIODS = 10.0
 _IN_TIME = (DrivenSetting(None, 12.0, 400), DrivenSetting(None, 9.0, 300))
 """References of driven contacts, all of the way in fine steps in time: the better one first."""
 _SCIPYS_BEST = 1e-13
 _MOST_NEWTON_STEPS = 12
+_SLOPES = ("by_speed", "by_viscosity")
 
 
 def overview_row(problem: str, method: str, setting: str, microseconds: float | None, error: float | None) -> Row:
@@ -67,13 +64,22 @@ def overview_row(problem: str, method: str, setting: str, microseconds: float | 
         "setting": setting,
         "microseconds": microseconds,
         "error": float(error) if known and error is not None else None,
-        "own": not method.startswith(("SciPy", "SUNDIALS", "Diffrax", "NumPy")),
+        "own": not method.startswith(RIVALS),
     }
 
 
-def _study(problem: str, rows: Sequence[Row], error_of: str, reference: str, reference_error: float) -> Study:
+def _study(
+    problem: str, rows: Iterable[Row], cost: tuple[str, str], error_of: str, reference: str, reference_error: float
+) -> Study:
+    """Return rows of the overview, from measured rows whose columns of time and error are named, and the reference."""
+    time, error = cost
+    overview = [
+        overview_row(problem, row["method"], row["setting"], row.get(time), row.get(error))
+        | {name: row[name] for name in ("reason",) if name in row}
+        for row in rows
+    ]
     told = {"error_of": error_of, "reference": reference, "reference_error": float(reference_error)}
-    return {"rows": list(rows), "references": {problem: told}}
+    return {"rows": overview, "references": {problem: told}}
 
 
 def impacts(
@@ -88,86 +94,17 @@ def impacts(
     """Measure the time of one impact of the regular scene (n = 1, beta = 2 nm, sigma = -1 nm, r = 0.5)."""
     case = regular_scene()
     starts = slow_ones_first(case, settled_starts(case.scene, batch), impacts, 1)
-    rows = []
-    for precision in ("float64", "float32"):
-        progress(f"accuracy: impacts, {precision}")
-        for row in map_rows(case, starts, precision, root_tolerances_us, (impacts, 1, repetitions)):
-            setting = f"root tolerance {row['tolerance']:g} us"
-            rows.append(
-                overview_row("impacts", row["method"], setting, row["microseconds_per_impact"], row["error_us"])
-            )
-    for method, tolerance in product(integrators, tolerances):
-        progress(f"accuracy: impacts, {title(method)}, {tolerance:g}")
-        row = integrator_row(case, starts, tolerance, impacts, method)
-        cells = (title(method), f"tolerance {tolerance:g}", row["microseconds_per_impact"], row["error_us"])
-        rows.append(overview_row("impacts", *cells) | _reason(row))
-    rows += _diffrax_impacts(case, starts, tolerances, impacts, repetitions)
-    return _study("impacts", rows, "impact time (us)", "50 digits", doubt_of_reference(case, starts, impacts))
 
+    def contestants() -> Iterator[Contestant]:
+        for precision in PRECISIONS:
+            yield map_contestant(case, starts, precision, root_tolerances_us, (impacts, 1, repetitions))
+        for method in integrators:
+            yield integrator_contestant(case, starts, method, tolerances, impacts)
+        yield event_contestant(case, starts, tolerances, impacts, repetitions)
 
-def _reason(row: Mapping[str, Any]) -> Row:
-    return {"reason": row["reason"]} if "reason" in row else {}
-
-
-def _diffrax_impacts(
-    case: BenchmarkScene, starts: Starts, tolerances: Sequence[float], impacts: int, repetitions: int
-) -> Iterator[Row]:
-    """Measure Diffrax's own events, restarted after each impact: what a user of Diffrax would write."""
-    one = _diffrax_impact(case.scene)
-
-    def run(time: Array, velocity: Array, tolerance: Array) -> Array:
-        def step(state: Array, _: None) -> tuple[Array, Array]:
-            after = one(state, tolerance)
-            return after, after
-
-        return jax.lax.scan(step, jnp.stack([time, velocity]), None, length=impacts)[1]
-
-    first = (starts.time_us[0], starts.velocity_nm_per_us[0])
-    compiled = compiled_for(run, *first, jnp.asarray(tolerances[0]))
-    single = BenchmarkScene(case.name, case.scene, chaotic=True)
-    for tolerance in tolerances:
-        progress(f"accuracy: impacts, {EVENT}, {tolerance:g}")
-        timing, found = time_compiled(compiled, *first, jnp.asarray(tolerance), repetitions=repetitions)
-        states = np.vstack([[float(part) for part in first], np.asarray(found)])
-        error = float(np.max(sequence_errors(single, states)))
-        yield overview_row("impacts", EVENT, f"tolerance {tolerance:g}", 1e6 * timing.best_s / impacts, error)
-
-
-def _diffrax_impact(scene: Scene) -> Callable[[Array, Array], Array]:
-    """Return the function from time and velocity after an impact, and a tolerance, to those after the next."""
-    law, cantilever, platform = impact_law_of(scene), scene.cantilever, scene.platform
-    period = platform.period_us
-
-    def motion(time: Any, state: Any, args: Any) -> Any:
-        del time, args
-        return state[1], cantilever.acceleration(*state)
-
-    def gap(t: Any, y: Any, args: Any, **extra: Any) -> Any:
-        del args, extra
-        return y[0] - platform.position(t)
-
-    def one(start: Array, tolerance: Array) -> Array:
-        time, velocity = start
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(motion),
-            diffrax.Dopri8(),
-            time,
-            time + _LONGEST_PERIODS * period,
-            None,
-            (platform.position(time), velocity),
-            stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance, dtmax=period / 3.0),
-            # downwards alone: it leaves with a gap of 0
-            event=diffrax.Event(gap, optimistix.Newton(1e-14, 1e-14), direction=False),
-            adjoint=diffrax.ForwardMode(),
-            throw=False,
-        )
-        assert solution.ts is not None  # noqa: S101 (for the type checker: the end is saved)
-        assert solution.ys is not None  # noqa: S101
-        arrival, before = solution.ts[-1], solution.ys[1][-1]
-        speed = platform.velocity(arrival)
-        return jnp.stack([arrival, speed + law.rebound_speed(speed - before)])
-
-    return one
+    rows = measured("accuracy: impacts", contestants(), unknown=COST)
+    doubt = doubt_of_reference(case, starts, impacts)
+    return _study("impacts", rows, COST, "impact time (us)", "50 digits", doubt)
 
 
 def collisions(
@@ -189,19 +126,15 @@ def collisions(
         repetitions=repetitions,
         integrators=(integrators, speeds),
     )
-    rows = []
     for row in found["rows"]:
-        method = EVENT if row["method"] == "Dopri8, adaptive" else str(row["method"])
+        if row["method"] == "Dopri8, adaptive":
+            row["method"] = EVENT
         if row["precision"] != "float64":
-            method = f"{method}, {row['precision']}"
-        cells = (row["setting"], row["microseconds_per_impact"], row["rebound_error"])
-        rows.append(overview_row("collisions", method, *cells) | _reason(row))
-    study = _study("collisions", rows, "rebound speed, relative", "quadrature", found["reference_error"])
+            row["method"] += f", {row['precision']}"
+    cost = ("microseconds_per_impact", "rebound_error")
+    study = _study("collisions", found["rows"], cost, "rebound speed, relative", "quadrature", found["reference_error"])
     slopes = _gradients(accuracies, tolerances, integrators, speeds_of(batch), repetitions)
     return {"rows": study["rows"] + slopes["rows"], "references": study["references"] | slopes["references"]}
-
-
-_SLOPES = ("by_speed", "by_viscosity")
 
 
 def _gradients(
@@ -216,17 +149,39 @@ def _gradients(
         jax.jit(lambda at, one=one: values_and_slopes(lambda c, s: batch_of(c, 1.0, s, one), at))(speeds)
         for one in (REFERENCE, COARSER_REFERENCE)
     )
-    rows = []
-    for method, settings in SETTINGS.items():
-        for accuracy in (level for level in settings if level in accuracies):
-            progress(f"accuracy: gradients, collide, {method}, {accuracy:g}")
 
-            def run(at: Array, setting: Any = settings[accuracy]) -> dict[str, Array]:
-                return values_and_slopes(lambda contact, some: batch_of(contact, 1.0, some, setting), at)
+    def contestants() -> Iterator[Contestant]:
+        for method, settings in SETTINGS.items():
+            levels = [accuracy for accuracy in settings if accuracy in accuracies]
+            yield _autodiff(method, levels, speeds, exact, repetitions)
+        yield _autodiff_of_events(tolerances, speeds, exact, repetitions)
+        for method in integrators:
+            yield _central_differences(method, tolerances, speeds, exact)
 
-            timing, slopes = time_compiled(compiled_for(run, speeds), speeds, repetitions=repetitions)
-            cells = (f"accuracy {accuracy:g}", 1e6 * timing.best_s / speeds.size, _slope_error(slopes, exact))
-            rows.append(overview_row("gradients", f"collide, {method}, autodiff", *cells))
+    cost = ("microseconds_per_impact", "slope_error")
+    rows = measured("accuracy: gradients", contestants(), unknown=cost)
+    doubt, reference = _slope_error(coarser, exact), "derivatives of the quadrature"
+    return _study("gradients", rows, cost, "slopes of the rebound speed, relative", reference, doubt)
+
+
+def _autodiff(
+    method: str, accuracies: Sequence[float], speeds: Array, exact: Mapping[str, Any], repetitions: int
+) -> Contestant:
+    def measure(accuracy: float) -> Row:
+        setting = SETTINGS[method][accuracy]
+
+        def run(at: Array) -> dict[str, Array]:
+            return values_and_slopes(lambda contact, some: batch_of(contact, 1.0, some, setting), at)
+
+        row, slopes = timed(compiled_for(run, speeds), speeds, repetitions=repetitions, events=speeds.size)
+        return row | {"slope_error": _slope_error(slopes, exact)}
+
+    return Contestant(f"collide, {method}, autodiff", named("accuracy", accuracies), measure)
+
+
+def _autodiff_of_events(
+    tolerances: Sequence[float], speeds: Array, exact: Mapping[str, Any], repetitions: int
+) -> Contestant:
     contact, run_in_time = Contact.paper(), adaptive_collisions("time", "Dopri8")
     junction = find_junction(contact)
 
@@ -234,48 +189,47 @@ def _gradients(
         return values_and_slopes(lambda contact, some: run_in_time(contact, junction, some, tolerance), at)
 
     compiled = compiled_for(by_events, junction, speeds, jnp.asarray(tolerances[0]))
-    for tolerance in tolerances:
-        progress(f"accuracy: gradients, {EVENT}, {tolerance:g}")
-        timing, slopes = time_compiled(compiled, junction, speeds, jnp.asarray(tolerance), repetitions=repetitions)
-        cells = (f"tolerance {tolerance:g}", 1e6 * timing.best_s / speeds.size, _slope_error(slopes, exact))
-        rows.append(overview_row("gradients", f"{EVENT}, autodiff", *cells))
+
+    def measure(tolerance: float) -> Row:
+        arguments = (junction, speeds, jnp.asarray(tolerance))
+        row, slopes = timed(compiled, *arguments, repetitions=repetitions, events=speeds.size)
+        return row | {"slope_error": _slope_error(slopes, exact)}
+
+    return Contestant(f"{EVENT}, autodiff", named("tolerance", tolerances), measure)
+
+
+def _central_differences(
+    method: str, tolerances: Sequence[float], speeds: Array, exact: Mapping[str, Any]
+) -> Contestant:
+    """Return an integrator whose slopes are differences; the step balances its own error with the tolerance's."""
     places = np.unique(np.linspace(0, speeds.size - 1, 3).astype(int))
     expected = {name: np.asarray(exact[name])[places] for name in _SLOPES}
-    for method, tolerance in product(integrators, tolerances):
-        progress(f"accuracy: gradients, {title(method)}, {tolerance:g}")
-        name = f"{title(method)}, central differences"
-        try:
-            runs = [_differences(float(speeds[place]), method, tolerance) for place in places]
-        except (ValueError, ModuleNotFoundError) as failure:
-            rows.append(
-                overview_row("gradients", name, f"tolerance {tolerance:g}", None, None) | {"reason": str(failure)}
-            )
-            continue
+
+    def slopes_at(speed: float, tolerance: float) -> dict[str, float]:
+        step = tolerance ** (1.0 / 3.0)
+
+        def at(factors: tuple[float, float]) -> Any:
+            contact = Contact.paper(viscosity_pa_s=PAPER["viscosity_pa_s"] * factors[1])
+            return scipy_collision(contact, speed * factors[0], method=method, rtol=tolerance)
+
+        slopes = {"seconds": 0.0}
+        for place, name in enumerate(_SLOPES):
+            up, down = (at((1.0 + sign, 1.0) if place == 0 else (1.0, 1.0 + sign)) for sign in (step, -step))
+            slopes[name] = (up.rebound_speed_nm_per_us - down.rebound_speed_nm_per_us) / (2.0 * step)
+            slopes["seconds"] += up.seconds + down.seconds
+        return slopes
+
+    def measure(tolerance: float) -> Row:
+        runs = [slopes_at(float(speeds[place]), tolerance) for place in places]
         slopes = {key: np.array([run[key] for run in runs]) for key in _SLOPES}
-        cells = (1e6 * float(np.mean([run["seconds"] for run in runs])), _slope_error(slopes, expected))
-        rows.append(overview_row("gradients", name, f"tolerance {tolerance:g}", *cells))
-    own = _slope_error(coarser, exact)
-    return _study("gradients", rows, "slopes of the rebound speed, relative", "derivatives of the quadrature", own)
+        seconds = float(np.mean([run["seconds"] for run in runs]))
+        return {"microseconds_per_impact": 1e6 * seconds, "slope_error": _slope_error(slopes, expected)}
+
+    return Contestant(f"{title(method)}, central differences", named("tolerance", tolerances), measure)
 
 
 def _slope_error(found: Mapping[str, Any], exact: Mapping[str, Any]) -> float:
     return max(float(np.max(np.abs(np.asarray(found[name]) / np.asarray(exact[name]) - 1.0))) for name in _SLOPES)
-
-
-def _differences(speed: float, method: str, tolerance: float) -> dict[str, float]:
-    """Return slopes by central differences; the step balances its own error with the tolerance's."""
-    step = tolerance ** (1.0 / 3.0)
-
-    def at(factors: tuple[float, float]) -> Any:
-        contact = Contact.paper(viscosity_pa_s=PAPER["viscosity_pa_s"] * factors[1])
-        return scipy_collision(contact, speed * factors[0], method=method, rtol=tolerance)
-
-    found = {"seconds": 0.0}
-    for place, name in enumerate(_SLOPES):
-        up, down = (at((1.0 + sign, 1.0) if place == 0 else (1.0, 1.0 + sign)) for sign in (step, -step))
-        found[name] = (up.rebound_speed_nm_per_us - down.rebound_speed_nm_per_us) / (2.0 * step)
-        found["seconds"] += up.seconds + down.seconds
-    return found
 
 
 def driven_contacts(
@@ -296,27 +250,25 @@ def driven_contacts(
     single = single_contacts(scene, finest(scene, starts, starts.time_us + duration), batch)
     arguments = (scene, single.starts, single.until_us)
     reference, coarser = (jax.jit(batch_run(setting, 2))(*arguments) for setting in _IN_TIME)
-    rows = []
-    for accuracy in (level for level in DRIVEN_SETTINGS if level in accuracies):
-        progress(f"accuracy: driven contacts, {accuracy:g}")
+
+    def measure(accuracy: float) -> Row:
         compiled = compiled_for(batch_run(DRIVEN_SETTINGS[accuracy], 2), *arguments)
-        timing, found = time_compiled(compiled, *arguments, repetitions=repetitions)
-        cells = (
-            f"accuracy {accuracy:g}",
-            1e6 * timing.best_s / batch,
-            _worst(contact_errors(found, reference, single)),
-        )
-        rows.append(overview_row("driven contacts", "simulate", *cells))
-    rivals = (*integrators, EVENT)
-    for row in scipy_rows("n = 5.277", scene, reference, single, contacts, methods=rivals, tolerances=tolerances):
-        method, setting = row["what"].split(" with events, the contact alone, rtol ")
-        cells = (f"tolerance {setting}", row.get("microseconds_per_contact"), _worst(row))
-        rows.append(overview_row("driven contacts", method, *cells) | _reason(row))
+        row, found = timed(compiled, *arguments, repetitions=repetitions, events=batch)
+        return {"microseconds_per_contact": row["microseconds_per_impact"], **contact_errors(found, reference, single)}
+
+    levels = [level for level in DRIVEN_SETTINGS if level in accuracies]
+    rivals = contact_contestants(
+        scene, reference, single, contacts, methods=(*integrators, EVENT), tolerances=tolerances
+    )
+    cost = ("microseconds_per_contact", "error")
+    contestants = [Contestant("simulate", named("accuracy", levels), measure), *rivals]
+    rows = [row | {"error": _worst(row)} for row in measured("accuracy: driven contacts", contestants, unknown=cost)]
     # how far from coarser steps, and from another program: the larger one is said
-    (beside,) = scipy_rows("n = 5.277", scene, reference, single, contacts, tolerances=(_SCIPYS_BEST,))
-    doubt = max(_worst(contact_errors(coarser, reference, single)) or 0.0, _worst(beside) or 0.0)
+    best = contact_contestants(scene, reference, single, contacts, tolerances=(_SCIPYS_BEST,))
+    beside = (_worst(row) for row in measured("accuracy: driven contacts", best))
+    doubt = max(error or 0.0 for error in (_worst(contact_errors(coarser, reference, single)), *beside))
     told = f"fine steps in time, beside SciPy DOP853 at {_SCIPYS_BEST:g}"
-    return _study("driven contacts", rows, "rebound speed, relative", told, doubt)
+    return _study("driven contacts", rows, cost, "rebound speed, relative", told, doubt)
 
 
 def _worst(errors: Mapping[str, Any]) -> float | None:
@@ -335,42 +287,45 @@ def orbits(*, tolerances: Sequence[float], integrators: Sequence[str], batch: in
     chosen = int(np.argmax(np.asarray(found.stable & found.admissible & found.exists)))
     place = (float(found.phase_rad[chosen]), float(found.velocity_after_nm_per_us[chosen]))
     exact = exact_orbit_state(mp, scene, 1, place)
-    rows = []
-    for count in (1, batch):
-        progress(f"accuracy: orbits, {count} at once")
-        scenes = jax.tree.map(lambda leaf, count=count: jnp.broadcast_to(leaf, (count, *leaf.shape)), scene)
+
+    def measure(count: int) -> Row:
+        scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), scene)
         compiled = compiled_for(jax.vmap(lambda one: single_impact_orbits(one, 1)), scenes)
-        timing, found = time_compiled(compiled, scenes, repetitions=repetitions)
-        error = abs(float(mp.mpf(float(found.velocity_after_nm_per_us[0, chosen])) / exact[1] - 1))
-        rows.append(
-            overview_row("orbits", "single_impact_orbits", f"{count} at once", 1e6 * timing.best_s / count, error)
-        )
-    for method, tolerance in product(integrators, tolerances):
-        progress(f"accuracy: orbits, {title(method)}, {tolerance:g}")
-        rows.append(_shooting(scene, place, (method, tolerance), float(exact[1])))
-    rows += _diffrax_shooting(scene, place, tolerances, float(exact[1]), repetitions)
-    return _study("orbits", rows, "velocity after the impact, relative", "50 digits", 1e-40)
+        row, closed = timed(compiled, scenes, repetitions=repetitions, events=count)
+        error = abs(float(mp.mpf(float(closed.velocity_after_nm_per_us[0, chosen])) / exact[1] - 1))
+        return row | {"error": error}
+
+    def contestants() -> Iterator[Contestant]:
+        yield Contestant("single_impact_orbits", {f"{count} at once": count for count in (1, batch)}, measure)
+        for method in integrators:
+            yield _shooting(scene, place, method, tolerances, float(exact[1]))
+        yield _diffrax_shooting(scene, place, tolerances, float(exact[1]), repetitions)
+
+    cost = ("microseconds_per_impact", "error")
+    rows = measured("accuracy: orbits", contestants(), unknown=cost)
+    return _study("orbits", rows, cost, "velocity after the impact, relative", "50 digits", 1e-40)
 
 
-def _shooting(scene: Scene, place: tuple[float, float], how: tuple[str, float], exact: float) -> Row:
-    """Close the orbit by SciPy's root of one flight and impact, from a start that is a few percent off."""
-    method, tolerance = how
-    period = float(scene.platform.period_us)
-    spent = 0.0
-
-    def leap(state: np.ndarray) -> np.ndarray:
-        nonlocal spent
-        run = scipy_impacts(scene, (float(state[0]), float(state[1])), 1, tolerance=tolerance, method=method)
-        spent += run.seconds
-        return run.states[1] - state - np.array([period, 0.0])
-
+def _shooting(
+    scene: Scene, place: tuple[float, float], method: str, tolerances: Sequence[float], exact: float
+) -> Contestant:
+    """Return SciPy's root of one flight and impact, from a start that is a few percent off."""
     start = _beside(scene, place)
-    cells = ("orbits", f"{title(method)}, shooting", f"tolerance {tolerance:g}")
-    try:
-        found = root(leap, start, tol=max(tolerance, 1e-14))
-    except (ValueError, ModuleNotFoundError) as failure:
-        return overview_row(*cells, None, None) | {"reason": str(failure)}
-    return overview_row(*cells, 1e6 * spent, abs(found.x[1] / exact - 1.0))
+    step = np.array([float(scene.platform.period_us), 0.0])
+
+    def measure(tolerance: float) -> Row:
+        spent = 0.0
+
+        def leap(state: np.ndarray) -> np.ndarray:
+            nonlocal spent
+            run = scipy_impacts(scene, (float(state[0]), float(state[1])), 1, tolerance=tolerance, method=method)
+            spent += run.seconds
+            return run.states[1] - state - step
+
+        closed = root(leap, start, tol=max(tolerance, 1e-14))
+        return {"microseconds_per_impact": 1e6 * spent, "error": abs(closed.x[1] / exact - 1.0)}
+
+    return Contestant(f"{title(method)}, shooting", named("tolerance", tolerances), measure)
 
 
 def _beside(scene: Scene, place: tuple[float, float]) -> np.ndarray:
@@ -381,13 +336,13 @@ def _beside(scene: Scene, place: tuple[float, float]) -> np.ndarray:
 
 def _diffrax_shooting(
     scene: Scene, place: tuple[float, float], tolerances: Sequence[float], exact: float, repetitions: int
-) -> Iterator[Row]:
-    """Close the orbit by Newton's method on Diffrax's flight with its event, derivatives by autodiff."""
-    one, period = _diffrax_impact(scene), jnp.stack([scene.platform.period_us, jnp.zeros(())])
+) -> Contestant:
+    """Return Newton's method on Diffrax's flight with its event, derivatives by autodiff."""
+    leap, period = diffrax_impact(scene), jnp.stack([scene.platform.period_us, jnp.zeros(())])
 
     def closed(start: Array, tolerance: Array) -> Array:
         def missed(state: Array) -> tuple[Array, Array]:
-            gap = one(state, tolerance) - state - period
+            gap = leap(state, tolerance) - state - period
             return gap, gap
 
         def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -403,11 +358,12 @@ def _diffrax_shooting(
 
     start = jnp.asarray(_beside(scene, place))
     compiled = compiled_for(closed, start, jnp.asarray(tolerances[0]))
-    for tolerance in tolerances:
-        progress(f"accuracy: orbits, {EVENT}, {tolerance:g}")
-        timing, found = time_compiled(compiled, start, jnp.asarray(tolerance), repetitions=repetitions)
-        error = abs(float(found[1]) / exact - 1.0)
-        yield overview_row("orbits", f"{EVENT}, shooting", f"tolerance {tolerance:g}", 1e6 * timing.best_s, error)
+
+    def measure(tolerance: float) -> Row:
+        row, found = timed(compiled, start, jnp.asarray(tolerance), repetitions=repetitions, events=1)
+        return row | {"error": abs(float(found[1]) / exact - 1.0)}
+
+    return Contestant(f"{EVENT}, shooting", named("tolerance", tolerances), measure)
 
 
 def cheapest(rows: Sequence[Row], wanted: Sequence[float]) -> list[Row]:

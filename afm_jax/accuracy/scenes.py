@@ -22,6 +22,7 @@ from jaxtyping import Array
 from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.bench.problems import ROUNDS
+from afm_jax.bench.study import Row, named
 from afm_jax.bench.timing import Compiled, compiled_for, progress, time_compiled
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting
@@ -39,8 +40,6 @@ from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.presets import PRESETS, preset
 from afm_jax.scenefile.scenefile import load_scene
 
-Row = dict[str, Any]
-
 _TRIALS = 240
 _BEYOND_US = 1e-3
 
@@ -53,6 +52,7 @@ class FollowedCourse(NamedTuple):
     peak_nm: float | None
     """Largest height between the first contact and the last; None with a single contact."""
     seconds: float
+    """For each contact."""
     compile_s: float
 
 
@@ -86,14 +86,11 @@ def settings_of(
         quick: levels of `quick_setting`.
         careful: steps per unit of the local pace, every contact followed in time.
     """
-    named = {f"level {level}": ("quick", quick_setting(level)) for level in quick}
-    named |= {
-        f"accuracy {accuracy:g}": ("quick", setting)
-        for accuracy, setting in DRIVEN_SETTINGS.items()
-        if accuracy in accuracies
-    }
-    careful_ones = {f"fineness {fine:g}": ("careful", DrivenSetting(None, fine, _TRIALS)) for fine in careful}
-    return named | careful_ones
+    levels = {f"level {level}": ("quick", quick_setting(level)) for level in quick}
+    chosen = {accuracy: setting for accuracy, setting in DRIVEN_SETTINGS.items() if accuracy in accuracies}
+    usual = {f"accuracy {accuracy:g}": ("quick", setting) for accuracy, setting in chosen.items()}
+    in_time = {f"fineness {fine:g}": ("careful", DrivenSetting(None, fine, _TRIALS)) for fine in careful}
+    return levels | usual | in_time
 
 
 def contact_accuracy(
@@ -123,36 +120,41 @@ def contact_accuracy(
     """
     loaded, begin = scene_named(scene), State(*(jnp.asarray(value) for value in start))
     world = (loaded, *surface_of(loaded), begin)
-    named = settings_of(accuracies, quick, careful)
-    *_, finest = named
+    settings = settings_of(accuracies, quick, careful)
+    *_, finest = settings
     courses: dict[str, FollowedCourse] = {}
     until = jnp.asarray(np.inf)
     # the finest first: it says where to stop
-    for name in (finest, *(key for key in named if key != finest)):
-        progress(f"accuracy: {named[name][0]}, {name}")
-        compiled = compiled_for(_runner(named[name][1], contacts), *world, until)
+    for name in (finest, *(key for key in settings if key != finest)):
+        progress(f"accuracy: {settings[name][0]}, {name}")
+        compiled = compiled_for(_runner(settings[name][1], contacts), *world, until)
         if name == finest:
             until = _departure(compiled.run(*world, until), contacts) + _BEYOND_US
         courses[name] = _course(compiled, (*world, until), contacts, repetitions)
-    second = f"fineness {careful[-2]:g}"
+    ways = {name: settings[name][0] for name in settings}
+    study = _judged({name: courses[name] for name in settings}, ways, second=f"fineness {careful[-2]:g}")
+    return study | {"contacts": contacts, "reference": f"every contact in time, {finest}"}
+
+
+def _judged(courses: Mapping[str, FollowedCourse], ways: Mapping[str, str], *, second: str) -> dict[str, Any]:
+    """Return rows of settings with their errors against the last one, whose own error is that of the second finest."""
+    *_, finest = courses.values()
     rows = [
         {
-            "way": way,
+            "way": ways[name],
             "setting": name,
-            "microseconds_per_contact": 1e6 * courses[name].seconds / contacts,
-            "compile_s": courses[name].compile_s,
+            "microseconds_per_contact": 1e6 * course.seconds,
+            "compile_s": course.compile_s,
             # the reference has no error of its own here: it is that of the second finest, at most
-            **(errors_of(courses[name], courses[finest]) if name != finest else {}),
+            **(errors_of(course, finest) if course is not finest else {}),
         }
-        for name, (way, _) in named.items()
+        for name, course in courses.items()
     ]
-    own = errors_of(courses[second], courses[finest])
+    own = errors_of(courses[second], finest)
     return {
         "rows": rows,
-        "contacts": contacts,
-        "arrival_us": courses[finest].arrival_us,
-        "peak_nm": courses[finest].peak_nm,
-        "reference": f"every contact in time, {finest}",
+        "arrival_us": finest.arrival_us,
+        "peak_nm": finest.peak_nm,
         "reference_error_us": own["arrival_error_us"],
         "reference_error_nm": own["peak_error_nm"],
     }
@@ -174,7 +176,9 @@ def _course(compiled: Compiled, arguments: tuple[Any, ...], contacts: int, repet
     timing, found = time_compiled(compiled, *arguments, repetitions=repetitions)
     peaks = peaks_between_contacts(arguments[0], found)
     arrival = float(found.contacts.arrival_time_us[contacts - 1])
-    return FollowedCourse(arrival, float(peaks.max()) if peaks.size else None, timing.best_s, timing.compile_s)
+    return FollowedCourse(
+        arrival, float(peaks.max()) if peaks.size else None, timing.best_s / contacts, timing.compile_s
+    )
 
 
 def errors_of(course: FollowedCourse, reference: FollowedCourse) -> dict[str, float | None]:
@@ -199,7 +203,7 @@ def law_accuracy(
     begin = first_departure(loaded, State(*(jnp.asarray(value) for value in start)))
     # the first impact ends the flight from the start
     impacts = max(contacts - 1, 1)
-    courses = []
+    courses: dict[str, FollowedCourse] = {}
     compiled = compiled_for(
         lambda scene, time, velocity, tolerance: iterate_map(
             scene, time, velocity, impacts, root_tolerance_us=tolerance
@@ -208,37 +212,18 @@ def law_accuracy(
         *begin,
         jnp.asarray(tolerances[0]),
     )
-    for tolerance in tolerances:
-        progress(f"accuracy: root tolerance {tolerance:g}")
+    for name, tolerance in named("root tolerance", tolerances, " us").items():
+        progress(f"accuracy: {name}")
         timing, found = time_compiled(compiled, loaded, *begin, jnp.asarray(tolerance), repetitions=repetitions)
         if int(found.outcome[-1]) not in {Outcome.IMPACT, Outcome.CAPTURED}:
             reached = int(np.sum(np.asarray(found.outcome) == Outcome.IMPACT))
             reason = Outcome(int(found.outcome[reached])).sentence
             raise ValueError(f"the motion has only {reached + 1} of {contacts} impacts: {reason}")
-        peaks = map_peaks(loaded, begin, found)
-        arrival = float(found.arrival_time_us[-1])
-        courses.append(FollowedCourse(arrival, float(peaks.max()), timing.best_s, timing.compile_s))
-    finest = courses[-1]
-    rows = [
-        {
-            "way": "map",
-            "setting": f"root tolerance {tolerance:g} us",
-            "microseconds_per_contact": 1e6 * course.seconds / impacts,
-            "compile_s": course.compile_s,
-            **(errors_of(course, finest) if course is not finest else {}),
-        }
-        for tolerance, course in zip(tolerances, courses, strict=True)
-    ]
-    own = errors_of(courses[-2], finest)
-    return {
-        "rows": rows,
-        "contacts": impacts + 1,
-        "arrival_us": finest.arrival_us,
-        "peak_nm": finest.peak_nm,
-        "reference": f"root tolerance {tolerances[-1]:g} us",
-        "reference_error_us": own["arrival_error_us"],
-        "reference_error_nm": own["peak_error_nm"],
-    }
+        peak, arrival = float(map_peaks(loaded, begin, found).max()), float(found.arrival_time_us[-1])
+        courses[name] = FollowedCourse(arrival, peak, timing.best_s / impacts, timing.compile_s)
+    *_, second, finest = courses
+    study = _judged(courses, dict.fromkeys(courses, "map"), second=second)
+    return study | {"contacts": impacts + 1, "reference": finest}
 
 
 def first_departure(scene: Scene, start: State) -> tuple[Array, Array]:
@@ -278,8 +263,6 @@ def map_peaks(scene: Scene, begin: tuple[Array, Array], found: NextImpact) -> np
     times, velocities, ends = (np.asarray(part)[flown] for part in (times, velocities, found.arrival_time_us))
     return peaks_of_flights(scene, times, np.asarray(scene.platform.position(times)), velocities, ends)
 
-
-LadderRow = dict[str, Any]
 
 LAST = 0.2
 """Share of the flights that count, the last ones: the motion is taken for settled there."""
@@ -352,9 +335,9 @@ def _expected_contacts(scene: Scene, duration_us: float) -> int:
     return max(math.ceil(duration_us * 2e-3 * float(scene.cantilever.frequency_khz)), 10)
 
 
-def _row(model: str, rung: Callable[[], tuple[float, float, int]], repetitions: int) -> LadderRow:
+def _row(model: str, rung: Callable[[], tuple[float, float, int]], repetitions: int) -> Row:
     progress(f"accuracy: {model}")
-    row: LadderRow = {"model": model, "peak_nm": None, "lowest_peak_nm": None, "seconds": None, "contacts": None}
+    row: Row = {"model": model, "peak_nm": None, "lowest_peak_nm": None, "seconds": None, "contacts": None}
     try:
         # the first run compiles
         peak, lowest, contacts = rung()

@@ -10,18 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from afm_jax.bench.integrators import title
 from afm_jax.bench.scipy_contacts import scipy_collision
-from afm_jax.bench.timing import compiled_for, progress, time_compiled
+from afm_jax.bench.study import Contestant, Row, measured, named, timed
+from afm_jax.bench.timing import compiled_for, progress
 from afm_jax.contact.collide import Collision, batch_of, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.contact.settings import SETTINGS, Setting
 
-Row = dict[str, Any]
-
 SPEEDS_NM_PER_US = (12.0, 200.0)
 REFERENCE = Setting("collocation", 40, 40, 48, iterations=14)
 """Converged to rounding; the tests compare it with 20 digits to 1e-12."""
+ERRORS = ("rebound_error", "delay_error_us")
 COARSER_REFERENCE = Setting("collocation", 32, 32, 40, iterations=12)
 
 
@@ -52,13 +53,17 @@ def contact_one_core(*, batch: int, repetitions: int, many: int, scipy_speeds: S
     """
     contact, speeds = Contact.paper(), speeds_of(batch)
     reference, coarser = (batch_of(contact, 1.0, speeds, setting) for setting in (REFERENCE, COARSER_REFERENCE))
-    rows = []
-    for method, settings in SETTINGS.items():
-        for accuracy in settings:
-            name = f"{method}, accuracy {accuracy:g}"
-            row, result = _timed(name, _runner(method, accuracy), (contact, speeds), repetitions)
-            rebound, delay = errors_against(result, reference)
-            rows.append(row | {"rebound_error": rebound, "delay_error_us": delay})
+
+    def errors(_: Any, result: Collision) -> Row:
+        return dict(zip(ERRORS, errors_against(result, reference), strict=True))
+
+    contestants = (
+        collide_contestant(method, list(SETTINGS[method]), speeds, repetitions, errors) for method in SETTINGS
+    )
+    rows = [
+        {"what": f"{row.pop('method').removeprefix('collide, ')}, {row.pop('setting')}", "batch": batch} | row
+        for row in measured("bench: contact", contestants)
+    ]
     plain = {row["what"]: row["microseconds_per_impact"] for row in rows}
     for accuracy in (1e-6, 1e-9):
         base = plain[f"diffrax, accuracy {accuracy:g}"]
@@ -68,7 +73,13 @@ def contact_one_core(*, batch: int, repetitions: int, many: int, scipy_speeds: S
         ]
     rows += _effects(speeds, repetitions)
     rows.append(_many(many))
-    rows += _scipy(contact, scipy_speeds)
+    # the finest setting, of the speeds that SciPy follows
+    finest = collide(contact, jnp.asarray(scipy_speeds), accuracy=1e-11)
+    for method, tolerances in (("DOP853", [1e-6, 1e-9]), ("LSODA", [1e-9])):
+        scipy = integrator_contestant(method, tolerances, scipy_speeds, finest)
+        for row in measured("bench: contact", [scipy], unknown=("microseconds_per_impact",)):
+            tolerance = row.pop("setting").removeprefix("tolerance ")
+            rows.append({"what": f"{row.pop('method')} with events, rtol {tolerance}", "batch": 1} | row)
     return {"rows": rows, "reference_error": max(errors_against(coarser, reference))}
 
 
@@ -77,19 +88,58 @@ def _runner(method: str, accuracy: float) -> Callable[[Contact, Array], Collisio
     return lambda contact, speeds: batch_of(contact, 1.0, speeds, setting)
 
 
-def _timed(what: str, function: Callable[..., Any], arguments: tuple[Any, ...], repetitions: int) -> tuple[Row, Any]:
+def collide_contestant(
+    method: str,
+    accuracies: Sequence[float],
+    speeds: Array,
+    repetitions: int,
+    errors: Callable[[Callable[[Contact, Array], Collision], Collision], Row],
+) -> Contestant:
+    """Return `collide` with accuracies as settings.
+
+    Args:
+        method: "diffrax" or "collocation".
+        accuracies: which of its settings.
+        speeds: approach speeds in nm/us of the batch that is timed, in the precision that is measured.
+        repetitions: of each measurement.
+        errors: from the function of contact and speeds, and its result for these speeds, the columns of errors.
+    """
+    contact = jax.tree.map(lambda leaf: leaf.astype(speeds.dtype), Contact.paper())
+
+    def measure(accuracy: float) -> Row:
+        run = _runner(method, accuracy)
+        compiled = compiled_for(run, contact, speeds)
+        row, result = timed(compiled, contact, speeds, repetitions=repetitions, events=speeds.size)
+        return row | errors(run, result)
+
+    return Contestant(f"collide, {method}", named("accuracy", accuracies), measure)
+
+
+def integrator_contestant(
+    method: str, tolerances: Sequence[float], speeds: Sequence[float], reference: Collision
+) -> Contestant:
+    """Return an integrator that follows tips of some approach speeds one by one, with tolerances as settings."""
+    contact = Contact.paper()
+
+    def measure(tolerance: float) -> Row:
+        runs = [scipy_collision(contact, speed, method=method, rtol=tolerance) for speed in speeds]
+        rebound = np.array([run.rebound_speed_nm_per_us for run in runs])
+        delay = np.array([run.collision_delay_us for run in runs])
+        found = reference._replace(rebound_speed_nm_per_us=rebound, collision_delay_us=delay)
+        return {
+            "microseconds_per_impact": 1e6 * float(np.mean([run.seconds for run in runs])),
+            "evaluations_per_impact": float(np.mean([run.evaluations for run in runs])),
+            **dict(zip(ERRORS, errors_against(found, reference), strict=True)),
+        }
+
+    return Contestant(title(method), named("tolerance", tolerances), measure)
+
+
+def _row(what: str, function: Callable[..., Any], arguments: tuple[Any, ...], repetitions: int) -> Row:
     progress(f"bench: contact, {what}")
-    compiled = compiled_for(function, *arguments)
-    timing, result = time_compiled(compiled, *arguments, repetitions=repetitions)
     batch = arguments[-1].shape[0]
-    row = {
-        "what": what,
-        "batch": batch,
-        "microseconds_per_impact": 1e6 * timing.best_s / batch,
-        "median_microseconds_per_impact": 1e6 * timing.median_s / batch,
-        "compile_s": timing.compile_s,
-    }
-    return row, result
+    compiled = compiled_for(function, *arguments)
+    return {"what": what, "batch": batch} | timed(compiled, *arguments, repetitions=repetitions, events=batch)[0]
 
 
 def _variants(accuracy: float, speeds: Float[Array, " batch"], repetitions: int) -> list[Row]:
@@ -118,7 +168,7 @@ def _variants(accuracy: float, speeds: Float[Array, " batch"], repetitions: int)
         "reverse gradient by all parameters and speeds": (reverse, (contact, speeds)),
     }
     return [
-        _timed(f"{what}, accuracy {accuracy:g}", function, arguments, repetitions)[0]
+        _row(f"{what}, accuracy {accuracy:g}", function, arguments, repetitions)
         for what, (function, arguments) in cases.items()
     ]
 
@@ -129,7 +179,7 @@ def _effects(speeds: Float[Array, " batch"], repetitions: int) -> list[Row]:
     for missing in (None, "structural", "viscous"):
         contact = Contact.paper(effects=tuple(name for name in EFFECTS if name != missing))
         run = _runner("diffrax", 1e-9)
-        row, _ = _timed("all effects" if missing is None else f"without {missing}", run, (contact, speeds), repetitions)
+        row = _row("all effects" if missing is None else f"without {missing}", run, (contact, speeds), repetitions)
         compiled = jax.jit(run).lower(contact, speeds[:64]).compile()
         cost = compiled.cost_analysis() or {}
         text = compiled.as_text() or ""
@@ -142,37 +192,16 @@ def _many(count: int) -> Row:
     contact, speeds = Contact.paper(), speeds_of(count)
     run = compiled_for(_runner("diffrax", 1e-9), contact, speeds)
     scratch = getattr(run.run, "memory_analysis", lambda: None)()
-    timing, result = time_compiled(run, contact, speeds, repetitions=1)
+    row, result = timed(run, contact, speeds, repetitions=1, events=count)
+    del row["median_microseconds_per_impact"]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
-    return {
+    return row | {
         "what": "one call with many speeds, accuracy 1e-09",
         "batch": count,
-        "microseconds_per_impact": 1e6 * timing.best_s / count,
-        "compile_s": timing.compile_s,
         "memory_mib": scratch.temp_size_in_bytes / 2**20 if scratch is not None else None,
         "results_mib": sum(part.nbytes for part in result) / 2**20,
         "peak_process_mib": peak,
     }
-
-
-def _scipy(contact: Contact, speeds: Sequence[float]) -> list[Row]:
-    reference = collide(contact, jnp.asarray(speeds), accuracy=1e-11)
-    rows = []
-    for method, rtol in (("DOP853", 1e-6), ("DOP853", 1e-9), ("LSODA", 1e-9)):
-        progress(f"bench: contact, SciPy {method} {rtol:g}")
-        runs = [scipy_collision(contact, speed, method=method, rtol=rtol) for speed in speeds]
-        found = np.array([run[:2] for run in runs])
-        rows.append(
-            {
-                "what": f"SciPy {method} with events, rtol {rtol:g}",
-                "batch": 1,
-                "microseconds_per_impact": 1e6 * float(np.mean([run.seconds for run in runs])),
-                "evaluations_per_impact": float(np.mean([run.evaluations for run in runs])),
-                "rebound_error": float(np.max(np.abs(found[:, 0] / np.asarray(reference.rebound_speed_nm_per_us) - 1))),
-                "delay_error_us": float(np.max(np.abs(found[:, 1] - np.asarray(reference.collision_delay_us)))),
-            }
-        )
-    return rows
 
 
 def aims(rows: Sequence[Row]) -> list[tuple[str, float | None, float]]:

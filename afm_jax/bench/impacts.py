@@ -3,10 +3,8 @@
 Each function here runs in a process of its own (`run_in_own_process`) and returns rows as plain dicts:
 
 what, scene, batch, cores, block, impacts, microseconds_per_impact (best), median_microseconds_per_impact,
-impacts_per_second, compile_s, error_us, error_kind ("after N impacts" or "impact by impact"), near_grazing,
-ratio_to_plain, derivative_relative_error.
-
-Errors of impact times against 50 digits: after a sequence, or impact by impact where a scene loses digits.
+impacts_per_second, compile_s, error_us (of impact times, against 50 digits), error_kind ("after N impacts", or "impact
+by impact" where a scene loses digits), near_grazing, ratio_to_plain, derivative_relative_error.
 """
 
 from typing import Any, NamedTuple
@@ -28,7 +26,8 @@ from afm_jax.bench.problems import (
     tabulated_scene,
 )
 from afm_jax.bench.scipy_impacts import scipy_impacts
-from afm_jax.bench.timing import Timing, compiled_for, progress, time_compiled
+from afm_jax.bench.study import Row, timed
+from afm_jax.bench.timing import compiled_for, progress
 from afm_jax.impact.map import DEFAULT_BLOCK, NEAR_GRAZING, NextImpact, iterate_batch
 from afm_jax.outcomes import Outcome
 from afm_jax.verify.fifty_digits import ExactMap, derivatives_by_r
@@ -98,8 +97,6 @@ def _slow_departure(case: BenchmarkScene, states: NDArray[np.float64]) -> NDArra
 
 
 SCIPY_TOLERANCE = 1e-10
-
-Row = dict[str, Any]
 
 
 def one_core(*, batches: list[int], blocks: list[int], impacts: int, repetitions: int, derivative_batch: int) -> dict:
@@ -173,10 +170,9 @@ def map_row(  # noqa: PLR0913
         # the loops inside run as long as their own lanes need, which the check of replication cannot follow
         run = jax.shard_map(run, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)
     compiled = compiled_for(run, case.scene, starts)
-    timing, result = time_compiled(compiled, case.scene, starts, repetitions=repetitions)
-    return _row(what, case, timing, batch=batch, impacts=impacts, cores=devices, block=min(block, batch)) | (
-        batch_errors(formula or case, starts, result)
-    )
+    row, result = timed(compiled, case.scene, starts, repetitions=repetitions, events=batch * impacts)
+    row |= batch_errors(formula or case, starts, result)
+    return _row(what, case, row, batch=batch, impacts=impacts, cores=devices, block=min(block, batch))
 
 
 def derivative_rows(case: BenchmarkScene, starts: Starts, *, impacts: int, repetitions: int) -> list[Row]:
@@ -205,8 +201,8 @@ def derivative_rows(case: BenchmarkScene, starts: Starts, *, impacts: int, repet
     for what, function in labels.items():
         progress(f"bench: {what}, {case.name} scene, batch {batch}, 1 core")
         compiled = compiled_for(function, case.scene, starts)
-        timing, result = time_compiled(compiled, case.scene, starts, repetitions=repetitions)
-        rows.append(_row(what, case, timing, batch=batch, impacts=impacts, cores=1, block=min(DEFAULT_BLOCK, batch)))
+        row, result = timed(compiled, case.scene, starts, repetitions=repetitions, events=batch * impacts)
+        rows.append(_row(what, case, row, batch=batch, impacts=impacts, cores=1, block=min(DEFAULT_BLOCK, batch)))
         results.append(result)
     for row in rows[1:]:
         row["ratio_to_plain"] = row["microseconds_per_impact"] / rows[0]["microseconds_per_impact"]
@@ -236,21 +232,24 @@ def scipy_row(case: BenchmarkScene, starts: Starts, *, impacts: int, tips: int) 
     progress(f"bench: SciPy, {case.name} scene, {tips} tips")
     first = np.stack([np.asarray(part)[:tips] for part in starts], axis=1).tolist()
     runs = [scipy_impacts(case.scene, (time, speed), impacts, tolerance=SCIPY_TOLERANCE) for time, speed in first]
-    seconds = [run.seconds for run in runs]
-    timing = Timing(0.0, min(seconds), float(np.median(seconds)))
-    what = f"SciPy DOP853 with events, tolerance {SCIPY_TOLERANCE:g}"
-    row = _row(what, case, timing, batch=1, impacts=impacts, cores=1, block=1) | {"compile_s": None}
+    microseconds = [1e6 * run.seconds / impacts for run in runs]
     errors = np.concatenate([sequence_errors(case, run.states) for run in runs])
-    kind = IMPACT_BY_IMPACT if case.chaotic else f"after {impacts} impacts"
-    return row | {"error_us": float(np.nanmax(errors)), "error_kind": kind}
+    row = {
+        "microseconds_per_impact": min(microseconds),
+        "median_microseconds_per_impact": float(np.median(microseconds)),
+        "compile_s": None,
+        "error_us": float(np.nanmax(errors)),
+        "error_kind": IMPACT_BY_IMPACT if case.chaotic else f"after {impacts} impacts",
+    }
+    what = f"SciPy DOP853 with events, tolerance {SCIPY_TOLERANCE:g}"
+    return _row(what, case, row, batch=1, impacts=impacts, cores=1, block=1)
 
 
 def _first(starts: Starts, batch: int) -> Starts:
     return Starts(starts.time_us[:batch], starts.velocity_nm_per_us[:batch])
 
 
-def _row(what: str, case: BenchmarkScene, timing: Timing, *, batch: int, impacts: int, cores: int, block: int) -> Row:
-    total = batch * impacts
+def _row(what: str, case: BenchmarkScene, row: Row, *, batch: int, impacts: int, cores: int, block: int) -> Row:
     return {
         "what": what,
         "scene": case.name,
@@ -258,8 +257,6 @@ def _row(what: str, case: BenchmarkScene, timing: Timing, *, batch: int, impacts
         "cores": cores,
         "block": block,
         "impacts": impacts,
-        "microseconds_per_impact": 1e6 * timing.best_s / total,
-        "median_microseconds_per_impact": 1e6 * timing.median_s / total,
-        "impacts_per_second": total / timing.best_s,
-        "compile_s": timing.compile_s,
+        "impacts_per_second": 1e6 / row["microseconds_per_impact"],
+        **row,
     }

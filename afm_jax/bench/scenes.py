@@ -15,14 +15,13 @@ from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.problems import SingleContacts, batch_run, bouncing_starts, single_contacts, spread_starts
-from afm_jax.bench.scipy_contacts import scipy_rows
+from afm_jax.bench.scipy_contacts import contact_contestants
+from afm_jax.bench.study import Row, measured
 from afm_jax.bench.timing import Compiled, compiled_for, progress, time_compiled
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.presets import contact_scene
-
-Row = dict[str, Any]
 
 REFERENCE = DrivenSetting(None, 8.0, 240)
 """Every contact in time, in fine steps; the tests compare it with an independent integration."""
@@ -113,7 +112,10 @@ def _scene(
                 one = runs[accuracy].run(scene, single.starts, single.until_us)
                 row |= contact_errors(one, reference, single)
             rows.append(row)
-    rows += scipy_rows(name, scene, reference, single, scipy_contacts)
+    for row in measured(f"bench: scenes, {name}", contact_contestants(scene, reference, single, scipy_contacts)):
+        tolerance = row.pop("setting").removeprefix("tolerance ")
+        what = f"{row.pop('method')} with events, the contact alone, rtol {tolerance}"
+        rows.append({"what": what, "scene": name, "batch": 1} | row)
     errors = contact_errors(coarser, reference, single)
     parts = [
         [errors.get(f"{part}_{column}_worst") or 0.0 for part in ("straight", "turning")]

@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Sequence
 from functools import partial
-from itertools import product
 from typing import Any, NamedTuple
 
 import diffrax
@@ -21,7 +20,7 @@ from jaxtyping import Array
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.integrators import EVENT, Integrator, integrate_to_event, title
 from afm_jax.bench.problems import SingleContacts
-from afm_jax.bench.timing import progress
+from afm_jax.bench.study import Contestant, Row, named
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.forces.liquid import Capillary, Structural, Viscous
@@ -322,8 +321,7 @@ def _diffrax_contact(
     return found[0], jnp.where(found[-1], found[2], jnp.nan), found[3], found[4]
 
 
-def scipy_rows(
-    name: str,
+def contact_contestants(
     scene: Scene,
     reference: Simulation,
     single: SingleContacts,
@@ -331,49 +329,59 @@ def scipy_rows(
     *,
     methods: Sequence[str] = ("DOP853",),
     tolerances: Sequence[float] = (1e-6, 1e-9),
-) -> list[dict[str, Any]]:
-    """Measure integrators on a few single contacts, flights not included; half of them turn where some do.
+) -> list[Contestant]:
+    """Return integrators that follow a few single contacts, flights not included; half of them turn where some do.
 
     Args:
-        name: what the scene is called in the rows.
         scene: the scene.
         reference: the contacts, each the first of its tip.
         single: the same contacts, and which of them turn.
         count: how many to follow.
         methods: see `Integrator`, or `EVENT`.
-        tolerances: relative ones.
+        tolerances: relative ones, the settings.
     """
     contacts = reference.contacts
     ended = np.asarray(contacts.kind)[:, 0] == ContactKind.IMPACT
-    groups = [np.flatnonzero(ended & ~single.turning), np.flatnonzero(ended & single.turning)]
-    half = count // 2 if groups[1].size else 0
-    tips = [*groups[0][: count - half], *groups[1][:half]]
-    rows = []
-    for method, rtol in product(methods, tolerances) if tips else ():
-        progress(f"bench: scenes, {name}, {title(method)} {rtol:g}")
-        columns = (contacts.arrival_time_us, contacts.approach_speed_nm_per_us)
-        began = [tuple(float(column[tip, 0]) for column in columns) for tip in tips]
+    straight, turning = np.flatnonzero(ended & ~single.turning), np.flatnonzero(ended & single.turning)
+    half = count // 2 if turning.size else 0
+    tips = np.concatenate([straight[: count - half], turning[:half]])
+    arrival, approach, rebound, departure = (
+        np.asarray(column)[tips, 0]
+        for column in (
+            contacts.arrival_time_us,
+            contacts.approach_speed_nm_per_us,
+            contacts.rebound_speed_nm_per_us,
+            contacts.departure_time_us,
+        )
+    )
+    parts = {"straight": slice(0, count - half), "turning": slice(count - half, None)}
+
+    def contestant(method: str) -> Contestant:
         follow = diffrax_driven_contact if method == EVENT else partial(scipy_driven_contact, method=method)
-        runs = [follow(scene, *state, rtol=rtol) for state in began]
-        expected = [
-            np.asarray(column)[tips, 0] for column in (contacts.rebound_speed_nm_per_us, contacts.departure_time_us)
-        ]
-        rebound = np.abs(np.array([run.rebound_speed_nm_per_us for run in runs]) / expected[0] - 1.0)
-        left = np.abs(np.array([run.departure_time_us for run in runs]) - expected[1])
-        row: dict[str, Any] = {
-            "what": f"{title(method)} with events, the contact alone, rtol {rtol:g}",
-            "scene": name,
-            "batch": 1,
-            "contacts": len(runs),
-            "microseconds_per_contact": 1e6 * float(np.median([run.seconds for run in runs])),
-            "evaluations_per_contact": float(np.mean([run.evaluations for run in runs])),
-        }
-        for part, chosen in (("straight", slice(0, count - half)), ("turning", slice(count - half, None))):
-            if rebound[chosen].size:
-                row[f"{part}_rebound_error_worst"] = float(rebound[chosen].max())
-                row[f"{part}_time_error_us_worst"] = float(left[chosen].max())
-        rows.append(row)
-    return rows
+
+        def measure(rtol: float) -> Row:
+            runs = [
+                follow(scene, float(at), float(speed), rtol=rtol) for at, speed in zip(arrival, approach, strict=True)
+            ]
+            errors = {
+                "rebound_error": np.abs(np.array([run.rebound_speed_nm_per_us for run in runs]) / rebound - 1.0),
+                "time_error_us": np.abs(np.array([run.departure_time_us for run in runs]) - departure),
+            }
+            return {
+                "contacts": len(runs),
+                "microseconds_per_contact": 1e6 * float(np.median([run.seconds for run in runs])),
+                "evaluations_per_contact": float(np.mean([run.evaluations for run in runs])),
+                **{
+                    f"{part}_{name}_worst": float(values[rows].max())
+                    for part, rows in parts.items()
+                    for name, values in errors.items()
+                    if values[rows].size
+                },
+            }
+
+        return Contestant(title(method), named("tolerance", tolerances), measure)
+
+    return [contestant(method) for method in methods] if tips.size else []
 
 
 def _drive_of(scene: Scene) -> _Drive:

@@ -1,18 +1,21 @@
 """`afm-jax accuracy`: error against time, and the cheapest setting for a wanted error."""
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from afm_jax.cli.accuracy_scene import scene_study, write_study
+from afm_jax.accuracy.collisions import cheapest_collision
+from afm_jax.accuracy.impacts import cheapest_settings
+from afm_jax.accuracy.overview import cheapest
+from afm_jax.bench import timing
+from afm_jax.cli.accuracy_scene import accuracy_picture, scene_study
+from afm_jax.cli.columns import Cell, columns_of, rows_table
+from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES
-from afm_jax.words import known
 
-if TYPE_CHECKING:
-    from rich.table import Table
+Row = dict[str, Any]
 
 COLUMNS = (
     "scene",
@@ -128,73 +131,17 @@ WANTED = [1e-3, 1e-6, 1e-9, 1e-11]
 
 def accuracy(
     session: Session, study: str | None, wanted_error_us: float, accuracy: float, *, contacts: int, quick: bool
-) -> None:
+) -> Output:
     """Measure errors against time, of everything or of one study."""
     if study is None:
-        overview_study(session, quick=quick)
-        return
-    if study not in {"map", "collide"}:
-        if not is_scene(study):
-            raise click.UsageError(f"there is no accuracy study of `{study}`; choose: map, collide, or a scene file")
-        scene_study(session, study, contacts, quick=quick)
-        return
+        return overview_study(session, quick=quick)
+    if study == "map":
+        return map_study(session, wanted_error_us, quick=quick)
     if study == "collide":
-        collide_study(session, accuracy, quick=quick)
-        return
-    from afm_jax.accuracy.impacts import cheapest_settings  # noqa: PLC0415
-    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
-
-    with session.working("measuring"):
-        result = run_in_own_process("afm_jax.accuracy.impacts:map_accuracy", QUICK if quick else FULL, cores=1)
-    cheapest = cheapest_settings(result["rows"], wanted_error_us)
-    payload = {**result, "wanted_error_us": wanted_error_us, "cheapest": cheapest}
-    session.write_table("accuracy.csv", result["rows"], COLUMNS)
-    write_study(session, payload, lambda plots: plots.accuracy_figure(result["rows"], wanted_error_us))
-    session.emit(
-        payload,
-        accuracy_table(result["rows"]),
-        f"Reference: 50 digits, its own error {result['reference_error_us']:.0e} us. Default of next_impact: float64, "
-        f"root tolerance {result['default_root_tolerance_us']:g} us.",
-        *(cheapest_sentence(choice, wanted_error_us) for choice in cheapest),
-    )
-
-
-def overview_study(session: Session, *, quick: bool) -> None:
-    """Run and show what each digit costs in everything."""
-    from afm_jax.accuracy.overview import cheapest  # noqa: PLC0415
-    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
-
-    rows: list[dict[str, Any]] = []
-    references: dict[str, dict[str, Any]] = {}
-    with session.working("measuring (some minutes)"):
-        for task, settings in (OVERVIEW_QUICK if quick else OVERVIEW_FULL).items():
-            found = run_in_own_process(task, settings, cores=1)
-            rows, references = rows + found["rows"], references | found["references"]
-    choices = cheapest(rows, WANTED)
-    payload = {"rows": rows, "references": references, "cheapest": choices}
-    session.write_table("accuracy.csv", rows, OVERVIEW_COLUMNS)
-    write_study(session, payload, lambda plots: plots.overview_figure(rows, references))
-    told = [
-        f"{problem}: error of the {known['error_of']}, against {known['reference']}, itself known to "
-        f"{known['reference_error']:.0e}"
-        for problem, known in references.items()
-    ]
-    session.emit(payload, overview_table(choices), *told)
-
-
-def overview_table(choices: Sequence[dict[str, Any]]) -> "Table":
-    """Return what each wanted error costs, here and elsewhere."""
-    from rich.table import Table  # noqa: PLC0415
-
-    table = Table(title="The fastest way to a wanted error (one core)", title_justify="left")
-    for heading in ("problem", "error", "here", "us", "others", "us"):
-        table.add_column(heading, justify="right" if heading in {"error", "us"} else "left")
-    for row in choices:
-        cells = [row["problem"], f"{row['wanted_error']:g}"]
-        for who in ("own", "other"):
-            cells += [row[who] or "none", known(row[f"{who}_microseconds"])]
-        table.add_row(*cells)
-    return table
+        return collide_study(session, accuracy, quick=quick)
+    if is_scene(study):
+        return scene_study(session, study, contacts, quick=quick)
+    raise click.UsageError(f"there is no accuracy study of `{study}`; choose: map, collide, or a scene file")
 
 
 def is_scene(name: str) -> bool:
@@ -202,18 +149,88 @@ def is_scene(name: str) -> bool:
     return name.endswith(".toml") or Path(name).exists() or name in PRESET_NAMES
 
 
-def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
-    """Run and show the accuracy study of `collide`."""
-    from afm_jax.accuracy.collisions import cheapest_collision  # noqa: PLC0415
-    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
+def overview_study(session: Session, *, quick: bool) -> Output:
+    """Return what each digit costs in everything."""
+    rows: list[Row] = []
+    references: dict[str, Row] = {}
+    with session.working("measuring (some minutes)"):
+        for task, settings in (OVERVIEW_QUICK if quick else OVERVIEW_FULL).items():
+            found = timing.run_in_own_process(task, settings, cores=1)
+            rows, references = rows + found["rows"], references | found["references"]
+    choices = cheapest(rows, WANTED)
+    cells: dict[str, Cell] = {
+        "problem": "problem",
+        "error": "wanted_error:g",
+        "here": lambda row: row["own"] or "none",
+        "us here": "own_microseconds",
+        "others": lambda row: row["other"] or "none",
+        "us there": "other_microseconds",
+    }
+    told = [
+        f"{problem}: error of the {known['error_of']}, against {known['reference']}, itself known to "
+        f"{known['reference_error']:.0e}"
+        for problem, known in references.items()
+    ]
+    return Output(
+        payload={"rows": rows, "references": references, "cheapest": choices},
+        text=[rows_table("The fastest way to a wanted error (one core)", cells, choices), *told],
+        tables={"accuracy.csv": columns_of(rows, OVERVIEW_COLUMNS)},
+        files={"accuracy.png": accuracy_picture("overview_figure", rows, references)},
+        json_file="accuracy.json",
+    )
 
+
+def map_study(session: Session, wanted_error_us: float, *, quick: bool) -> Output:
+    """Return error against time of impact times."""
+    with session.working("measuring"):
+        result = timing.run_in_own_process("afm_jax.accuracy.impacts:map_accuracy", QUICK if quick else FULL, cores=1)
+    rows, choices = result["rows"], cheapest_settings(result["rows"], wanted_error_us)
+    # SciPy's tolerance is relative and in nm; the map's is in us
+    cells: dict[str, Cell] = {
+        "scene": "scene",
+        "method": "method",
+        "tolerance": "tolerance",
+        "us/impact": "microseconds_per_impact",
+        "largest error us": "error_us",
+        "median us": "median_error_us",
+        "after sequence us": "sequence_error_us",
+        "near grazing us": "near_grazing_error_us",
+    }
+    reference = (
+        f"Reference: 50 digits, its own error {result['reference_error_us']:.0e} us. Default of next_impact: float64, "
+        f"root tolerance {result['default_root_tolerance_us']:g} us."
+    )
+    return Output(
+        payload={**result, "wanted_error_us": wanted_error_us, "cheapest": choices},
+        text=[
+            rows_table("Error of an impact time against the time it takes (one core)", cells, rows),
+            reference,
+            *(cheapest_sentence(choice, wanted_error_us) for choice in choices),
+        ],
+        tables={"accuracy.csv": columns_of(rows, COLUMNS)},
+        files={"accuracy.png": accuracy_picture("accuracy_figure", rows, wanted_error_us)},
+        json_file="accuracy.json",
+    )
+
+
+def collide_study(session: Session, accuracy: float, *, quick: bool) -> Output:
+    """Return error against time of `collide`."""
     with session.working("measuring"):
         task = "afm_jax.accuracy.collisions:collide_accuracy"
-        result = run_in_own_process(task, COLLIDE_QUICK if quick else COLLIDE_FULL, cores=1)
-    best = cheapest_collision(result["rows"], accuracy)
-    payload = {**result, "accuracy": accuracy, "cheapest": best}
-    session.write_table("accuracy.csv", result["rows"], COLLIDE_COLUMNS)
-    write_study(session, payload, lambda plots: plots.collide_accuracy_figure(result["rows"]))
+        result = timing.run_in_own_process(task, COLLIDE_QUICK if quick else COLLIDE_FULL, cores=1)
+    rows, best = result["rows"], cheapest_collision(result["rows"], accuracy)
+    cells: dict[str, Cell] = {
+        "method": "method",
+        "in": "variable",
+        "setting": "setting",
+        "precision": "precision",
+        "us/impact": "microseconds_per_impact",
+        "u_out error": "rebound_error",
+        "delay error us": "delay_error_us",
+        "slopes' error": "slope_error",
+        "near capture": "near_capture_error",
+        "compile s": "compile_s",
+    }
     sentence = (
         f"No contestant reaches {accuracy:g}."
         if best is None
@@ -221,44 +238,18 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
         f"{best['microseconds_per_impact']:.3g} us an impact, errors {best['rebound_error']:.1e} and "
         f"{best['delay_error_us']:.1e} us."
     )
+    title = "Error of a collision against the time it takes, 12 to 200 nm/us (one core)"
     reference = f"Reference: quadrature converged to {result['reference_error']:.0e}."
-    session.emit(payload, collide_table(result["rows"]), reference, sentence)
+    return Output(
+        payload={**result, "accuracy": accuracy, "cheapest": best},
+        text=[rows_table(title, cells, rows), reference, sentence],
+        tables={"accuracy.csv": columns_of(rows, COLLIDE_COLUMNS)},
+        files={"accuracy.png": accuracy_picture("collide_accuracy_figure", rows)},
+        json_file="accuracy.json",
+    )
 
 
-def collide_table(rows: Sequence[dict[str, Any]]) -> "Table":
-    """Return the contestants of `collide` as a table."""
-    from rich.table import Table  # noqa: PLC0415
-
-    table = Table(title="Error of a collision against the time it takes, 12 to 200 nm/us (one core)")
-    for heading in ("method", "in", "setting", "precision"):
-        table.add_column(heading)
-    for heading in ("us/impact", "u_out error", "delay error us", "slopes' error", "near capture", "compile s"):
-        table.add_column(heading, justify="right")
-    names = ("microseconds_per_impact", "rebound_error", "delay_error_us", "slope_error", "near_capture_error")
-    for row in rows:
-        cells = [known(row.get(name)) for name in (*names, "compile_s")]
-        table.add_row(row["method"], row["variable"], row["setting"], row["precision"], *cells)
-    return table
-
-
-def accuracy_table(rows: Sequence[dict[str, Any]]) -> "Table":
-    """Return the settings as a table."""
-    from rich.table import Table  # noqa: PLC0415
-
-    table = Table(title="Error of an impact time against the time it takes (one core)")
-    for heading in ("scene", "method"):
-        table.add_column(heading)
-    # SciPy's tolerance is relative and in nm; the map's is in us
-    for heading in ("tolerance", "us/impact", "largest error us", "median us", "after sequence us", "near grazing us"):
-        table.add_column(heading, justify="right")
-    names = ("tolerance", "microseconds_per_impact", "error_us", "median_error_us", "sequence_error_us")
-    for row in rows:
-        cells = [known(row.get(name)) for name in (*names, "near_grazing_error_us")]
-        table.add_row(row["scene"], row["method"], *cells)
-    return table
-
-
-def cheapest_sentence(choice: dict[str, Any], wanted_error_us: float) -> str:
+def cheapest_sentence(choice: Row, wanted_error_us: float) -> str:
     """Say which setting is the cheapest for a scene, or that none is good enough."""
     where = "in all scenes" if choice["scene"] == "all" else f"in the scene `{choice['scene']}`"
     if choice["method"] is None:

@@ -1,18 +1,24 @@
 """`afm-jax accuracy SCENE.toml`: error against time of one scene's settings, and of simpler models of it."""
 
-from collections.abc import Callable, Mapping, Sequence
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
-from afm_jax.cli.session import Session, write_json
-from afm_jax.words import known
+import numpy as np
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from rich.table import Table
-
-    from afm_jax.apparatus.scene import Scene
-    from afm_jax.motion.record import Simulation, State
+from afm_jax.accuracy.scenes import ladder_duration
+from afm_jax.apparatus.scene import Scene
+from afm_jax.bench import timing
+from afm_jax.cli.columns import Cell, columns_of, rows_table
+from afm_jax.cli.command import Output, later
+from afm_jax.cli.session import Session
+from afm_jax.cli.values import scene_and_start
+from afm_jax.contact.collide import capture_speed
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import fit_delay, fit_law
+from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
+from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import start_of
 
 COLUMNS = (
     "way",
@@ -34,12 +40,8 @@ _WIDER = 1.1
 _ABOVE_CAPTURE = 1.02
 
 
-def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> None:
-    """Run and show the accuracy study of a scene file or a preset."""
-    from afm_jax.accuracy.scenes import ladder_duration  # noqa: PLC0415
-    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
-    from afm_jax.contact.contact import Contact  # noqa: PLC0415
-
+def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> Output:
+    """Return the accuracy study of a scene file or a preset."""
     scene, start = scene_to_study(name)
     resolved = isinstance(scene.interaction, Contact)
     common = {"scene": name, "start": [float(part) for part in start]}
@@ -48,56 +50,73 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
         law = fitted_law(scene, followed(scene, start, duration, contacts)) if resolved else None
         task = "contact_accuracy" if resolved else "law_accuracy"
         settings = (CONTACT_QUICK if quick else CONTACT) if resolved else (LAW_QUICK if quick else LAW)
-        result = run_in_own_process(
+        result = timing.run_in_own_process(
             f"afm_jax.accuracy.scenes:{task}", {**common, **settings, "contacts": contacts}, cores=1
         )
         rungs = {**common, "law": law, "duration_us": duration, "repetitions": settings["repetitions"]}
-        result |= run_in_own_process("afm_jax.accuracy.scenes:fidelity_ladder", rungs, cores=1)
-    payload = {**result, "scene": name, "law": law}
-    session.write_table("accuracy.csv", result["rows"], COLUMNS)
-    session.write_table("ladder.csv", result["ladder"], LADDER_COLUMNS)
-    write_study(session, payload, lambda plots: plots.scene_accuracy_figure(result))
-    session.emit(payload, settings_table(result), reference_sentence(result), ladder_table(result), *_reasons(result))
+        result |= timing.run_in_own_process("afm_jax.accuracy.scenes:fidelity_ladder", rungs, cores=1)
+    errors: dict[str, Cell] = {
+        "way": "way",
+        "setting": "setting",
+        "us/contact": "microseconds_per_contact",
+        "arrival error us": "arrival_error_us",
+        "peak error nm": "peak_error_nm",
+        "compile s": "compile_s",
+    }
+    ladder: dict[str, Cell] = {
+        "model": "model",
+        "peak nm": "peak_nm:.5g",
+        "lowest peak nm": "lowest_peak_nm:.5g",
+        "error": "model_error:.2%",
+        "seconds": "seconds",
+        "contacts": "contacts:d",
+    }
+    settings_title = f"Error after {result['contacts']} contacts against the time of one (one core, one tip)"
+    ladder_title = f"The same amplitude from simpler models: error against the {result['model_reference']}"
+    return Output(
+        payload={**result, "scene": name, "law": law},
+        text=[
+            rows_table(settings_title, errors, result["rows"]),
+            reference_sentence(result),
+            rows_table(ladder_title, ladder, result["ladder"]),
+            *(f"{row['model']}: {row['reason']}" for row in result["ladder"] if row.get("reason")),
+        ],
+        tables={
+            "accuracy.csv": columns_of(result["rows"], COLUMNS),
+            "ladder.csv": columns_of(result["ladder"], LADDER_COLUMNS),
+        },
+        files={"accuracy.png": accuracy_picture("scene_accuracy_figure", result)},
+        json_file="accuracy.json",
+    )
 
 
-def write_study(session: Session, payload: dict[str, Any], draw: "Callable[[ModuleType], Figure]") -> None:
-    """Write a study, whole, and its picture, which a function draws with `afm_jax.plots.accuracy`."""
-    if session.out is None:
-        return
-    from afm_jax.plots import accuracy as plots  # noqa: PLC0415
-    from afm_jax.plots.picture_style import save  # noqa: PLC0415
+def accuracy_picture(figure: str, *arguments: Any) -> Callable[[Path], object]:
+    """Return a function that draws a figure of `afm_jax.plots.accuracy` into a file."""
 
-    write_json(session.out / "accuracy.json", payload)
-    save(draw(plots), session.out / "accuracy.png")
-    session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    def draw(path: Path) -> None:
+        later("afm_jax.plots.picture_style:save")(later(f"afm_jax.plots.accuracy:{figure}")(*arguments), path)
+
+    return draw
 
 
-def scene_to_study(name: str) -> "tuple[Scene, State]":
+def scene_to_study(name: str) -> tuple[Scene, State]:
     """Return the scene of a file or a preset, and where its motion begins.
 
     Raises:
         ValueError: if the tip never meets anything, or the file is wrong.
     """
-    from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
-    from afm_jax.motion.start import start_of  # noqa: PLC0415
-
     scene, told = scene_and_start(name)
     if scene.interaction is None:
         raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")
     return scene, start_of(scene, told)
 
 
-def followed(scene: "Scene", start: "State", duration_us: float, contacts: int) -> "Simulation":
+def followed(scene: Scene, start: State, duration_us: float, contacts: int) -> Simulation:
     """Return the scene's motion, from which the range of its approach speeds is taken.
 
     Raises:
         ValueError: if the tip leaves fewer contacts than are to be compared.
     """
-    import numpy as np  # noqa: PLC0415
-
-    from afm_jax.motion.record import ContactKind, MotionOutcome  # noqa: PLC0415
-    from afm_jax.motion.simulate import simulate  # noqa: PLC0415
-
     found = simulate(scene, start, duration_us)
     left = int(np.sum(np.asarray(found.contacts.kind) == ContactKind.IMPACT))
     if left < contacts:
@@ -108,14 +127,8 @@ def followed(scene: "Scene", start: "State", duration_us: float, contacts: int) 
     return found
 
 
-def fitted_law(scene: "Scene", found: "Simulation") -> dict[str, float]:
+def fitted_law(scene: Scene, found: Simulation) -> dict[str, float]:
     """Return the paper's law with delay, fitted to the scene's contact over the scene's own range of speeds."""
-    import numpy as np  # noqa: PLC0415
-
-    from afm_jax.contact.collide import capture_speed  # noqa: PLC0415
-    from afm_jax.contact.law_of_contact import fit_delay, fit_law  # noqa: PLC0415
-    from afm_jax.motion.record import ContactKind  # noqa: PLC0415
-
     mass = float(scene.cantilever.mass_ng)
     left = np.asarray(found.contacts.kind) == ContactKind.IMPACT
     speeds = np.asarray(found.contacts.approach_speed_nm_per_us)[left]
@@ -134,38 +147,6 @@ def fitted_law(scene: "Scene", found: "Simulation") -> dict[str, float]:
     }
 
 
-def settings_table(result: Mapping[str, Any]) -> "Table":
-    """Return the settings as a table."""
-    from rich.table import Table  # noqa: PLC0415
-
-    title = f"Error after {result['contacts']} contacts against the time of one (one core, one tip)"
-    table = Table(title=title, title_justify="left")
-    for heading in ("way", "setting"):
-        table.add_column(heading)
-    for heading in ("us/contact", "arrival error us", "peak error nm", "compile s"):
-        table.add_column(heading, justify="right")
-    for row in result["rows"]:
-        table.add_row(row["way"], row["setting"], *(known(row.get(name)) for name in COLUMNS[2:]))
-    return table
-
-
-def ladder_table(result: Mapping[str, Any]) -> "Table":
-    """Return the fidelity ladder as a table."""
-    from rich.table import Table  # noqa: PLC0415
-
-    title = f"The same amplitude from simpler models: error against the {result['model_reference']}"
-    table = Table(title=title, title_justify="left")
-    table.add_column("model")
-    for heading in ("peak nm", "lowest peak nm", "error", "seconds", "contacts"):
-        table.add_column(heading, justify="right")
-    for row in result["ladder"]:
-        error = row.get("model_error")
-        heights = [known(row[name], ".5g") for name in ("peak_nm", "lowest_peak_nm")]
-        count = known(row["contacts"], "d")
-        table.add_row(row["model"], *heights, known(error, ".2%"), known(row["seconds"]), count)
-    return table
-
-
 def reference_sentence(result: Mapping[str, Any]) -> str:
     """Say what the errors are measured against, and how good that is."""
     peak = result["reference_error_nm"]
@@ -174,7 +155,3 @@ def reference_sentence(result: Mapping[str, Any]) -> str:
         f"Reference: {result['reference']}; it differs from the second finest by {result['reference_error_us']:.1e} us"
         f"{heights}. Contact {result['contacts']} arrives at {result['arrival_us']:.9g} us."
     )
-
-
-def _reasons(result: Mapping[str, Any]) -> Sequence[str]:
-    return [f"{row['model']}: {row['reason']}" for row in result["ladder"] if row.get("reason")]

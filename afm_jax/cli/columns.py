@@ -55,9 +55,36 @@ def printed_table(title: str, columns: Sequence[TableColumn], rows: Iterable[Any
     """Return a table to print, a row a line."""
     from rich.table import Table  # noqa: PLC0415 (help is there without it)
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title or None, title_justify="left")
     for column in columns:
         table.add_column(column.heading, justify="left" if column.left else "right")
     for row in rows:
         table.add_row(*(column.cell(row) for column in columns))
     return table
+
+
+Cell = str | Callable[[Mapping[str, Any]], str]
+"""The key of a row, with a format behind a colon if its numbers are not to have three digits, or a function of it."""
+
+
+def rows_table(title: str, cells: Mapping[str, Cell], rows: Sequence[Mapping[str, Any]]) -> "Table":
+    """Return a table to print of rows that hold words, numbers, or None where nothing is known, which is a dash.
+
+    Args:
+        title: what stands above the table; may be empty.
+        cells: of each heading what stands below it; columns of words are set to the left.
+        rows: numbers and words by key.
+    """
+
+    def column(heading: str, cell: Cell) -> TableColumn:
+        if callable(cell):
+            return TableColumn(heading, cell, form="", left=True)
+        key, _, form = cell.partition(":")
+
+        def text(row: Mapping[str, Any]) -> str:
+            value = row.get(key)
+            return value if isinstance(value, str) else known(value, form or ".3g")
+
+        return TableColumn(heading, text, form="", left=any(isinstance(row.get(key), str) for row in rows))
+
+    return printed_table(title, [column(heading, cell) for heading, cell in cells.items()], rows)

@@ -1,28 +1,26 @@
 """`afm-jax verify`: the equations against automatic differentiation and against 50 digits."""
 
 from dataclasses import asdict
-from typing import Any
 
-from rich.table import Table
-
-from afm_jax.cli.columns import columns_of
+from afm_jax.cli.columns import Cell, columns_of, rows_table
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.verify.checks import Check, verify
 from afm_jax.words import known
 
 _COLUMNS = (
-    "equation",
-    "against",
-    "where",
-    "points",
-    "max_relative_difference",
-    "mode",
-    "judged",
-    "tolerance",
-    "passed",
+    *("equation", "against", "where", "points", "max_relative_difference", "mode", "judged", "tolerance", "passed"),
     "reason",
 )
+_CELLS: dict[str, Cell] = {
+    "equation": "equation",
+    "against": "against",
+    "where": "where",
+    "points": "points:d",
+    "worst rel. difference": "max_relative_difference:.1e",
+    "in rounding": lambda row: "" if row["against"] == "autodiff" else known(row["judged"], ".2g"),
+    "passed": lambda row: {True: "yes", False: "NO", None: "not compared"}[row["passed"]],
+}
 
 
 def verification(session: Session, *, states: int, seed: int, exact_states: int) -> Output:
@@ -39,7 +37,7 @@ def verification(session: Session, *, states: int, seed: int, exact_states: int)
             "states": states,
             "exact_states": exact_states,
         },
-        text=[_table(checks), *_remarks(checks)],
+        text=[rows_table("", _CELLS, rows), *_remarks(checks)],
         tables={"verify.csv": columns_of(rows, _COLUMNS)},
         not_valid=_why_not(failed, len(checks)) if failed else None,
     )
@@ -51,18 +49,6 @@ def _why_not(failed: list[Check], compared: int) -> str:
         f"{len(failed)} of {compared} comparisons differ too much, first {worst.equation} ({worst.against}, "
         f"{worst.where}): {worst.judged:.2g}, allowed {worst.tolerance:g}"
     )
-
-
-def _table(checks: list[Check]) -> Any:
-    table = Table()
-    for title in ("equation", "against", "where", "points", "worst rel. difference", "in rounding", "passed"):
-        table.add_column(title, justify="right" if title in {"points", "worst rel. difference"} else "left")
-    for check in checks:
-        worst = known(check.max_relative_difference, ".1e")
-        scaled = "" if check.against == "autodiff" or check.judged is None else f"{check.judged:.2g}"
-        passed = {True: "yes", False: "NO", None: "not compared"}[check.passed]
-        table.add_row(check.equation, check.against, check.where, str(check.points), worst, scaled, passed)
-    return table
 
 
 def _remarks(checks: list[Check]) -> list[str]:
