@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from afm_jax.cli.columns import columns_of
 from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session, session_options, write_json
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.bands import UncertainParameters
     from afm_jax.scenefile.scenefile import Start
+
+__all__ = ["Command", "NamedScene", "Options", "Output", "columns_of", "hand_out", "later", "run_command"]
 
 Options = dict[str, Any]
 

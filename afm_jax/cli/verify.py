@@ -5,8 +5,7 @@ from typing import Any
 
 from rich.table import Table
 
-from afm_jax.cli.columns import columns_of
-from afm_jax.cli.command import Output
+from afm_jax.cli.command import Output, columns_of
 from afm_jax.cli.session import Session
 from afm_jax.verify.checks import Check, verify
 from afm_jax.words import known
