@@ -7,6 +7,7 @@ control, and in time, where gap and rate are the state, the phase is frozen, and
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import diffrax
@@ -141,7 +142,9 @@ def collide_accuracy(
     # one program tells how far the reference is converged and what SciPy should find
     methods, tips = integrators
     coarser = batch_of(Contact.paper(), 1.0, jnp.concatenate([speeds, jnp.asarray(tips)]), COARSER_REFERENCE)
-    of_batch, of_tips = (jax.tree.map(lambda part, rows=rows: part[rows], coarser) for rows in _parts(speeds.size))
+    # the first speed is the one near capture, the last ones are those of single tips
+    of_batch = jax.tree.map(itemgetter(slice(1, speeds.size)), coarser)
+    of_tips = jax.tree.map(itemgetter(slice(speeds.size, None)), coarser)
     exact = of_batch._replace(
         rebound_speed_nm_per_us=reference["rebound"][1:], collision_delay_us=reference["delay"][1:]
     )
@@ -165,11 +168,6 @@ def collide_accuracy(
     for row in rows:
         row.pop("median_microseconds_per_impact", None)
     return {"rows": rows, "reference_error": max(errors_against(of_batch, exact))}
-
-
-def _parts(size: int) -> tuple[slice, slice]:
-    """Return which of the speeds are the batch's, without the one near capture, and which are single tips'."""
-    return slice(1, size), slice(size, None)
 
 
 def _collide(
