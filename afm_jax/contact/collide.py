@@ -195,7 +195,7 @@ _Pair = tuple[Float[Array, "..."], Float[Array, "..."]]
 """Of approach and retraction, or of the outer and the inner end of one."""
 
 
-class Parts(NamedTuple):
+class ThreeParts(NamedTuple):
     """The three parts of a collision that forms the junction."""
 
     approach: Passage
@@ -214,7 +214,7 @@ def three_parts(
     mass: Float[Array, "..."],
     setting: Setting,
     crossing: Callable[[Way], Passage] | None = None,
-) -> Parts:
+) -> ThreeParts:
     """Return approach, junction and retraction of one tip, each from the kinetic energy that the one before leaves.
 
     Args:
@@ -242,7 +242,7 @@ def three_parts(
         retract = cross(way_through(tip, gaps_out, solid.energy_aj, margin_of(end, pull_out), inward=False))
 
     resolved = _few_steps_suffice(tip, (approach, solid, retract), start, (pull_in, pull_out), setting)
-    return Parts(approach, solid, retract, tip.ends_nm, resolved)
+    return ThreeParts(approach, solid, retract, tip.ends_nm, resolved)
 
 
 def _few_steps_suffice(
@@ -286,6 +286,7 @@ def _parts_in_a_loop(
         formed_aj, end_aj = before
         goes_in, first_out = number == 0, number == 1
         solid = pass_through_junction(tip, formed_aj, setting.junction_nodes)
+        # of the way in or of the way out
         gaps, pull = jax.tree.map(lambda a, b: jnp.where(goes_in, a, b), *zip(gaps_nm, pulls_aj, strict=True))
         margin = jnp.where(first_out, _TRIAL_MARGIN, margin_of(end_aj, pull))
         energy = jnp.where(goes_in, start, solid.energy_aj)
@@ -300,7 +301,11 @@ def _parts_in_a_loop(
 
 
 def collision_of(
-    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], parts: Parts
+    contact: Contact,
+    junction: Junction,
+    approach_speed: Float[Array, "..."],
+    mass: Float[Array, "..."],
+    parts: ThreeParts,
 ) -> Collision:
     """Return the collision that three parts make, for a tip that forms the junction."""
     approach, solid, retract = parts[:3]
