@@ -7,7 +7,7 @@ again for parameters drawn from the normal distribution with covariance C.
 """
 
 from collections.abc import Iterator, Mapping
-from functools import partial
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -19,9 +19,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
 from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
 from afm_jax.dynamics.continuation import Continuation
-from afm_jax.dynamics.curves import BLOCK, Equations, equations_at, loop_at
+from afm_jax.dynamics.curves import BLOCK, equations_at, loop_at
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.dynamics.impact_loop import Frame, closing_gaps, highest_point
+from afm_jax.dynamics.impact_loop import LoopFamily, closing_gaps, highest_point
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.solve.lanes import in_blocks
@@ -88,53 +88,49 @@ def amplitude_errors(
     It grows without bound towards a fold, where the orbit of a held parameter ceases to exist.
     """
     uncertain = uncertain.without(continuation.range.path)
-    frame, equations = _with_uncertain(continuation, uncertain, None)
+    family = _with_uncertain(continuation, uncertain, None)
     followed = (branch.parameter - continuation.range.low) / (continuation.range.high - continuation.range.low)
     points = np.column_stack([branch.unknowns, followed, np.tile(uncertain.values, (len(followed), 1))])
-    slope = in_blocks(lambda block: _amplitude_slopes(frame, block, equations), points, block=BLOCK, widths=())
+    slope = in_blocks(lambda block: _amplitude_slopes(family, block), points, block=BLOCK, widths=())
     return np.sqrt(np.einsum("ni,ij,nj->n", slope, uncertain.covariance, slope))
 
 
-def _with_uncertain(
-    continuation: Continuation, uncertain: UncertainParameters, test: int | None
-) -> tuple[Frame, Equations]:
-    """Return frame and equations of a continuation with the uncertain parameters behind the followed one."""
-    zero, unit = jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
-    low, width = continuation.frame.low[:1], continuation.frame.width[:1]
-    frame = continuation.frame._replace(low=jnp.concatenate([low, zero]), width=jnp.concatenate([width, unit]))
-    paths = (continuation.range.path, *uncertain.paths)
-    return frame, continuation.equations._replace(paths=paths, kind=test)
+def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, test: int | None) -> LoopFamily:
+    """Return the loops of a continuation with the uncertain parameters behind the followed one."""
+    family, zero, unit = continuation.family, jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
+    low, width = jnp.concatenate([family.low[:1], zero]), jnp.concatenate([family.width[:1], unit])
+    return replace(family, low=low, width=width, paths=(continuation.range.path, *uncertain.paths), test=test)
 
 
 def _slopes_of_special_point(
     continuation: Continuation, point: SpecialPoint, uncertain: UncertainParameters
 ) -> Float[np.ndarray, " uncertain"]:
     """Return dp/da: the derivatives of the parameter of a special point by the uncertain ones."""
-    frame, equations = _with_uncertain(continuation, uncertain, point.test)
+    family = _with_uncertain(continuation, uncertain, point.test)
     width = continuation.range.high - continuation.range.low
     followed = (point.parameter - continuation.range.low) / width
     at = jnp.asarray(np.concatenate([point.unknowns, [followed], uncertain.values]))
-    return np.asarray(_slopes_by_uncertain(frame, at, equations))[-1] * width
+    return np.asarray(_slopes_by_uncertain(family, at))[-1] * width
 
 
-@partial(jax.jit, static_argnames=("equations",))
-def _slopes_by_uncertain(frame: Frame, point: Array, equations: Equations) -> Float[Array, "n uncertain"]:
-    slopes = jax.jacfwd(lambda unknowns: equations_at(unknowns, frame, equations))(point)
+@jax.jit
+def _slopes_by_uncertain(family: LoopFamily, point: Array) -> Float[Array, "n uncertain"]:
+    slopes = jax.jacfwd(lambda unknowns: equations_at(unknowns, family))(point)
     solved = slopes.shape[0]
     return -jnp.linalg.solve(slopes[:, :solved], slopes[:, solved:])
 
 
-@partial(jax.jit, static_argnames=("equations",))
-def _amplitude_slopes(frame: Frame, points: Array, equations: Equations) -> Float[Array, "points uncertain"]:
+@jax.jit
+def _amplitude_slopes(family: LoopFamily, points: Array) -> Float[Array, "points uncertain"]:
     """Return the derivatives of the peak amplitude of closed loops by the uncertain parameters."""
 
     def slopes_at(point):
-        count = point.shape[0] - len(equations.paths)
+        count = point.shape[0] - len(family.paths)
         followed, uncertain = point[count : count + 1], point[count + 1 :]
 
         def gaps_and_peak(unknowns, values):
-            loop = loop_at(jnp.concatenate([followed, values]), frame, equations)
-            return closing_gaps(unknowns, loop), highest_point(unknowns, loop, equations.samples)
+            loop = loop_at(jnp.concatenate([followed, values]), family)
+            return closing_gaps(unknowns, loop), highest_point(unknowns, loop, family.samples)
 
         slopes = jax.jacfwd(gaps_and_peak, argnums=(0, 1))(point[:count], uncertain)
         (gaps_by_loop, gaps_by_uncertain), (peak_by_loop, peak_by_uncertain) = slopes

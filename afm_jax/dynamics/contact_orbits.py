@@ -20,7 +20,7 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.dynamics.impact_loop import Frame, FreeFlights, LoopReading, driven_part, lowest_of_flights
+from afm_jax.dynamics.impact_loop import FreeFlights, LoopFamily, LoopReading, driven_part, lowest_of_flights
 from afm_jax.dynamics.impact_orbits import (
     ManyImpactOrbits,
     check_loop,
@@ -126,7 +126,7 @@ def contact_loops(
     Returns:
         One row a loop: m departure phases in rad, ascending, and m rebound speeds in nm/us.
     """
-    scene, order = flights.family(*values), flights.order
+    scene, order = flights.scene_at(*values), flights.order
     guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, order, impacts, flights.accuracy)]
     loops = _closed(np.array(guesses).reshape(-1, 2 * impacts), flights, values)
     return loops_told_apart(loops, order)
@@ -459,11 +459,11 @@ class ContactFlights:
         """Make the program, which is compiled when it is first used."""
         self.accuracy = accuracy
         self.order, self._driven = order, driven_part(scene)
-        self.family = scene_family(scene, *paths) if paths else lambda: scene
+        self.scene_at = scene_family(scene, *paths) if paths else lambda: scene
 
         def one(phase: Array, rebound: Array, until: Array, values: Array) -> tuple[Array, Contacts, Array]:
             def departs(unknowns: Array) -> tuple[Array, Contacts]:
-                there = self.family(*unknowns[2:])
+                there = self.scene_at(*unknowns[2:])
                 omega = RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz
                 return _next_departure(there, omega, unknowns[:2], until, accuracy)
 
@@ -530,9 +530,9 @@ class ContactFlights:
         )
         return LoopReading(*(jnp.asarray(part) for part in facts))
 
-    def readings_of_points(self, points: Float[np.ndarray, "points n"], frame: Frame) -> LoopReading:
+    def readings_of_points(self, points: Float[np.ndarray, "points n"], family: LoopFamily) -> LoopReading:
         """Return what there is to know of the loops at points of a curve (`solve`), NumPy arrays."""
-        readings = [reading for reading in self.readings(*frame.loops_and_values(points)) if reading is not None]
+        readings = [reading for reading in self.readings(*family.loops_and_values(points)) if reading is not None]
         if len(readings) < len(points):
             raise ValueError("a loop that was closed does not fly")
         return _stacked(readings, len(readings[0].phase_rad))
@@ -540,41 +540,40 @@ class ContactFlights:
     def _departures(self, flown: FlownLoop) -> tuple[Scene, np.ndarray, np.ndarray]:
         """Return the scene of a loop, its departure times in us and rebound speeds in nm/us."""
         phase, rebound = np.split(flown.loop, 2)
-        there = self.family(*flown.values)
+        there = self.scene_at(*flown.values)
         return there, phase / float(RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz), rebound
 
-    def linearised(self, point: Float[np.ndarray, " n"], frame: Frame, kind: int | None) -> EquationsAt | None:
+    def linearised(self, point: Float[np.ndarray, " n"], family: LoopFamily) -> EquationsAt | None:
         """Return the closing conditions at a point of a curve, and the test functions there; None where none flies.
 
         Args:
             point: m phases in rad, m rebound speeds in the unit of speeds, the parameters as fractions of their ranges.
-            frame: of the curve.
-            kind: number of the test function that is to be 0 besides; None: the loop closes, and that is all.
+            family: of the curve.
         """
         # the test function's derivatives are differences, which only lead to its root
         size = len(point)
-        around = [np.eye(size), -np.eye(size)] if kind is not None else []
+        around = [np.eye(size), -np.eye(size)] if family.test is not None else []
         aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
-        flown = [one for one in self.flown(*frame.loops_and_values(point + aside)) if one is not None]
+        flown = [one for one in self.flown(*family.loops_and_values(point + aside)) if one is not None]
         if len(flown) < len(aside):
             return None
         here = flown[0]
-        units = frame.units(len(here.loop) // 2)
-        value, slopes = here.gaps / units, here.slopes * np.concatenate([units, frame.width]) / units[:, None]
-        if kind is not None:
-            tests = np.array([self.tests(one, frame, grazing=kind == _GRAZING)[kind] for one in flown])
+        units = family.units(len(here.loop) // 2)
+        value, slopes = here.gaps / units, here.slopes * np.concatenate([units, family.width]) / units[:, None]
+        if family.test is not None:
+            tests = np.array([self.tests(one, family, grazing=family.test == _GRAZING)[family.test] for one in flown])
             value = np.append(value, tests[0])
             slopes = np.vstack([slopes, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
         return EquationsAt(value, slopes, here)
 
-    def tests(self, flown: FlownLoop, frame: Frame, *, grazing: bool = True) -> np.ndarray:
+    def tests(self, flown: FlownLoop, family: LoopFamily, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `curves`; that of grazing NaN where it is not asked for."""
         trace, determinant = flown.trace_and_determinant
-        slowest = np.split(flown.loop, 2)[1].min() / float(frame.speed_unit)
+        slowest = np.split(flown.loop, 2)[1].min() / float(family.speed_unit)
         near = np.nan
         if grazing:
             lowest, omega = _lowest_gap(*self._departures(flown), flown.contacts.arrival_time_us)
-            near = float(lowest * omega) / float(frame.speed_unit)
+            near = float(lowest * omega) / float(family.speed_unit)
         return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, [near, slowest])
 
 

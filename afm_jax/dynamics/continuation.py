@@ -18,16 +18,15 @@ from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
 from afm_jax.dynamics.curves import (
     CAPTURE,
     CurveLeg,
-    Equations,
     FollowedCurve,
+    family_of,
     followed_both_ways,
-    frame_of,
     lies_on,
     read_points,
     root_on,
     tested_by,
 )
-from afm_jax.dynamics.impact_loop import Frame, driven_part, samples_for
+from afm_jax.dynamics.impact_loop import LoopFamily, driven_part, samples_for
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.dynamics.special_points import (
     OrbitBranch,
@@ -61,8 +60,7 @@ class Continuation(ResultTuple):
     curves: tuple[SpecialCurve, ...]
     rejected: int
     """Orbits found to begin with whose flights pass through the surface; not followed."""
-    frame: Frame
-    equations: Equations
+    family: LoopFamily
     sticking: bool = False
     """The orbits rest on the surface (`follow_sticking`)."""
 
@@ -111,26 +109,26 @@ def continue_orbits(
         if not second.low <= value <= second.high:
             raise ValueError(f"{second}: the range must hold the scene's own value, {value:g}, where the curves begin")
     flights = ContactFlights(scene, order, (given.path,)) if isinstance(scene.interaction, Contact) else None
-    equations = Equations((given.path,), driven, samples_for(scene, order, driven), flights=flights)
     starts, rejected = _orbits_in_range(scene, order, impacts, given, flights)
     speed_unit = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
-    frame = frame_of(scene, order, speed_unit, (given,))
+    static = {"speed_unit": speed_unit, "samples": samples_for(scene, order, driven), "flights": flights}
+    family = family_of(scene, order, (given,), driven, **static)
     followed: list[FollowedCurve] = []
     for fraction, loop in starts:
         start = np.concatenate([loop[:impacts], loop[impacts:] / speed_unit, [fraction]])
-        if not any(lies_on(start, curve, frame, equations) for curve in followed):
-            curve = followed_both_ways(start, frame, equations)
+        if not any(lies_on(start, curve, family) for curve in followed):
+            curve = followed_both_ways(start, family)
             if curve is not None:
                 followed.append(curve)
-    branches = tuple(_branch(curve, frame, equations) for curve in followed)
+    branches = tuple(_branch(curve, family) for curve in followed)
     special = tuple(
-        point for number, curve in enumerate(followed) for point in special_points_of(curve, number, frame, equations)
+        point for number, curve in enumerate(followed) for point in special_points_of(curve, number, family)
     )
     curves = ()
     if second is not None:
-        both = frame_of(scene, order, speed_unit, ranges)
-        curves = special_curves(special, both, equations, second, parameter_values(scene)[second.path])
-    return Continuation(order, impacts, given, second, branches, special, curves, rejected, frame, equations)
+        both = family_of(scene, order, ranges, driven, **static)
+        curves = special_curves(special, both, second, parameter_values(scene)[second.path])
+    return Continuation(order, impacts, given, second, branches, special, curves, rejected, family)
 
 
 def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRange]) -> None:
@@ -194,20 +192,20 @@ def _single_impact_loops(scene: Scene, order: int) -> tuple[Float[np.ndarray, "o
     return np.stack([phases, coordinates], axis=1)[admissible], int(np.sum(exists & ~admissible))
 
 
-def _branch(curve: FollowedCurve, frame: Frame, equations: Equations) -> OrbitBranch:
+def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:
     """Return the orbits along a curve; where an impact loses its speed the last point is just before."""
     points, ends = curve.points, list(curve.ends)
     for place, legs in ((0, curve.behind), (-1, curve.ahead)):
         if ends[place] == "capture":
-            points[place] = _before_capture(legs[-1], frame, equations)
-            if captures_nothing(points[place], frame, equations):
+            points[place] = _before_capture(legs[-1], family)
+            if captures_nothing(points[place], family):
                 ends[place] = "no_speed"
-    value = float(frame.low[0]) + float(frame.width[0]) * points[:, -1]
-    return OrbitBranch(value, points[:, :-1], read_points(points, frame, equations), (ends[0], ends[1]))
+    value = float(family.low[0]) + float(family.width[0]) * points[:, -1]
+    return OrbitBranch(value, points[:, :-1], read_points(points, family), (ends[0], ends[1]))
 
 
-def _before_capture(leg: CurveLeg, frame: Frame, equations: Equations) -> Float[np.ndarray, " n"]:
+def _before_capture(leg: CurveLeg, family: LoopFamily) -> Float[np.ndarray, " n"]:
     """Return the last point of a leg before capture, to a millionth of the way."""
-    root = root_on(leg, tested_by(CAPTURE, equations), frame, equations)
-    point = None if root is None else leg.at((1.0 - _BEFORE_CAPTURE) * root[0], frame, equations)
+    root = root_on(leg, tested_by(CAPTURE, family), family)
+    point = None if root is None else leg.at((1.0 - _BEFORE_CAPTURE) * root[0], family)
     return leg.begin.point if point is None else point.point

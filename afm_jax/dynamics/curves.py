@@ -15,7 +15,6 @@ On curves in two parameters the test function is solved for together with the cl
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -25,10 +24,9 @@ from jaxtyping import Array, Float
 from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.dynamics.contact_orbits import ContactFlights
 from afm_jax.dynamics.impact_loop import (
-    Frame,
     ImpactLoop,
+    LoopFamily,
     LoopReading,
     closing_gaps,
     impacts_at,
@@ -71,44 +69,41 @@ _UNLIKE = 1e-3
 _SAME = 1e-5
 
 
-class Equations(NamedTuple):
-    """Which equations are solved, static: each is a program of its own."""
+def family_of(
+    scene: Scene, order: int, ranges: Sequence[ParameterRange], driven: str, *, speed_unit: float = 1.0, **static: Any
+) -> LoopFamily:
+    """Return the loops of a scene over the ranges of some parameters.
 
-    paths: tuple[str, ...]
-    """Of the parameters that move."""
-    driven: str
-    """The part of the scene that sets the period (`driven_part`)."""
-    samples: int
-    """Heights at which every flight is evaluated for its lowest point."""
-    kind: int | None = None
-    """Number of the test function that is 0 besides; None: none is."""
-    flights: ContactFlights | None = None
-    """Simulates the loops of a scene with a contact; None: the scene has a law."""
-
-
-def frame_of(scene: Scene, order: int, speed_unit: float, ranges: Sequence[ParameterRange]) -> Frame:
-    """Return the frame of curves through the ranges of some parameters; the unit of speeds in nm/us."""
+    Args:
+        scene: one scene.
+        order: N.
+        ranges: of the parameters.
+        driven: the part that sets the period.
+        speed_unit: unit of speeds in nm/us.
+        static: samples, test and flights of the family.
+    """
     low, high = (jnp.asarray([getattr(given, end) for given in ranges]) for end in ("low", "high"))
-    return Frame(scene, jnp.asarray(float(order)), jnp.asarray(speed_unit), low, high - low)
+    paths, number = tuple(given.path for given in ranges), jnp.asarray(float(order))
+    return LoopFamily(scene, number, jnp.asarray(speed_unit), low, high - low, paths, driven, **static)
 
 
-def loop_at(fractions: Float[Array, " parameters"], frame: Frame, equations: Equations) -> ImpactLoop:
+def loop_at(fractions: Float[Array, " parameters"], family: LoopFamily) -> ImpactLoop:
     """Return the loop of a law scene where the parameters are at fractions of their ranges."""
-    values = dict(zip(equations.paths, frame.low + frame.width * fractions, strict=True))
-    return loop_of(with_numbers(frame.scene, values), frame.order, equations.driven, frame.speed_unit)
+    values = dict(zip(family.paths, family.low + family.width * fractions, strict=True))
+    return loop_of(with_numbers(family.scene, values), family.order, family.driven, family.speed_unit)
 
 
-def split_point(point: Array, equations: Equations) -> tuple[Array, Array]:
+def split_point(point: Array, family: LoopFamily) -> tuple[Array, Array]:
     """Return the unknowns of a point, and the parameters as fractions of their ranges."""
-    count = point.shape[0] - len(equations.paths)
+    count = point.shape[0] - len(family.paths)
     return point[:count], point[count:]
 
 
-def _tests(unknowns: Array, loop: ImpactLoop, equations: Equations) -> list[Array]:
+def _tests(unknowns: Array, loop: ImpactLoop, family: LoopFamily) -> list[Array]:
     """Return the test functions in the order of `KINDS`, without dimension."""
     trace, determinant = trace_and_determinant_of(unknowns, loop)
-    near = nearest_approach(unknowns, loop, equations.samples).gap_nm
-    if equations.kind == CAPTURE:
+    near = nearest_approach(unknowns, loop, family.samples).gap_nm
+    if family.test == CAPTURE:
         near = jnp.minimum(near, _rise_when_captured(unknowns, loop))
     speeds = unknowns[unknowns.shape[0] // 2 :]
     slowest = -largest(-speeds) if speeds.size else jnp.inf
@@ -133,14 +128,14 @@ def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
     return -height - (2.0 * decay * velocity + jax.grad(loop.surface.velocity)(leaving)) / omega**2
 
 
-def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) -> Float[Array, " rows"]:
+def equations_at(point: Float[Array, " n"], family: LoopFamily) -> Float[Array, " rows"]:
     """Return the closing conditions at a point of a curve, and behind them the test function that is to be 0."""
-    unknowns, fractions = split_point(point, equations)
-    loop = loop_at(fractions, frame, equations)
+    unknowns, fractions = split_point(point, family)
+    loop = loop_at(fractions, family)
     gaps = closing_gaps(unknowns, loop)
-    if equations.kind is None:
+    if family.test is None:
         return gaps
-    test = _tests(unknowns, loop, equations)[equations.kind]
+    test = _tests(unknowns, loop, family)[family.test]
     return jnp.append(gaps, test)
 
 
@@ -156,60 +151,60 @@ class CurvePoint(NamedTuple):
     """Longest delay of an impact, in drive periods."""
 
 
-@partial(jax.jit, static_argnames=("equations",))
-def _linearised(frame: Frame, point: Array, equations: Equations) -> tuple[Array, Array]:
+@jax.jit
+def _linearised(family: LoopFamily, point: Array) -> tuple[Array, Array]:
     def twice(point):
-        value = equations_at(point, frame, equations)
+        value = equations_at(point, family)
         return value, value
 
     slopes, value = jax.jacfwd(twice, has_aux=True)(point)
     return value, slopes
 
 
-@partial(jax.jit, static_argnames=("equations",))
-def _tests_and_delay(frame: Frame, point: Array, equations: Equations) -> tuple[Array, Array]:
-    unknowns, fractions = split_point(point, equations)
-    loop = loop_at(fractions, frame, equations)
+@jax.jit
+def _tests_and_delay(family: LoopFamily, point: Array) -> tuple[Array, Array]:
+    unknowns, fractions = split_point(point, family)
+    loop = loop_at(fractions, family)
     delay = jnp.zeros(())
     if loop.impact.delayed:
         delays = impacts_at(unknowns, loop).speeds.delay
         delay = jnp.max(jnp.abs(delays)) * loop.angular_frequency / (2.0 * jnp.pi)
-    return jnp.stack(_tests(unknowns, loop, equations)), delay
+    return jnp.stack(_tests(unknowns, loop, family)), delay
 
 
-def solved_point(frame: Frame, guess: np.ndarray, normal: np.ndarray, equations: Equations) -> CurvePoint | None:
+def solved_point(guess: np.ndarray, normal: np.ndarray, family: LoopFamily) -> CurvePoint | None:
     """Return the point of a curve in the plane through a guess across a normal; None where no loop closes there."""
-    flights = equations.flights
+    flights = family.flights
 
     def linearised(point: np.ndarray) -> EquationsAt | None:
         if flights is not None:
-            return flights.linearised(point, frame, equations.kind)
-        return EquationsAt(*(np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations)))
+            return flights.linearised(point, family)
+        return EquationsAt(*(np.asarray(part) for part in _linearised(family, jnp.asarray(point))))
 
     point = point_in_plane(linearised, guess, normal, _CLOSING)
     if point is None:
         return None
     if flights is None:
-        tests, delay = (np.asarray(part) for part in _tests_and_delay(frame, jnp.asarray(point.x), equations))
+        tests, delay = (np.asarray(part) for part in _tests_and_delay(family, jnp.asarray(point.x)))
     else:
-        tests, delay = flights.tests(point.details, frame), 0.0
+        tests, delay = flights.tests(point.details, family), 0.0
     return CurvePoint(point.x, point.tangent, tests, delay)
 
 
-@partial(jax.jit, static_argnames=("equations",))
-def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
+@jax.jit
+def _read(family: LoopFamily, points: Array) -> LoopReading:
     def reading_at(point):
-        unknowns, fractions = split_point(point, equations)
-        return reading_of(unknowns, loop_at(fractions, frame, equations), equations.samples)
+        unknowns, fractions = split_point(point, family)
+        return reading_of(unknowns, loop_at(fractions, family), family.samples)
 
     return jax.vmap(reading_at)(points)
 
 
-def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: Equations) -> LoopReading:
+def read_points(points: Float[np.ndarray, "points n"], family: LoopFamily) -> LoopReading:
     """Return the readings of the orbits at points of a curve, NumPy arrays."""
-    if equations.flights is not None:
-        return equations.flights.readings_of_points(points, frame)
-    return in_blocks(lambda block: _read(frame, block, equations), points, block=BLOCK, widths=())
+    if family.flights is not None:
+        return family.flights.readings_of_points(points, family)
+    return in_blocks(lambda block: _read(family, block), points, block=BLOCK, widths=())
 
 
 class CurveLeg(NamedTuple):
@@ -222,10 +217,10 @@ class CurveLeg(NamedTuple):
     normal: np.ndarray
     """Of the plane in which it was."""
 
-    def at(self, fraction: float, frame: Frame, equations: Equations) -> CurvePoint | None:
+    def at(self, fraction: float, family: LoopFamily) -> CurvePoint | None:
         """Return the curve's point in the plane at a fraction of the step."""
         guess = self.begin.point + fraction * (self.guess - self.begin.point)
-        point = solved_point(frame, guess, self.normal, equations)
+        point = solved_point(guess, self.normal, family)
         return point if point is None or point.tangent @ self.begin.tangent > 0.0 else _reversed(point)
 
 
@@ -256,28 +251,28 @@ class FollowedCurve(NamedTuple):
             yield leg, lambda fraction, index=index: count + index + fraction
 
 
-def followed_both_ways(start: np.ndarray, frame: Frame, equations: Equations) -> FollowedCurve | None:
+def followed_both_ways(start: np.ndarray, family: LoopFamily) -> FollowedCurve | None:
     """Return the curve through a point, followed both ways; None where the point is none of a curve."""
     normals = np.eye(len(start))[-1], np.full(len(start), 1.0 / np.sqrt(len(start)))
-    solved = (solved_point(frame, start, normal, equations) for normal in normals)
+    solved = (solved_point(start, normal, family) for normal in normals)
     first = next((point for point in solved if point is not None and np.abs(point.point - start).max() < _NEAR), None)
     if first is None:
         return None
-    ahead, why_ahead = _follow(first, first.tangent, frame, equations)
+    ahead, why_ahead = _follow(first, first.tangent, family)
     if why_ahead == "closed":
         return FollowedCurve(first, [], ahead, ("closed", "closed"))
-    behind, why_behind = _follow(first, -first.tangent, frame, equations)
+    behind, why_behind = _follow(first, -first.tangent, family)
     return FollowedCurve(first, behind, ahead, (why_behind, why_ahead)) if ahead or behind else None
 
 
-def _follow(first: CurvePoint, tangent: np.ndarray, frame: Frame, equations: Equations) -> tuple[list[CurveLeg], str]:
+def _follow(first: CurvePoint, tangent: np.ndarray, family: LoopFamily) -> tuple[list[CurveLeg], str]:
     """Return the legs of a curve from a point in a direction, and why they end."""
-    parameters = len(equations.paths)
+    parameters = len(family.paths)
     here, legs, length = first._replace(tangent=tangent), [], FIRST_STEP
-    begin, unlike_shorter = here, _unlike_a_shorter_loop(first, frame, parameters)
+    begin, unlike_shorter = here, _unlike_a_shorter_loop(first, family)
     while len(legs) < _MOST_POINTS:
         guess = here.point + length * here.tangent
-        ahead = solved_point(frame, guess, here.tangent, equations)
+        ahead = solved_point(guess, here.tangent, family)
         if ahead is None or not _is_next(ahead, guess, length, here):
             length *= 0.5
             if length < _SHORTEST_STEP:
@@ -285,10 +280,10 @@ def _follow(first: CurvePoint, tangent: np.ndarray, frame: Frame, equations: Equ
             continue
         fractions = ahead.point[-parameters:]
         if np.any(fractions < 0.0) or np.any(fractions > 1.0):
-            last = _at_the_border(here, ahead, frame, equations)
+            last = _at_the_border(here, ahead, family)
             return (legs if last is None else [*legs, last]), "range"
         legs.append(CurveLeg(here, ahead, guess, here.tangent))
-        over = _why_over(ahead, unlike_shorter, equations)
+        over = _why_over(ahead, unlike_shorter, family)
         if over is not None:
             return (legs if over == "capture" else legs[:-1]), over
         if len(legs) > 10 and _closes(ahead, begin, length, parameters):
@@ -300,24 +295,24 @@ def _follow(first: CurvePoint, tangent: np.ndarray, frame: Frame, equations: Equ
 
 
 def _why_over(
-    point: CurvePoint, unlike_shorter: Callable[[CurvePoint], float] | None, equations: Equations
+    point: CurvePoint, unlike_shorter: Callable[[CurvePoint], float] | None, family: LoopFamily
 ) -> str | None:
     """Return why a curve ends before a point; None where it goes on."""
-    if equations.kind != CAPTURE and point.tests[CAPTURE] < 0.0:
+    if family.test != CAPTURE and point.tests[CAPTURE] < 0.0:
         return "capture"
     if point.delay > _LONGEST_DELAY:
         return "delay"
     return "shorter" if unlike_shorter is not None and unlike_shorter(point) < _UNLIKE else None
 
 
-def _unlike_a_shorter_loop(first: CurvePoint, frame: Frame, parameters: int) -> Callable[[CurvePoint], float] | None:
+def _unlike_a_shorter_loop(first: CurvePoint, family: LoopFamily) -> Callable[[CurvePoint], float] | None:
     """Return the function that tells how far a loop is from repeating itself after fewer impacts, with a sign.
 
     None where a loop of so many impacts and periods cannot. A curve that comes to a loop of fewer impacts goes through
     it, back along its own loops begun with another impact: the sign changes there.
     """
-    count = (len(first.point) - parameters) // 2
-    divisor = math.gcd(count, int(frame.order))
+    count = (len(first.point) - len(family.paths)) // 2
+    divisor = math.gcd(count, int(family.order))
     shifts = [count // parts for parts in range(2, divisor + 1) if divisor % parts == 0]
     if not shifts:
         return None
@@ -352,9 +347,9 @@ def _closes(here: CurvePoint, first: CurvePoint, length: float, parameters: int)
     return bool(np.linalg.norm(apart) < length and here.tangent @ first.tangent > _STRAIGHT)
 
 
-def _at_the_border(here: CurvePoint, beyond: CurvePoint, frame: Frame, equations: Equations) -> CurveLeg | None:
+def _at_the_border(here: CurvePoint, beyond: CurvePoint, family: LoopFamily) -> CurveLeg | None:
     """Return the leg to where a curve leaves the range of a parameter; None where no loop closes there."""
-    parameters = len(equations.paths)
+    parameters = len(family.paths)
     inside, outside = here.point[-parameters:], beyond.point[-parameters:]
     border = np.clip(outside, 0.0, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -364,22 +359,22 @@ def _at_the_border(here: CurvePoint, beyond: CurvePoint, frame: Frame, equations
     place = len(guess) - parameters + which
     guess[place] = border[which]
     normal = np.eye(len(guess))[place]
-    end = solved_point(frame, guess, normal, equations)
+    end = solved_point(guess, normal, family)
     if end is None or np.linalg.norm(end.point - guess) > LONGEST_STEP:
         return None
     return CurveLeg(here, end if end.tangent @ here.tangent >= 0.0 else _reversed(end), guess, normal)
 
 
-def lies_on(point: np.ndarray, curve: FollowedCurve, frame: Frame, equations: Equations) -> bool:
+def lies_on(point: np.ndarray, curve: FollowedCurve, family: LoopFamily) -> bool:
     """Say whether a curve goes through a point, up to whole drive periods and the choice of the first impact."""
-    points, parameters = curve.points, len(equations.paths)
+    points, parameters = curve.points, len(family.paths)
     between = np.flatnonzero((points[:-1, -1] - point[-1]) * (points[1:, -1] - point[-1]) <= 0.0)
     for index in between:
         low, high = points[index], points[index + 1]
         rise = high[-1] - low[-1]
         guess = low + ((point[-1] - low[-1]) / rise if rise else 0.0) * (high - low)
         guess[-1] = point[-1]
-        on_curve = solved_point(frame, guess, np.eye(len(guess))[-1], equations)
+        on_curve = solved_point(guess, np.eye(len(guess))[-1], family)
         if on_curve is not None and _same_loop(on_curve.point, point, parameters):
             return True
     return False
@@ -392,9 +387,9 @@ def _same_loop(point: np.ndarray, other: np.ndarray, parameters: int) -> bool:
     return bool(apart < _SAME and np.abs(point - other)[-parameters:].max() < _SAME)
 
 
-def tested_by(test: int, equations: Equations) -> Callable[[CurvePoint], float]:
+def tested_by(test: int, family: LoopFamily) -> Callable[[CurvePoint], float]:
     """Return the function from a point to the value of a test function by its number; 1 where it has none."""
-    along = test == FOLD and equations.kind is None
+    along = test == FOLD and family.test is None
 
     def value(point: CurvePoint) -> float:
         tested = float(point.tangent[-1] if along else point.tests[test])
@@ -403,15 +398,13 @@ def tested_by(test: int, equations: Equations) -> Callable[[CurvePoint], float]:
     return value
 
 
-def root_on(
-    leg: CurveLeg, test: Callable[[CurvePoint], float], frame: Frame, equations: Equations
-) -> tuple[float, CurvePoint] | None:
+def root_on(leg: CurveLeg, test: Callable[[CurvePoint], float], family: LoopFamily) -> tuple[float, CurvePoint] | None:
     """Return where on a leg a test function is 0, as a fraction of the leg, and the point there; None: nowhere."""
     if not test(leg.begin) * test(leg.end) < 0.0:
         return None
 
     def tested_at(fraction: float) -> float:
-        point = leg.at(fraction, frame, equations)
+        point = leg.at(fraction, family)
         return np.nan if point is None else test(point)
 
     try:
@@ -419,6 +412,6 @@ def root_on(
     except ValueError:
         # the guesses on the way led elsewhere
         return None
-    point = leg.at(fraction, frame, equations)
+    point = leg.at(fraction, family)
     # a jump or a pole is no root
     return None if point is None or not abs(test(point)) < AT_A_ROOT else (fraction, point)

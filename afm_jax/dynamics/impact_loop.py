@@ -9,7 +9,7 @@ The linearised map of the whole loop is the product of its flights' and impacts'
 """
 
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -331,17 +331,31 @@ def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> 
     )
 
 
-class Frame(NamedTuple):
-    """The scene of a curve of loops, its order N, and what loops and parameters are measured in along the curve."""
+class LoopFamily(eqx.Module):
+    """Closed loops of a scene of which parameters move: what is solved along a curve of them, and in which units.
+
+    What is static makes a program of its own.
+    """
 
     scene: Scene
     order: Float[Array, ""]
+    """N."""
     speed_unit: Float[Array, ""]
-    """In nm/us."""
+    """Unit of a loop's speeds or coordinates in nm/us."""
     low: Float[Array, " parameters"]
     """Lower ends of the parameters' ranges."""
     width: Float[Array, " parameters"]
     """Widths of the ranges: parameters count as fractions of them."""
+    paths: tuple[str, ...] = eqx.field(static=True)
+    """Of the parameters that move."""
+    driven: str = eqx.field(static=True)
+    """The part of the scene that sets the period (`driven_part`)."""
+    samples: int = eqx.field(static=True, default=0)
+    """Heights at which every flight is evaluated for its lowest point."""
+    test: int | None = eqx.field(static=True, default=None)
+    """Number of the test function that is 0 besides; None: none is."""
+    flights: Any = eqx.field(static=True, default=None)
+    """`ContactFlights` that simulate the loops of a scene with a contact; None: the scene has a law."""
 
     def units(self, impacts: int) -> Float[np.ndarray, " n"]:
         """Return the units of a loop's unknowns: m phases in rad, m speeds or coordinates in nm/us."""

@@ -5,6 +5,7 @@ In two parameters the closing equations together with the test function are foll
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -23,7 +24,6 @@ from afm_jax.dynamics.curves import (
     TORUS,
     CurveLeg,
     CurvePoint,
-    Equations,
     FollowedCurve,
     followed_both_ways,
     lies_on,
@@ -33,7 +33,7 @@ from afm_jax.dynamics.curves import (
     split_point,
     tested_by,
 )
-from afm_jax.dynamics.impact_loop import Frame, LoopReading
+from afm_jax.dynamics.impact_loop import LoopFamily, LoopReading
 from afm_jax.scenefile.parameter_paths import ParameterRange
 
 _ASIDE = 1e-5
@@ -104,27 +104,26 @@ class _Root(NamedTuple):
     """Points whose orbits are read: that of the root first, then its neighbours on either side."""
 
 
-def special_points_of(curve: FollowedCurve, number: int, frame: Frame, equations: Equations) -> list[SpecialPoint]:
+def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> list[SpecialPoint]:
     """Return the special points of a branch in their order along it, and where a contact's curve was lost at one.
 
     Args:
         curve: the branch.
         number: of the branch.
-        frame: in which it was followed.
-        equations: of its loops.
+        family: of its loops.
     """
-    roots = [*_roots_on(curve, frame, equations), *(_at_lost_ends(curve) if equations.flights is not None else ())]
+    roots = [*_roots_on(curve, family), *(_at_lost_ends(curve) if family.flights is not None else ())]
     if not roots:
         return []
     roots.sort(key=lambda root: root.position)
-    readings = read_points(np.stack([point for root in roots for point in root.seen]), frame, equations)
-    low, width = float(frame.low[0]), float(frame.width[0])
+    readings = read_points(np.stack([point for root in roots for point in root.seen]), family)
+    low, width = float(family.low[0]), float(family.width[0])
     special, first = [], 0
     for root in roots:
         reading = jax.tree.map(lambda column, first=first: column[first], readings)
         admissible = bool(readings.admissible[first : first + len(root.seen)].any())
         first += len(root.seen)
-        kind = _kind_of(root.test, root.point, frame, equations)
+        kind = _kind_of(root.test, root.point, family)
         if root.test == CAPTURE and kind == KINDS[GRAZING] and not admissible:
             # the tip rests while the sample goes through it: no motion comes to that
             continue
@@ -138,12 +137,12 @@ def special_points_of(curve: FollowedCurve, number: int, frame: Frame, equations
     return special
 
 
-def _roots_on(curve: FollowedCurve, frame: Frame, equations: Equations) -> list[_Root]:
+def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
     """Return the roots of all test functions between the points of a branch."""
     roots = []
     for leg, position_of in curve.places():
         for test in range(len(KINDS)):
-            root = root_on(leg, tested_by(test, equations), frame, equations)
+            root = root_on(leg, tested_by(test, family), family)
             if root is None or (test == TORUS and not _is_complex(root[1])):
                 continue
             fraction, point = root
@@ -151,7 +150,7 @@ def _roots_on(curve: FollowedCurve, frame: Frame, equations: Equations) -> list[
             if test == CAPTURE:
                 # there the branch ends: its last point is beside it
                 position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
-            roots.append(_Root(position, test, point, [point.point, *_beside(leg, fraction, test, frame, equations)]))
+            roots.append(_Root(position, test, point, [point.point, *_beside(leg, fraction, test, family)]))
     return roots
 
 
@@ -160,11 +159,11 @@ def _is_the_same(point: SpecialPoint, other: SpecialPoint, width: float) -> bool
     return point.kind == other.kind and abs(point.parameter - other.parameter) < _SAME_POINT * width
 
 
-def _beside(leg: CurveLeg, fraction: float, test: int, frame: Frame, equations: Equations) -> list[np.ndarray]:
+def _beside(leg: CurveLeg, fraction: float, test: int, family: LoopFamily) -> list[np.ndarray]:
     """Return the points on either side of a grazing or a capture: on one of them the orbit may be flown."""
     if test not in (GRAZING, CAPTURE):
         return []
-    points = (leg.at(fraction + apart, frame, equations) for apart in (-_ASIDE, _ASIDE))
+    points = (leg.at(fraction + apart, family) for apart in (-_ASIDE, _ASIDE))
     return [point.point for point in points if point is not None]
 
 
@@ -189,17 +188,17 @@ def _at_lost_ends(curve: FollowedCurve) -> list[_Root]:
     return roots
 
 
-def _kind_of(test: int, point: CurvePoint, frame: Frame, equations: Equations) -> str:
+def _kind_of(test: int, point: CurvePoint, family: LoopFamily) -> str:
     """Return what a root of a test function is: where the law captures nothing, an impact that vanishes is a graze."""
-    return KINDS[GRAZING] if test == CAPTURE and captures_nothing(point.point, frame, equations) else KINDS[test]
+    return KINDS[GRAZING] if test == CAPTURE and captures_nothing(point.point, family) else KINDS[test]
 
 
-def captures_nothing(point: Float[np.ndarray, " n"], frame: Frame, equations: Equations) -> bool:
+def captures_nothing(point: Float[np.ndarray, " n"], family: LoopFamily) -> bool:
     """Say whether the impacts of a point of a curve are of a law without adhesion, which any speed leaves."""
-    if equations.flights is not None:
+    if family.flights is not None:
         return False
-    _, fractions = split_point(jnp.asarray(point), equations)
-    return float(loop_at(fractions, frame, equations).impact.lowest) == 0.0
+    _, fractions = split_point(jnp.asarray(point), family)
+    return float(loop_at(fractions, family).impact.lowest) == 0.0
 
 
 def _is_complex(point: CurvePoint) -> bool:
@@ -208,60 +207,58 @@ def _is_complex(point: CurvePoint) -> bool:
 
 
 def special_curves(
-    special: Sequence[SpecialPoint], frame: Frame, equations: Equations, second: ParameterRange, value: float
+    special: Sequence[SpecialPoint], family: LoopFamily, second: ParameterRange, value: float
 ) -> tuple[SpecialCurve, ...]:
     """Return the curves in two parameters through special points that the map flies, each once.
 
     Args:
         special: points of branches in the first parameter.
-        frame: of both parameters.
-        equations: of the branches.
+        family: of the branches' loops, over both parameters.
         second: the second parameter and its range.
         value: of the second parameter at the special points.
     """
     followed: list[tuple[int, FollowedCurve]] = []
     curves, flights = [], None
-    paths = (*equations.paths, second.path)
     for point in special:
         if not point.admissible:
             continue
-        fraction = (point.parameter - float(frame.low[0])) / float(frame.width[0])
+        fraction = (point.parameter - float(family.low[0])) / float(family.width[0])
         start = np.concatenate([point.unknowns, [fraction, (value - second.low) / (second.high - second.low)]])
-        with_test = equations._replace(paths=paths, kind=point.test)
-        if equations.flights is not None:
-            flights = flights or ContactFlights(frame.scene, int(frame.order), paths)
-            with_test = with_test._replace(flights=flights)
-        if any(lies_on(start, curve, frame, with_test) for test, curve in followed if test == point.test):
+        with_test = replace(family, test=point.test)
+        if family.flights is not None:
+            flights = flights or ContactFlights(family.scene, int(family.order), family.paths)
+            with_test = replace(with_test, flights=flights)
+        if any(lies_on(start, curve, with_test) for test, curve in followed if test == point.test):
             continue
-        curve = followed_both_ways(start, frame, with_test)
+        curve = followed_both_ways(start, with_test)
         if curve is not None:
             followed.append((point.test, curve))
-            curves.append(_special_curve(point.kind, curve, frame, with_test))
+            curves.append(_special_curve(point.kind, curve, with_test))
     return tuple(curves)
 
 
-def _special_curve(kind: str, curve: FollowedCurve, frame: Frame, equations: Equations) -> SpecialCurve:
-    low, width = np.asarray(frame.low), np.asarray(frame.width)
+def _special_curve(kind: str, curve: FollowedCurve, family: LoopFamily) -> SpecialCurve:
+    low, width = np.asarray(family.low), np.asarray(family.width)
     # an impact without speed, or of a captured tip, has no linearised map
-    others = [GRAZING] if equations.kind == CAPTURE else [test for test in range(len(KINDS)) if test != equations.kind]
+    others = [GRAZING] if family.test == CAPTURE else [test for test in range(len(KINDS)) if test != family.test]
     meetings = []
     for leg, _ in curve.places():
         for test in others:
-            root = root_on(leg, tested_by(test, equations), frame, equations)
+            root = root_on(leg, tested_by(test, family), family)
             if root is not None:
-                name = f"{kind}_{_kind_of(test, root[1], frame, equations)}"
+                name = f"{kind}_{_kind_of(test, root[1], family)}"
                 meetings.append(Meeting(name, *(low + width * root[1].point[-2:]).tolist()))
-        if equations.kind == FOLD:
-            root = root_on(leg, _cusp_function(leg), frame, equations)
+        if family.test == FOLD:
+            root = root_on(leg, _cusp_function(leg), family)
             if root is not None:
                 meetings.append(Meeting("cusp", *(low + width * root[1].point[-2:]).tolist()))
     values = low + width * curve.points[:, -2:]
-    if equations.kind in (GRAZING, CAPTURE):
+    if family.test in (GRAZING, CAPTURE):
         # they are the border of what the map flies: only the other border can be passed
-        other = np.array([point.tests[GRAZING + CAPTURE - equations.kind] for point in curve.steps])
+        other = np.array([point.tests[GRAZING + CAPTURE - family.test] for point in curve.steps])
         admissible = ~(other < -AT_A_ROOT)
     else:
-        admissible = np.asarray(read_points(curve.points, frame, equations).admissible)
+        admissible = np.asarray(read_points(curve.points, family).admissible)
     return SpecialCurve(kind, values[:, 0], values[:, 1], admissible, tuple(meetings), curve.ends)
 
 

@@ -17,7 +17,7 @@ from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import require_float64
 from afm_jax.dynamics.continuation import Continuation
-from afm_jax.dynamics.curves import Equations, frame_of
+from afm_jax.dynamics.curves import family_of
 from afm_jax.dynamics.impact_loop import LoopReading, driven_part
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.impact.law import impact_law_of
@@ -179,8 +179,8 @@ def follow_sticking(
                     test=_NO_TEST,
                 )
                 special.append(point)
-    frame, equations = frame_of(scene, order, 1.0, (given,)), Equations((given.path,), driven_part(scene), 0)
-    return Continuation(order, 0, given, None, tuple(branches), tuple(special), (), 0, frame, equations, sticking=True)
+    of_range = family_of(scene, order, (given,), driven_part(scene))
+    return Continuation(order, 0, given, None, tuple(branches), tuple(special), (), 0, of_range, sticking=True)
 
 
 _At = Callable[[float], StickingOrbit | None]
