@@ -159,7 +159,7 @@ class AtMinimum(NamedTuple):
         return ModelLaw(self.problem, self.objective.measurement, self.values, covariance, after)
 
 
-class Estimate(NamedTuple):
+class FitEstimate(NamedTuple):
     """The law, values and errors of a fit, with the model discrepancy where there is one.
 
     Attributes:
@@ -234,10 +234,10 @@ class TablesCompared(NamedTuple):
     departing: tuple[Float[np.ndarray, "readings m"], ...] = ()
 
 
-def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> Estimate:
+def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstimate:
     """Return the law, values and errors that a minimum stands for, with the model discrepancy where impacts last."""
     at = at_minimum(table, found)
-    estimate = Estimate(at, at.values, at.covariance, at.chi2, at.rows, at.rows.residual)
+    estimate = FitEstimate(at, at.values, at.covariance, at.chi2, at.rows, at.rows.residual)
     rows = _rows_to_step_from(at)
     if rows is None:
         return estimate
@@ -374,7 +374,9 @@ def _compare_tables(at: AtMinimum, system: StepSystem) -> TablesCompared | None:
     return TablesCompared(pulls_of(parts), between, departed * between.value, departing)
 
 
-def _after_step(estimate: Estimate, part: Descended, discrepancy: ModelDiscrepancy, system: StepSystem) -> Estimate:
+def _after_step(
+    estimate: FitEstimate, part: Descended, discrepancy: ModelDiscrepancy, system: StepSystem
+) -> FitEstimate:
     """Return the estimate with law, values, errors and predictions after the part of a step that lowers chi2."""
     at, step, count = estimate.at, part.step, estimate.at.table.rows
     member = _closest_member(at, step, discrepancy)
@@ -452,7 +454,7 @@ _MUCH = 0.25
 """Share of a parameter's variance that comes of a held one from which it is said to hang on that."""
 
 
-def hanging_on_held(estimate: Estimate) -> dict[str, tuple[str, ...]]:
+def hanging_on_held(estimate: FitEstimate) -> dict[str, tuple[str, ...]]:
     """Return which held parameters' errors are much of each fitted one's, by the fitted one's name."""
     hanging: dict[str, tuple[str, ...]] = {}
     if estimate.after is None or estimate.step_rows is None:

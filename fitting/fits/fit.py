@@ -16,7 +16,7 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.least_squares import chi2_tail
 from afm_jax.version import version_of
 from fitting.fits.estimate import (
-    Estimate,
+    FitEstimate,
     Found,
     courses_along_rows,
     estimate_of,
@@ -195,7 +195,7 @@ _HARDLY_TOLD, _LOOKED_AT = 4.0, 30.0
 """Rise of chi2 up to which another minimum may as well be the true one; and from where it is followed to find that."""
 
 
-def other_minimum(estimate: Estimate) -> Estimate | None:
+def other_minimum(estimate: FitEstimate) -> FitEstimate | None:
     """Return another minimum that the data hardly tell from the best one, None if there is none."""
     at, found, problem = estimate.at, estimate.at.found, estimate.at.problem
     errors = _errors(at.covariance)
@@ -223,7 +223,7 @@ def other_minimum(estimate: Estimate) -> Estimate | None:
     return other if above < _HARDLY_TOLD else None
 
 
-def evidence_of(estimate: Estimate, other: Estimate | None) -> Evidence:
+def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
     """Return all that the verdict looks at, the parameters without errors and intervals yet."""
     at, problem, rows = estimate.at, estimate.at.problem, estimate.rows
     robust, scale = at.found.objective.robust, at.settings["error_scale"]
@@ -265,7 +265,7 @@ def evidence_of(estimate: Estimate, other: Estimate | None) -> Evidence:
     )
 
 
-def parameters_with_intervals(estimate: Estimate) -> dict[str, FittedParameter]:
+def parameters_with_intervals(estimate: FitEstimate) -> dict[str, FittedParameter]:
     """Return the parameters with their errors and, where all are determined, profile intervals.
 
     The intervals have moved with their values in the step, and grown with their errors.
@@ -289,7 +289,7 @@ def parameters_with_intervals(estimate: Estimate) -> dict[str, FittedParameter]:
 
 
 def _parameters(
-    estimate: Estimate, errors: Float[np.ndarray, " k"], intervals: Sequence[Interval]
+    estimate: FitEstimate, errors: Float[np.ndarray, " k"], intervals: Sequence[Interval]
 ) -> dict[str, FittedParameter]:
     """Return the parameters with errors and intervals."""
     at, problem = estimate.at, estimate.at.problem
@@ -317,7 +317,7 @@ def _parameters(
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 
 
-def result_of(estimate: Estimate, other: Estimate | None, evidence: Evidence, *, explained: bool) -> FitResult:
+def result_of(estimate: FitEstimate, other: FitEstimate | None, evidence: Evidence, *, explained: bool) -> FitResult:
     """Return the result of a fit: the law and its loss with their bands, and the verdict.
 
     Args:
@@ -370,7 +370,7 @@ def result_of(estimate: Estimate, other: Estimate | None, evidence: Evidence, *,
     )
 
 
-def _scatter(estimate: Estimate) -> dict[str, Scatter]:
+def _scatter(estimate: FitEstimate) -> dict[str, Scatter]:
     """Return the scatter of the law's parameters between tables; nothing where laws do not scatter."""
     if estimate.tables is None or estimate.tables.between is None:
         return {}
@@ -381,7 +381,7 @@ def _scatter(estimate: Estimate) -> dict[str, Scatter]:
     }
 
 
-def _fitted_tables(estimate: Estimate, parameters: dict[str, FittedParameter]) -> tuple[FittedTable, ...]:
+def _fitted_tables(estimate: FitEstimate, parameters: dict[str, FittedParameter]) -> tuple[FittedTable, ...]:
     """Return what there is to say of each of several tables; nothing of one."""
     table, rows, law = estimate.at.table, estimate.rows, estimate.at.free_law
     if not isinstance(table, SeveralTables):

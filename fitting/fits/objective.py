@@ -5,7 +5,7 @@ with their Jacobian for a handful of parameter sets at once (`forward.linearise`
 and the profile intervals all drive it from outside.
 """
 
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -55,65 +55,59 @@ def lowest(objective: Float[np.ndarray, " points"]) -> int:
     return int(np.argmin(np.where(np.isnan(objective), np.inf, objective)))
 
 
+@dataclass(eq=False)
 class Objective:
-    """The objective of a table and a model in optimiser coordinates, with its gradient, for up to `BATCH` sets."""
+    """The objective of a table and a model in optimiser coordinates, with its gradient, for up to `BATCH` sets.
 
-    def __init__(
-        self,
-        measurement: Measurement,
-        problem: Problem,
-        *,
-        near: Float[np.ndarray, " rows"] | Float[np.ndarray, "sets rows"] | None = None,
-        robust: bool = False,
-        searched: dict[bytes, Linearised] | None = None,
-    ):
-        """Keep what every evaluation shares.
+    Attributes:
+        measurement: what predictions are compared with.
+        problem: the model.
+        near: coordinates of the rows' orbits from which they are followed, the same for every set of values or each
+            set's own; None: searched for.
+        robust: let outliers count linearly, everywhere: residuals are then such that their squares add up to the soft
+            objective.
+        searched: what searches at single sets of values have found, for objectives of the same rows: the same set is
+            asked for again and again.
+    """
 
-        Args:
-            measurement: what predictions are compared with.
-            problem: the model.
-            near: coordinates of the rows' orbits from which they are followed, the same for every set of values or
-                each set's own; None: searched for.
-            robust: let outliers count linearly, everywhere: residuals are then such that their squares add up to the
-                soft objective.
-            searched: what searches at single sets of values have found, for objectives of the same rows: the same set
-                is asked for again and again.
-        """
-        self.measurement, self.problem, self.near, self.robust = measurement, problem, near, robust
-        self.searched: dict[bytes, Linearised] = {} if searched is None else searched
+    measurement: Measurement
+    problem: Problem
+    _: KW_ONLY
+    near: Float[np.ndarray, " rows"] | Float[np.ndarray, "sets rows"] | None = None
+    robust: bool = False
+    searched: dict[bytes, Linearised] = field(default_factory=dict)
+
+    def _with(self, **changes: Any) -> "Objective":
+        """Return the same objective with other attributes; what was searched for stays with the same rows only."""
+        parts = {known.name: getattr(self, known.name) for known in fields(Objective)}
+        return Objective(**(parts | changes))
 
     def following(self, values: Float[np.ndarray, " p"]) -> "Objective":
         """Return the same objective with the orbits followed from those at a set of values; only if impacts last."""
-        follower = self.following_each(values[None])
-        if follower.near is None:
-            return self
-        return self._with_orbits(follower.near[0])
+        near = self.following_each(values[None]).near
+        return self if near is None else self._with(near=near[0])
 
     def following_each(self, values: Float[np.ndarray, "sets p"]) -> "Objective":
         """Return the same objective for as many sets of values, each set's orbits followed from those at its values."""
         if not self.problem.lasting:
             return self
         found = self.searching().at_values(values).prediction
-        near = np.where(np.asarray(found.orbits) > 0, np.asarray(found.coordinate), np.nan)
-        return self._with_orbits(near)
+        return self._with(near=np.where(np.asarray(found.orbits) > 0, np.asarray(found.coordinate), np.nan))
 
     def searching(self) -> "Objective":
         """Return the same objective with every orbit searched for."""
-        return self._with_orbits(None)
-
-    def _with_orbits(self, near: Float[np.ndarray, "..."] | None) -> "Objective":
-        return Objective(self.measurement, self.problem, near=near, robust=self.robust, searched=self.searched)
+        return self._with(near=None)
 
     def with_rows(self, **columns: Any) -> "Objective":
         """Return the same objective with other columns of the rows."""
         rows = self.measurement.rows._replace(**{name: np.asarray(column) for name, column in columns.items()})
-        return Objective(self.measurement._replace(rows=rows), self.problem, near=self.near, robust=self.robust)
+        return self._with(measurement=self.measurement._replace(rows=rows), searched={})
 
     def of_rows(self, chosen: Int[np.ndarray, " chosen"] | Bool[np.ndarray, " rows"]) -> "Objective":
         """Return the same objective of some of the rows, with their orbits followed if they were."""
         rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.measurement.rows)
         near = None if self.near is None else np.asarray(self.near)[..., chosen]
-        return Objective(self.measurement._replace(rows=rows), self.problem, near=near, robust=self.robust)
+        return self._with(measurement=self.measurement._replace(rows=rows), near=near, searched={})
 
     def by_instrument(self) -> list[tuple[Bool[np.ndarray, " rows"], "Objective"]]:
         """Return which rows are of each head and drive, and the objective of these; all of them of one table."""
@@ -130,7 +124,7 @@ class Objective:
             part = self if mine.all() else self.of_rows(mine)
             measurement = part.measurement._replace(cantilever=joint.cantilevers[heads.index(head)])
             problem = replace(self.problem, drive=head[0])
-            parts.append((mine, part._of(measurement, problem)))  # noqa: SLF001
+            parts.append((mine, part._with(measurement=measurement, problem=problem)))  # noqa: SLF001
         return [part for part in parts if part[0].any()]
 
     def of_common_parameters(self) -> "Objective | None":
@@ -145,10 +139,8 @@ class Objective:
         measurement = self.measurement._replace(
             constraint_value=value[:count], constraint_error=error[:count], joint=held
         )
-        return Objective(measurement, replace(self.problem, names=names[:count]), robust=self.robust)
-
-    def _of(self, measurement: Measurement, problem: Problem) -> "Objective":
-        return Objective(measurement, problem, near=self.near, robust=self.robust, searched=self.searched)
+        problem = replace(self.problem, names=names[:count])
+        return self._with(measurement=measurement, problem=problem, near=None, searched={})
 
     def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
         """Return the linearised model at parameter values, as NumPy arrays."""
