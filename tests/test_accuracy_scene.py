@@ -11,7 +11,7 @@ from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy_scene import COLUMNS, LADDER_COLUMNS, fitted_law, scene_to_study
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.peaks import peaks_of_flights
+from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.presets import contact_scene

@@ -32,7 +32,7 @@ from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law
 from afm_jax.impact.map import NextImpact, iterate_map
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.contact_motion import follow_contacts
-from afm_jax.motion.peaks import peaks_between_contacts, peaks_of_flights
+from afm_jax.motion.observe import peaks_between_contacts, peaks_of_flights
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.settle import is_stuck
 from afm_jax.motion.simulate import simulate

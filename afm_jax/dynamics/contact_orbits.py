@@ -32,7 +32,7 @@ from afm_jax.dynamics.impact_orbits import (
 from afm_jax.dynamics.many_tips import follow_contacts, next_contact
 from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leaving_tips
 from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_sum, peak_amplitude, single_impact_orbits
-from afm_jax.motion.peaks import peaks_of_flights
+from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.scenefile.parameter_paths import scene_family

@@ -22,7 +22,7 @@ from afm_jax.dynamics.impact_loop import LoopReading, driven_part
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.law_motion import Bed, first_release, take_off
-from afm_jax.motion.peaks import peaks_of_flights
+from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family

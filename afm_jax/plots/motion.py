@@ -11,8 +11,7 @@ from matplotlib.figure import Figure
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase, find_junction
-from afm_jax.motion.observe import poincare_section
-from afm_jax.motion.peaks import peaks_between_contacts
+from afm_jax.motion.observe import peaks_between_contacts, poincare_section
 from afm_jax.motion.record import ContactKind, Contacts, Simulation
 from afm_jax.motion.settle import Settled, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
