@@ -26,9 +26,9 @@ from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
 from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Law
+from afm_jax.impact.orbits import FlightEnds, peak_amplitude
 from afm_jax.motion.record import ContactKind, Contacts, Simulation, State, contacts_left, to_gap
 from afm_jax.motion.settle import Settled, Window, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly
