@@ -180,7 +180,7 @@ class SweepObjective(Objective):
 
     def __init__(self, points: Points, kind: str, problem: SweepProblem):
         """Keep what every evaluation shares."""
-        self.points, self.kind, self.problem = points, kind, problem
+        self.points, self.kind, self.problem, self.background = points, kind, problem, problem
 
     def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
         """Return residuals and their Jacobian by the values, in batches that share one compilation; of rows nothing."""
@@ -200,14 +200,14 @@ class SweepObjective(Objective):
         across: Float[np.ndarray, " n"],
         direction: Complex[np.ndarray, " n"] | None = None,
     ) -> "SweepObjective":
-        """Return the same with other errors, in a direction of their own where one is given."""
+        """Return the objective with other errors, in a direction of their own where one is given."""
         rows = len(self.points.amplitude)
         weight = np.pad(1.0 / np.stack([along, across], axis=1), ((0, rows - len(along)), (0, 0)))
         points = self.points._replace(weight=jnp.asarray(weight))
         if direction is not None:
             turn = np.pad(np.conj(direction), (0, rows - len(direction)), constant_values=1.0)
             points = points._replace(turn=jnp.asarray(turn))
-        return SweepObjective(points, self.kind, self.problem)
+        return SweepObjective(points, self.kind, self.background)
 
 
 def points_of(sweep: ResonanceSweep, *, reverse: bool) -> Points:
@@ -492,7 +492,7 @@ def refit(fit: SweepFit, sweep: ResonanceSweep, background: str) -> SweepFit:
     kept = min(len(known), len(fit.values))
     known[:kept] = fit.values[:kept]
     values[-1] = known
-    problem = fit.objective.problem
+    problem = fit.objective.background
     names = ("frequency_khz", "quality_factor", *LINEAR_NAMES[kind][:terms])
     own = SweepProblem(background, names, reference_khz=problem.reference_khz, width_khz=problem.width_khz)
     objective = SweepObjective(fit.objective.points, kind, own)
