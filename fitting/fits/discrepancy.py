@@ -425,6 +425,11 @@ class LinearStep(NamedTuple):
             values=self.values - (1.0 - share) * self.change, change=share * self.change, unknown=share * self.unknown
         )
 
+    def towards(self, other: "LinearStep") -> "LinearStep":
+        """Return the step half way to another one; covariances, chi2 and residuals are those of this one."""
+        middle = {name: 0.5 * (getattr(self, name) + getattr(other, name)) for name in ("values", "change", "unknown")}
+        return self._replace(**middle)
+
 
 class StepSystem(NamedTuple):
     """A fit's rows, linearised, with all that is left out.
@@ -458,6 +463,12 @@ class StepSystem(NamedTuple):
         """
         rest, coefficients = self.rest(step), step.unknown[: self.of_law]
         return float(misfit @ self.alone(misfit)[1] + rest @ rest + coefficients @ coefficients)
+
+    def misfit(self, step: LinearStep) -> Float[np.ndarray, " readings"]:
+        """Return (predicted - measured)/error of the readings by the law after a step, to first order."""
+        size = self.noise.shape[0]
+        by_law = self.unknown[:, : self.of_law] @ step.unknown[: self.of_law]
+        return self.residual[:size] + self.jacobian[:size] @ step.change + by_law
 
     def rest(self, step: LinearStep) -> Float[np.ndarray, " n"]:
         """Return the residuals besides the readings' after a step: of rows without orbit, and of what is known."""
@@ -650,6 +661,51 @@ def descending_part(
                 return one
     assert stay is not None  # noqa: S101
     return stay._replace(stuck=(begin, step.chi2) if begin - step.chi2 > _NOTHING else None)
+
+
+_ROUNDS = 6
+"""Steps at most that follow the first one."""
+_SETTLED = 1e-2
+"""Fall of chi2 from which another one is taken."""
+
+
+def settled_step(
+    begun: Descended,
+    system: StepSystem,
+    predicted: Callable[[list[LinearStep]], Predicted],
+    again: Callable[[Float[np.ndarray, " readings"]], LinearStep],
+) -> Descended:
+    """Return the step taken again, from the same slopes, with what the readings do beyond first order.
+
+    Where slow impacts are far from the fitted law, readings are not linear in the law: a step by their slopes at the
+    fit leaves the law off by some of its errors. With the readings as computed after the step in place of their
+    linearisation the next step is that of Newton's method with slopes kept (a chord), whose root is the law that
+    explains the computed readings. Rounds end when chi2 falls no more.
+
+    Args:
+        begun: the part of the first step that lowers chi2.
+        system: of the fit.
+        predicted: what the laws after two steps predict.
+        again: the step for readings' residuals that are this much larger at the fit.
+    """
+    best, chi2 = begun, system.chi2(begun.step, begun.predicted.misfit.ravel())
+    for _ in range(_ROUNDS):
+        whole = again(best.predicted.misfit.ravel() - system.misfit(best.step))
+        parts = [whole, whole.towards(best.step)]
+        found = predicted(parts)
+        looked = [
+            Descended(part, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], found), None)
+            for i, part in enumerate(parts)
+        ]
+        each = [system.chi2(one.step, one.predicted.misfit.ravel()) for one in looked]
+        lowest = int(np.argmin(each))
+        fall = chi2 - each[lowest]
+        if not fall > 0.0:
+            break
+        best, chi2 = looked[lowest], each[lowest]
+        if fall < _SETTLED:
+            break
+    return best
 
 
 def _bounded(residual, slope, begin, ends, moving) -> Float[np.ndarray, " k"]:

@@ -39,6 +39,7 @@ from fitting.fits.discrepancy import (
     root_of,
     rows_of_fit,
     seen_in_taps,
+    settled_step,
     split_held,
     step_of,
     system_of,
@@ -471,6 +472,7 @@ class _Summary:
         self.between: tuple[Between, Float[np.ndarray, "tables l"]] | None = None
         self.alone, self.system = self.rows.residual, None
         self.stuck: tuple[float, float] | None = None
+        self.departing: Float[np.ndarray, "readings m"] | None = None
         self.step_rows: StepRows | None = None
         self.unbent: Float[np.ndarray, "rows k"] | None = None
         self.after = self._step()
@@ -514,7 +516,8 @@ class _Summary:
         departing = self._tables_compared(self.system, joint, scattering=scattering)
         if not (self.problem.lasting or departing):
             return None
-        self.system = self.system.with_unknowns(departing[0] if departing else None)
+        self.departing = departing[0] if departing else None
+        self.system = self.system.with_unknowns(self.departing)
         step, *cautious = (step_of(rows, discrepancy, self.free, one) for one in departing or [None])
         return step._replace(covariance=(*cautious, step)[0].covariance), discrepancy
 
@@ -550,7 +553,17 @@ class _Summary:
         def look(parts: list[LinearStep]) -> Predicted:
             return self._predicted(parts, discrepancy)
 
-        step, predicted, self.stuck = descending_part(step, system, look)
+        def again(beyond: Float[np.ndarray, " readings"]) -> LinearStep:
+            assert self.step_rows is not None  # noqa: S101
+            residual = self.step_rows.residual.copy()
+            residual[: beyond.size] += beyond
+            rows = self.step_rows._replace(residual=residual)
+            return step_of(rows, discrepancy, self.free, self.departing)._replace(covariance=step.covariance)
+
+        found = descending_part(step, system, look)
+        if self.problem.lasting and not self.problem.pulled:
+            found = settled_step(found, system, look, again)
+        step, predicted, self.stuck = found
         self.after = step, discrepancy
         count = len(self.names)
         self.ends, self.spread = step.values[:count], step.covariance[:count, :count]
