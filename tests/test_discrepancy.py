@@ -20,6 +20,7 @@ from fitting.fits.discrepancy import (
     law_after,
     longest_run,
     root_of,
+    settled_step,
     step_of,
     system_of,
     with_runs,
@@ -161,6 +162,38 @@ def test_a_step_is_damped_until_chi2_falls(rows, falls_from, share):
     if found.stuck is not None:
         begin, expected = found.stuck
         assert begin > expected
+
+
+def test_a_settled_step_explains_the_readings_as_computed(rows):
+    """Readings bend with the law: the first step's do not fit, the settled one's misfit is that of a fit to them."""
+    free = np.ones(6, dtype=bool)
+    step, system = step_of(rows, LEFT_OUT, free), system_of(rows, LEFT_OUT)
+    looks = []
+
+    def bent(part):
+        linear = system.misfit(part)
+        return linear + 0.01 * (linear - system.misfit(step.partly(0.0))) ** 2
+
+    def predicted(parts):
+        looks.append(len(parts))
+        nothing: Any = np.zeros((2, 1))
+        return Predicted(np.array([bent(part) for part in parts]).reshape(2, ROWS, 2), Prediction(*(nothing,) * 7))
+
+    def again(beyond):
+        residual = rows.residual.copy()
+        residual[: 2 * ROWS] += beyond
+        return step_of(rows._replace(residual=residual), LEFT_OUT, free)
+
+    first = descending_part(step, system, predicted)
+    found = settled_step(first, system, predicted, again)
+    chi2 = [system.chi2(one.step, bent(one.step)) for one in (first, found)]
+    assert chi2[1] < chi2[0]
+    # its root: the step from there leads back to it
+    last = again(bent(found.step) - system.misfit(found.step))
+    error = np.sqrt(np.diag(step.covariance))
+    np.testing.assert_allclose(last.change / error, found.step.change / error, atol=0.1)
+    assert len(looks) <= 8
+    np.testing.assert_array_equal(found.predicted.misfit.ravel(), bent(found.step))
 
 
 def test_the_law_after_the_step_is_the_formula_with_its_discrepancy(rows):

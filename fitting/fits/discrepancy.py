@@ -1,4 +1,4 @@
-"""What a model leaves out, as uncertain as it is: one linear step after the fit, for parameters, law, band and chi2.
+"""What a model leaves out, as uncertain as it is: a step after the fit, for parameters, law, band and chi2.
 
 A law of a few numbers is itself an approximation. What it misses is known in size and in character, and is put beside
 its parameters as unknowns, each with a prior:
@@ -13,9 +13,10 @@ its parameters as unknowns, each with a prior:
 - the corrections of impacts that last: the leading remainder of each, of either sign;
 - what slow impacts lack in any picture of impacts: common to peak and lock-in of a row.
 
-All of it is small: one step from the fit's own linearisation, of which as much is taken as lowers chi2 with the
-readings computed from the law after it, not linearised. Remainders and what slow impacts lack are no part of that law:
-they are in the covariance of the rows.
+All of it is small: a step from the fit's own linearisation, of which as much is taken as lowers chi2 with the readings
+computed from the law after it, not linearised. Readings of slow impacts bend with the law: the step is taken again with
+what was computed in place of its linearisation, until chi2 falls no more (`settled_step`). Remainders and what slow
+impacts lack are no part of that law: they are in the covariance of the rows.
 """
 
 from collections.abc import Callable, Mapping
@@ -359,6 +360,11 @@ class LinearStep(NamedTuple):
             values=self.values - (1.0 - share) * self.change, change=share * self.change, unknown=share * self.unknown
         )
 
+    def towards(self, other: "LinearStep") -> "LinearStep":
+        """Return the step half way to another one; covariances, chi2 and residuals are those of this one."""
+        middle = {name: 0.5 * (getattr(self, name) + getattr(other, name)) for name in ("values", "change", "unknown")}
+        return self._replace(**middle)
+
 
 class StepSystem(NamedTuple):
     """A fit's rows, linearised, with all that is left out.
@@ -392,6 +398,12 @@ class StepSystem(NamedTuple):
         """
         rest, coefficients = self.rest(step), step.unknown[: self.of_law]
         return float(misfit @ self.alone(misfit)[1] + rest @ rest + coefficients @ coefficients)
+
+    def misfit(self, step: LinearStep) -> Float[np.ndarray, " readings"]:
+        """Return (predicted - measured)/error of the readings by the law after a step, to first order."""
+        size = self.noise.shape[0]
+        by_law = self.unknown[:, : self.of_law] @ step.unknown[: self.of_law]
+        return self.residual[:size] + self.jacobian[:size] @ step.change + by_law
 
     def rest(self, step: LinearStep) -> Float[np.ndarray, " n"]:
         """Return the residuals besides the readings' after a step: of rows without orbit, and of what is known."""
@@ -570,13 +582,7 @@ def descending_part(
     """
     begin, stay = np.inf, None
     for shares in _STEP_PARTS:
-        parts = [step.partly(share) for share in shares]
-        found = predicted(parts)
-        looked = [
-            Descended(part, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], found), None)
-            for i, part in enumerate(parts)
-        ]
-        chi2 = [system.chi2(one.step, one.predicted.misfit.ravel()) for one in looked]
+        looked, chi2 = _computed([step.partly(share) for share in shares], system, predicted)
         if stay is None:
             begin, stay = chi2.pop(), looked.pop()
         for one, here in zip(looked, chi2, strict=True):
@@ -584,6 +590,56 @@ def descending_part(
                 return one
     assert stay is not None  # noqa: S101
     return stay._replace(stuck=(begin, step.chi2) if begin - step.chi2 > _NOTHING else None)
+
+
+def _computed(
+    steps: list[LinearStep], system: StepSystem, predicted: Callable[[list[LinearStep]], Predicted]
+) -> tuple[list[Descended], list[float]]:
+    """Return the laws after steps with what they predict, and chi2 of each."""
+    found = predicted(steps)
+    looked = [
+        Descended(one, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], found), None) for i, one in enumerate(steps)
+    ]
+    return looked, [system.chi2(one.step, one.predicted.misfit.ravel()) for one in looked]
+
+
+_ROUNDS = 6
+"""Steps at most that follow the first one."""
+_SETTLED = 1e-2
+"""Fall of chi2 from which another one is taken."""
+
+
+def settled_step(
+    begun: Descended,
+    system: StepSystem,
+    predicted: Callable[[list[LinearStep]], Predicted],
+    again: Callable[[Float[np.ndarray, " readings"]], LinearStep],
+) -> Descended:
+    """Return the step taken again and again, by the slopes at the fit, with what readings do beyond first order.
+
+    Where the fitted law is far off for slow impacts, readings are not linear in it: one step leaves the law off by some
+    of its errors there, too slow on the average. Each further step starts at the fit too, with the readings as computed
+    after the last one in place of their linearisation: Newton's method with slopes kept (a chord), which ends at the
+    law that explains the computed readings. It stops when chi2 falls no more.
+
+    Args:
+        begun: the part of the first step that lowers chi2.
+        system: of the fit.
+        predicted: what the laws after two steps predict.
+        again: the step for readings' residuals that are this much larger at the fit.
+    """
+    best, chi2 = begun, system.chi2(begun.step, begun.predicted.misfit.ravel())
+    for _ in range(_ROUNDS):
+        whole = again(best.predicted.misfit.ravel() - system.misfit(best.step))
+        looked, each = _computed([whole, whole.towards(best.step)], system, predicted)
+        lowest = int(np.argmin(each))
+        fall = chi2 - each[lowest]
+        if not fall > 0.0:
+            break
+        best, chi2 = looked[lowest], each[lowest]
+        if fall < _SETTLED:
+            break
+    return best
 
 
 def _bounded(residual, slope, begin, ends, moving) -> Float[np.ndarray, " k"]:

@@ -35,6 +35,7 @@ from fitting.fits.discrepancy import (
     root_of,
     rows_of_fit,
     seen_in_taps,
+    settled_step,
     step_of,
     system_of,
     with_runs,
@@ -254,7 +255,21 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
     step, *cautious = (step_of(rows, discrepancy, at.free, sizes) for sizes in departing or (None,))
     step = step._replace(covariance=(*cautious, step)[0].covariance)
     system = system.with_unknowns(departing[0] if departing else None)
-    part = descending_part(step, system, lambda parts: _predicted_after(at, parts, discrepancy))
+
+    def predicted(steps: list[LinearStep]) -> Predicted:
+        return _predicted_after(at, steps, discrepancy)
+
+    def again(beyond: Float[np.ndarray, " readings"]) -> LinearStep:
+        residual = rows.residual.copy()
+        residual[: beyond.size] += beyond
+        likely = departing[0] if departing else None
+        return step_of(rows._replace(residual=residual), discrepancy, at.free, likely)._replace(
+            covariance=step.covariance
+        )
+
+    part = descending_part(step, system, predicted)
+    if at.problem.lasting and not at.problem.pulled:
+        part = settled_step(part, system, predicted, again)
     return _after_step(estimate, part, discrepancy, system)
 
 
