@@ -15,7 +15,6 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument
-from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.scenefile.scenefile import SceneAsRead, Start, read_scene
 
@@ -115,12 +114,17 @@ def contact_scene(
     """
     drive = drive_frequency_khz(reduced_frequency)
     platform = Platform(drive_amplitude_nm, drive, offset_nm, offset_rate_nm_per_us)
+    # only here, so that files of scenes with a law do without the contact's modules
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
+
     return Scene(Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR, 1.0), platform, Contact.paper())
 
 
 def dry_scene() -> Scene:
     """Return figure 10's scene at offset 0 with a dry contact in place of the liquid bridge and the JKR junction."""
     scene = contact_scene(0.97, 2.0, 0.0)
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415 (as above)
+
     return Scene(scene.cantilever, scene.platform, Contact.of(("van_der_waals", "dmt")))
 
 
