@@ -79,11 +79,11 @@ class Result:
         return figure
 
     def to_pandas(self) -> "DataFrame":
-        """Return this result as a table of pandas; rows without a result are left out, numbers without a value NaN."""
+        """Return a result as a table of pandas; rows without a result are left out, numbers without a value NaN."""
         return _frame(self, self._rows)
 
     def to_xarray(self) -> "Dataset":
-        """Return this result's arrays as a data set of xarray, with their units; texts are its attributes."""
+        """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
         return dataset_of(self)
 
     def save(self, path: str | Path) -> None:
@@ -198,7 +198,7 @@ def known_rows(record: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def dataset_of(self: Any) -> "Dataset":
-    """Return this result's arrays as a data set of xarray, with their units; texts are its attributes."""
+    """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
     xarray = _needed("xarray", "xarray")
     sizes: dict[str, int] = {}
     variables = {}

@@ -53,7 +53,7 @@ class Names(ValueKind):
     name = "names"
 
     def read(self, text: str) -> tuple[str, ...]:
-        """Return the names."""
+        """Return the names that a text lists, separated by commas."""
         names = tuple(part.strip() for part in text.split(","))
         if not all(names):
             raise ValueError(f"must be names separated by commas, but is {text}")

@@ -66,7 +66,7 @@ class Finite(ValueKind):
         self.positive, self.none = positive, none
 
     def read(self, text: str) -> float:
-        """Return the number."""
+        """Return the number that a text says."""
         if self.none and text == "none":
             return math.inf
         number = _number_or_nan(text)

@@ -603,7 +603,7 @@ class PulledImpact(Impact):
 
     @property
     def hertz_contact(self) -> HertzContact:
-        """That of a free tip, without lead and height: the time counts the bridge, the depth is tabulated."""
+        """The Hertz contact of a free tip, without lead and height: time counts the bridge, the depth is tabulated."""
         none = jnp.zeros_like(self.plane_nm)
         return self.free.hertz_contact._replace(lead_nm=none, raised_nm=none)
 

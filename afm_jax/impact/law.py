@@ -295,7 +295,7 @@ class ImpactLaw(Law):
 
     @property
     def slow_restitution(self) -> Float[Array, "..."]:
-        """The coefficient r."""
+        """The coefficient of restitution r, which the slowest impacts have."""
         return self.r
 
     def without_delay(self) -> "ImpactLaw":

@@ -461,7 +461,7 @@ class Signal:
 
     @property
     def mean(self) -> float:
-        """Mean in nm."""
+        """The mean of the signal over the window, in nm."""
         return 0.5 * self.lockin(0.0).real
 
     def lockin(self, angular_frequency: float) -> complex:

@@ -92,7 +92,7 @@ class Check:
 
 
 def verify(*, states: int = 10_000, seed: int = 0, exact_states: int = 200) -> list[Check]:
-    """Run all comparisons.
+    """Compare eqs. 5 to 8 with automatic differentiation, and both with 50 digits.
 
     Args:
         states: ordinary random states (and orbits) of each kind, at least.

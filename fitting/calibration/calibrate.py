@@ -149,7 +149,7 @@ def _calibrated_sweep(
 
 
 def _alternatives(sweep: ResonanceSweep, fit: SweepFit, background: str) -> list[Alternative]:
-    """Return the same sweep with the same errors in front of all other backgrounds that it has points for."""
+    """Return fits of a frequency scan, errors unchanged, in front of all other backgrounds that it has points for."""
     kind = fit.objective.kind
     others = [name for name in TERMS[kind] if name != background and _enough_points(sweep, kind, name)]
     return [_alternative(refit(fit, sweep, name), name) for name in others]

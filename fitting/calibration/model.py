@@ -411,7 +411,7 @@ class SweepFit:
 
     @property
     def points(self) -> int:
-        """Number of points."""
+        """The number of points of the frequency scan."""
         return self.data // (2 if self.objective.kind == "phase" else 1)
 
 

@@ -18,7 +18,7 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True)
 class CalibratedValue:
-    """A calibrated quantity.
+    """A quantity that a calibration determines, with its standard error and interval.
 
     Attributes:
         value: in the unit of the quantity's name.
@@ -35,7 +35,7 @@ class CalibratedValue:
 
 @dataclass(frozen=True)
 class Alternative:
-    """The same sweep, with the same errors, in front of another background."""
+    """A fit of the frequency scan, with its errors unchanged, in front of another background."""
 
     background: str
     frequency_khz: float

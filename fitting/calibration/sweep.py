@@ -238,7 +238,7 @@ class ResonanceSweep(Result):
 
     @property
     def points(self) -> int:
-        """Number of points."""
+        """The number of points of the frequency scan."""
         return len(self.frequency_khz)
 
     @property

@@ -384,7 +384,7 @@ class StepSystem(NamedTuple):
     of_law: int = 0
 
     def with_unknowns(self, more: Float[np.ndarray, "readings m"] | None) -> "StepSystem":
-        """Return the same with further unknowns of unit variance, which belong to the rows."""
+        """Return the system with further unknowns of unit variance, which belong to the rows."""
         return self if more is None else self._replace(unknown=np.concatenate([self.unknown, more], axis=1))
 
     def chi2(self, step: LinearStep, misfit: Float[np.ndarray, " readings"]) -> float:

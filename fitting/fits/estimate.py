@@ -145,7 +145,7 @@ class AtMinimum(NamedTuple):
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom."""
+        """The degrees of freedom: numbers compared, minus parameters fitted."""
         return self.data - len(self.values)
 
     @property

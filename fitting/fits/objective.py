@@ -78,33 +78,33 @@ class Objective:
     searched: dict[bytes, Linearised] = field(default_factory=dict)
 
     def _with(self, **changes: Any) -> "Objective":
-        """Return the same objective with other attributes; what was searched for stays with the same rows only."""
+        """Return an objective with some attributes changed; what was searched for is kept where the rows stay."""
         parts = {known.name: getattr(self, known.name) for known in fields(Objective)}
         return Objective(**(parts | changes))
 
     def following(self, values: Float[np.ndarray, " p"]) -> "Objective":
-        """Return the same objective with the orbits followed from those at a set of values; only if impacts last."""
+        """Return the objective with orbits followed from those at a set of values; only if impacts last."""
         near = self.following_each(values[None]).near
         return self if near is None else self._with(near=near[0])
 
     def following_each(self, values: Float[np.ndarray, "sets p"]) -> "Objective":
-        """Return the same objective for as many sets of values, each set's orbits followed from those at its values."""
+        """Return the objective for as many sets of values, each set's orbits followed from those at its values."""
         if not self.problem.lasting:
             return self
         found = self.searching().at_values(values).prediction
         return self._with(near=np.where(np.asarray(found.orbits) > 0, np.asarray(found.coordinate), np.nan))
 
     def searching(self) -> "Objective":
-        """Return the same objective with every orbit searched for."""
+        """Return the objective with every orbit searched for."""
         return self._with(near=None)
 
     def with_rows(self, **columns: Any) -> "Objective":
-        """Return the same objective with other columns of the rows."""
+        """Return the objective with some columns of its rows changed."""
         rows = self.measurement.rows._replace(**{name: np.asarray(column) for name, column in columns.items()})
         return self._with(measurement=self.measurement._replace(rows=rows), searched={})
 
     def of_rows(self, chosen: Int[np.ndarray, " chosen"] | Bool[np.ndarray, " rows"]) -> "Objective":
-        """Return the same objective of some of the rows, with their orbits followed if they were."""
+        """Return the objective of some of the rows, with their orbits followed if they were before."""
         rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.measurement.rows)
         near = None if self.near is None else np.asarray(self.near)[..., chosen]
         return self._with(measurement=self.measurement._replace(rows=rows), near=near, searched={})

@@ -193,7 +193,7 @@ class Form:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The columns' names."""
+        """The names of the table's columns."""
         return tuple(column.name for column in self.columns)
 
 

@@ -568,7 +568,7 @@ class AmplitudeTable(Result):
 
     @property
     def rows(self) -> int:
-        """Number of rows."""
+        """The number of rows of the table."""
         return len(self.order)
 
     @property

@@ -105,7 +105,7 @@ class TappingCurve:
 
     @property
     def rows(self) -> int:
-        """Number of rows."""
+        """The number of rows of the curve."""
         return len(self.offset_nm)
 
     @property

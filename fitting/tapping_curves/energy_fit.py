@@ -852,7 +852,7 @@ def _agreement(told: list[np.ndarray], weighted: list[np.ndarray]) -> float:
 
 
 def _smoothed(values: np.ndarray, width: int = 5) -> np.ndarray:
-    """Return running means."""
+    """Return running means of residuals along the curve."""
     width = min(width, len(values))
     return np.convolve(values, np.full(width, 1.0 / width), "valid")
 

@@ -100,7 +100,7 @@ class _Flight(NamedTuple):
 
 
 def _flight(seen: _Seen, x: np.ndarray) -> _Flight:
-    """Return flights.
+    """Return the tip's flights between taps.
 
     Args:
         seen: of the rows.

@@ -141,7 +141,7 @@ class Fold:
 
     @property
     def cycles(self) -> int:
-        """Whole response periods."""
+        """The number of whole response periods in the trace."""
         return int(self.cycle[-1]) + 1
 
     @property
@@ -150,7 +150,7 @@ class Fold:
         return complex(2.0 * self.waveform.coefficients[self.waveform.line])
 
     def at_drive(self) -> "Fold | None":
-        """Return the same, read at the drive's frequency omega; None where too few phases are sampled for that."""
+        """Return the reading at the drive's frequency omega; None where too few phases are sampled for it."""
         highest = len(self.waveform.coefficients) - 1
         if self.order > highest:
             return None

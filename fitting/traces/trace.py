@@ -414,7 +414,7 @@ class Trace(Result):
 
     @property
     def samples(self) -> int:
-        """Number of samples."""
+        """The number of samples of the trace."""
         return len(self.deflection_nm)
 
     @property

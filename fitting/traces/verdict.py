@@ -43,7 +43,7 @@ class TraceKind(enum.StrEnum):
 
 
 class TraceVerdict(NamedTuple):
-    """Kind and sentence."""
+    """What a trace shows: its kind, and a sentence that says so."""
 
     kind: TraceKind
     sentence: str

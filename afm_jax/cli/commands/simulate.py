@@ -133,7 +133,7 @@ class PositiveInteger(ValueKind):
     name = "integer"
 
     def read(self, text: str) -> int:
-        """Return the integer."""
+        """Return the integer that a text says."""
         if not re.fullmatch(r"\s*[0-9]{1,7}\s*", text) or not 1 <= int(text) <= 1_000_000:
             raise ValueError(f"must be a positive integer up to 1000000, but is {text}")
         return int(text)
