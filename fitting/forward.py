@@ -67,7 +67,7 @@ def orbit_problem(
     cantilever = problem.cantilever(values, measurement.cantilever)
     amplitude = row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration")
     if problem.tapping:
-        # the free tip's amplitude, read by the same detector: in the frame of the free tip the sample moves by it
+        # the free tip's amplitude as the detector shows it: seen from that tip the sample moves by it
         amplitude = amplitude / problem.nuisance(values, "tip_calibration")
         amplitude = amplitude * (1.0 + problem.nuisance(values, "free_amplitude_drift") * row.time)
     if problem.drive == "base":
@@ -84,7 +84,18 @@ def orbit_problem(
 def shown(
     seen: Float[Array, " 3"], orbit: OrbitProblem, row: Rows, values: Float[Array, " p"], problem: Problem
 ) -> Float[Array, " k"]:
-    """Return what the instrument shows of an orbit's peak, lock-in amplitude and phase; phases next to the measured."""
+    """Return the readings of an orbit: peak and lock-in amplitude in nm and, where the table has it, the phase in deg.
+
+    Calibration, zero and drift of the instrument are included. Of the phases that differ by 360/N the one next to the
+    measured phase is returned. A further reading of a table would be one more entry here and in `Rows`.
+
+    Args:
+        seen: peak height in nm, lock-in amplitude in nm and phase in degrees of the orbit itself.
+        orbit: the orbit's scene.
+        row: the row.
+        values: of all parameters, of which the nuisances count.
+        problem: the model.
+    """
     height, amplitude, phase = seen
     if problem.tapping:
         ratio = row.drive_frequency_khz / orbit.cantilever.frequency_khz
@@ -141,9 +152,10 @@ def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
 class Prediction(NamedTuple):
     """Predicted readings of shape (rows, k) as in `Rows`, `nothing_shown` without orbit; the rest has shape (rows,).
 
-    ``orbits`` counts the stable admissible orbits (where roots are followed: whether there is one); ``coordinate``,
-    ``near_fold``, ``approach_speed_nm_per_us`` (NaN of a free tip) and at mid contact the pull and its change are those
-    of the chosen one.
+    ``orbits`` is the number of stable admissible orbits; where an orbit is followed it is not counted again. All else
+    belongs to the chosen orbit: ``coordinate`` is that of its impact in the law (`Law.speeds`),
+    ``approach_speed_nm_per_us`` is NaN of a free tip, ``pull_nm_per_us2`` and ``change_nm_per_us3`` are the
+    acceleration at mid contact and its derivative by time.
     """
 
     amplitude_nm: Float[Array, "rows k"]
@@ -186,8 +198,8 @@ def nothing_shown(row: Rows) -> Float[Array, " k"]:
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
 TAPPED, SEARCHED, SOLVED = 32, 128, 1024
-"""Pairs of a set and a row that one program takes: of taps, where impacts last, and where each takes a hundredth of
-that."""
+"""Pairs of a set and a row that one program takes: of taps; of other impacts that last; and of instantaneous ones, of
+which a pair takes a hundredth of the time."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
 
@@ -289,10 +301,10 @@ def predict(
 
 
 class ImpactSlopes(NamedTuple):
-    """How the residuals of the rows change with what their impacts do, shape (rows, k): peak, lock-in, phase.
+    """Derivatives of the rows' residuals by what their impacts do, shape (rows, k): peak, lock-in, phase.
 
-    By the squared rebound speed in nm^2/us^2, the delay changing with the speed as its law says, and by the delay in
-    us; 0 where nothing was measured, and where impacts are instantaneous.
+    ``by_square``: by the squared rebound speed, in us^2/nm^2; in a formula the delay follows the speed. ``by_delay``:
+    by the delay, in 1/us; 0 where impacts are instantaneous. Both are 0 where nothing was measured.
     """
 
     by_square: Float[np.ndarray, "rows k"]
@@ -320,7 +332,7 @@ def impact_slopes(
         block = _of_pairs(batch, 1, turned, measurement, problem, near, linearise_pairs)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
-    # of a series its constant term
+    # -1: a larger loss, or epsilon, is a smaller squared speed; of a series the constant term is changed
     if isinstance(impacts.impact, PulledImpact):
         both = 0, slice(None), 0
         squares, times = along(lambda i: i.taps.terms, -1.0, *both, 0), along(lambda i: i.taps.terms, 1.0, *both, 1)
@@ -628,8 +640,9 @@ class Free(NamedTuple):
     hertz_time: Float[Array, " n"]
     lowest: Float[Array, ""]
     capture_speed: Float[Array, ""]
-    """Just above capture."""
+    """Approach speed in nm/us just above capture."""
     length: Float[Array, ""]
+    """Gap in nm at which the bridge breaks: the length over which a leaving tip loses its energy."""
 
 
 @jax.jit

@@ -1,7 +1,8 @@
 """Many tips followed from impact to impact at once: the engine behind exponents, bifurcation diagrams and basins.
 
 `follow` takes `Tips`, each at the beginning of a flight, and returns them some impacts later with a `Record` of the
-last ones. Times count within the drive's period, so that long motions keep the digits of their phase.
+last ones. A time is a number of whole drive periods plus a remainder in us within one period, so that the drive's phase
+stays accurate in long motions.
 
 Of laws, `advance` is one step of the impact map (`impact_after`) for a block of tips that fits the processor's cache.
 It is written for arrays, not as a `vmap` of one tip: what only a resting tip needs (chatter summed up, the ride, the
@@ -39,17 +40,18 @@ MAX_STEPS = 2000
 _QUICK_STEPS = 14
 """Steps of the search that all tips of a block take together; those that need more go on among themselves."""
 _RIDE_PERIODS = 1.1
-"""Drive periods within which a resting tip is let go, or never: the push on it repeats every one."""
+"""Drive periods for which a rest is followed. The push on a resting tip repeats every drive period: a tip that one
+period does not release is held for ever."""
 _FEW = 16
 """Tips of a block whose rest, or long search, is computed together."""
 _ROWS = 40
-"""Contacts of a stretch that is simulated at a time."""
+"""Contacts of one stretch, which is one call of `simulate`."""
 _PERIODS_EACH = 6.0
-"""Periods, the slower of drive and free tip, that are allowed for each of them."""
+"""Duration of a stretch per contact, in periods of the drive or of the free tip, whichever is longer."""
 _AWAY = 30.0
-"""Such periods without a contact after which the tip has left the sample."""
+"""Time without a contact after which the tip counts as having left the sample, in these longer periods."""
 _BEYOND = 1e-3
-"""Free periods after a departure at which its contact is surely over, and the next not begun."""
+"""Time after a departure, in free periods, at which this contact is over and the next one has not begun."""
 
 
 class Tips(NamedTuple):
@@ -60,7 +62,8 @@ class Tips(NamedTuple):
     periods: Float[Any, " lanes"]
     """Whole drive periods gone before."""
     gap_nm: Float[Any, " lanes"]
-    """0 just after an impact, next to nothing after a release."""
+    """Height over the surface: 0 after an impact of a law, almost 0 after a release from rest, and after a contact the
+    gap where the bridge breaks."""
     velocity_nm_per_us: Float[Any, " lanes"]
     """In the lab."""
     outcome: Int[Any, " lanes"]
@@ -96,7 +99,7 @@ def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float
     Args:
         scenes: a batch of scenes with laws or contacts.
         tips: at the beginning of a flight each.
-        skip: impacts before those that are recorded.
+        skip: impacts before those that are recorded; contacts are skipped in whole stretches, so at least as many.
         record: impacts that are recorded.
         accuracy: of `simulate`, for contacts.
     """
@@ -141,7 +144,7 @@ def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
     rebound = impact.velocity_after_nm_per_us - surface.velocity(impact.time_us)
     leaving = Departure(impact.time_us, jnp.zeros_like(rebound), impact.velocity_after_nm_per_us)
     never = jnp.zeros_like(going)
-    # without adhesion alone a tip that came to rest may leave again, and chatter comes to an end
+    # only where the law has no adhesion can a tip at rest leave again, and can chatter end in a rest
     law = impact_law_of(scenes)
     may_rest = landed & (~law.adheres) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
 
@@ -168,7 +171,11 @@ def _one_impact(scene: Scene, tip: Tips, *, max_steps: int) -> NextImpact:
 
 
 def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
-    """Return a bound in nm/us of the rebound speeds from which on impacts may be summed up (`law_motion.chatter`)."""
+    """Return the rebound speed in nm/us below which the impacts that follow may have a closed sum (chatter).
+
+    It is 1e-5 P (1 - r)/(2 F), with a bound P of the push N/m in nm/us^2 and the largest angular frequency F: an upper
+    limit, so that `law_motion.chatter` is asked about every rebound that it may sum up.
+    """
     surface, bed = scene.platform, Bed(scene.cantilever, scene.platform)
     omega, decay = scene.cantilever.angular_frequency, scene.cantilever.decay_rate
     reach = jnp.abs(surface.offset_nm) + surface.amplitude_nm
@@ -233,7 +240,8 @@ def follow_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, accura
     Args:
         scenes: a batch of scenes with a contact.
         tips: at a departure each, or anywhere free above the sample.
-        skip: contacts before those that are recorded.
+        skip: least number of contacts before those that are recorded; skip and record are each rounded up to whole
+            stretches of 40, and the last contacts are recorded.
         record: contacts that are recorded.
         accuracy: of `simulate`.
     """

@@ -1,11 +1,13 @@
-"""A contact scene in time: closed-form flight to the bridge, through the contact, and so on to the end.
+"""A contact scene in time (eq. 16): closed-form flight to the bridge, through the contact, and so on to the end.
 
-A round takes a tip through its flight to the next contact, as far through the contact as its legs hold
-(`legs_through`), and from there some steps in time (`contact/step.py`) until a leg begins again or the tip has left. A
-leg holds for a tip that goes straight on: in the bridge the gap is the variable, in the junction s = sqrt(A), so that
-thresholds are met without a search, and the speed follows from the energy. One that turns in the bridge, or is slow
-somewhere, goes in time from where the last leg that held has left it. Contacts that magnify errors are computed again
-in finer steps.
+A leg is one integral through the whole bridge, or through the whole junction, with a coordinate in place of time: the
+gap D in the bridge, s = sqrt(A) of JKR's normalised contact radius A (eq. 15) in the junction. Thresholds are met
+without a search, and the speed follows from the energy. A leg holds (is accurate) for a tip that passes without turning
+in the bridge or becoming slow; every other tip takes steps in time (`contact/step.py`) from the end of the last leg
+that held.
+
+One round of the loop is a flight to the next contact, the legs that hold (`legs_through`), then some steps in time
+until a leg begins or the tip has left. Contacts that magnify errors are computed again in finer steps (`_repetition`).
 
 Every tip of a batch goes at its own rate, and a batch does not wait for the few contacts that turn inside the bridge.
 All shapes are fixed.
@@ -46,8 +48,9 @@ from afm_jax.solve.lanes import repeat_for
 _ROUNDS = 8
 """Rounds between two checks whether all tips have arrived at the end."""
 _FLIGHT_STEPS = 2000
-_ROUNDS_PER_CONTACT = 4
-_SPARE_ROUNDS = 64
+"""Most steps of the search for the end of a flight."""
+_ROUNDS_PER_CONTACT, _SPARE_ROUNDS = 4, 64
+"""Rounds of a motion in reverse mode: for every contact there is room for, and besides."""
 _HELD_ROUNDS_PER_CONTACT, _LEAST_HELD_ROUNDS = 256, 1 << 16
 """Far more rounds than any motion takes that comes to an end: for every contact there is room for, and at least."""
 _TRIALS_BACKWARDS = 40
@@ -57,14 +60,15 @@ _LEGS_AT_ONCE, _TRIALS_AT_ONCE = 256, 64
 _TRIALS = 4
 """Trial steps between two checks which tips of a batch need more."""
 _LASTS_LONG = 10.0
-"""Times that a tip as fast as it came takes for the bridge's gaps, in and out."""
+"""Duration from which a contact counts as long, in units of (gap at arrival + gap at departure)/(arrival speed)."""
 _FINER, _MOST_REPEATS = 1.5, 5
-"""Steps are so many times as fine every time: an eighth-order error is 25 times smaller, or 4 to be careful."""
+"""Factor by which steps are finer in each repetition of a contact, and the most repetitions."""
 _LESS = 4.0
+"""Factor by which a repetition is taken to lower the error: the order of the steps, 8, gives 1.5^8 = 25."""
 
 
 class ContactRow(NamedTuple):
-    """A contact, in the gap and its rate; stored as one vector."""
+    """One contact as numbers in one vector: gaps in nm over the surface, their rates in nm/us, times in us."""
 
     kind: Float[Array, "..."]
     arrival_us: Float[Array, "..."]
@@ -258,7 +262,9 @@ def _fly(
 
 
 def cross(driven: Driven, start: ContactState, setting: QuickSetting) -> Leg:
-    """Return a tip beyond the contact that it has just begun, leg by leg.
+    """Return a contact passed in three legs, from where the bridge forms to where it breaks, as one leg.
+
+    Approach through the bridge, junction, retract through the bridge; the result holds where all three do.
 
     Args:
         driven: the equation of motion.
@@ -404,7 +410,12 @@ def _advanced(driven: Driven, tip: TipInContact, moving: Array, fineness: Array,
 def _repetition(
     tip: TipInContact, arrival: ContactState, repeats: Repeats, has_left: Array, setting: DrivenSetting
 ) -> tuple[Bool[Array, ""], Repeats]:
-    """Return whether a contact that a tip has left is to be computed again in finer steps, and what it ended with."""
+    """Return whether a contact that a tip has left is to be computed again in finer steps, and what it ended with.
+
+    The first repetition is made of contacts that magnify errors: the tip left with less than 1/`magnified` of its
+    kinetic energy, stayed long, or did not form the junction exactly once. More follow, up to five in all, until rate
+    (relative) and time (in us, times 10) of the departure change by less than 4 `agreement`.
+    """
     if setting.agreement is None:
         return jnp.zeros_like(has_left), repeats
     arrived, departed, previous = lax.stop_gradient((arrival, tip.state, repeats))
@@ -447,7 +458,10 @@ def _row(tip: TipInContact, arrival: ContactState, *, held: Array) -> Float[Arra
 def _contacts(
     row: ContactRow, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
 ) -> Contacts:
-    """Return the rows as contacts in the lab."""
+    """Return the rows as contacts in the lab, with the energy in aJ that each one dissipated.
+
+    Loss = hysteresis of the bridge (of a tip that left) + junctions times their hysteresis + viscous loss.
+    """
     junction = driven.junction
     has_left, touched = row.kind == ContactKind.IMPACT, row.junctions > 0.0
     bridge = jnp.where(has_left, junction.bridge_hysteresis_aj, 0.0)

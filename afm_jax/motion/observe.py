@@ -5,10 +5,10 @@
 sweeps, so that a new quantity is a new row here.
 
 A response period has N drive periods, T = N 2 pi/omega. Over a window of n response periods a lock-in at the angular
-frequency nu reads 2/(n T) int z exp(-i nu t) dt: at nu = omega/N, the response's frequency, at nu = omega, where every
-lock-in reads a tip that base or force drives, or at any other multiple k omega/N. Integrals over time are sums over
-the Gauss nodes of a dense path. The window (`window_of`) is the last response period once a motion has settled, else
-whole ones in the last fifth.
+frequency nu in rad/us returns 2/(n T) int z exp(-i nu t) dt in nm. It is evaluated at nu = omega/N, the frequency of
+the response; at nu = omega, where instruments demodulate a tip that is driven by its base or by a force; and at any
+other multiple k omega/N. Integrals over time are sums over the Gauss nodes of a dense path. The window (`window_of`) is
+the last response period once a motion has settled, else the whole response periods in the last fifth of the motion.
 """
 
 import math
@@ -36,6 +36,7 @@ from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 _LOADS = 4001
+"""Points on the junction's load curve at which its most attractive force is searched for."""
 _COVERED = 1e-6
 """Fraction of a window that may be missing from its nodes: rounding."""
 _REFINEMENTS = 4
@@ -43,6 +44,7 @@ _REFINED = 33
 """Times between two around the best one, of every refinement."""
 _GRID = 257
 _ZOOMS = 3
+"""Times of the grid that looks for the highest point of a driven flight, and how many grids follow one another."""
 TOO_SHORT = "the window is shorter than a response period: follow the motion longer"
 _ONLY_RESOLVED = "only a resolved contact has a force"
 _BASE_RESTS = "the base rests: the deflection is the height"
@@ -57,7 +59,8 @@ class Harmonic(NamedTuple):
     """k omega/(2 pi N)."""
     amplitude_nm: float
     phase_deg: float
-    """In [0, 360/N'): which of the N' = N/gcd(k, N) equivalent periods is locked is unknown."""
+    """In [0, 360/N') with N' = N/gcd(k, N): a response may lock to any of its N drive periods, which shifts the phase
+    of this harmonic by multiples of 360/N'."""
 
 
 @dataclass(frozen=True)
@@ -501,7 +504,7 @@ class EnergyBalance(NamedTuple):
     """Work of all drives on the tip; with a law what closes the balance, else an integral of its own."""
     air_aj: float
     contact_aj: float
-    """Dissipated by the contacts; from their ledger, or from the work of the force where one is cut."""
+    """Dissipated by the contacts: the sum of their losses, or -int F D' dt over the window where it cuts a contact."""
     stored_aj: float
     """By how much the tip's kinetic energy and the spring's energy have grown."""
     imbalance: float | None
@@ -509,10 +512,11 @@ class EnergyBalance(NamedTuple):
 
 
 def _energy_balance(motion: MotionWindow) -> EnergyBalance:
-    """Return the energies of a window.
+    """Return the energies of a window in aJ, from the equation of motion multiplied by z'.
 
-    m z'' + (m Omega/Q) z' + k z = F + f + k z_b, times z': with F z' = F D' + F z_p', the drives give
-    F z_p' + f z' + k z_b z', air takes (m Omega/Q) z'^2, the contact -F D' but for what its forces store.
+    m z'' + (m Omega/Q) z' + k z = F + f + k z_b, with the contact force F, the drive force f and the base z_b. The gap
+    D and the platform z_p split the contact's power, F z' = F D' + F z_p'. Drives give F z_p' + f z' + k z_b z', air
+    dissipates (m Omega/Q) z'^2, and the contact takes -F D', of which conservative forces give their part back.
     """
     scene, path = motion.scene, motion.path
     cantilever = scene.cantilever
@@ -543,9 +547,11 @@ def _energy_balance(motion: MotionWindow) -> EnergyBalance:
 def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> complex:
     """Return what impacts of a law add to int z exp(-i nu t) dt of flights and rests, in nm us.
 
-    In an impact that lasts the tip is below the surface by the indentation of a Hertz contact (`impact/orbits.py`
-    does likewise for an orbit). A negative collision delay lets a flight begin before the last one has ended: until
-    then both are counted, and the surface once too often. Impacts whose middle is in the window count.
+    An impact that lasts, with its middle at t_m, adds -I exp(-i nu t_m), where I is the time integral in nm us of the
+    indentation of a Hertz contact (`depth_of_impact`; `impact/orbits.py` does this for an orbit). With a negative
+    collision delay a flight begins before the previous one has ended. While they overlap, the motion counts as the sum
+    of both heights less that of the surface: the nodes hold the earlier flight, and the gap of the later one is added.
+    Impacts whose middle is in the window count.
 
     Args:
         motion: of any scene; only a law with a delay has something to add.
@@ -612,8 +618,8 @@ def largest_along(
 ) -> float:
     """Return the largest value of a quantity of trajectories between two times.
 
-    It is evaluated at the given times, then ever closer to the two best ones: a period that begins just before its top
-    ends nearly as high.
+    The quantity is evaluated at the given times, then on ever finer grids around its two highest local maxima. Two are
+    refined because a response period that begins just before its maximum ends on one that is nearly as high.
 
     Args:
         dense: the tip between the two times.

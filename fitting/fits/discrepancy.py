@@ -1,7 +1,10 @@
-"""What a model leaves out, as uncertain as it is: a step after the fit, for parameters, law, band and chi2.
+"""The model discrepancy (Kennedy and O'Hagan): a step after the fit that gives parameters, law, band and chi2.
 
-A law of a few numbers is itself an approximation. What it misses is known in size and in character, and is put beside
-its parameters as unknowns, each with a prior:
+A law of a few numbers is itself an approximation. Size and character of what it lacks are known, and enter as unknowns
+b ~ N(0, 1) beside the parameters. To first order the readings' residuals in errors are r + J d + U b + noise; with
+V = noise covariance + U U^T the step of the parameters is d = -(J^T V^-1 J)^-1 J^T V^-1 r, their covariance is
+(J^T V^-1 J)^-1, and the most likely unknowns are b = -U^T V^-1 (r + J d) (`step_of`). With the approach speed u and the
+rebound speed u_out the unknowns are:
 
 - the shape of the loss: the bridge's drag acts on a speed that its pull has raised, u_out^2 = u^2 - c sqrt(u^2 + q) -
   epsilon with q = 110 +- 60 nm^2/us^2; and a smooth function of ln u (a Gaussian process);
@@ -52,7 +55,8 @@ _SQUARE_PER_LEAD, _LEAST_SQUARE = 2.0, 2.0
 _SMOOTH, _KNOTS = 0.8, 0.4
 """Correlation length of the smooth functions, and distance of their knots, in ln u."""
 _SHORT, _SHORT_KNOTS, _SHORT_PATH_NM = 0.25, 0.15, 0.1
-"""The same of the functions of shorter range; and the path in nm for a share of the loss of 1."""
+"""Correlation length and distance of the knots in ln u of the functions of shorter range; and the standard deviation of
+their path in nm where that of their share of the loss is 1."""
 _RUN, _RUN_STEP = 0.2, 0.1
 """Width of the bumps in ln u that a run of residuals is looked for with (standard deviation), and their distance."""
 _RUN_BY_CHANCE, _SHARE_PER_RUN, _LARGEST_SHARE = 2.2, 0.25, 1.0
@@ -211,10 +215,11 @@ class StepRows(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """Changes of the squared rebound speed and of the delay at some speeds.
+    """Discrepancy at n speeds: of the squared rebound speed in nm^2/us^2 (first entry) and of the delay in us (second).
 
-    ``known``: on average; ``drag``: by the viscous loss, beyond what the model says; ``shape``: by each shape's number;
-    ``unknown``: by unknowns of unit variance. The first entry is the squared speed, the second the delay.
+    ``known``: its mean; ``drag``: its derivative by the viscous loss; ``shape``: its derivatives by q of the loss and f
+    of the delay (`priors`); ``unknown``: its derivatives by unknowns of unit variance. A new term of the discrepancy of
+    the law is a column of ``unknown`` (`ModelDiscrepancy.columns`).
     """
 
     known: Float[np.ndarray, "2 n"]
@@ -330,18 +335,18 @@ def _stacked(square: list, late: list, count: int) -> Float[np.ndarray, "2 n m"]
 
 
 class LinearStep(NamedTuple):
-    """The fit after the step.
+    """The fit after the step, to first order: parameters, shapes, and unknowns b of the model discrepancy.
 
     Attributes:
         names: of the parameters, then of the shapes.
-        values: of these.
-        change: by which they have moved.
-        covariance: of these; infinite where a direction is not determined.
-        chi2: with everything that is left out.
-        residual: of the amplitudes, in the objective's errors, what is left out being at its most likely.
-        unknown: their most likely values, of unit variance beforehand.
-        unknown_covariance: theirs for given parameters.
-        follow: how their most likely values change with the parameters.
+        values: of parameters and shapes.
+        change: d, by which these values have moved in the step.
+        covariance: of these values; infinite where a direction is not determined.
+        chi2: r^T V^-1 r of the readings, with the constraints and priors.
+        residual: of the readings, in the objective's errors, at the most likely b.
+        unknown: the most likely b; the prior of each is N(0, 1).
+        unknown_covariance: of b, for given parameters.
+        follow: derivatives of the most likely b by the parameters and shapes.
     """
 
     names: tuple[str, ...]
@@ -432,7 +437,8 @@ def system_of(rows: StepRows, discrepancy: ModelDiscrepancy) -> StepSystem:
     residual[:size] += amplitudes(columns.known)
     jacobian = np.zeros((residual.size + len(priors), known + len(priors)))
     jacobian[: residual.size, :known] = rows.jacobian
-    # what may stay open has its range, around where the fit ended; the rows' last residuals are what is known of each
+    # the last rows of residual and Jacobian are the parameters' constraints; a parameter that may stay open and has
+    # none gets a prior as wide as its range, centred where the fit ended
     place = residual.size - known + np.arange(known), np.arange(known)
     ranges = np.sqrt(discrepancy.problem.known_by_range(np.array([discrepancy.values[name] for name in names])))
     jacobian[place] = np.where(jacobian[place] == 0.0, ranges, jacobian[place])
@@ -457,7 +463,7 @@ def step_of(
     free: Bool[np.ndarray, " p"],
     more: Float[np.ndarray, "readings m"] | None = None,
 ) -> LinearStep:
-    """Return where one linear step leads from a fit, with all that is left out.
+    """Return the generalised least-squares step from a fit, with the model discrepancy in the covariance V of the rows.
 
     Args:
         rows: of the fit.
@@ -685,7 +691,7 @@ def _remainders(rows: StepRows, problem: Problem) -> Float[np.ndarray, "2 rows m
     if problem.pulled:
         return np.zeros((2, rows.approach.size, 0))
     u, w, g, j, time = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
-    # of the loss by the speed; rows of one speed say nothing of it
+    # slope in nm/us of the loss u^2 - w^2 over the speed, by regression; 0 where all rows have one speed
     apart = u - u.mean()
     slope = max(float(apart @ (u**2 - w**2)) / max(float(apart @ apart), 1e-9), 0.0)
     nothing = np.zeros_like(u)

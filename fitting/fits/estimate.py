@@ -169,7 +169,8 @@ class FitEstimate(NamedTuple):
         covariance: of these, with what the formula leaves out.
         chi2: with the model discrepancy.
         rows: measured and predicted amplitudes of the law.
-        independent_residual: residuals without the most likely remainders that rows have in common.
+        independent_residual: residuals in errors without the most likely part that rows share: remainders of the
+            corrections, and deviations of the tables' laws.
         after: the step, as much of it as lowers chi2, and the discrepancy that it leads to; None: there is none.
         step_rows: the rows as the step sees them.
         stuck: chi2 that no part of the step lowers, and what the whole step takes it to to first order; None elsewhere.
@@ -246,12 +247,13 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
     system = system_of(rows, discrepancy)
     tables = _compare_tables(at, system)
     used = np.isfinite(at.speeds)
-    # of the Hertz time, in us and kHz
+    # Hertz time in us times the drive's frequency in kHz; 1e-3 makes it a share of the period
     contact_share = float(np.max(1e-3 * rows.hertz_time[: used.size][used] * table.drive_frequency_khz[used]))
     estimate = estimate._replace(step_rows=rows, runs=runs, tables=tables, contact_share=contact_share)
     departing = () if tables is None else tables.departing
     if not (at.problem.lasting or departing):
         return estimate
+    # where laws scatter between tables: values by the most likely scatter, covariance by the cautious one
     step, *cautious = (step_of(rows, discrepancy, at.free, sizes) for sizes in departing or (None,))
     step = step._replace(covariance=(*cautious, step)[0].covariance)
     system = system.with_unknowns(departing[0] if departing else None)
@@ -260,6 +262,7 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
         return _predicted_after(at, steps, discrepancy)
 
     def again(beyond: Float[np.ndarray, " readings"]) -> LinearStep:
+        """Return the step for readings whose residuals at the fit are larger by what is beyond first order."""
         residual = rows.residual.copy()
         residual[: beyond.size] += beyond
         likely = departing[0] if departing else None
@@ -470,7 +473,7 @@ _MUCH = 0.25
 
 
 def hanging_on_held(estimate: FitEstimate) -> dict[str, tuple[str, ...]]:
-    """Return which held parameters' errors are much of each fitted one's, by the fitted one's name."""
+    """Return, by the name of a fitted parameter, the held parameters whose error gives over 25 % of its variance."""
     hanging: dict[str, tuple[str, ...]] = {}
     if estimate.after is None or estimate.step_rows is None:
         return hanging
@@ -487,7 +490,7 @@ def hanging_on_held(estimate: FitEstimate) -> dict[str, tuple[str, ...]]:
 _KINDS = (("peak amplitude", ""), ("lock-in amplitude", ""), ("phase", "degrees"))
 """What is read, and its unit if it does not drift by a share."""
 _FOLLOWING = 4.0
-"""Standard errors of a course of the residuals along the rows beyond which it is no chance."""
+"""Slope of the residuals along the rows, in its standard errors, beyond which it is not taken to be chance."""
 
 
 def courses_along_rows(at: AtMinimum) -> dict[str, list[str]]:
@@ -516,7 +519,15 @@ def courses_along_rows(at: AtMinimum) -> dict[str, list[str]]:
 
 
 def _slope_along(at: AtMinimum, along: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return how far readings follow a course that the parameters leave them, and that in standard errors."""
+    """Return the size of a course in the readings that the parameters cannot explain, and its size in standard errors.
+
+    Least squares: a is the course less its projection on the residuals' Jacobian, and the size is -a.r/(a.a) with the
+    standard error (a.a)^(-1/2), r being (predicted - measured)/error; 0 where the parameters explain the course.
+
+    Args:
+        at: the minimum.
+        along: the course in errors of the readings, row by row, of size 1 from the first row to the last.
+    """
     residual = np.nan_to_num(np.asarray(at.linear.residual)[0])
     column = np.append(along, np.zeros(residual.size - along.size))
     slopes = np.nan_to_num(np.asarray(at.linear.jacobian)[0])
@@ -729,9 +740,10 @@ def law_before(
 def law_and_slope(
     impact: AnyImpact, slopes: AnyImpact, speeds: Float[Array, " n"]
 ) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
-    """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
+    """Return rebound speeds in nm/us and delays in us at approach speeds, and their derivatives by the parameters.
 
-    The last column is that of the capture speed, twice.
+    The two rows are speed and delay; behind the approach speeds there is one more column, with the capture speed in
+    nm/us in both rows.
 
     Args:
         impact: what is fitted.

@@ -61,8 +61,8 @@ def fit(  # noqa: PLR0913
             be known to 5 % where impacts last, and exactly by the instantaneous laws. Several of them: one law for all,
             each with nuisances of its own.
         model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
-            each instantaneous or with "+delay", the collision delay; or "contact", physical parameters through the
-            resolved contact, which a tapping curve gives on resonance too.
+            each instantaneous or with "+delay", the collision delay; or "contact", physical parameters of the resolved
+            contact. On resonance, where a tapping curve determines no impact law, "contact" still can be fitted.
         share: nuisances that several tables have in common, by name; "all": every one.
         hierarchical: let the laws of several tables scatter around a mean, each parameter by a standard deviation that
             is fitted too: the values are then means.
@@ -74,8 +74,9 @@ def fit(  # noqa: PLR0913
         fixed: values at which other parameters of the model are held; of "contact" what is not named is the paper's.
         constraints: value and standard error of what else is known, by parameter: a nuisance (`quality_factor`,
             `tip_calibration`, `drive_calibration`, `offset_origin_nm`), which then is fitted along, or one of the
-            model's parameters. Of several tables every one's nuisance is known that well. What a fit of the contact
-            holds is held at the value then, and known that well; of the others an error is assumed, and named.
+            model's parameters. With several tables a nuisance's constraint holds for each of them. In a fit of
+            "contact" a constrained parameter that is not free is held at its value, and its error adds to the errors
+            of the fitted ones; a held parameter without constraint gets an assumed error, which the report names.
         effects: for "contact": the effects there are.
         robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
             amplitudes are explained.
@@ -192,7 +193,8 @@ def summarise(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
 
 
 _HARDLY_TOLD, _LOOKED_AT = 4.0, 30.0
-"""Rise of chi2 up to which another minimum may as well be the true one; and from where it is followed to find that."""
+"""Rise of chi2 over the best minimum up to which another one may be the true one; and the rise up to which another end
+of the search is minimised further, where impacts last, before that is decided."""
 
 
 def other_minimum(estimate: FitEstimate) -> FitEstimate | None:
@@ -207,7 +209,7 @@ def other_minimum(estimate: FitEstimate) -> FitEstimate | None:
     ends = found.minimum.ends[apart(found.minimum.ends)]
     if not ends.size:
         return None
-    # of impacts that last they were found with the errors as stated and outliers counting less
+    # where impacts last, these ends come from stated errors and a robust loss: take chi2 with the errors as used
     chi2 = np.sum(found.objective.residual(ends) ** 2, axis=1)
     place = lowest(chi2)
     if not chi2[place] < at.chi2 + (_LOOKED_AT if problem.lasting else _HARDLY_TOLD):
@@ -224,7 +226,10 @@ def other_minimum(estimate: FitEstimate) -> FitEstimate | None:
 
 
 def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
-    """Return all that the verdict looks at, the parameters without errors and intervals yet."""
+    """Return all that the verdict looks at, the parameters without errors and intervals yet.
+
+    A new ground for an invalid fit is a field of `Evidence` that is set here, and a rule in `fitting/fits/verdict.py`.
+    """
     at, problem, rows = estimate.at, estimate.at.problem, estimate.rows
     robust, scale = at.found.objective.robust, at.settings["error_scale"]
     judged = at.freedom > 0 and scale is None and not robust
@@ -268,7 +273,8 @@ def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
 def parameters_with_intervals(estimate: FitEstimate) -> dict[str, FittedParameter]:
     """Return the parameters with their errors and, where all are determined, profile intervals.
 
-    The intervals have moved with their values in the step, and grown with their errors.
+    Intervals are profiled at the minimum. After a step from value x and error s to x' and s', an end e of an interval
+    becomes x' + (s'/s)(e - x).
     """
     at, errors, before = estimate.at, _errors(estimate.covariance), _errors(estimate.at.covariance)
     if not np.all(np.isfinite(errors)) or not np.all(np.isfinite(at.covariance)):
@@ -441,8 +447,9 @@ def _autocorrelation(residual: Float[np.ndarray, "rows k"]) -> float:
 _GROSS = 10.0
 """chi2 over degrees of freedom from which on other units are tried."""
 _GRID = np.array([[r, epsilon] for r in (0.5, 0.7, 0.85, 0.93, 0.97, 0.99) for epsilon in (0.0, 30.0, 300.0, 3000.0)])
-"""Values of r and epsilon over which the law of eq. 6 is looked at."""
+"""Values of r and of epsilon in nm^2/us^2 at which a table's distance from the law of eq. 6 is evaluated."""
 _BETTER = 0.5
+"""Distance from the law in other units, over that in the stated units, below which the other units are tried."""
 _TRIED = 6
 """Tables of several that are tried in other units: each takes a fit."""
 
