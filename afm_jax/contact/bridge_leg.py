@@ -2,12 +2,15 @@
 
 Where the bridge is crossed monotonically the gap can replace time. With the kinetic energy K = m w^2/2, w the size of
 the gap's rate, the potential U of the static forces and the spring, and the energy S that is spent, K + U + S is the
-energy at the start. The static forces, which vary most, thereby leave the equation, and only S is integrated,
+energy at the start (eq. 16, integrated once). The static forces, which vary most, leave the equation, S is integrated,
 
-    dS/d|path| = (damping(D) + m Omega/Q) w -+ m q(t),    dt/d|path| = 1/w,
+    dS/d|path| = (damping(D) + m Omega/Q) w + sense m q(t),    dt/d|path| = 1/w,
 
-q the push of the surface's motion (`Drive`). A free tip has neither Omega nor q. The gap is a function of the fraction
-of the way that is done, chosen so that the square roots of w at the ends are gone (`Exit`, `Turning`).
+sense +1 on the way in and -1 on the way out, q the push of the surface's motion on the gap in nm/us^2 (`Drive`). S is
+what bridge and air dissipate and what the push takes; a `Passage` tells what the bridge dissipates apart. A free tip
+has neither Omega nor q. A new force is a term of the contact (`bridge_of`) and needs nothing here. The gap is a
+function of the fraction of the way that is done, chosen so that the square roots of w at the ends are gone (`Exit`,
+`Turning`).
 
 `way_through` states the problem, `pass_bridge` solves it for a free tip by one of two integrators: Picard's iterations
 over Gauss nodes (`collocate`), or Diffrax's steps (`pass_in_steps`). `go_in` and `go_out` are the legs of driven
@@ -46,10 +49,10 @@ _SCAN = 256
 
 
 class Exit(NamedTuple):
-    """D = scale exp(-y^2), y linear in the fraction: smooth where the tip is slow at the outer end.
+    """D = scale exp(-y^2), y linear in the fraction: smooth where the tip is slow at the outer end, on either way.
 
-    The scale is exp(b) times the outer gap; b is the distance in ln D of the turning point that a slow tip would have
-    beyond that end, at most 1.
+    The scale is exp(b) times the outer gap. A tip that is slow at the outer end would, a little farther out, be turned
+    round by the bridge's pull: b is how much farther in ln D, and at most 1 (`margin_of`).
     """
 
     scale_nm: Float[Array, "..."]
@@ -85,7 +88,7 @@ class Passage(NamedTuple):
     time_us: Float[Array, "..."]
     """Time taken; meaningless where the energy is not positive."""
     dissipated_aj: Float[Array, "..."]
-    """Energy that the dissipative forces took."""
+    """Energy that the contact's dissipative forces took, without the cantilever's own damping."""
 
 
 class Along(NamedTuple):
@@ -95,7 +98,7 @@ class Along(NamedTuple):
     path_nm: Float[Array, "..."]
     """|dD| per fraction of the way."""
     drag: Float[Array, "..."]
-    """Path times damping."""
+    """Path times damping, in nN us: times the speed it is the energy dissipated per fraction."""
     available_aj: Float[Array, "..."]
     """The kinetic energy if nothing had been spent."""
 
@@ -148,7 +151,13 @@ class Way(NamedTuple):
         return jnp.where(moving, speed, 0.0), jnp.where(moving, path / speed, 0.0)
 
     def spending(self, at: Along, speed: Float[Array, "..."], lasted_us: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the kinetic energy in aJ spent per fraction, at times in us since the start."""
+        """Return dS/d(fraction) in aJ: what drag, air and the surface's push take of the kinetic energy.
+
+        Args:
+            at: the points of the way.
+            speed: there, in nm/us.
+            lasted_us: times since the start, at which the push is taken.
+        """
         drive, lost = self.tip.drive, at.drag * speed
         if drive is None:
             return lost
@@ -199,7 +208,12 @@ def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
 
 
 def margin_of(energy: Float[Array, "..."], pull: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return b for a kinetic energy at the outer end: energy over pull times gap there, between 0 and 1."""
+    """Return b, without unit, between 0 and 1: the kinetic energy at the outer end over that end's pull.
+
+    Args:
+        energy: kinetic energy at the outer end, in aJ.
+        pull: -F(D) D there, the bridge's attraction times the gap, in aJ.
+    """
     near = energy < pull
     return jnp.where(near, jnp.maximum(energy, _NEAREST * pull) / jnp.where(near, pull, 1.0), 1.0)
 
@@ -218,7 +232,7 @@ class Collocation(NamedTuple):
     change_aj: Float[Array, "nodes ..."]
     """By how much the last iteration has changed the energy spent at the nodes."""
     end_change_aj: Float[Array, "..."]
-    """By how much the last iteration has changed the energy spent at the end."""
+    """By how much the last iteration has changed the energy that a free tip has spent at the end."""
 
 
 def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
@@ -400,9 +414,9 @@ def _cross(
 
 
 class Turn(NamedTuple):
-    """What an impact ends with that the bridge turns round before the junction forms: its repulsion stops a slow tip.
+    """What an impact ends with when the bridge's repulsion stops a slow tip before the junction forms.
 
-    The turning gap is where the energy that is left equals the potential.
+    It turns at the gap where the potential equals the energy that is left.
     """
 
     turns: Bool[Array, "..."]

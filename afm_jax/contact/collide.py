@@ -51,7 +51,10 @@ _CAPTURE_ROUNDS = 9
 _MOST_SPENT = {"steps": 0.2, "collocation": 0.05}
 """Fraction of the energy that dissipation may take where few steps, or few iterations, are enough."""
 _NEAR_CAPTURE = (-0.02, 0.2)
-"""Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
+"""Kinetic energy at the end over that at the start: between these a tip is close to capture and needs many steps.
+
+The upper bound is reached at about 1.1 times the capture speed.
+"""
 _TRIAL_MARGIN = 1e-3
 """Margin of a first pass of the retraction, which tells how fast the tip is at its end."""
 
@@ -65,7 +68,8 @@ ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj
 class Collision(ResultTuple):
     """What collisions end with; arrays of one shape.
 
-    Energies are in aJ. Where the tip is captured rebound speed, delay and time in junction are 0: see `outcome`.
+    Where the tip is captured, rebound speed, delay, time in contact and time in the junction are 0, and the hystereses
+    and the viscous loss are not what it has lost, since it stops on the way: see `outcome`. Energies are in aJ.
     """
 
     approach_speed_nm_per_us: Float[Array, "..."]
@@ -227,7 +231,7 @@ def three_parts(
     """
     tip = free_tip(contact, junction, mass)
     gaps_in, gaps_out = (tip.forms_nm, junction.forms_gap_nm), (tip.ends_nm, junction.breaks_gap_nm)
-    # aJ: what the bridge's pull at an outer gap does along such a gap; tells how slow a tip is there (`margin_of`)
+    # -F(D) D in aJ at either outer gap: beside it a small kinetic energy counts as slow (`margin_of`)
     pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap, _ in (gaps_in, gaps_out))
     start = 0.5 * mass * approach_speed * approach_speed
 
@@ -237,6 +241,7 @@ def three_parts(
         cross = crossing or partial(pass_bridge, setting=setting)
         approach = cross(way_through(tip, gaps_in, start, margin_of(start, pull_in), inward=True))
         solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
+        # the way out twice: roughly, for the energy at its end and so for its margin, then as the setting says
         trial = way_through(tip, gaps_out, solid.energy_aj, jnp.full_like(start, _TRIAL_MARGIN), inward=False)
         end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
         retract = cross(way_through(tip, gaps_out, solid.energy_aj, margin_of(end, pull_out), inward=False))
@@ -279,7 +284,8 @@ def _parts_in_a_loop(
 ) -> tuple[Passage, JunctionWay, Passage]:
     """Return approach, junction and retraction by one program in a loop, since three copies of it compile for long.
 
-    The three rounds are: the approach; the retraction for its energy at the end; the retraction.
+    The three rounds are: the approach; the retraction for its energy at the end; the retraction. Every round computes
+    the junction, too; before the approach is known (round 0) its result is not used.
     """
 
     def leg(before, number):
@@ -410,9 +416,10 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
 
 @jax.jit
 def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Array]:
+    """Return the capture speed in nm/us (0: every tip leaves, infinite: none does), and whether a junction exists."""
     junction = find_junction(contact)
     fixed = lax.stop_gradient((contact, junction, mass))
-    # sqrt(2 hysteresis / m) without dissipation, which raises it; less where the bridge turns the tip round
+    # the search begins around sqrt(2 hysteresis / m); dissipation raises the root, a turn in the bridge lowers it
     taken = fixed[1].hysteresis_aj
     if contact.dry and contact.forces.terms:
         # drag alone captures a tip, on its way out of the well of the attraction
@@ -424,16 +431,16 @@ def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Arr
     def narrow(ends, _):
         # one small program for all rounds: the first looks far and wide, each further one inside an interval
         points = ends[0] + (ends[1] - ends[0]) * jnp.linspace(0.0, 1.0, _CAPTURE_POINTS, dtype=scale.dtype)
-        held = jax.vmap(lambda point: _end_energy(jnp.exp(point), fixed))(points) <= 0.0
-        last = _CAPTURE_POINTS - 1 - jnp.argmax(held[::-1])
+        captured = jax.vmap(lambda point: _end_energy(jnp.exp(point), fixed))(points) <= 0.0
+        last = _CAPTURE_POINTS - 1 - jnp.argmax(captured[::-1])
         inside = jnp.stack([points[last], points[jnp.minimum(last + 1, _CAPTURE_POINTS - 1)]])
-        return inside, (held.any(), held[-1])
+        return inside, (captured.any(), captured[-1])
 
-    ends, (any_held, top_held) = lax.scan(narrow, scale + width, None, length=_CAPTURE_ROUNDS)
+    ends, (any_captured, fastest_captured) = lax.scan(narrow, scale + width, None, length=_CAPTURE_ROUNDS)
     found = jnp.exp(ends[0])
     root = implicit_root(_end_energy, found, (contact, junction, mass))
-    held = jnp.where(top_held[0], jnp.inf, root)
-    return jnp.where(any_held[0], held, 0.0), junction.exists
+    speed = jnp.where(fastest_captured[0], jnp.inf, root)
+    return jnp.where(any_captured[0], speed, 0.0), junction.exists
 
 
 def _end_energy(
@@ -537,7 +544,7 @@ def collisions(
     accuracy: float = 1e-9,
     method: str = "diffrax",
 ) -> Collisions:
-    """Return what becomes of free tips.
+    """Return a table of collisions of free tips with a sample at rest, with the capture speed and the junction.
 
     Args:
         contact: the contact, of numbers.

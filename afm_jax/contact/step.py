@@ -42,7 +42,9 @@ _SHORTEST = 1e-3
 _CORE_FRACTION = 0.4
 """Of the gap where the junction forms: there the core's force varies over the gap less this."""
 _FROM_REST = 0.5
+"""Weight of the acceleration in the time scale, without which a tip at rest would take no notice of the forces."""
 _CUBIC_STEPS = 4
+"""Steps of Newton's method to where a cubic vanishes."""
 
 
 class TipInContact(NamedTuple):
@@ -86,7 +88,10 @@ class TipInContact(NamedTuple):
 def advance(
     driven: Driven, tip: TipInContact, until_us: Float[Array, "..."], fineness: float | Float[Array, "..."]
 ) -> TipInContact:
-    """Return a tip in contact after one trial.
+    """Return a tip in contact after one trial step.
+
+    A step that is taken moves state and record on, and where it meets a threshold the phase changes; one that must be
+    repeated leaves them as they were and only sets the length of the next trial.
 
     Args:
         driven: the equation of motion.
@@ -129,17 +134,23 @@ class _Trial(NamedTuple):
     to_turn: Bool[Array, "..."]
     """Whether it should end at a turning point."""
     length: Float[Array, "..."]
+    """In us of time in the bridge, in us of fictitious time in the junction (`Driven.rates`)."""
     start: ContactState
     start_rates: ContactState
     end: ContactState
     end_rates: ContactState
     low: Float[Array, "..."]
-    """Thresholds of x: where the junction forms and the bridge breaks, or the fold and none."""
+    """Lower threshold of x: in the bridge the gap where the junction forms, in the junction the root s at the fold."""
     high: Float[Array, "..."]
+    """Upper threshold of x: in the bridge the gap where it breaks, in the junction infinite."""
 
     @property
     def near_low(self) -> Float[Array, "..."]:
-        """Distance from the low threshold within which the parabola is exact; s is 0 at the fold of a dry contact."""
+        """Distance from the low threshold within which the parabola is exact.
+
+        It is relative to the threshold; where that is 0, as s is at the fold of a contact without bridge and adhesion
+        (`Contact.dry`), to the x from which the step began.
+        """
         return jnp.where(self.low > 0.0, _NEAR * self.low, _NEAR_FOLD * self.start.x)
 
     @property
@@ -237,7 +248,10 @@ def _length_to_event(
 
 
 def _length_to_go(state: ContactState, rates: ContactState, distance: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the length after which the parabola of x has gone a distance; infinite if never."""
+    """Return the length h after which the parabola of x has gone a distance d; infinite if never.
+
+    d = x' h + x'' h^2/2, of which h = 2 d/(x' +- sqrt(x'^2 + 2 x'' d)), with the sign of x', is the first root.
+    """
     # x'' along the step: in both phases x' is proportional to the gap's rate, whose slope is known
     ratio = rates.x / jnp.where(state.gap_rate == 0.0, 1.0, state.gap_rate)
     bend = 0.5 * ratio * rates.gap_rate
@@ -260,8 +274,9 @@ def _inverse_step(
 def inverse_bridge_step(driven: Driven, state: ContactState, acceleration: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the inverse of the time scale of a tip in the bridge, in 1/us.
 
-    The root of the squares of: the frequency of the local stiffness, the speed over the distance in which the forces
-    change, the root of the acceleration over that distance, and the frequencies of cantilever and drive.
+    sqrt(|k_b|/m + (w/L)^2 + |a|/(2 L) + (Omega + omega)^2), k_b the bridge's stiffness at the gap, w the speed and a
+    the acceleration of the gap, L the distance over which the forces change, Omega + omega the frequencies of
+    cantilever and drive.
 
     Args:
         driven: the equation of motion.
@@ -277,10 +292,11 @@ def inverse_bridge_step(driven: Driven, state: ContactState, acceleration: Float
 
 
 def inverse_junction_step(driven: Driven, state: ContactState) -> Float[Array, "..."]:
-    """Return the inverse of the scale of fictitious time of a tip in the junction.
+    """Return the inverse of the scale of fictitious time of a tip in the junction, in 1/us.
 
-    The root of the squares of: the frequency of the junction's stiffness, the speed over the distance in s in which the
-    load changes, and the frequencies of cantilever and drive.
+    0.8 times the root of the sum of three squares: the frequency of the junction's stiffness; three times the speed
+    over the distance in which the load changes; and the frequencies of cantilever and drive times the depth's slope by
+    s, which turns time into fictitious time.
     """
     s, curve = state.x, driven.solid
     energy = 0.5 * driven.mass_ng * state.gap_rate**2 / curve.energy_scale_aj

@@ -1,10 +1,13 @@
 """An impact that lasts: what the platform's motion, the spring and the air do to the tip while it is in contact.
 
-A law tells rebound speed w and delay of a free tip on a sample at rest that arrives at u. On a moving platform, in air,
-the contact is that of Hertz with a pull: with the Hertz time tau = a u^(-1/5) and the acceleration g + j t of the tip
-relative to the platform, t counted from mid contact,
+A law tells rebound speed w and delay of a free tip that arrives with speed u at a sample at rest. On a moving platform,
+in air, the contact is that of Hertz with a pull. With the Hertz time tau = a u^(-1/5), the indentation x, and the
+acceleration g + j t that spring, air and platform give the tip relative to the platform (positive: away from the
+sample, t from mid contact, j called `change`),
 
-    x'' = -k x^(3/2) - g - j t,   x(0) = 0, x'(0) = u;   kappa = g tau/u,  J = j tau^2/u.
+    x'' = -c x^(3/2) - g - j t,   x = 0 and x' = u at first touch;   kappa = g tau/u,  J = j tau^2/u,
+
+c the contact's stiffness over the mass, which tau tells.
 
 A constant pull is exact: the contact takes F(kappa) tau and the integral of its indentation is H(kappa) u tau^2 (scaled
 to x'' = -x^(3/2) - kappa/3.2181 with x'(0) = 1, they are 3.2181 F and 3.2181^2 H). All else counts to first order:
@@ -14,7 +17,9 @@ to x'' = -x^(3/2) - kappa/3.2181 with x'(0) = 1, they are 3.2181 F and 3.2181^2 
     duration    grows by (F - 1 - 0.0393 (Omega tau)^2) tau: the spring, weak beside the contact, stiffens it
     depth       the integral of the indentation is H (1 - 0.0836 (Omega tau)^2) u tau^2; a lock-in at nu counts what
                 happens away from mid contact less, by 0.0232 (nu tau)^2
-    lead        a leaving tip keeps its energy over a length, which an acceleration makes it pass sooner
+    lead        a leaving tip keeps its energy over a length l, and b (1/w - 1/u) of the delay stands for that; under
+                g it passes l in another time, and the delay grows by (b/(1.3 l)) (lag(u) - lag(w)), where
+                lag(v) = 2 l/(v + sqrt(v^2 + 2 g l)) - l/v
 
 A delay with an offset d is that of a surface d/2 above gap 0: the pull acts on the way there, and the tip is less deep
 below gap 0 by as much. Mid contact is half a delay after the arrival, so that delay and pull are found in a few passes.
@@ -54,7 +59,8 @@ USUAL_LEAD = 1.3
 class Middle(NamedTuple):
     """Acceleration g of the tip relative to the platform at mid contact, in nm/us^2, and its time derivatives.
 
-    ``change``, ``bend``, ``twist``: the first, second and third derivative.
+    g is positive away from the sample. ``change`` (j of the equations), ``bend``, ``twist``: its first, second and
+    third derivative, in nm/us^3, nm/us^4 and nm/us^5.
     """
 
     acceleration: Float[Array, ""]
@@ -72,7 +78,7 @@ def speeds_of_impact(
 ) -> Speeds:
     """Return rebound speed (nm/us) and delay (us) of an impact on the moving surface: for map, orbits, simulation, fit.
 
-    A captured tip has neither.
+    Both are 0 for a captured tip.
 
     Args:
         impact: instantaneous, delayed or lasting.
@@ -193,9 +199,10 @@ def gained_and_longer(
         middle: accelerations at mid contact.
         cantilever: its spring and its damping by the air.
     """
-    pull, change = middle.acceleration * tau / approach_speed, middle.change * tau**2 / approach_speed
-    lasts, deep = hertz_under_pull(pull)
-    air = AIR * (lasts - 1.2 * jnp.clip(pull, *PULLS) * deep)
+    # without units: kappa and J of the equations
+    kappa, change = middle.acceleration * tau / approach_speed, middle.change * tau**2 / approach_speed
+    lasts, deep = hertz_under_pull(kappa)
+    air = AIR * (lasts - 1.2 * jnp.clip(kappa, *PULLS) * deep)
     gained = 2.0 * (deep * change - air * cantilever.decay_rate * tau)
     return gained * approach_speed**2, (lasts - 1.0 - STIFFER * (cantilever.angular_frequency * tau) ** 2) * tau
 
@@ -486,15 +493,17 @@ def _rebound(u: Float[Array, "..."], loss: Float[Array, "..."]) -> Float[Array, 
 
 
 class Taps(eqx.Module):
-    """Taps as series over the speed with which they come, and over ln(g + more) of the pull g.
+    """Taps (collisions of a tip on a bent lever) as Chebyshev series over approach speed and over ln(g + more).
 
-    Of three kinds: light, that the bridge turns round; hard; and hard under less pull than that, or pushed.
+    g is the lever's pull away from the sample. There are three kinds: 0, light taps, which the bridge turns round
+    before a junction forms; 1, hard taps; 2, hard taps where the pull is weaker than the weakest of kind 1, or a push.
 
     Attributes:
         terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, kinds, terms, 6).
-        low: squared speed where they begin, coefficients of shape (pulls, kinds).
-        high: where they end: the squared speed of light ones, of hard ones the variable.
-        gaps: between which light ones turn, as a ratio.
+        low: squared speed in nm^2/us^2 where they begin, coefficients of shape (pulls, kinds).
+        high: where they end, coefficients of shape (pulls, kinds): of light taps the squared speed, of hard ones
+            asinh(sqrt(u^2 - low)/scale).
+        gaps: ratio of the largest to the smallest gap at which light taps turn.
         scale: speed of the hard ones' variable, in nm/us.
         pulls: weakest and strongest pull in nm/us^2, shape (2, kinds).
         more: what is added to pulls before their logarithms are taken, shape (kinds,).
@@ -565,10 +574,11 @@ def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... cou
 
 
 class Tap(NamedTuple):
-    """What a tap does: speeds and time at the plane; time integrals of the depth below it and of the squared speed.
+    """What a tap does: speeds (nm/us) and time (us) at the plane, the gap where the bridge breaks.
 
-    ``late``: by how much the mean time of the depth is behind the middle of the tap, and ``spread``, in us^2, the mean
-    square of that time.
+    ``area``, in nm us: time integral of the depth below the plane; ``action``, in nm^2/us: that of the squared speed;
+    ``late``, in us: by how much the mean time of the depth is behind the middle of the tap; ``spread``, in us^2: the
+    mean square of that time.
     """
 
     speeds: Speeds
@@ -620,8 +630,9 @@ class PulledImpact(Impact):
     def during(self, approach_speed: Float[Array, ""], middle: Middle, cantilever: Cantilever) -> Tap:
         """Return a tap while the pull changes, in air.
 
-        To first order what is odd about the middle of the tap, the air with it, makes the speeds differ, and leaves the
-        rest as it is for the mean of their squares. What is even, bend t^2/2, shifts the ends: with h half the time,
+        All counts to first order. What is odd about the middle of the tap, and the air, change the squared speed by
+        G = 2 (change area + twist spread area/2 - (Omega/Q) action): the table is read at u_in^2 + G/2, half way, and
+        G/2 is added to the squared rebound speed. What is even, bend t^2/2, shifts the ends: with h half the time,
         h' its slope by the speed and paths that move apart evenly outside the turn, the time grows by
         -bend h^3 (h'/3 - h (g h' - 1)/(12 u)), and the area by the depth times that, less bend h^5/10.
         """

@@ -164,14 +164,18 @@ def _single_impact_orbits(scene: Scene, frame: FreeFrame, order: Float[Array, ""
 
 
 def orbit_problem(cantilever: Cantilever, platform: Platform, law: Law, order: Float[Array, ""]) -> OrbitProblem:
-    """Return what orbits are of; for a law with r = 0, which captures every tip and has none, one with r = 1."""
+    """Return the problem whose roots are orbits: cantilever, platform, law and order N.
+
+    A law with r = 0 captures every tip and has no orbits; r = 1 stands in to keep its program finite, and whoever asks
+    discards the roots (`Law.leaves`).
+    """
     if isinstance(law, ImpactLaw):
         law = eqx.tree_at(lambda law: law.r, law, jnp.where(law.r > 0.0, law.r, 1.0))
     return OrbitProblem(cantilever, platform, law, order)
 
 
 def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem) -> SingleImpactOrbits:
-    """Return what there is to know about one root; NaN where there is none.
+    """Return one slot of `SingleImpactOrbits`: motion, verdict and readings of one root; NaN where there is none.
 
     Args:
         place: the root.
@@ -343,7 +347,7 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
 
 
 def near_fold(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
-    """Say whether the closing condition hardly changes with the logarithm of the coordinate at a root."""
+    """Say whether a root is near-double: |d f/d ln Y| < 1e-3, f the closing condition and Y its coordinate."""
     # a difference, right to nine digits: the derivative's program is twice as large; not beyond capture
     step = _NEARBY * (coordinate - problem.impact.lowest)
     ends = coordinate + step * jnp.array([-1.0, 1.0])
@@ -368,7 +372,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
 
 
 def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
-    """Return the steady motion that comes fastest, without derivatives, and whether there is one.
+    """Return the steady motion of the greatest approach speed, without derivatives, and whether there is one.
 
     The roots are those of `steady_orbits`; of the stable ones flights are followed only until one is admissible.
     """
@@ -421,7 +425,7 @@ def _lockin(
         nu = platform.angular_frequency / (1.0 if at_drive else order)
         if isinstance(impact, PulledImpact):
             tap = impact.during(approach, middle, cantilever)
-            # the last term as of a parabola
+            # mean of cos(nu t) weighted by the depth, t from mid tap, to fourth order; that one as of a parabola
             depth = tap.area * (1.0 - 0.5 * nu**2 * tap.spread + (nu * delay) ** 4 / 4480.0)
             late = tap.late
         else:
@@ -443,7 +447,7 @@ def trace_and_determinant(
 
 
 def contracts(trace: Float[Array, ""], determinant: Float[Array, ""]) -> Bool[Array, ""]:
-    """Say whether a map of this trace and determinant is stable."""
+    """Say whether an orbit is stable, its linearised map of trace T and determinant D: |T| < |1 + D|, |D| <= 1."""
     return (jnp.abs(trace) < jnp.abs(1.0 + determinant)) & (jnp.abs(determinant) <= 1.0)
 
 
@@ -533,12 +537,23 @@ def lockin(  # noqa: PLR0913
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return lock-in amplitude in nm and phase in degrees of an orbit at its response frequency omega/N, or omega.
 
-    a exp(i phi) = 2/T int z exp(-i nu t) dt over one response period T; nu = omega/N, phi modulo 360/N, or with
-    `at_drive` the drive's nu = omega, phi modulo 360. The flight's integral
-    is closed: with [.] the difference of the ends, I (Omega^2 - nu^2 + i nu Omega/Q) = -[v e] - (i nu + Omega/Q)[z e],
-    e = exp(-i nu t). From the flight's end to the next start (a collision delay, if there is one: `delayed`) the tip
-    rides on the platform, or below it: `indentation` is the time integral of how much, in nm us, and
-    `late_us` by how much its mean time is behind the middle.
+    a exp(i phi) = 2/T int z exp(-i nu t) dt over one response period T = N drive periods, z the height over rest;
+    nu = omega/N and phi modulo 360/N, or with `at_drive` nu = omega and phi modulo 360. The flight's part I of the
+    integral is closed: with [.] the difference of the flight's ends and e = exp(-i nu t),
+
+        I (Omega^2 - nu^2 + i nu Omega/Q) = -[v e] - (i nu + Omega/Q) [z e].
+
+    The rest of the period is a collision delay, in which the tip is on the platform or below it.
+
+    Args:
+        cantilever: of the flight.
+        platform: drives, and carries the tip during a delay.
+        flight: from impact to impact.
+        order: N, drive periods between impacts.
+        delayed: whether there is a delay between the flight's end and the next start.
+        indentation: time integral, over the delay, of the depth below the platform, in nm us.
+        late_us: by how much that depth's mean time is behind the middle of the delay.
+        at_drive: read at the drive's omega instead of omega/N.
     """
     period = as_argument(order) * platform.period_us
     turns = 1.0 if at_drive else as_argument(order)
@@ -554,12 +569,12 @@ def lockin(  # noqa: PLR0913
     size = real**2 + imaginary**2
     # Without damping a free flight can be exactly resonant with the response; no orbit lives there.
     size = jnp.where(size == 0.0, 1.0, size)
-    flying = jnp.array([real * source[0] + imaginary * source[1], real * source[1] - imaginary * source[0]]) / size
+    integral = jnp.array([real * source[0] + imaginary * source[1], real * source[1] - imaginary * source[0]]) / size
     if delayed:
-        start_us = flight.start_us + period
-        flying = flying + _platform_integral(platform, nu, end_us, start_us)
-        flying = flying - indentation * _turned_back(nu, 0.5 * (end_us + start_us) + late_us)
-    cosine, sine = 2.0 / period * flying
+        next_start_us = flight.start_us + period
+        integral = integral + _platform_integral(platform, nu, end_us, next_start_us)
+        integral = integral - indentation * _turned_back(nu, 0.5 * (end_us + next_start_us) + late_us)
+    cosine, sine = 2.0 / period * integral
     phase = within_turn(jnp.rad2deg(jnp.arctan2(sine, cosine)), 360.0 / turns)
     return jnp.sqrt(cosine**2 + sine**2), phase
 
