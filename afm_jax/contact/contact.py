@@ -45,7 +45,8 @@ class Contact(eqx.Module):
     are cut, to where the solids meet. Hertz's contact has no forces and begins at gap 0.
 
     Args:
-        forces: the forces outside the solid contact, a sum (`Capillary() + CoreRepulsion()`) or a sequence; no order.
+        forces: the forces outside the solid contact, a sum (`Capillary() + CoreRepulsion()`) or a sequence; no order; none
+            if left out.
         junction: the solid contact: `Jkr()`, `Dmt()` or `Hertz()`.
         bridge_forms_nm: gap at which an approaching tip meets the bridge, in nm; of a dry contact its range.
         bridge_breaks_nm: gap at which a leaving tip breaks it, in nm; of a dry contact its range.
@@ -57,6 +58,8 @@ class Contact(eqx.Module):
 
     >>> Contact(forces=Capillary() + CoreRepulsion(), junction=Jkr()).effects
     ('capillary', 'core', 'jkr')
+    >>> Contact(junction=Hertz()).effects
+    ('hertz',)
     >>> Contact(forces=(VanDerWaals(),), junction=Dmt()).effects
     ('van_der_waals', 'dmt')
     """
@@ -70,7 +73,7 @@ class Contact(eqx.Module):
 
     def __init__(
         self,
-        forces: Force | Sequence[Force],
+        forces: Force | Sequence[Force] = (),
         junction: Jkr | Dmt | Hertz | None = None,
         bridge_forms_nm: ArrayLike | None = None,
         bridge_breaks_nm: ArrayLike | None = None,
