@@ -45,8 +45,8 @@ class Contact(eqx.Module):
     are cut, to where the solids meet. Hertz's contact has no forces and begins at gap 0.
 
     Args:
-        forces: the forces outside the solid contact, a sum (`Capillary() + CoreRepulsion()`) or a sequence; none if left
-            out. Their order does not matter.
+        forces: the forces outside the solid contact, a sum (`Capillary() + CoreRepulsion()`) or a sequence; none if
+            left out. Their order does not matter.
         junction: the solid contact: `Jkr()`, `Dmt()` or `Hertz()`.
         bridge_forms_nm: gap at which an approaching tip meets the bridge, in nm; of a dry contact its range.
         bridge_breaks_nm: gap at which a leaving tip breaks it, in nm; of a dry contact its range.
