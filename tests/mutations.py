@@ -138,7 +138,7 @@ MUTATIONS = {
     ),
     "trace bound with 1 - D": Mutation("jnp.abs(1.0 + determinant)", "jnp.abs(1.0 - determinant)", ORBIT),
     "peak without damping": Mutation("fall = cantilever.decay_rate * flight.start_velocity + ", "fall = ", ORBIT),
-    "lock-in with half its amplitude": Mutation("2.0 / period * flying", "1.0 / period * flying", ORBIT),
+    "lock-in with half its amplitude": Mutation("2.0 / period * integral", "1.0 / period * integral", ORBIT),
     "bracket that keeps the wrong half": Mutation(
         "(value > 0.0) == rising",
         "(value > 0.0) != rising",
