@@ -210,10 +210,14 @@ def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
 def margin_of(energy: Float[Array, "..."], pull: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return b, without unit, between 0 and 1: the kinetic energy at the outer end over that end's pull.
 
+    No derivative: b chooses the variable of the integration and not its result. At capture that of sqrt(b) is 1e7, and
+    with it the last digits of the integration would enter every gradient.
+
     Args:
         energy: kinetic energy at the outer end, in aJ.
         pull: -F(D) D there, the bridge's attraction times the gap, in aJ.
     """
+    energy, pull = lax.stop_gradient((energy, pull))
     near = energy < pull
     return jnp.where(near, jnp.maximum(energy, _NEAREST * pull) / jnp.where(near, pull, 1.0), 1.0)
 
@@ -388,7 +392,7 @@ def driven_way(driven: Driven, gaps: tuple[Array, Array], state: ContactState, *
         if driven.drive is not None:
             at_outer = at_outer + driven.mass_ng * driven.drive.push(state.time_us) * (outer - inner)
     pull = -driven.bridge.force(outer) * outer
-    margin = lax.stop_gradient(margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30)))
+    margin = margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30))
     return way_through(driven, gaps, start, margin, inward=inward, begin_us=state.time_us)
 
 
