@@ -25,7 +25,7 @@ _KEPT_ELSEWHERE = {
     "contributing.md": "CONTRIBUTING.md",
     "security.md": "SECURITY.md",
 }
-_GALLERY = """Each of these notebooks is shown as it ran, ends with assertions on what it claims, and is run by the tests.
+_GALLERY = """Each notebook is shown as it ran, ends with assertions on what it claims, and is run by the tests.
 They are in the repository's folder `notebooks/`; open them in JupyterLab, where *An orbit by sliders* moves."""
 _FROM_AFAR = re.compile(
     r'<script[^>]*\bsrc="https?://[^>]*>.*?</script>|<script[^>]*>\s*import mermaid.*?</script>', re.DOTALL
