@@ -27,6 +27,9 @@ _KEPT_ELSEWHERE = {
 }
 _GALLERY = """Each notebook is shown as it ran, ends with assertions on what it claims, and is run by the tests.
 They are in the repository's folder `notebooks/`; open them in JupyterLab, where *An orbit by sliders* moves."""
+_CODE_IN_CELLS = re.compile(r"(?<=<code>)[^<]*(?=</code>(?:(?!<t[dh]|</table>).)*</t[dh]>)", re.DOTALL)
+_JOINT = re.compile(r"(?<=[a-z]_)(?=[a-z0-9])|(?<=[(=/,])(?=[\w&])|(?<=[a-z]\.)(?=[a-z])")
+_WHOLE = re.compile(r"(?<![\w-])(--[a-z][\w-]*|afm-jax)")
 _FROM_AFAR = re.compile(
     r'<script[^>]*\bsrc="https?://[^>]*>.*?</script>|<script[^>]*>\s*import mermaid.*?</script>', re.DOTALL
 )
@@ -60,9 +63,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Keep units whole where lines break: browsers break them after the slash."""
+    """Keep units, options and the program's name whole where lines break; names in cells of tables break at joints."""
     del page, config, files
-    return re.sub("(nm²?)/(µs)", "\\1/\u2060\\2", html)
+    html = re.sub("(nm²?)/(µs)", "\\1/\u2060\\2", html)
+    html = _CODE_IN_CELLS.sub(lambda code: _JOINT.sub("<wbr>", code[0]), html)
+    return re.sub(
+        r"(?<=<code>)[^<]*(?=</code>)", lambda code: _WHOLE.sub(r'<span class="whole">\g<0></span>', code[0]), html
+    )
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
