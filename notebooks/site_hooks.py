@@ -2,6 +2,7 @@
 
 import base64
 import re
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -45,7 +46,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 @event_priority(100)  # before the plugin that turns notebooks into pages
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made or kept outside the folder of pages."""
-    with ThreadPoolExecutor(available_cores()) as pool:
+    with warnings.catch_warnings(), ThreadPoolExecutor(available_cores()) as pool:
+        warnings.simplefilter("ignore")  # Jupyter's own; threads cannot do so one by one
         places = dict(zip((path.name for path in NOTEBOOKS), pool.map(kept, NOTEBOOKS), strict=True))
     pictures = {name: first_picture(place) for name, place in places.items()}
     for name, place in places.items():
