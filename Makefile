@@ -74,7 +74,7 @@ types: $(SETUP)
 # From Python 3.12 on lines are counted by sys.monitoring, which costs little; the tracer before it doubles the time.
 TRACED := COVERAGE_CORE=$$($(BIN)/python -c 'import sys; print("sysmon" if sys.version_info >= (3, 12) else "ctrace")')
 
-coverage: $(SETUP) ## make test and make slow with the share of lines that they run (90 % at least)
+coverage: $(SETUP) ## make test and make slow with line coverage (at least 90 %)
 	$(BIN)/python -m coverage erase
 	$(TRACED) $(MAKE) test PYTEST='-m coverage run -m pytest'
 	$(TRACED) $(MAKE) slow PYTEST='-m coverage run -m pytest'
@@ -90,12 +90,12 @@ docs: $(SETUP) ## the site, in build/site/index.html; notebooks are run unless `
 pictures: $(SETUP) ## the pictures of README and site anew, by the commands beside them
 	$(BIN)/python notebooks/make_pictures.py
 
-mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
+mutations: $(SETUP) ## mutation tests: wrong formulas, one edit each, that a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py
 
 FUZZ ?= --flights 100000 --orbits 10000 --scenes 2000 --files 4000
 
-fuzz: $(SETUP) ## random work, seeded; FUZZ='--flights 1000000 --orbits 100000 --scenes 10000 --files 20000' for all of it
+fuzz: $(SETUP) ## seeded fuzzing of flights, orbits, scenes and files; FUZZ='--flights 1000000 --orbits 100000 --scenes 10000 --files 20000' for all of it
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python -m tests.fuzz $(FUZZ)
 
 bands: $(SETUP) ## do 95 % bands hold the laws of ten random contacts, intervals r and epsilon of twenty? (forty minutes; truths are kept in /tmp)
@@ -120,7 +120,7 @@ kills: $(SETUP) ## a sweep killed at fifty random times and resumed ends in the 
 
 check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
 
-thorough: lint types coverage mutations bands tapping energies ranks fuzz kills newest ## all of make check with the share of lines it runs, mutations, bands, tapping curves, energies of taps, ranks, random work, kills, the newest Python and JAX
+thorough: lint types coverage mutations bands tapping energies ranks fuzz kills newest ## all of make check with line coverage, mutation tests, bands, tapping curves, energies of taps, ranks, fuzzing, kills, the newest Python and JAX
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

@@ -36,7 +36,10 @@ def main() -> None:
             )
             assert block is not None
             (folder / name).write_text(block.group(1), encoding="utf-8")
-        for picture in sys.argv[1:] or PICTURES:
+        for picture in sys.argv[1:] or [*PICTURES, "figure3"]:
+            if picture == "figure3":
+                subprocess.run([sys.executable, ROOT / "notebooks" / "figure3.py"], check=True)
+                continue
             arguments = shlex.split(PICTURES[picture])
             print("afm-jax", *arguments)
             subprocess.run([sys.executable, "-m", "afm_jax", *arguments], cwd=folder, check=True)

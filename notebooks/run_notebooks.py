@@ -33,7 +33,12 @@ def run(path: Path) -> nbformat.NotebookNode:
         warnings.simplefilter("ignore")
         from nbclient import NotebookClient  # noqa: PLC0415
 
-        client = NotebookClient(notebook, timeout=_SECONDS_A_CELL, resources={"metadata": {"path": folder}})
+        client = NotebookClient(
+            notebook,
+            timeout=_SECONDS_A_CELL,
+            resources={"metadata": {"path": folder}},
+            extra_arguments=["--IPKernelApp.log_level=ERROR"],  # not that kernels talk over TCP, on this very machine
+        )
         client.execute(env={**environment, "PYTHONPATH": str(ROOT)})
     notebook.metadata.pop("widgets", None)  # a page without a kernel shows pictures
     notebook.metadata["made_from"] = _made_from(path)

@@ -1,6 +1,9 @@
 """What the site's build adds to the pages: notebooks as they ran, commands from their own help, the public names."""
 
+import base64
 import re
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import click
@@ -13,6 +16,7 @@ from mkdocs.structure.pages import Page
 import afm_jax
 import fitting
 from afm_jax.cli.main import main
+from afm_jax.compilation_cache import available_cores
 from notebooks.run_notebooks import NOTEBOOKS, ROOT, kept
 
 _KEPT_ELSEWHERE = {
@@ -20,9 +24,13 @@ _KEPT_ELSEWHERE = {
     "adding_a_force.md": "notebooks/adding_a_force.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
+    "security.md": "SECURITY.md",
 }
-_GALLERY = """Notebooks as they ran, from the repository's folder `notebooks/`. Each ends with assertions on what it
-claims, and is run by the tests. They are meant to be opened in JupyterLab too: *An orbit by sliders* moves there."""
+_GALLERY = """Each notebook is shown as it ran, ends with assertions on what it claims, and is run by the tests.
+They are in the repository's folder `notebooks/`; open them in JupyterLab, where *An orbit by sliders* moves."""
+_CODE_IN_CELLS = re.compile(r"(?<=<code>)[^<]*(?=</code>(?:(?!<t[dh]|</table>).)*</t[dh]>)", re.DOTALL)
+_JOINT = re.compile(r"(?<=[a-z]_)(?=[a-z0-9])|(?<=[(=/,])(?=[\w&])|(?<=[a-z]\.)(?=[a-z])")
+_WHOLE = re.compile(r"(?<![\w-])(--[a-z][\w-]*|afm-jax)")
 _FROM_AFAR = re.compile(
     r'<script[^>]*\bsrc="https?://[^>]*>.*?</script>|<script[^>]*>\s*import mermaid.*?</script>', re.DOTALL
 )
@@ -38,19 +46,32 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 @event_priority(100)  # before the plugin that turns notebooks into pages
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made or kept outside the folder of pages."""
-    for path in NOTEBOOKS:
-        place = kept(path)
-        name = f"{place.parent.name}/{place.name}"
-        files.append(File(name, str(place.parent.parent), config.site_dir, config.use_directory_urls))
+    with warnings.catch_warnings(), ThreadPoolExecutor(available_cores()) as pool:
+        warnings.simplefilter("ignore")  # Jupyter's own; threads cannot do so one by one
+        places = dict(zip((path.name for path in NOTEBOOKS), pool.map(kept, NOTEBOOKS), strict=True))
+    pictures = {name: first_picture(place) for name, place in places.items()}
+    for name, place in places.items():
+        files.append(File(f"gallery/{name}", str(place.parent.parent), config.site_dir, config.use_directory_urls))
+        if picture := pictures[name]:
+            files.append(File.generated(config, f"gallery/{Path(name).stem}.png", content=picture))
     listed = next(part["Gallery"] for part in config.nav or [] if "Gallery" in part)
-    files.append(
-        File.generated(config, "gallery/index.md", content=gallery([Path(place).name for place in listed[1:]]))
-    )
+    pictured = {Path(place).name: bool(pictures[Path(place).name]) for place in listed[1:]}
+    files.append(File.generated(config, "gallery/index.md", content=gallery(pictured)))
     for name, place in _KEPT_ELSEWHERE.items():
         files.append(File.generated(config, name, abs_src_path=str(ROOT / place)))
     files.append(File.generated(config, "commands.md", content=commands()))
     files.append(File.generated(config, "api.md", content=public_names()))
     return files
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Keep units, options and the program's name whole where lines break; names in cells of tables break at joints."""
+    del page, config, files
+    html = re.sub("(nm²?)/(µs)", "\\1/\u2060\\2", html)
+    html = _CODE_IN_CELLS.sub(lambda code: _JOINT.sub("<wbr>", code[0]), html)
+    return re.sub(
+        r"(?<=<code>)[^<]*(?=</code>)", lambda code: _WHOLE.sub(r'<span class="whole">\g<0></span>', code[0]), html
+    )
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
@@ -63,17 +84,26 @@ def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
     return re.sub(r'href="(\w+)\.ipynb"', r'href="\1.html"', own)
 
 
-def gallery(names: list[str]) -> str:
-    """Return the page of all notebooks, each with its title and its first sentence."""
-    parts = [
-        "# Gallery",
-        _GALLERY,
-    ]
-    for name in names:
-        title, _, text = nbformat.read(ROOT / "notebooks" / name, as_version=4).cells[0].source.partition("\n")
+def first_picture(notebook: Path) -> bytes | None:
+    """Return the first picture that a notebook shows, as PNG; None where it shows none."""
+    for cell in nbformat.read(notebook, as_version=4).cells:
+        for output in cell.get("outputs", []):
+            if picture := output.get("data", {}).get("image/png"):
+                return base64.b64decode(picture)
+    return None
+
+
+def gallery(pictured: dict[str, bool]) -> str:
+    """Return the page of all notebooks, each with its picture if there is one, its title and its first sentence."""
+    parts = ["# Gallery", _GALLERY, '<div class="gallery" markdown>']
+    for name, has_picture in pictured.items():
+        path = ROOT / "notebooks" / name
+        title, _, text = nbformat.read(path, as_version=4).cells[0].source.partition("\n")
         sentence = re.split(r"(?<=[.?!])\s", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text.strip()), maxsplit=1)[0]
-        parts.append(f"[**{title.lstrip('# ')}**]({name})\n: {' '.join(sentence.split())}")
-    return "\n\n".join(parts)
+        picture = f"[![]({path.stem}.png)]({name})\n\n" if has_picture else ""
+        words = f"[**{title.lstrip('# ')}**]({name})\n\n{' '.join(sentence.split())}"
+        parts.append(f"<div markdown>\n\n{picture}{words}\n\n</div>")
+    return "\n\n".join([*parts, "</div>"])
 
 
 def commands() -> str:

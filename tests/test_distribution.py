@@ -36,7 +36,8 @@ def test_wheel_from_the_source_distribution_fits_the_example(tmp_path: Path):
     (source,), (wheel,) = tmp_path.glob("*.tar.gz"), tmp_path.glob("*.whl")
     with tarfile.open(source) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"README.md", "LICENSE", "CITATION.cff", "tests/test_readme.py", "notebooks/mkdocs.yml"} <= names
+    documents = {"README.md", "LICENSE", "CITATION.cff", "SECURITY.md", "paper.md", "paper.bib"}
+    assert {*documents, "tests/test_readme.py", "notebooks/mkdocs.yml"} <= names
     assert not any(name.startswith((".venv", "build", "report")) for name in names)
 
     place = tmp_path / "environment"

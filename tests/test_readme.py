@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli import main
+from tests.mutations import MUTATIONS
 from tests.resonance_sweeps import synthetic_sweep
 
 ROOT = Path(__file__).parent.parent
@@ -44,6 +45,7 @@ def test_readme_is_short_and_keeps_its_promises():
     assert len(README.splitlines()) <= 150
     for target in ("fit", "test", "check", "thorough", "docs"):
         assert f"make {target}" in README
+    assert f"({len(MUTATIONS)} wrong formulas" in README
     for link in re.findall(r"\]\(([^)]+)\)", README):
         assert (ROOT / link).exists(), link
 
@@ -93,6 +95,7 @@ FEWER = (
 """What pages name, as what is there; grids of a few points, and models that compile quickly."""
 LEFT_OUT = {
     "simulate figure8": "tests/test_presets.py simulates it",
+    "calibrate fitting/examples/real": "tests/test_thermal.py fits such spectra",
     "fit monday.csv": "three tables are fitted by tests/test_several_tables.py",
     "fit my_amplitudes.csv --model law --posterior": "samples for a minute: tests/test_posterior.py",
     **dict.fromkeys(
@@ -120,6 +123,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "resonance.csv").write_text("".join(["frequency_khz,amplitude_nm\n", *lines]))
     (folder / "scene.toml").write_text(of_page("first_steps", "toml")[0])
     (folder / "sweep.toml").write_text(of_page("sweeps", "toml")[0].replace("201", "3"))
+    for name, scene in zip(("base", "force", "two_tones"), of_page("drives", "toml"), strict=True):
+        (folder / f"{name}.toml").write_text(scene)
     return folder
 
 
@@ -137,9 +142,11 @@ def cheap(arguments: list[str]) -> list[str]:
 @pytest.mark.slow
 def test_commands_of_the_pages_run(desk: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(desk)
+    monkeypatch.setenv("COLUMNS", "200")
     for page in (
         "first_steps",
         "simulate",
+        "drives",
         "contact",
         "fit",
         "orbits",
@@ -150,12 +157,16 @@ def test_commands_of_the_pages_run(desk: Path, monkeypatch: pytest.MonkeyPatch):
         "sweeps",
     ):
         text = (ROOT / "notebooks" / "pages" / f"{page}.md").read_text(encoding="utf-8")
+        printed: list[str] = []
         for line, comment in re.findall(r"^ {4}afm-jax ([^#\n]*)(.*)$", text, re.MULTILINE):
             if any(line.startswith(one) for one in LEFT_OUT):
                 continue
             result = CliRunner().invoke(main.main, cheap(shlex.split(line)))
             expected = 3 if "exit code 3" in comment else 0
             assert result.exit_code == expected, (page, line, result.output, result.exception)
+            printed += result.output.splitlines()
+        for shown in "".join(of_page(page, "text")).splitlines() if page == "drives" else ():
+            assert any(same(shown, other) for other in printed), (page, shown)
 
 
 @pytest.mark.slow

@@ -61,10 +61,23 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_pictures_stand_beside_their_commands():
     pages = ROOT / "notebooks" / "pages"
     text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages.glob("*.md")).split())
-    assert {path.stem for path in (pages / "pictures").glob("*.png")} == set(PICTURES)
+    assert {path.stem for path in (pages / "pictures").glob("*.png")} == {*PICTURES, "figure3"}
     for picture, command in PICTURES.items():
         assert f"(pictures/{picture}.png)" in text
         assert f"`afm-jax {command}`" in text
+
+
+def test_gallery_shows_the_first_picture_of_a_notebook(tmp_path: Path):
+    import nbformat  # noqa: PLC0415  # a second and a half, as in tests/test_notebooks.py
+
+    from notebooks.site_hooks import first_picture  # noqa: PLC0415
+
+    outputs = [nbformat.v4.new_output("display_data", data=data) for data in ({}, {"image/png": "UE5H"})]
+    cells = [nbformat.v4.new_markdown_cell("# Title"), nbformat.v4.new_code_cell("draw()", outputs=outputs)]
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "drawn.ipynb")
+    nbformat.write(nbformat.v4.new_notebook(cells=cells[:1]), tmp_path / "bare.ipynb")
+    assert first_picture(tmp_path / "drawn.ipynb") == b"PNG"
+    assert first_picture(tmp_path / "bare.ipynb") is None
 
 
 @pytest.mark.slow
@@ -78,6 +91,7 @@ def test_links_lead_somewhere_and_nothing_is_fetched_from_other_machines(site: P
             assert (page.parent / link).exists(), (page.name, link)
     gallery = (site / "gallery" / "index.html").read_text(encoding="utf-8")
     assert all(f'href="{path.stem}.html"' in gallery for path in NOTEBOOKS)
+    assert "(pictures/figure3.png)" in (ROOT / "notebooks" / "pages" / "index.md").read_text(encoding="utf-8")
     assert "capture_speed" in (site / "api.html").read_text(encoding="utf-8")
     assert "--scale-errors" in (site / "commands.html").read_text(encoding="utf-8")
 
