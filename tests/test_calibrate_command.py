@@ -57,7 +57,7 @@ def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
 
 def test_report_is_written(reported, sweep_path):
     result, folder = reported
-    names = {"calibration.txt", "calibration.json", "calibration.png", "calibration_points.csv"}
+    names = {"calibration.html", "calibration.txt", "calibration.json", "calibration.png", "calibration_points.csv"}
     assert names == {path.name for path in folder.iterdir()}
     assert strictly((folder / "calibration.json").read_text(encoding="utf-8")) == strictly(result.stdout)
     assert "VALID" in (folder / "calibration.txt").read_text(encoding="utf-8").splitlines()

@@ -88,7 +88,8 @@ def test_the_table_is_one_that_the_fitter_reads(reported):
 
 def test_pictures_show_periods_and_spectrum(reported):
     result, out, _ = reported
-    names = {"lockin.json", "amplitudes.csv", "lockin_first.png", "lockin_third.png", "lockin_doubled.png"}
+    names = {"lockin.html", "lockin.json", "amplitudes.csv"}
+    names |= {f"lockin_{name}.png" for name in ("first", "third", "doubled")}
     assert {path.name for path in out.iterdir()} == names
     assert strictly((out / "lockin.json").read_text(encoding="utf-8")) == strictly(result.stdout)
     pixels = imread(out / "lockin_third.png")[..., :3]

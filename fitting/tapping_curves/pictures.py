@@ -24,8 +24,8 @@ def tapping_figures(result: Tapping) -> dict[str, Figure]:
         "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free.": (
             curve_figure(result)
         ),
-        "The same motion in two frames. Left, the lab: a shaken tip meets a sample at rest. Right, with its free motion "
-        "taken away: the tip flies freely, and the sample moves up and down with the free amplitude.": (
+        "The same motion in two frames. Left, the lab: a shaken tip meets a sample at rest. Right, with its free "
+        "motion taken away: the tip flies freely, and the sample moves up and down with the free amplitude.": (
             frames_figure(result)
         ),
     }

@@ -243,10 +243,10 @@ def _speeds(result: Tapping) -> list[ReportSection]:
     if not here.any():
         return [ReportSection("Impact speeds", [Text("Impact speeds: in no row known to a quarter.")])]
     many = found.in_capture_speeds[here]
+    known = percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))
+    speeds = f"{u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows"
     lines = [
-        f"Impact speeds: {u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows "
-        f"({many.min():.2g} to {many.max():.2g} capture speeds), known to "
-        f"{percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))} in the median"
+        f"Impact speeds: {speeds} ({many.min():.2g} to {many.max():.2g} capture speeds), known to {known} in the median"
     ]
     for one in result.laws_of_energies:
         values = ", ".join(f"{name} {with_error(*pair)}" for name, pair in one.parameters.items())
@@ -328,7 +328,7 @@ def _cell(value: Any, form: str) -> str:
 
 
 def together_report(result: TappingTogether) -> Report:
-    """Return what several curves of one lever say together: each branch's mean and scatter, what they have in common."""
+    """Return what several curves of one lever say together: mean and scatter of each branch, the instrument."""
     cells = [
         [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", f"{at[1]:.2g}", f"{at[2]:.2g}", f"{at[3]:.2g}"]
         for one in result.scatter
