@@ -223,7 +223,15 @@ def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tm
     assert set(answer["common"]) >= {"spring_constant", "quality_factor", "free_frequency", "free_phase"}
     text = (out / "map.txt").read_text("utf-8")
     assert len(re.findall(r"common error of the energy", text)) == 1
-    assert {one.name for one in out.iterdir()} == {"map.png", "map.json", "map.txt", "map.npz", "map.gwy", "map.zarr"}
+    assert {one.name for one in out.iterdir()} == {
+        "map.html",
+        "map.png",
+        "map.json",
+        "map.txt",
+        "map.npz",
+        "map.gwy",
+        "map.zarr",
+    }
     np.testing.assert_allclose(np.load(out / "map.npz")["energy"], energy, rtol=2e-4)
     import zarr  # noqa: PLC0415
 
