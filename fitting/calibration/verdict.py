@@ -238,8 +238,8 @@ REASONS: Rules[SweepEvidence] = [
 WARNINGS: Rules[SweepEvidence] = [
     Rule(
         lambda e: e.frequency.value > _FAST_KHZ,
-        "A resonance of {e.frequency.value:.6g} kHz is beyond any cantilever's: if the frequencies are in Hz, name their "
-        "column frequency_hz.",
+        "A resonance of {e.frequency.value:.6g} kHz is beyond any cantilever's: if the frequencies are in Hz, name "
+        "their column frequency_hz.",
     ),
     Rule(
         lambda e: e.sweep.reordered,
@@ -254,19 +254,20 @@ WARNINGS: Rules[SweepEvidence] = [
     (
         Rule(
             lambda e: e.fit.errors.scale is not None,
-            "The points' errors were scaled by {e.fit.errors.scale:.3g} so that chi2/dof = 1: the goodness of fit cannot "
-            "be judged.",
+            "The points' errors were scaled by {e.fit.errors.scale:.3g} so that chi2/dof = 1: the goodness of fit "
+            "cannot be judged.",
         ),
         Rule(
             lambda e: e.fit.errors.origin == "estimated",
-            "The points' errors were estimated from the misfit so that chi2/dof = 1: the goodness of fit cannot be judged.",
+            "The points' errors were estimated from the misfit so that chi2/dof = 1: the goodness of fit cannot be "
+            "judged.",
         ),
         Rule(lambda e: e.p_value > 1.0 - 1e-6, "The errors look too large: chi2 is improbably small."),
     ),
     Rule(
         lambda e: 3.0 / np.sqrt(e.fit.data) < e.autocorrelation <= _SYSTEMATIC,
-        "Neighbouring residuals are correlated ({e.autocorrelation:+.2f}): something systematic is left, or a filter joins "
-        "neighbouring points.",
+        "Neighbouring residuals are correlated ({e.autocorrelation:+.2f}): something systematic is left, or a filter "
+        "joins neighbouring points.",
     ),
     Rule(
         lambda e: max(e.wider) > _WIDER,
@@ -276,14 +277,14 @@ WARNINGS: Rules[SweepEvidence] = [
     (
         Rule(
             lambda e: e.repeat is not None,
-            "The residuals repeat every {e.repeat[0]} points (correlation {e.repeat[1]:+.2f}): something periodic, such as "
-            "a drive whose frequency is rounded to steps of its own, not noise.",
+            "The residuals repeat every {e.repeat[0]} points (correlation {e.repeat[1]:+.2f}): something periodic, "
+            "such as a drive whose frequency is rounded to steps of its own, not noise.",
         ),
         Rule(
             lambda e: abs(e.runs_excess) > 4.0,
             lambda e, _: (
-                f"The amplitude's residuals change their sign {'fewer' if e.runs_excess < 0 else 'more'} often than chance "
-                f"allows ({abs(e.runs_excess):.1f} standard deviations)."
+                f"The amplitude's residuals change their sign {'fewer' if e.runs_excess < 0 else 'more'} often than "
+                f"chance allows ({abs(e.runs_excess):.1f} standard deviations)."
             ),
         ),
     ),

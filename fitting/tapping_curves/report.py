@@ -26,8 +26,9 @@ from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.energy_curve import HEADLINE
 from fitting.tapping_curves.energy_fit import EnergyFit
 from fitting.tapping_curves.pictures import tapping_figures, together_figure
-from fitting.tapping_curves.result import Tapping, origin_in_words
+from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
+from fitting.tapping_curves.verdict import ORIGINS
 
 _EV_PER_AJ = 6.241509
 _WIDTH = 150
@@ -179,7 +180,7 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
         of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
         lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2" + of_mass)
     shares = sorted(result.energy.get("share_of_variance", {}).items(), key=lambda pair: -pair[1])
-    words = [f"{origin_in_words(name)} {percent(share)}" for name, share in shares if share > 0.005]
+    words = [f"{ORIGINS[name]} {percent(share)}" for name, share in shares if share > 0.005]
     lines += [f"  its variance comes from {', '.join(words)}"] if words else []
     cells = []
     for i, group in enumerate(result.groups):

@@ -1,4 +1,5 @@
-"""Whether a trace is a steady single-impact orbit, and if not, what it is: a list of findings, the first one applies."""
+"""Whether a trace is a steady single-impact orbit, and if not, what it is: a list of findings, the first one "
+"applies."""
 
 import enum
 from dataclasses import dataclass
@@ -226,8 +227,8 @@ FINDINGS: tuple[tuple[TraceKind, Rule[TraceEvidence]], ...] = (
         TraceKind.DRIFTING,
         Rule(
             lambda e: e.unrepeated and e.steadiness.phase_step_deg is not None,
-            "the phase runs by {e.steadiness.phase_step_deg:+.3g} degrees per response period: the drive frequency seems "
-            "to be {e.seen_khz:.7g} kHz, not {e.drive_khz:g} kHz (or the sampling rate is off)",
+            "the phase runs by {e.steadiness.phase_step_deg:+.3g} degrees per response period: the drive frequency "
+            "seems to be {e.seen_khz:.7g} kHz, not {e.drive_khz:g} kHz (or the sampling rate is off)",
         ),
     ),
     (
@@ -257,8 +258,8 @@ FINDINGS: tuple[tuple[TraceKind, Rule[TraceEvidence]], ...] = (
         TraceKind.UPSIDE_DOWN,
         Rule(
             lambda e: e.ends_nm[0] < 0.0 and abs(e.ends_nm[1]) <= _BELOW * abs(e.ends_nm[0]),
-            "the deflection lies between {e.ends_nm[0]:.4g} and {e.ends_nm[1]:.4g} nm, but a bouncing tip flies above its "
-            "rest position: multiply it by -1, or give what it reads at rest (--rest-nm)",
+            "the deflection lies between {e.ends_nm[0]:.4g} and {e.ends_nm[1]:.4g} nm, but a bouncing tip flies above "
+            "its rest position: multiply it by -1, or give what it reads at rest (--rest-nm)",
         ),
     ),
     (
