@@ -1,5 +1,4 @@
-"""Whether a trace is a steady single-impact orbit, and if not, what it is: a list of findings, the first one "
-"applies."""
+"""Whether a trace is a steady single-impact orbit, and if not, what it is: of a list of findings the first that applies."""
 
 import enum
 from dataclasses import dataclass
