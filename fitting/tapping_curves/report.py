@@ -148,7 +148,7 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     instrument = _instrument(fit, "instrument, fitted with the energy along the branches")
     return [
         ReportSection("Energy along the branches", [Table(caption, head, cells), *_lines(lines)], "Energy"),
-        ReportSection("The instrument", [instrument, *_lines([chi2])]),
+        ReportSection("Instrument", [instrument, *_lines([chi2])]),
     ]
 
 
@@ -192,14 +192,14 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
     return [
         ReportSection("One energy for all taps", _lines(lines), "One energy"),
         ReportSection(
-            "One energy for each branch",
+            "Branches with one energy each",
             [
                 Table(
                     "Each tap of a branch is assumed to take the same", ["branch", "rows", "energy (aJ)", "95 %"], cells
                 )
             ],
         ),
-        ReportSection("The instrument, with one energy", [_instrument(fit, "instrument"), *_lines([chi2])]),
+        ReportSection("Fitted with one energy: the instrument", [_instrument(fit, "instrument"), *_lines([chi2])]),
     ]
 
 

@@ -1,9 +1,10 @@
-"""Whether a trace is a steady single-impact orbit, and if not, what it is: of a list of findings the first that applies."""
+"""Whether a trace is a steady single-impact orbit, and if not, what it is: the first finding of a list that applies."""
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -51,6 +52,14 @@ class TraceVerdict(NamedTuple):
 
     kind: TraceKind
     sentence: str
+
+
+class Finding(NamedTuple):
+    """One thing that a trace may show: its kind, and when it does with which sentence, as a `Rule` has them."""
+
+    kind: TraceKind
+    when: Callable[["TraceEvidence"], Any]
+    sentence: str | Callable[["TraceEvidence", Any], str]
 
 
 @dataclass(frozen=True)
@@ -173,7 +182,7 @@ class TraceEvidence:
 
 def judge_trace(evidence: TraceEvidence) -> TraceVerdict:
     """Return what a trace shows: the first of the findings that applies."""
-    found = ((kind, rule.said_of(evidence)) for kind, rule in FINDINGS)
+    found = ((one.kind, Rule(one.when, one.sentence).said_of(evidence)) for one in FINDINGS)
     return next(TraceVerdict(kind, said[0]) for kind, said in found if said)
 
 
@@ -187,7 +196,7 @@ def _held(e: TraceEvidence) -> bool:
     return given is None or _FOLLOWS[0] * given <= e.lines.amplitude_nm <= _FOLLOWS[1] * given
 
 
-def _ringing_in_words(e: TraceEvidence, found: Ringing) -> str:
+def _ringing_in_words(_: TraceEvidence, found: Ringing) -> str:
     fades = "without a decay" if np.isinf(found.quality_factor) else f"decaying with Q = {found.quality_factor:.3g}"
     what = f"a free vibration of {found.frequency_khz:.5g} kHz {fades}, beside the drive's frequency"
     return f"{what}: the tip rings, nothing touches it"
@@ -196,118 +205,95 @@ def _ringing_in_words(e: TraceEvidence, found: Ringing) -> str:
 _SINE_IN_WORDS = "a sine of {e.lines.amplitude_nm:.4g} nm at the drive frequency without impacts"
 _OF_PLATFORM = f"{_SINE_IN_WORDS}, whose amplitude is {{e.lines.drive_amplitude_nm:.4g}} nm"
 
-FINDINGS: tuple[tuple[TraceKind, Rule[TraceEvidence]], ...] = (
-    (
+FINDINGS = (
+    Finding(
         TraceKind.NO_RESPONSE,
-        Rule(lambda e: e.folded.is_constant, "no response: the deflection is {e.folded.height[0]:.4g} nm throughout"),
+        lambda e: e.folded.is_constant,
+        "no response: the deflection is {e.folded.height[0]:.4g} nm throughout",
     ),
-    (
+    Finding(
         TraceKind.NO_RESPONSE,
-        Rule(
-            lambda e: e.lines.silent and not e.scattered,
-            "no response at the drive frequency or its subharmonics: no line of the response exceeds "
-            "{e.lines.seen_nm:.3g} nm (noise {e.folded.noise_nm:.3g} nm a sample)",
-        ),
+        lambda e: e.lines.silent and not e.scattered,
+        "no response at the drive frequency or its subharmonics: no line of the response exceeds "
+        "{e.lines.seen_nm:.3g} nm (noise {e.folded.noise_nm:.3g} nm a sample)",
     ),
-    (
+    Finding(
         TraceKind.STUCK,
-        Rule(
-            lambda e: _flightless(e) and e.lines.drive_amplitude_nm is None,
-            f"{_SINE_IN_WORDS}: the tip is held and moves with the platform, or nothing touches it",
-        ),
+        lambda e: _flightless(e) and e.lines.drive_amplitude_nm is None,
+        f"{_SINE_IN_WORDS}: the tip is held and moves with the platform, or nothing touches it",
     ),
-    (
+    Finding(
         TraceKind.STUCK,
-        Rule(lambda e: _flightless(e) and _held(e), f"{_OF_PLATFORM}: the tip is stuck to the platform"),
+        lambda e: _flightless(e) and _held(e),
+        f"{_OF_PLATFORM}: the tip is stuck to the platform",
     ),
-    (TraceKind.NO_IMPACT, Rule(_flightless, f"{_OF_PLATFORM}: no free flight, no impact")),
-    (TraceKind.RINGING, Rule(lambda e: [] if e.ringing is None else [e.ringing], _ringing_in_words)),
-    (
+    Finding(TraceKind.NO_IMPACT, _flightless, f"{_OF_PLATFORM}: no free flight, no impact"),
+    Finding(TraceKind.RINGING, lambda e: [] if e.ringing is None else [e.ringing], _ringing_in_words),
+    Finding(
         TraceKind.DRIFTING,
-        Rule(
-            lambda e: e.unrepeated and e.steadiness.phase_step_deg is not None,
-            "the phase runs by {e.steadiness.phase_step_deg:+.3g} degrees per response period: the drive frequency "
-            "seems to be {e.seen_khz:.7g} kHz, not {e.drive_khz:g} kHz (or the sampling rate is off)",
-        ),
+        lambda e: e.unrepeated and e.steadiness.phase_step_deg is not None,
+        "the phase runs by {e.steadiness.phase_step_deg:+.3g} degrees per response period: the drive frequency "
+        "seems to be {e.seen_khz:.7g} kHz, not {e.drive_khz:g} kHz (or the sampling rate is off)",
     ),
-    (
+    Finding(
         TraceKind.DRIFTING,
-        Rule(
-            lambda e: e.scattered and e.steadiness.trend_share > _SLOW,
-            "a transient or a drift: the response changes by {e.steadiness.excess:.1%} over the trace",
-        ),
+        lambda e: e.scattered and e.steadiness.trend_share > _SLOW,
+        "a transient or a drift: the response changes by {e.steadiness.excess:.1%} over the trace",
     ),
-    (
+    Finding(
         TraceKind.NOT_PERIODIC,
-        Rule(
-            lambda e: e.unrepeated and not e.scattered,
-            "{e.longest}, or too much noise: {e.left:.0%} of the motion is not explained",
-        ),
+        lambda e: e.unrepeated and not e.scattered,
+        "{e.longest}, or too much noise: {e.left:.0%} of the motion is not explained",
     ),
-    (
+    Finding(
         TraceKind.NOT_PERIODIC,
-        Rule(
-            lambda e: e.scattered,
-            "chaotic, or of a longer period: {e.longest}; response periods differ by {e.steadiness.excess:.1%} of the "
-            "motion beyond the noise",
-        ),
+        lambda e: e.scattered,
+        "chaotic, or of a longer period: {e.longest}; response periods differ by {e.steadiness.excess:.1%} of the "
+        "motion beyond the noise",
     ),
-    (
+    Finding(
         # a sample from below lets the tip fly upward only
         TraceKind.UPSIDE_DOWN,
-        Rule(
-            lambda e: e.ends_nm[0] < 0.0 and abs(e.ends_nm[1]) <= _BELOW * abs(e.ends_nm[0]),
-            "the deflection lies between {e.ends_nm[0]:.4g} and {e.ends_nm[1]:.4g} nm, but a bouncing tip flies above "
-            "its rest position: multiply it by -1, or give what it reads at rest (--rest-nm)",
-        ),
+        lambda e: e.ends_nm[0] < 0.0 and abs(e.ends_nm[1]) <= _BELOW * abs(e.ends_nm[0]),
+        "the deflection lies between {e.ends_nm[0]:.4g} and {e.ends_nm[1]:.4g} nm, but a bouncing tip flies above "
+        "its rest position: multiply it by -1, or give what it reads at rest (--rest-nm)",
     ),
-    (
+    Finding(
         TraceKind.DRIFTING,
-        Rule(
-            lambda e: max(e.steadiness.lockin_drift, e.steadiness.peak_drift) > _DRIFT,
-            "a transient or a drift: over the trace the lock-in value by {e.steadiness.lockin_drift:.2%}, peak by "
-            f"{{e.steadiness.peak_drift:.2%}} (steady below {_DRIFT:.0%})",
-        ),
+        lambda e: max(e.steadiness.lockin_drift, e.steadiness.peak_drift) > _DRIFT,
+        "a transient or a drift: over the trace the lock-in value by {e.steadiness.lockin_drift:.2%}, peak by "
+        f"{{e.steadiness.peak_drift:.2%}} (steady below {_DRIFT:.0%})",
     ),
-    (
+    Finding(
         # one drive period cannot hold a doubled one
         TraceKind.NOT_COUNTED,
-        Rule(
-            lambda e: e.folded.order > 1 and bool(e.uncounted),
-            "repeats after {e.folded.order} drive periods, but whether with one impact cannot be said: {e.uncounted}",
-        ),
+        lambda e: e.folded.order > 1 and bool(e.uncounted),
+        "repeats after {e.folded.order} drive periods, but whether with one impact cannot be said: {e.uncounted}",
     ),
-    (
+    Finding(
         TraceKind.NO_IMPACT,
-        Rule(
-            lambda e: e.count == 0,
-            "repeats after {e.folded.order} drive periods without a jump of the velocity: no impact",
-        ),
+        lambda e: e.count == 0,
+        "repeats after {e.folded.order} drive periods without a jump of the velocity: no impact",
     ),
-    (
+    Finding(
         TraceKind.PERIOD_MULTIPLIED,
-        Rule(
-            lambda e: [e.folded.order // e.count] if e.count > 1 and e.folded.order % e.count == 0 else [],
-            "a ({e.count},{e.folded.order}) orbit: the period of a (1,{case}) orbit {e.multiple}",
-        ),
+        lambda e: [e.folded.order // e.count] if e.count > 1 and e.folded.order % e.count == 0 else [],
+        "a ({e.count},{e.folded.order}) orbit: the period of a (1,{case}) orbit {e.multiple}",
     ),
-    (
+    Finding(
         TraceKind.SEVERAL_IMPACTS,
-        Rule(
-            lambda e: e.count > 1,
-            "a ({e.count},{e.folded.order}) orbit: {e.count} impacts in {e.folded.order} drive periods",
-        ),
+        lambda e: e.count > 1,
+        "a ({e.count},{e.folded.order}) orbit: {e.count} impacts in {e.folded.order} drive periods",
     ),
-    (
+    Finding(
         TraceKind.OTHER_ORDER,
-        Rule(
-            lambda e: e.order not in {None, e.folded.order},
-            "repeats after {e.folded.order} drive periods, not after {e.order} as asked for",
-        ),
+        lambda e: e.order not in {None, e.folded.order},
+        "repeats after {e.folded.order} drive periods, not after {e.order} as asked for",
     ),
-    (
+    Finding(
         TraceKind.STEADY,
-        Rule(lambda _: True, "a steady ({e.count},{e.folded.order}) orbit over {e.folded.cycles} response periods"),
+        lambda _: True,
+        "a steady ({e.count},{e.folded.order}) orbit over {e.folded.cycles} response periods",
     ),
 )
-"""What a trace may show, a rule each; the first that applies is the verdict."""
+"""What a trace may show, in the order in which it is looked for."""
