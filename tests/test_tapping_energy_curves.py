@@ -16,6 +16,7 @@ from fitting.tapping_curves.tapping import tapping
 from fitting.tapping_curves.together import tapping_together
 from tests.coverage_of_tapping import random_curve
 from tests.fresh_python import python
+from tests.html_pages import read_page, words_of
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_laws import (
     GRAPHITE,
@@ -267,6 +268,8 @@ def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_pa
     assert len(answer["curves"]) == 4
     assert answer["together"]["valid"]
     assert (tmp_path / "out" / "together.png").stat().st_size > 10000
+    page = read_page((tmp_path / "out" / "together.html").read_text("utf-8"))
+    assert [words_of(one) for one in page.iter("h2")] == ["Picture", "Branches", "What the curves have in common"]
     # not one lever
     other = replace(tables[1], quality_factor=150.0)
     with pytest.raises(TableError, match="states the Q as 150 \\+- 5"):
