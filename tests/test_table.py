@@ -286,7 +286,7 @@ def test_thirty_thousand_rows_read_in_seconds(tmp_path: Path):
     write_table(table, tmp_path / "long.csv")
     start = time.process_time()
     back = read_table(tmp_path / "long.csv")
-    # About 0.3 s of processor time on a slow core, 1.2 s where coverage is counted; the rest is room for a busy machine.
+    # About 0.3 s of processor time on a slow core, 1.2 s where coverage is counted; the rest is room for a busy one.
     assert time.process_time() - start < 3.0
     assert_same(table, back, but=("source", "lines"))
 
