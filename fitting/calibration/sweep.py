@@ -116,10 +116,10 @@ def _parse_nanonis(text: str, faults: Faults) -> dict[str, Any]:
     if not rows:
         faults.fail(f"there is nothing below {_MARK}; export the sweep again", line=lines[start][0])
     columns, names, numbers = columns_of_rows(rows, NANONIS, faults)
-    if _SHIFT in names and _CENTRE not in names:
-        faults.fail(f"the column {_CENTRE} is missing; add it", line=rows[0][0])
-    if _SHIFT in names:
-        columns.setdefault("frequency_khz", _in_khz(columns[_SHIFT] + columns[_CENTRE]))
+    if "frequency_khz" not in columns:
+        if _CENTRE not in names:
+            faults.fail(f"the column {_CENTRE} is missing; add it", line=rows[0][0])
+        columns["frequency_khz"] = _in_khz(columns[_SHIFT] + columns[_CENTRE])
     found = {
         key: float(settings[name]) / unit
         for name, (key, unit) in _FOUND.items()

@@ -552,7 +552,7 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
 def _cells(text: str, separator: str) -> list[str]:
     """Return the cells of one line, without the spaces and quotation marks around them."""
     # instruments end their lines with a tab
-    text = text.removesuffix("\t") if separator == "\t" else text
+    text = text.rstrip(" ").removesuffix("\t") if separator == "\t" else text
     # The csv module is needed for quotation marks only, and costs more than the rest of the reading.
     quotes = '"' in text
     cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True)) if quotes else text.split(separator)
@@ -592,10 +592,10 @@ def check_not_empty(comments: NumberedLines, rows: NumberedLines, faults: Faults
 
 
 def _check_delimiter(names: str, form: Form, *, line: int, faults: Faults) -> None:
-    if form.separator in names:
+    if form.separator != "," or "," in names:
         return
     for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
-        if sign in names.strip() and sign != form.separator:
+        if sign in names.strip():
             advice = f"separate them by commas, decimals by points{form.separators}"
             Faults(faults.source).fail(f"the columns are separated by {word}; {advice}", line=line)
 
