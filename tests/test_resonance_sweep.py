@@ -64,6 +64,8 @@ def test_absolute_frequencies_of_nanonis_and_a_missing_phase(tmp_path):
     assert sweep.frequency_khz.tolist() == [30.0, 30.001]
     assert sweep.phase_deg is None
     assert sweep.instrument == {}
+    with pytest.raises(TableError, match=r"line 2: the column Center Frequency \(Hz\) is missing; add it"):
+        read_sweep(written(tmp_path, text.replace("Frequency (Hz)", "Frequency Shift (Hz)")))
 
 
 @pytest.mark.parametrize(("order", "reordered"), [((2, 1, 0), False), ((1, 0, 2), True), ((0, 1, 2), False)])
