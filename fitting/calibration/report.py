@@ -175,7 +175,7 @@ def write_calibration(
     Raises:
         OSError: if a file cannot be written.
     """
-    shows = "Amplitude (and phase) with the fit; below, what is left of them."
+    shows = "Amplitude (and phase) with the fit; below, the misfit, fit less measured."
     written = write_with_picture(calibration_report(result, found), calibration_figure(result), shows, folder, data)
     write_table("calibration_points.csv", point_records(result), POINT_COLUMNS)
     return written
@@ -248,14 +248,14 @@ def calibration_figure(result: Calibration) -> Figure:
     grid[0, 0].legend(fontsize=_SMALL, loc="upper right")
     _mark_instrument(grid[0, 0], result)
     if result.model == "power":
-        _draw_misfit(grid[1, 0], shift, 100.0 * curves.amplitude_misfit / curves.amplitude, "fit - measured\n(%)")
+        _draw_misfit(grid[1, 0], shift, 100.0 * curves.amplitude_misfit / curves.amplitude, "misfit (%)")
     else:
-        _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"fit - measured\n{unit.strip()}".strip())
+        _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"misfit{unit}")
     if result.sweep.phase_deg is not None and curves.phase_deg is not None and curves.phase_misfit_deg is not None:
         measured = np.rad2deg(np.unwrap(np.deg2rad(result.sweep.phase_deg)))
         _draw_curve(grid[0, 1], result, shift, measured, measured + curves.phase_deg - result.sweep.phase_deg)
         label_axes(grid[0, 1], x="", y="phase (degrees)")
-        _draw_misfit(grid[1, 1], shift, curves.phase_misfit_deg, "fit - measured\n(degrees)")
+        _draw_misfit(grid[1, 1], shift, curves.phase_misfit_deg, "misfit (degrees)")
     title = f"f0 = {value_in_words(result.frequency_khz)} kHz,  Q = {value_in_words(result.quality_factor)}"
     title += f"  (background '{result.background}')"
     title = title.replace("+-", "±")
