@@ -120,7 +120,7 @@ def drift_of_free_rows(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> 
 
 def _impossible(e: Any) -> bool:
     """Say whether an energy along a branch is below zero by more than its errors."""
-    return min((b.curve.energy_aj + _NEGATIVE * b.curve.energy_error_aj).min() for b in e.branches) < 0.0
+    return any(np.any(b.curve.energy_aj + _NEGATIVE * b.curve.energy_error_aj < 0.0) for b in e.branches)
 
 
 NO_FUNCTIONS: tuple[Rule[Any], ...] = (
