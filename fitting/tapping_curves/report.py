@@ -118,7 +118,7 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     if fit is None:
         return []
     head = ["energy (aJ) at A/A0 =", "measured", *(f"{ratio:g}" for ratio in HEADLINE), "largest"]
-    several = len({(b.drive_frequency_khz, b.free_amplitude_nm) for b in result.branches}) > 1
+    several = len({branch.drive for branch in result.branches}) > 1
     cells = []
     for branch in result.branches:
         curve, top = branch.curve, int(np.argmax(branch.curve.energy_aj))

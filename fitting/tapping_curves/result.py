@@ -309,30 +309,20 @@ class Tapping(Result):
     def turning_points(self) -> list[dict[str, Any]]:
         """Where attraction gives way to repulsion on each drive and way: between which amplitudes and heights."""
         found = []
-        keys = {(b.drive_frequency_khz, b.free_amplitude_nm, b.retract): None for b in self.branches}
-        for key in keys:
-            sides = [
-                [
-                    b
-                    for b in self.branches
-                    if (b.drive_frequency_khz, b.free_amplitude_nm, b.retract, b.repulsive) == (*key, state)
-                ]
-                for state in (False, True)
-            ]
-            if not all(sides):
+        for drive, retract in dict.fromkeys((b.drive, b.retract) for b in self.branches):
+            here = [b for b in self.branches if (b.drive, b.retract) == (drive, retract)]
+            attractive, repulsive = ([b.curve for b in here if b.repulsive == side] for side in (False, True))
+            if not (attractive and repulsive):
                 continue
-            attractive, repulsive = sides[0][-1].curve, sides[1][0].curve
-            last, first = int(np.argmax(attractive.height_nm)), int(np.argmin(repulsive.height_nm))
+            before, after = attractive[-1], repulsive[0]
+            last, first = int(np.argmax(before.height_nm)), int(np.argmin(after.height_nm))
             found.append(
                 {
-                    "drive_frequency_khz": key[0],
-                    "free_amplitude_nm": key[1],
-                    "branch": way_of(key[2]),
-                    "amplitude_ratio": [
-                        float(repulsive.amplitude_ratio[first]),
-                        float(attractive.amplitude_ratio[last]),
-                    ],
-                    "height_nm": [float(attractive.height_nm[last]), float(repulsive.height_nm[first])],
+                    "drive_frequency_khz": drive[0],
+                    "free_amplitude_nm": drive[1],
+                    "branch": way_of(retract),
+                    "amplitude_ratio": [float(after.amplitude_ratio[first]), float(before.amplitude_ratio[last])],
+                    "height_nm": [float(before.height_nm[last]), float(after.height_nm[first])],
                 }
             )
         return found

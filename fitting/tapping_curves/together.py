@@ -183,10 +183,9 @@ def _scatters(curves: Sequence[Tapping], common: tuple[str, ...]) -> tuple[Curve
 
 
 def _alike(one: TappingBranch, other: TappingBranch) -> bool:
-    return (
-        (one.drive_frequency_khz, one.retract, one.repulsive)
-        == (other.drive_frequency_khz, other.retract, other.repulsive)
-    ) and abs(one.free_amplitude_nm - other.free_amplitude_nm) < _SAME * one.free_amplitude_nm
+    apart = abs(one.free_amplitude_nm - other.free_amplitude_nm)
+    sides = [(b.drive_frequency_khz, b.retract, b.repulsive) for b in (one, other)]
+    return sides[0] == sides[1] and apart < _SAME * one.free_amplitude_nm
 
 
 def _scatter(
