@@ -183,9 +183,11 @@ def write_calibration(
 
 def write_with_picture(report: Report, figure: Figure, shows: str, folder: Path, data: dict[str, Any]) -> list[Path]:
     """Write calibration.html, .txt, .json and .png: a report with one picture, and its numbers."""
+    # the SVG file has the layout of the PNG drawn before
+    picture = png_of(figure)
     seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
     page = page_of(replace(report, sections=[seen, *report.sections]))
-    return write_report_files(folder, "calibration", text=text_of(report), data=data, picture=png_of(figure), page=page)
+    return write_report_files(folder, "calibration", text=text_of(report), data=data, picture=picture, page=page)
 
 
 def _value_cells(name: str, value: CalibratedValue, unit: str) -> list[str]:

@@ -73,11 +73,13 @@ def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[
     """
     payload = {"format": "afm-jax tapping-map", "format_version": 1, **result.to_dict()}
     report, figure = map_report(result), map_figure(result)
+    # the SVG file has the layout of the PNG drawn before
+    picture = png_of(figure)
     shows = "Energy and virial over the image, pixels out of range in grey; below, how often each value comes."
     seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
     contents: dict[str, str | bytes] = {
         "map.html": page_of(replace(report, sections=[seen, *report.sections])),
-        "map.png": png_of(figure),
+        "map.png": picture,
         "map.json": strict_json(payload) + "\n",
         "map.txt": text_of(report) + "\n",
     }

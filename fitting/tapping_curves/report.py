@@ -275,16 +275,17 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     from fitting.report.report import write_report, write_report_files  # noqa: PLC0415 - it imports JAX
 
     figures = tapping_figures(result)
-    curve, frames, *_ = figures.values()
+    # SVG files have the layout of the PNG drawn before
+    curve, frames, *_ = [png_of(figure) for figure in figures.values()]
     written = write_report_files(
         folder,
         "tapping",
         text=tapping_summary(result),
         data={"format": "afm-jax tapping", "format_version": 1, **result.to_dict()},
-        picture=png_of(curve),
+        picture=curve,
         page=tapping_page(result, [svg_of(figure) for figure in figures.values()], list(figures)),
     )
-    write_whole(folder / "tapping_frames.png", png_of(frames))
+    write_whole(folder / "tapping_frames.png", frames)
     records = result.keyed(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
     law = [] if result.law is None else write_report(result.law, folder, write_table)
@@ -381,6 +382,7 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
     from fitting.report.report import write_report_files  # noqa: PLC0415 - it imports JAX
 
     figure, report = together_figure(result), together_report(result)
+    picture = png_of(figure)
     shows = (
         "Energy over the amplitude, each curve and their mean, with the scatter and the error that all have in common."
     )
@@ -390,6 +392,6 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
         "together",
         text=together_summary(result),
         data={"format": "afm-jax tapping together", "format_version": 1, **result.to_dict()},
-        picture=png_of(figure),
+        picture=picture,
         page=result.curves[0].in_unit(page_of(replace(report, sections=[seen, *report.sections]))),
     )
