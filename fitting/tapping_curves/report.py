@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.plots.picture_style import png_of, svg_of
 from afm_jax.strict_json import plain
 from afm_jax.whole_files import write_whole
 from afm_jax.words import broken, interval, percent, with_error
@@ -25,7 +24,6 @@ from fitting.report.sections import (
 from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.energy_curve import HEADLINE
 from fitting.tapping_curves.energy_fit import EnergyFit
-from fitting.tapping_curves.pictures import tapping_figures, together_figure
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 from fitting.tapping_curves.verdict import ORIGINS
@@ -272,7 +270,10 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     Raises:
         OSError: if a file cannot be written.
     """
-    from fitting.report.report import write_report, write_report_files  # noqa: PLC0415 - it imports JAX
+    # a call without --out needs neither matplotlib nor JAX
+    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
+    from fitting.report.report import write_report, write_report_files  # noqa: PLC0415
+    from fitting.tapping_curves.pictures import tapping_figures  # noqa: PLC0415
 
     figures = tapping_figures(result)
     # SVG files have the layout of the PNG drawn before
@@ -379,7 +380,9 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
     Raises:
         OSError: if a file cannot be written.
     """
-    from fitting.report.report import write_report_files  # noqa: PLC0415 - it imports JAX
+    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
+    from fitting.report.report import write_report_files  # noqa: PLC0415
+    from fitting.tapping_curves.pictures import together_figure  # noqa: PLC0415
 
     figure, report = together_figure(result), together_report(result)
     picture = png_of(figure)
