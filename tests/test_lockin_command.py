@@ -130,15 +130,3 @@ def test_a_table_needs_what_the_fitter_needs(tmp_path):
     assert table.drive_amplitude_nm is not None
     assert table.drive_amplitude_nm[0] == pytest.approx(4.0, rel=1e-6)
     assert table.offset_nm[0] == pytest.approx(-1.0, rel=1e-6)
-
-
-def test_a_deflection_with_the_wrong_sign_is_named(tmp_path):
-    path, _ = written(tmp_path / "turned.csv", order=1)
-    lines = path.read_text(encoding="utf-8").splitlines()
-    start = lines.index("time_us,deflection_nm,platform_nm") + 1
-    turned = [f"{time},{-float(height)},{platform}" for time, height, platform in (x.split(",") for x in lines[start:])]
-    path.write_text("\n".join([*lines[:start], *turned]) + "\n", encoding="utf-8")
-    result = run(path, "--json")
-    assert result.exit_code == 3
-    assert strictly(result.stdout)["traces"][0]["kind"] == "upside_down"
-    assert "multiply it by -1" in result.stderr

@@ -295,14 +295,6 @@ def test_thresholds_are_found_to_a_tenth_of_a_nanometre(width: float):
         assert between[0] == pytest.approx(0.5 * K * ((1.03 + width) ** 2 - 1.03**2), rel=0.05)
 
 
-def test_what_no_energy_can_do_without_is_asked_for():
-    table = made_curve()
-    with pytest.raises(TableError, match="--quality-factor '200 \\+- 2'"):
-        tapping(replace(table, quality_factor=None, quality_factor_error=None))
-    with pytest.raises(TableError, match="use `afm-jax fit`"):
-        tapping(fitting.read_table(AMPLITUDES))
-
-
 def test_a_zero_that_free_rows_were_set_to_is_no_knowledge_besides_frequency_and_q(tmp_path: Path):
     path = tmp_path / "curve.csv"
     path.write_text(table_text(read_curve(make_raw_curve.EXAMPLE, **make_raw_curve.OPTIONS)), "utf-8")
