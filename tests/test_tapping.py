@@ -26,7 +26,7 @@ from tests.html_pages import first_screen, read_page
 from tests.strict_reading import strictly
 
 EXAMPLES = Path(fitting.__file__).parent / "examples"
-EXAMPLE, AMPLITUDES, REAL = EXAMPLES / "tapping_resonance.csv", EXAMPLES / "amplitudes_law.csv", EXAMPLES / "real"
+EXAMPLE, REAL = EXAMPLES / "tapping_resonance.csv", EXAMPLES / "real"
 ENERGY_AJ = 2.951
 """What a tap of the bundled curve takes by the ledger of its simulation (`fitting.examples.make_tapping`)."""
 K, F0, Q = 5.4, 90.0, 200.0
