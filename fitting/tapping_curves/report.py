@@ -240,7 +240,7 @@ def _speeds(result: Tapping) -> list[ReportSection]:
     u = found.approach_speed_nm_per_us
     here = np.isfinite(u)
     if not here.any():
-        return [ReportSection("Impact speeds", [Text("Impact speeds: in no row known to a quarter.")])]
+        return [ReportSection("Speeds of the impacts", [Text("Impact speeds: in no row known to a quarter.")])]
     many = found.in_capture_speeds[here]
     known = percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))
     speeds = f"{u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows"
@@ -253,7 +253,7 @@ def _speeds(result: Tapping) -> list[ReportSection]:
             f"  energy against speed: {one.formula} with {values}, chi2 {one.chi2:.1f} for {one.degrees_of_freedom} "
             "(errors of noise and speeds alone)"
         )
-    return [ReportSection("Impact speeds", _lines(lines), "Speeds")]
+    return [ReportSection("Speeds of the impacts", _lines(lines), "Speeds")]
 
 
 def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> list[Path]:
