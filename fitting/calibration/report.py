@@ -68,7 +68,7 @@ def calibration_report(result: Calibration, found: Sequence[Stiffness] = ()) -> 
         comments = ["For the top of an amplitude table:", *result.table_comments]
         sections.append(ReportSection("For an amplitude table", [_lines(comments)], "Table"))
     return Report(
-        title=f"Free resonance of {result.sweep.source} ({result.sweep.points} points, {what}):",
+        title=f"Free resonance of {result.sweep.source} ({result.sweep.points} points, {what})",
         about=[f"background '{result.background}': {_BACKGROUNDS[result.model, result.background]}"],
         valid=result.valid and doubt is None,
         verdict=verdict,
