@@ -64,7 +64,7 @@ def test_absolute_frequencies_of_nanonis_and_a_missing_phase(tmp_path):
     assert sweep.frequency_khz.tolist() == [30.0, 30.001]
     assert sweep.phase_deg is None
     assert sweep.instrument == {}
-    with pytest.raises(TableError, match=r"line 2: the column Center Frequency \(Hz\) is missing; add it"):
+    with pytest.raises(TableError, match=r'line 2: the column "Center Frequency \(Hz\)" is missing; add it'):
         read_sweep(written(tmp_path, text.replace("Frequency (Hz)", "Frequency Shift (Hz)")))
 
 

@@ -118,7 +118,7 @@ def _parse_nanonis(text: str, faults: Faults) -> dict[str, Any]:
     columns, names, numbers = columns_of_rows(rows, NANONIS, faults)
     if "frequency_khz" not in columns:
         if _CENTRE not in names:
-            faults.fail(f"the column {_CENTRE} is missing; add it", line=rows[0][0])
+            faults.fail(f'the column "{_CENTRE}" is missing; add it', line=rows[0][0])
         columns["frequency_khz"] = _in_khz(columns[_SHIFT] + columns[_CENTRE])
     found = {
         key: float(settings[name]) / unit
