@@ -41,7 +41,9 @@ class Box(NamedTuple):
         return self._replace(fixed=self.fixed[some])
 
 
-def descended(evaluate: Evaluate, start: Searches, box: Box, *, settled: float, most: int) -> Searches:
+def descended(
+    evaluate: Evaluate, start: Searches, box: Box, *, settled: float, most: int, rise: float = 0.0
+) -> Searches:
     """Return where searches end that go down from their starts, each as long as it has not arrived.
 
     Args:
@@ -50,6 +52,7 @@ def descended(evaluate: Evaluate, start: Searches, box: Box, *, settled: float, 
         box: where they may go; a parameter at a bound stays there while the sum falls towards the outside.
         settled: estimated distance of the sum of squares to its minimum at which a search has arrived.
         most: steps at most.
+        rise: by how much a step may raise the sum, where the Jacobian is not quite that of the residuals.
     """
     state = Searches(*(np.array(leaf) for leaf in start))
     damping = np.full(len(state.chi2), _FIRST_DAMPING)
@@ -61,7 +64,7 @@ def descended(evaluate: Evaluate, start: Searches, box: Box, *, settled: float, 
         step = _step(some, box.of(active), damping[active])
         trial = some.place + np.clip(step, -box.longest, box.longest)
         trials = evaluate(np.clip(trial, box.lowest, box.highest), active)
-        better = trials.chi2 <= some.chi2
+        better = trials.chi2 <= some.chi2 + rise
         for leaf, new in zip(state, trials, strict=True):
             leaf[active[better]] = new[better]
         less = np.maximum(0.1 * damping[active], _SMALLEST_DAMPING)

@@ -44,7 +44,7 @@ LEVELS = {
 FITTING_LEVELS = {
     "parameters": 0,
     "tables": 0,
-    "traces": 1,
+    "traces": 6,
     "instruments": 1,
     "models": 1,
     "simulated": 1,

@@ -236,8 +236,9 @@ def test_ten_tables_are_the_table_that_they_are_parts_of():
         begin = time.process_time()
         return fit(table, **options), time.process_time() - begin
 
-    times = np.array([[timed(together)[1], timed(parts, share=["all"])[1]] for _ in range(3)]).min(axis=0)
-    one, many = fit(together), fit(parts, share=["all"])
+    # the first fit of each compiles
+    (one, _), (many, _) = timed(together), timed(parts, share=["all"])
+    times = np.array([[timed(together)[1], timed(parts, share=["all"])[1]] for _ in range(2)]).min(axis=0)
     assert times[1] < 1.5 * times[0]
     for name, parameter in one.parameters.items():
         assert many.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)

@@ -277,8 +277,8 @@ def test_an_unwritable_path_is_one_line(tmp_path: Path):
     )
 
 
-def test_a_hundred_thousand_rows_read_in_seconds(tmp_path: Path):
-    rows = 100_000
+def test_thirty_thousand_rows_read_in_seconds(tmp_path: Path):
+    rows = 30_000
     random = np.random.default_rng(1)
     columns = {name: random.uniform(1.0, 100.0, rows) for name in TABLE.names}
     columns |= {"order": np.full(rows, 2), "no_orbit": np.zeros(rows)}
@@ -286,8 +286,8 @@ def test_a_hundred_thousand_rows_read_in_seconds(tmp_path: Path):
     write_table(table, tmp_path / "long.csv")
     start = time.process_time()
     back = read_table(tmp_path / "long.csv")
-    # About 1 s of processor time on a slow core, 4 s where coverage is counted; the rest is room for a busy machine.
-    assert time.process_time() - start < 10.0
+    # About 0.3 s of processor time on a slow core, 1.2 s where coverage is counted; the rest is room for a busy one.
+    assert time.process_time() - start < 3.0
     assert_same(table, back, but=("source", "lines"))
 
 

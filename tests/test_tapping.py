@@ -22,10 +22,11 @@ from fitting.tapping_curves.energy_fit import Bins, Process, Smoother
 from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.speeds import _flight, _Seen
 from fitting.tapping_curves.tapping import tapping
+from tests.html_pages import first_screen, read_page
 from tests.strict_reading import strictly
 
 EXAMPLES = Path(fitting.__file__).parent / "examples"
-EXAMPLE, AMPLITUDES, REAL = EXAMPLES / "tapping_resonance.csv", EXAMPLES / "amplitudes_law.csv", EXAMPLES / "real"
+EXAMPLE, REAL = EXAMPLES / "tapping_resonance.csv", EXAMPLES / "real"
 ENERGY_AJ = 2.951
 """What a tap of the bundled curve takes by the ledger of its simulation (`fitting.examples.make_tapping`)."""
 K, F0, Q = 5.4, 90.0, 200.0
@@ -294,14 +295,6 @@ def test_thresholds_are_found_to_a_tenth_of_a_nanometre(width: float):
         assert between[0] == pytest.approx(0.5 * K * ((1.03 + width) ** 2 - 1.03**2), rel=0.05)
 
 
-def test_what_no_energy_can_do_without_is_asked_for():
-    table = made_curve()
-    with pytest.raises(TableError, match="--quality-factor '200 \\+- 2'"):
-        tapping(replace(table, quality_factor=None, quality_factor_error=None))
-    with pytest.raises(TableError, match="use `afm-jax fit`"):
-        tapping(fitting.read_table(AMPLITUDES))
-
-
 def test_a_zero_that_free_rows_were_set_to_is_no_knowledge_besides_frequency_and_q(tmp_path: Path):
     path = tmp_path / "curve.csv"
     path.write_text(table_text(read_curve(make_raw_curve.EXAMPLE, **make_raw_curve.OPTIONS)), "utf-8")
@@ -405,9 +398,9 @@ def test_command_prints_and_writes_the_report(tmp_path: Path):
     assert "above resonance" in answer["reason"]
     assert len(answer["rows"]) == 64
     assert all(one["reason"].startswith("excluded") for one in answer["set_aside"])
-    page = (tmp_path / "tapping.html").read_text(encoding="utf-8")
-    assert "VALID" in page
-    assert page.count("<img") == 2
+    page = read_page((tmp_path / "tapping.html").read_text(encoding="utf-8"))
+    assert "VALID" in first_screen(page)
+    assert len(list(page.iter("img"))) == 2
     assert strictly((tmp_path / "tapping.json").read_text(encoding="utf-8"))["energy_per_tap_aj"]
     for name in ("tapping.png", "tapping_frames.png"):
         # a drawn picture has many shades

@@ -11,11 +11,13 @@ from afm_jax.cli.main import main
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import write_table
 from fitting.tapping_curves.pictures import curve_figure
+from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
 from fitting.tapping_curves.together import tapping_together
 from tests.coverage_of_tapping import random_curve
 from tests.fresh_python import python
+from tests.html_pages import read_page, words_of
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_laws import (
     GRAPHITE,
@@ -66,16 +68,13 @@ def one_energy(rows: int = 60) -> Truth:
     return curve_of_energy(Tip(), np.linspace(0.9, 0.15, rows), np.full(rows, ONE_ENERGY_AJ), np.ones(rows, bool))
 
 
-def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function(tmp_path: Path):
+def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     truth = curve_like_graphite()
     # the figures it goes through
     np.testing.assert_allclose(truth.at("energy_aj", np.array([0.98, 0.94, 0.86]), 13.4), [1.6, 4.2, 10.9], rtol=0.02)
     table = table_of(GRAPHITE, truth, Stated(**SHARP), np.random.default_rng(1), free_rows=30)
-    path = tmp_path / "curve.csv"
-    write_table(table, path)
-    run = CliRunner().invoke(main, ["tapping", str(path), "--json"])
-    assert run.exit_code == 0, run.stderr
-    answer = strictly(run.stdout)
+    result = tapping(table, law=False)
+    answer = result.to_dict()
     assert answer["valid"]
     assert answer["energy_per_tap_aj"] is None
     assert "one energy a branch does not describe the rows" in answer["energy_per_tap_reason"]
@@ -100,8 +99,7 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function(tm
     assert min(turn["amplitude_ratio"]) < 0.916
     assert max(turn["amplitude_ratio"]) > 0.908
     assert answer["largest_energy_aj"]["value"] == pytest.approx(12.0, rel=0.08)
-    # by the figures it goes through
-    assert "changes along the curve" in CliRunner().invoke(main, ["tapping", str(path)]).stdout
+    assert "changes along the curve" in tapping_summary(result)
 
 
 def test_energies_that_grow_along_a_branch_are_no_single_energy_with_the_frequency_pulled():
@@ -267,6 +265,8 @@ def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_pa
     assert len(answer["curves"]) == 4
     assert answer["together"]["valid"]
     assert (tmp_path / "out" / "together.png").stat().st_size > 10000
+    page = read_page((tmp_path / "out" / "together.html").read_text("utf-8"))
+    assert [words_of(one) for one in page.iter("h2")] == ["Picture", "Branches", "What the curves have in common"]
     # not one lever
     other = replace(tables[1], quality_factor=150.0)
     with pytest.raises(TableError, match="states the Q as 150 \\+- 5"):

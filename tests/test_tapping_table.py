@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from fitting.tables.table import AmplitudeTable, read_table, write_table
-from tests.table_texts import fault_of
 from tests.test_table import assert_same
 
 HEAD = """# drive = force
@@ -56,7 +55,3 @@ def test_a_written_curve_reads_back_the_same(tmp_path: Path, drive: str):
 def test_orders_are_those_of_the_drive(tmp_path: Path):
     text = HEAD + NAMES.replace("\n", ",order\n")
     assert read(tmp_path, text + ROW.replace("\n", ",1\n")).order.tolist() == [1]
-    assert fault_of(tmp_path, text + ROW.replace("\n", ",2\n")) == (
-        "line 6, column order: must be 1 where the cantilever is driven: amplitude and lag are read at the drive's "
-        "frequency; remove the row"
-    )

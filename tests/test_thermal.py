@@ -147,12 +147,6 @@ def test_spectra_are_read_from_csv(tmp_path):
     sweep = read_sweep(path)
     assert (sweep.averages, sweep.spectrum) == (200.0, True)
     np.testing.assert_allclose(sweep.amplitude**2, density(khz), rtol=1e-14)
-    path.write_text(f"# averages = many\nfrequency_hz,psd_nm2_per_hz\n{rows}\n", encoding="utf-8")
-    with pytest.raises(TableError, match="line 1: averages has 'many' where a number must stand"):
-        read_sweep(path)
-    path.write_text(f"# averages = 200\n# averages = 300\nfrequency_hz,psd_nm2_per_hz\n{rows}\n", encoding="utf-8")
-    with pytest.raises(TableError, match="line 2: averages was given in line 1 already; remove one of the two"):
-        read_sweep(path)
     cut = tmp_path / "cut.nid"
     cut.write_bytes(THERMAL.read_bytes()[:-8])
     with pytest.raises(TableError, match="announces 66952 bytes"):

@@ -1,15 +1,21 @@
 """`afm-jax calibrate SWEEP`: frequency, quality factor and stiffness of the free cantilever, sensitivity."""
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
-from afm_jax.plots.picture_style import png_of
 from afm_jax.strict_json import plain
 from fitting.calibration.calibrate import calibrate
-from fitting.calibration.report import calibration_summary, slope_figure, write_calibration
+from fitting.calibration.report import (
+    calibration_report,
+    slope_figure,
+    slope_report,
+    write_calibration,
+    write_with_picture,
+)
 from fitting.calibration.result import Calibration
 from fitting.calibration.stiffness import (
     AIR_K,
@@ -18,13 +24,11 @@ from fitting.calibration.stiffness import (
     equipartition,
     sader,
     sensitivity,
-    stiffness_lines,
     stiffness_payload,
-    uncalibrated,
 )
 from fitting.calibration.sweep import read_sweep, without_phase
 from fitting.instruments.curve import read_curves
-from fitting.report.report import write_report_files
+from fitting.report.sections import text_of
 
 
 def calibration(session: Session, *, sweep: Path, slope: bool, amplitude_only: bool, **options: Any) -> Output:
@@ -38,21 +42,11 @@ def calibration(session: Session, *, sweep: Path, slope: bool, amplitude_only: b
         fit_options = {name: options[name] for name in ("background", "noise", "scale_errors", "whole")}
         result = calibrate(measured, **fit_options)
     stiffnesses = _stiffnesses(result, options)
-    payload, doubt = result.to_dict(), None
-    if stiffnesses:
-        payload |= stiffness_payload(result, stiffnesses)
-        doubt = uncalibrated(stiffnesses)
-
-    def summary() -> str:
-        text = calibration_summary(result, doubt)
-        if not stiffnesses:
-            return text
-        return "\n".join([text, "", "Spring constant:", *stiffness_lines(result, stiffnesses)])
-
+    payload = result.to_dict() | (stiffness_payload(result, stiffnesses) if stiffnesses else {})
     return Output(
         payload=payload,
-        text=[summary],
-        report=lambda folder, write_table: write_calibration(result, folder, write_table, summary(), payload),
+        text=[lambda: text_of(calibration_report(result, stiffnesses))],
+        report=lambda folder, write_table: write_calibration(result, folder, write_table, stiffnesses, payload),
         not_valid=payload["reasons"][0] if payload["reasons"] else None,
     )
 
@@ -79,10 +73,10 @@ def _sensitivity(path: Path) -> Output:
     slope = sensitivity(curves)
     payload = {"deflection_nm_per_volt": asdict(slope.value), "assumed": slope.assumed, "valid": True}
     payload |= {"budget": budget(None, [slope])}
-    text = "\n".join(stiffness_lines(None, [slope]))
+    report = slope_report(curves, slope)
+    shows = "Deflection over the height of the sample; dashed, the sensitivity through the end of each curve."
 
-    def report(folder: Path, _: Any) -> list[Path]:
-        picture = png_of(slope_figure(curves, slope))
-        return write_report_files(folder, "calibration", text=text, data=plain(payload), picture=picture)
+    def write(folder: Path, _: Any) -> list[Path]:
+        return write_with_picture(report, slope_figure(curves, slope), shows, folder, plain(payload))
 
-    return Output(payload=payload, text=[text], report=report)
+    return Output(payload=payload, text=[partial(text_of, report)], report=write)

@@ -14,10 +14,10 @@ from afm_jax.cli.values import option_of
 from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS
 from fitting.tables.table import AmplitudeTable, read_table
 from fitting.tapping_curves.measured import MeasuredFile, is_table, read_measured
-from fitting.tapping_curves.report import tapping_summary, write_tapping, write_together
+from fitting.tapping_curves.report import tapping_summary, together_summary, write_tapping, write_together
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
-from fitting.tapping_curves.together import TappingTogether, together, together_lines
+from fitting.tapping_curves.together import TappingTogether, together
 
 
 def energy_of_taps(
@@ -91,7 +91,7 @@ def _together(
             "of the amplitude"
         )
     if whole is not None and len(curves) > 1:
-        text.append("\n".join(together_lines(whole)))
+        text.append(together_summary(whole))
     valid = whole is not None and whole.valid and not refused
     payload = {
         "valid": valid,

@@ -1,9 +1,7 @@
-"""A calibration as a person reads it: text for the terminal, files for the drawer (JSON, CSV, PNG).
+"""A calibration as a person reads it: sections, the files of --out, and the picture of the scan with the fit."""
 
-The picture shows the sweep with the fit, and the residuals below.
-"""
-
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +10,13 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, DARK, GRID, label_axes, new_figure
-from afm_jax.words import bullets, interval, known, text_table, value_alone, with_error
+from afm_jax.plots.picture_style import ACCENT, DARK, GRID, label_axes, new_figure, png_of, svg_of
+from afm_jax.words import interval, known, value_alone, with_error
 from fitting.calibration.result import CalibratedValue, Calibration
-from fitting.calibration.stiffness import Stiffness
+from fitting.calibration.stiffness import WORTH, Stiffness, budget, doubts, uncalibrated
 from fitting.instruments.curve import MeasuredCurve
+from fitting.report.report import write_report_files
+from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
 
 POINT_COLUMNS = (
     "line",
@@ -41,37 +41,93 @@ _BACKGROUNDS = {
 }
 
 
-def calibration_summary(result: Calibration, stiffness: str | None = None) -> str:
-    """Return the calibration as text: verdict first, then the values, their comparison, goodness of fit, notes.
+def calibration_report(result: Calibration, found: Sequence[Stiffness] = ()) -> Report:
+    """Return the calibration as sections: the values, their comparison, goodness of fit, notes, spring constants.
 
     Args:
         result: of frequency and quality factor.
-        stiffness: why the spring constant is not calibrated; None: it is, or there is none.
+        found: spring constants of the lever.
     """
     what = {"phase": "amplitude and phase", "power": "thermal spectrum"}.get(result.model, "amplitude")
+    doubt = uncalibrated(found)
+    verdict = "VALID" if result.valid else "NOT VALID: the numbers below are not a calibration."
+    if result.valid and doubt is not None:
+        verdict = "NOT VALID: frequency and quality factor are calibrated, the spring constant is not."
+    head = ["", "value", "std. error", "95 % interval"]
     values = [
         _value_cells("frequency_khz", result.frequency_khz, "  kHz"),
         _value_cells("quality_factor", result.quality_factor, ""),
     ]
-    verdict = "VALID" if result.valid else "NOT VALID: the numbers below are not a calibration."
-    if result.valid and stiffness is not None:
-        verdict = "NOT VALID: frequency and quality factor are calibrated, the spring constant is not."
-    lines = [
-        f"Free resonance of {result.sweep.source} ({result.sweep.points} points, {what}):",
-        f"  background '{result.background}': {_BACKGROUNDS[result.model, result.background]}",
-        "",
-        verdict,
-        *(f"  - {reason}" for reason in (*result.reasons, *([] if stiffness is None else [stiffness]))),
-        "",
-        *text_table(["", "value", "std. error", "95 % interval"], values, words=(0, 3)),
-        *_comparison_lines(result),
-        "",
-        _goodness_line(result),
-    ]
-    lines += bullets("Notes:", result.warnings)
+    compared, sections = _comparison_lines(result), []
+    if compared:
+        sections.append(ReportSection("Comparison", [_lines(compared)]))
+    sections.append(ReportSection("Goodness of fit", [_lines([_goodness_line(result)])]))
+    if result.warnings:
+        sections.append(ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"))
     if result.valid:
-        lines += ["", "For the top of an amplitude table:", *result.table_comments]
-    return "\n".join(lines)
+        comments = ["For the top of an amplitude table:", *result.table_comments]
+        sections.append(ReportSection("For an amplitude table", [_lines(comments)], "Table"))
+    return Report(
+        title=f"Free resonance of {result.sweep.source} ({result.sweep.points} points, {what})",
+        about=[f"background '{result.background}': {_BACKGROUNDS[result.model, result.background]}"],
+        valid=result.valid and doubt is None,
+        verdict=verdict,
+        reasons=[*result.reasons, *([] if doubt is None else [doubt])],
+        sections=[
+            ReportSection("Values", [Table("Of the free cantilever", head, values, words=head[3:])], "Values"),
+            *sections,
+            *(stiffness_sections(result, found) if found else []),
+        ],
+    )
+
+
+def _lines(lines: Sequence[str]) -> Text:
+    return Text("\n".join(lines), "lines")
+
+
+def stiffness_sections(calibration: Calibration, found: Sequence[Stiffness]) -> list[ReportSection]:
+    """Return spring constants with what they rest on, doubts about them, a table's line, and what each is worth."""
+    stated, parts = calibration.sweep.instrument.get("spring_constant_n_per_m"), []
+    for one in found:
+        parts += [Text(f"{one.method}: {_in_words(one.value, 'N/m')}"), Bullets(one.assumed)]
+        if stated is not None:
+            apart = 100.0 * (one.value.value / stated - 1.0)
+            parts.append(Text(f"  The instrument says {stated:g} N/m: this {apart:+.1f} %."))
+    sections = [ReportSection("Spring constant", [Text("Spring constant:"), *parts], "Spring constant")]
+    if doubts(found):
+        sections.append(ReportSection("Doubts", [_lines(doubts(found))]))
+    last = found[-1].value
+    if last.standard_error is not None:
+        line = f"# spring_constant_n_per_m = {with_error(last.value, last.standard_error)}"
+        sections.append(ReportSection("For a table", [_lines(["For the top of a table:", line])]))
+    return [*sections, _budget_section(calibration, found)]
+
+
+def slope_report(curves: Sequence[MeasuredCurve], found: Stiffness) -> Report:
+    """Return the sensitivity that force curves give as sections: what it rests on, and what it is worth."""
+    return Report(
+        title=f"deflection_nm_per_volt: {_in_words(found.value, 'nm/V')}, from {curves[0].source}",
+        valid=True,
+        verdict="VALID",
+        reasons=(),
+        sections=[ReportSection("Assumptions", [Bullets(found.assumed, "Assumed:")]), _budget_section(None, [found])],
+    )
+
+
+def _budget_section(calibration: Calibration | None, found: Sequence[Stiffness]) -> ReportSection:
+    """Return what one standard error of each calibrated number changes of the energy of a tap and of a law."""
+    head = ["one standard error of", "is", "of the energy of a tap", "of epsilon", "of 1 - r^2", ""]
+    rows = budget(calibration, found)
+    cells = [[row["quantity"], *(known(row[key], ".2%") for key in ("share", *WORTH)), row["why"]] for row in rows]
+    return ReportSection("What it is worth", [Table("Relative changes", head, cells, words=head[5:])], "Worth")
+
+
+def _in_words(value: CalibratedValue, unit: str) -> str:
+    """Return a value with its error and interval; without error it is no calibration."""
+    low, high = value.interval95
+    if value.standard_error is None or low is None or high is None:
+        return f"{value.value:.3g} {unit}, NOT VALID: no calibration"
+    return f"{with_error(value.value, value.standard_error)} {unit} (95 % {interval(low, high)})"
 
 
 def value_in_words(value: CalibratedValue) -> str:
@@ -101,16 +157,16 @@ def write_calibration(
     result: Calibration,
     folder: Path,
     write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None],
-    text: str,
+    found: Sequence[Stiffness],
     data: dict[str, Any],
 ) -> list[Path]:
-    """Write calibration.txt, calibration.json, calibration.png and calibration_points.csv into a folder.
+    """Write calibration.html, .txt, .json and .png and calibration_points.csv into a folder.
 
     Args:
         result: the calibration.
         folder: an existing folder; files of these names are replaced.
         write_table: called with a file name, records and columns for the CSV file.
-        text: of calibration.txt.
+        found: spring constants of the lever.
         data: of calibration.json.
 
     Returns:
@@ -119,13 +175,19 @@ def write_calibration(
     Raises:
         OSError: if a file cannot be written.
     """
-    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
-    from fitting.report.report import write_report_files  # noqa: PLC0415
-
-    picture = png_of(calibration_figure(result))
-    written = write_report_files(folder, "calibration", text=text, data=data, picture=picture)
+    shows = "Amplitude (and phase) with the fit; below, the misfit, fit less measured."
+    written = write_with_picture(calibration_report(result, found), calibration_figure(result), shows, folder, data)
     write_table("calibration_points.csv", point_records(result), POINT_COLUMNS)
     return written
+
+
+def write_with_picture(report: Report, figure: Figure, shows: str, folder: Path, data: dict[str, Any]) -> list[Path]:
+    """Write calibration.html, .txt, .json and .png: a report with one picture, and its numbers."""
+    # the SVG file has the layout of the PNG drawn before
+    picture = png_of(figure)
+    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
+    page = page_of(replace(report, sections=[seen, *report.sections]))
+    return write_report_files(folder, "calibration", text=text_of(report), data=data, picture=picture, page=page)
 
 
 def _value_cells(name: str, value: CalibratedValue, unit: str) -> list[str]:
@@ -152,7 +214,7 @@ def _comparison_lines(result: Calibration) -> list[str]:
         values = f"{other.frequency_khz:.8g} kHz, Q {other.quality_factor:.6g}{error}"
         per_freedom = other.chi2 / other.degrees_of_freedom
         lines.append(f"  background '{other.background}' instead: {values}, chi2/dof {per_freedom:.3g}")
-    return ["", *lines] if lines else []
+    return lines
 
 
 def _goodness_line(result: Calibration) -> str:
@@ -188,14 +250,14 @@ def calibration_figure(result: Calibration) -> Figure:
     grid[0, 0].legend(fontsize=_SMALL, loc="upper right")
     _mark_instrument(grid[0, 0], result)
     if result.model == "power":
-        _draw_misfit(grid[1, 0], shift, 100.0 * curves.amplitude_misfit / curves.amplitude, "fit - measured\n(%)")
+        _draw_misfit(grid[1, 0], shift, 100.0 * curves.amplitude_misfit / curves.amplitude, "misfit (%)")
     else:
-        _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"fit - measured\n{unit.strip()}".strip())
+        _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"misfit{unit}")
     if result.sweep.phase_deg is not None and curves.phase_deg is not None and curves.phase_misfit_deg is not None:
         measured = np.rad2deg(np.unwrap(np.deg2rad(result.sweep.phase_deg)))
         _draw_curve(grid[0, 1], result, shift, measured, measured + curves.phase_deg - result.sweep.phase_deg)
         label_axes(grid[0, 1], x="", y="phase (degrees)")
-        _draw_misfit(grid[1, 1], shift, curves.phase_misfit_deg, "fit - measured\n(degrees)")
+        _draw_misfit(grid[1, 1], shift, curves.phase_misfit_deg, "misfit (degrees)")
     title = f"f0 = {value_in_words(result.frequency_khz)} kHz,  Q = {value_in_words(result.quality_factor)}"
     title += f"  (background '{result.background}')"
     title = title.replace("+-", "±")

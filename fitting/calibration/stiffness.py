@@ -8,6 +8,7 @@ Sader's method (Sader, Chon, Mulvaney 1999), rectangular levers: k = 0.1906 rho 
 omega b^2/4 eta, with the hydrodynamic function Gamma of Sader 1998. It does not need the scale of the deflection.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -18,7 +19,6 @@ from scipy.special import kv, stdtrit
 from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
-from afm_jax.words import interval, known, text_table, with_error
 from fitting.calibration.result import CalibratedValue, Calibration
 from fitting.instruments.curve import MeasuredCurve
 from fitting.tables.csv_text import TableError
@@ -177,7 +177,7 @@ def _with_share(value: float, share: float) -> CalibratedValue:
 
 
 @checked
-def sensitivity(curves: list[MeasuredCurve]) -> Stiffness:
+def sensitivity(curves: Sequence[MeasuredCurve]) -> Stiffness:
     """Return the sensitivity in nm/V (InvOLS) from the slope of force curves on a hard sample.
 
     The slope is that of the upper half of the deflection in contact; its error the scatter over curves and branches
@@ -225,7 +225,7 @@ def _slope(curve: MeasuredCurve, branch: str) -> tuple[float, float] | None:
     return (float(slope), float(np.sqrt(covariance[0, 0]))) if slope > 0.0 else None
 
 
-def budget(calibration: Calibration | None, found: list[Stiffness]) -> list[dict[str, Any]]:
+def budget(calibration: Calibration | None, found: Sequence[Stiffness]) -> list[dict[str, Any]]:
     """Return what each calibrated number is worth: shares of the energy of a tap and of the law's parameters.
 
     On resonance the energy of a tap is pi k A (A0 sin(phi) - A)/Q: in proportion to k and to 1/Q, to first order
@@ -256,7 +256,7 @@ def _worth(name: str, value: CalibratedValue, times: tuple[float, ...], why: str
     return {"quantity": name, "share": share, **worth, "why": why}
 
 
-def disagreement(found: list[Stiffness], stated_n_per_m: float | None = None) -> str | None:
+def disagreement(found: Sequence[Stiffness], stated_n_per_m: float | None = None) -> str | None:
     """Return what a spring constant by equipartition says about the scale of the deflection; None if all agree.
 
     Args:
@@ -283,52 +283,21 @@ def disagreement(found: list[Stiffness], stated_n_per_m: float | None = None) ->
     )
 
 
-def uncalibrated(found: list[Stiffness]) -> str | None:
+def uncalibrated(found: Sequence[Stiffness]) -> str | None:
     """Return why none of the spring constants that were found is a calibration; None if one is."""
-    doubts = _doubts(found)
-    return f"The spring constant is not calibrated. {doubts[0]}" if doubts and len(doubts) == len(found) else None
+    why = doubts(found)
+    return f"The spring constant is not calibrated. {why[0]}" if why and len(why) == len(found) else None
 
 
-def _doubts(found: list[Stiffness]) -> list[str]:
+def doubts(found: Sequence[Stiffness]) -> list[str]:
+    """Return why spring constants are no calibration, of those that are none."""
     return [one.value.interval_reason or "" for one in found if one.value.standard_error is None]
 
 
-def _in_words(value: CalibratedValue, unit: str) -> str:
-    """Return a value with its error and interval; without error it is no calibration."""
-    low, high = value.interval95
-    if value.standard_error is None or low is None or high is None:
-        return f"{value.value:.3g} {unit}, NOT VALID: no calibration"
-    return f"{with_error(value.value, value.standard_error)} {unit} (95 % {interval(low, high)})"
-
-
-def stiffness_lines(calibration: Calibration | None, found: list[Stiffness]) -> list[str]:
-    """Return spring constants, sensitivity and budget as lines of text."""
-    stated = None if calibration is None else calibration.sweep.instrument.get("spring_constant_n_per_m")
-    lines = []
-    for one in found:
-        name, unit = ("deflection_nm_per_volt", "nm/V") if one.method == "slope" else (one.method, "N/m")
-        lines.append(f"{name}: {_in_words(one.value, unit)}")
-        lines += [f"  - {text}" for text in one.assumed]
-        if stated is not None:
-            lines.append(
-                f"  The instrument says {stated:g} N/m: this {100.0 * (one.value.value / stated - 1.0):+.1f} %."
-            )
-    notes = _doubts(found)
-    lines += ["", *notes] if notes else []
-    if calibration is not None and found[-1].value.standard_error is not None:
-        line = f"# spring_constant_n_per_m = {with_error(found[-1].value.value, found[-1].value.standard_error)}"
-        lines += ["", "For the top of a table:", line]
-    keys = ("share", *WORTH)
-    rows = budget(calibration, found)
-    cells = [[row["quantity"], *(known(row[key], ".2%") for key in keys), row["why"]] for row in rows]
-    head = ["one standard error of", "is", "of the energy of a tap", "of epsilon", "of 1 - r^2", ""]
-    return [*lines, "", *text_table(head, cells, words=(0, 5))]
-
-
-def stiffness_payload(calibration: Calibration, found: list[Stiffness]) -> dict[str, Any]:
+def stiffness_payload(calibration: Calibration, found: Sequence[Stiffness]) -> dict[str, Any]:
     """Return spring constants and budget as plain lists, numbers and strings."""
     named = {one.method.lower(): asdict(one.value) | {"assumed": list(one.assumed)} for one in found}
-    found_out = {"note": next(iter(_doubts(found)), None)}
+    found_out = {"note": next(iter(doubts(found)), None)}
     reason = uncalibrated(found)
     if reason is not None:
         found_out |= {"valid": False, "reasons": [*calibration.reasons, reason]}

@@ -21,6 +21,7 @@ passed over.
 import contextlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,29 +38,35 @@ from fitting.tables.csv_text import (
     FileSetting,
     Form,
     TableError,
-    beyond,
-    check_not_empty,
     column_of,
-    named_rows,
-    parse_cells,
-    parse_rows,
+    columns_of_rows,
+    read_columns,
     read_text,
-    said_beyond,
-    settings_in,
-    split_lines,
 )
 
 HZ_PER_KHZ = 1e3
 
+DENSITY = "nm/sqrt(Hz)"
+"""The unit that makes a sweep a thermal spectrum."""
+
+
+def _in_khz(hertz: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:
+    return hertz / HZ_PER_KHZ
+
+
+def _root(power: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:
+    return np.sqrt(np.maximum(power, 0.0))
+
+
 SWEEP = Form(
     (
         Column("frequency_khz", needed="frequency"),
-        Column("frequency_hz", meaning="frequency_khz", needed="frequency"),
-        Column("amplitude_nm", meaning="amplitude", needed="amplitude"),
-        Column("amplitude", meaning="amplitude", needed="amplitude"),
-        Column("asd_nm_per_sqrt_hz", meaning="amplitude", needed="amplitude"),
-        Column("psd_nm2_per_hz", meaning="amplitude", needed="amplitude"),
-        Column("phase_deg"),
+        Column("frequency_hz", meaning="frequency_khz", needed="frequency", convert=_in_khz),
+        Column("amplitude_nm", kind="not negative", meaning="amplitude", needed="amplitude"),
+        Column("amplitude", kind="not negative", needed="amplitude"),
+        Column("asd_nm_per_sqrt_hz", kind="not negative", meaning="amplitude", needed="amplitude"),
+        Column("psd_nm2_per_hz", kind="not negative", meaning="amplitude", needed="amplitude", convert=_root),
+        Column("phase_deg", kind="number"),
         Column("amplitude_error_nm", meaning="amplitude_error"),
         Column("amplitude_error"),
         Column("phase_error_deg"),
@@ -67,115 +74,72 @@ SWEEP = Form(
     "point",
     separators=" (Nanonis text needs its line [DATA])",
 )
-"""The columns a file may have, and the attribute of `ResonanceSweep` that each becomes."""
+"""The columns that a CSV file may have, and the attribute of `ResonanceSweep` that each becomes."""
+_UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}
+_SETTINGS = {"averages": FileSetting("averages", "1000", lowest=0.5)}
 
-
-DENSITY = "nm/sqrt(Hz)"
-"""The unit that makes a sweep a thermal spectrum."""
-SPECTRUM_SETTINGS = {"averages": FileSetting("averages", "1000", lowest=0.5)}
-
-
-@dataclass(frozen=True)
-class ParsedSweep:
-    """What a file says, in the names and units of `ResonanceSweep`."""
-
-    columns: dict[str, Float[np.ndarray, " points"]]
-    lines: Int[np.ndarray, " points"]
-    amplitude_unit: str
-    instrument: dict[str, float] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    averages: float | None = None
-
-
-def parse_csv(text: str, faults: Faults) -> ParsedSweep:
-    """Read the text of a CSV file.
-
-    Args:
-        text: all of it.
-        faults: where faults are noted; with any, the result is not to be used.
-
-    Raises:
-        TableError: at once where the column names are wrong: the cells below them cannot be judged.
-    """
-    comments, rows = split_lines(text)
-    settings, _ = settings_in(comments, SPECTRUM_SETTINGS, faults)
-    check_not_empty(comments, rows, faults)
-    head, rows = named_rows(rows, SWEEP, faults)
-    faults.raise_any()
-    columns, _, lines = parse_rows(rows, head.names, SWEEP, faults)
-    if "frequency_hz" in columns:
-        columns["frequency_hz"] = columns["frequency_hz"] / HZ_PER_KHZ
-    unit = "nm" if "amplitude_nm" in columns else ""
-    if "psd_nm2_per_hz" in columns:
-        columns["psd_nm2_per_hz"] = np.sqrt(np.maximum(columns["psd_nm2_per_hz"], 0.0))
-    if {"psd_nm2_per_hz", "asd_nm_per_sqrt_hz"} & set(columns):
-        unit = DENSITY
-    attributes = {column.says: columns[column.name] for column in SWEEP.columns if column.name in columns}
-    remarks = tuple(remark for _, remark in comments)
-    return ParsedSweep(attributes, lines, unit, remarks=remarks, averages=settings.get("averages", (None,))[0])
-
-
-MARK = "[DATA]"
-"""The line above the block of data."""
-
-SHIFT, CENTRE, FREQUENCY = "Frequency Shift (Hz)", "Center Frequency (Hz)", "Frequency (Hz)"
-AMPLITUDE, PHASE = "Amplitude (m)", "Phase (deg)"
-NM_PER_M = 1e9
-_FOUND = {"f_res (Hz)": ("frequency_khz", 1.0 / HZ_PER_KHZ), "Q": ("quality_factor", 1.0)}
+_MARK = "[DATA]"
+"""The line above the block of data of Nanonis text."""
+_SHIFT, _CENTRE = "Frequency Shift (Hz)", "Center Frequency (Hz)"
+NANONIS = Form(
+    (
+        Column("Frequency (Hz)", meaning="frequency_khz", needed="frequency", convert=_in_khz),
+        Column(_SHIFT, needed="frequency"),
+        Column(_CENTRE),
+        Column("Amplitude (m)", meaning="amplitude", needed="amplitude", convert=lambda metres: metres * 1e9),
+        Column("Phase (deg)", meaning="phase_deg"),
+    ),
+    "point",
+    open=True,
+    separator="\t",
+)
+"""The columns of Nanonis text that are read."""
+_FOUND = {"f_res (Hz)": ("frequency_khz", HZ_PER_KHZ), "Q": ("quality_factor", 1.0)}
 _REMARKS = ("Experiment", "Date", "User", "Comment01")
 
 
-def parse_nanonis(text: str, faults: Faults) -> ParsedSweep:
-    """Read the text of a Nanonis file.
+def _parse_nanonis(text: str, faults: Faults) -> dict[str, Any]:
+    """Return what a Nanonis file says, by the names of `ResonanceSweep`.
 
     Args:
-        text: all of it; one of its lines is `MARK`.
+        text: all of it; one of its lines is `[DATA]`.
         faults: where faults are noted; with any, the result is not to be used.
 
     Raises:
         TableError: at once where a column is missing: the cells cannot be judged then.
     """
     lines = list(enumerate(text.split("\n"), start=1))
-    start = next(position for position, (_, line) in enumerate(lines) if line.strip() == MARK)
-    header = [_cells(line) for _, line in lines[:start]]
+    start = next(position for position, (_, line) in enumerate(lines) if line.strip() == _MARK)
+    header = [[cell.strip() for cell in line.split("\t")] for _, line in lines[:start]]
     settings = {cells[0]: cells[1] for cells in header if len(cells) > 1 and cells[1]}
-    rows = [(number, _cells(line)) for number, line in lines[start + 1 :] if line.strip()]
+    rows = [(number, line) for number, line in lines[start + 1 :] if line.strip()]
     if not rows:
-        faults.add(f"there is nothing below {MARK}; export the sweep again", line=lines[start][0])
-        faults.raise_any()
-    names_line, names = rows.pop(0)
-    by_shift = FREQUENCY not in names
-    wanted = ([SHIFT, CENTRE] if by_shift else [FREQUENCY]) + [AMPLITUDE]
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        what = "column is" if len(missing) == 1 else "columns are"
-        faults.add(f"the {what} missing: {', '.join(missing)}; export the sweep with it", line=names_line)
-    elif not rows:
-        faults.add("there are column names but no rows below them; export the sweep again", line=names_line)
-    faults.raise_any()
-    wanted += [PHASE] if PHASE in names else []
-    columns, _, numbers = parse_cells(rows, names, wanted, SWEEP, faults)
-    frequency_hz = columns[SHIFT] + columns[CENTRE] if by_shift else columns[FREQUENCY]
-    attributes = {"frequency_khz": frequency_hz / HZ_PER_KHZ, "amplitude": columns[AMPLITUDE] * NM_PER_M}
-    if PHASE in columns:
-        attributes["phase_deg"] = columns[PHASE]
+        faults.fail(f"there is nothing below {_MARK}; export the sweep again", line=lines[start][0])
+    columns, names, numbers = columns_of_rows(rows, NANONIS, faults)
+    if "frequency_khz" not in columns:
+        if _CENTRE not in names:
+            faults.fail(f'the column "{_CENTRE}" is missing; add it', line=rows[0][0])
+        columns["frequency_khz"] = _in_khz(columns[_SHIFT] + columns[_CENTRE])
     found = {
-        key: float(settings[name]) * factor
-        for name, (key, factor) in _FOUND.items()
+        key: float(settings[name]) / unit
+        for name, (key, unit) in _FOUND.items()
         if NUMBER.fullmatch(settings.get(name, ""))
     }
     remarks = tuple(f"{name}: {settings[name]}" for name in _REMARKS if name in settings)
-    return ParsedSweep(attributes, numbers, "nm", instrument=found, remarks=remarks)
+    own = {name: columns[name] for name in _COLUMNS if name in columns}
+    return own | {"amplitude_unit": "nm", "instrument": found, "lines": numbers, "remarks": remarks}
 
 
-def _cells(text: str) -> list[str]:
-    cells = [cell.strip() for cell in text.split("\t")]
-    # The header's lines end with a tab, those of the data may.
-    return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
+def _parse_csv(text: str, faults: Faults) -> dict[str, Any]:
+    """Return what a CSV file says, by the names of `ResonanceSweep`."""
+    table = read_columns(text, SWEEP, _SETTINGS, faults)
+    unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
+    averages, _ = table.settings.get("averages", (None, None))
+    found = {"amplitude_unit": unit, "averages": averages, "lines": table.lines, "remarks": table.remarks}
+    return table.columns | found
 
 
 _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase_error_deg")
-_POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
 
 
 @public_result()
@@ -224,7 +188,7 @@ class ResonanceSweep(Result):
         _check_pairs(arrays, faults)
         faults.raise_any()
         for name, values in arrays.items():
-            _check_numbers(name, values, lines, faults)
+            SWEEP.check_numbers(name, values, lines, faults)
         faults.raise_any()
         # The sort is stable: repeated measurements at one frequency keep their order.
         order = np.argsort(arrays["frequency_khz"], kind="stable")
@@ -266,20 +230,6 @@ def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -
         faults.add("the phase has errors but the amplitude has none; add amplitude_error or remove phase_error_deg")
 
 
-def _check_numbers(
-    name: str, values: Float[np.ndarray, " points"], lines: Int[np.ndarray, " points"], faults: Faults
-) -> None:
-    bad, what = ~np.isfinite(values), "must be finite"
-    if name in _POSITIVE:
-        bad, what = bad | (values <= 0.0), "must be finite and above 0"
-    elif name == "amplitude":
-        bad, what = bad | (values < 0.0), "must be finite and not negative"
-    far = beyond(values, positive=name in _POSITIVE or name == "amplitude")
-    for row in np.flatnonzero(bad | far):
-        number, must = repr(float(values[row])).removesuffix(".0"), said_beyond(values[row]) if far[row] else what
-        faults.add(f"{must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
-
-
 @checked
 def read_sweep(path: str | Path) -> ResonanceSweep:
     """Read a free resonance sweep from plain CSV or Nanonis text, or a thermal spectrum, and check all of it.
@@ -301,24 +251,10 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
                 "curves, `afm-jax tapping` the energy of a tap off amplitude and phase"
             )
     text = read_text(path)
-    parse = parse_nanonis if any(line.strip() == MARK for line in text.split("\n")) else parse_csv
-    parsed = parse(text, faults)
+    parse = _parse_nanonis if any(line.strip() == _MARK for line in text.split("\n")) else _parse_csv
+    found = parse(text, faults)
     faults.raise_any()
-    arrays = {name: parsed.columns.get(name) for name in _COLUMNS}
-    frequency, amplitude = arrays.pop("frequency_khz"), arrays.pop("amplitude")
-    if frequency is None or amplitude is None:
-        raise TableError(f"{path}: the frequency or the amplitude is missing; add its column")
-    return ResonanceSweep(
-        frequency_khz=frequency,
-        amplitude=amplitude,
-        **arrays,
-        amplitude_unit=parsed.amplitude_unit,
-        instrument=parsed.instrument,
-        source=str(path),
-        averages=parsed.averages,
-        lines=parsed.lines,
-        remarks=parsed.remarks,
-    )
+    return ResonanceSweep(**found, source=str(path))
 
 
 def _spectrum_of(recording: Recording) -> ResonanceSweep:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.words import counted
 from fitting.calibration.model import SweepFit
 from fitting.calibration.result import Alternative, CalibratedValue
@@ -43,122 +44,57 @@ class SweepEvidence:
     chi2_without: float
     alternatives: list[Alternative]
 
+    @property
+    def per_freedom(self) -> float:
+        """Chi2 over the degrees of freedom."""
+        return self.fit.chi2 / self.fit.freedom
+
+    @property
+    def half_width_khz(self) -> float:
+        """Half-width of the resonance, f0/2Q."""
+        return self.frequency.value / self.quality_factor.value / 2.0
+
+    @property
+    def below(self) -> float:
+        """How many half-widths the scan reaches below the resonance."""
+        return float((self.frequency.value - self.sweep.frequency_khz[0]) / self.half_width_khz)
+
+    @property
+    def above(self) -> float:
+        """How many half-widths the scan reaches above the resonance."""
+        return float((self.sweep.frequency_khz[-1] - self.frequency.value) / self.half_width_khz)
+
+    @property
+    def reach(self) -> float:
+        """Half-widths to the nearer end of the scan; negative where the resonance lies outside."""
+        return min(self.below, self.above)
+
+    @property
+    def side(self) -> str:
+        """Which end of the scan is the nearer one."""
+        return "lower" if self.below < self.above else "upper"
+
+    @property
+    def inside(self) -> int:
+        """Points within the half-width."""
+        return int(np.sum(np.abs(self.sweep.frequency_khz - self.frequency.value) < self.half_width_khz))
+
+    @property
+    def wider(self) -> list[float]:
+        """By how much the residuals' correlation widens the errors of frequency and quality factor."""
+        return inflation_of(self.fit).tolist()
+
+    @property
+    def better(self) -> list[tuple[Alternative, float]]:
+        """The background that describes the scan clearly better, if there is one, and by how much its AIC is lower."""
+        best = _better(self.fit, self.alternatives)
+        return [] if best is None else [(best, self.fit.chi2 + 2.0 * len(self.fit.values) - best.aic)]
+
 
 def judge_calibration(evidence: SweepEvidence) -> tuple[list[str], list[str]]:
     """Return what makes a calibration invalid, and its warnings; each a sentence."""
-    return _reasons(evidence), _warnings(evidence)
-
-
-def half_widths(evidence: SweepEvidence) -> tuple[float, float]:
-    """Return how many half-widths f0/2Q the sweep reaches below and above the resonance."""
-    frequency, half = evidence.frequency.value, evidence.frequency.value / evidence.quality_factor.value / 2.0
-    measured = evidence.sweep.frequency_khz
-    return float((frequency - measured[0]) / half), float((measured[-1] - frequency) / half)
-
-
-def _reasons(evidence: SweepEvidence) -> list[str]:
-    fit, reasons = evidence.fit, []
-    per_freedom = fit.chi2 / fit.freedom
-    if evidence.chi2_without - fit.chi2 < _PEAK * max(per_freedom, 1e-300):
-        reasons.append("No resonance stands out of the sweep: a parabola explains it about as well.")
-    if fit.convergence.reason is not None:
-        reasons.append(f"Not converged: {fit.convergence.reason}.")
-    elif not np.all(np.isfinite(fit.covariance)):
-        reasons.append(
-            "Not identified: the sweep does not determine frequency, quality factor and background together."
-        )
-    elif not fit.convergence.converged:
-        distance = fit.convergence.estimated_distance
-        reasons.append(f"Not converged: chi2 lies an estimated {distance:.2g} above its minimum.")
-    reasons += _range_reasons(evidence)
-    if evidence.p_value < IMPROBABLE:
-        reasons.append(
-            f"The model does not explain the sweep: chi2/dof = {per_freedom:.3g} (probability {evidence.p_value:.1g}). "
-            "The background may be another one, the frequency may have drifted, the resonance may be nonlinear, or the "
-            "errors are too small."
-        )
-    if evidence.autocorrelation > _SYSTEMATIC:
-        reasons.append(
-            f"Neighbouring residuals are strongly correlated ({evidence.autocorrelation:+.2f}): the model misses "
-            "something (another background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
-        )
-    for name, value in (("frequency_khz", evidence.frequency), ("quality_factor", evidence.quality_factor)):
-        if value.interval95 == (None, None) and not reasons:
-            reasons.append(f"{name} is not identified: {value.interval_reason}.")
-    return reasons
-
-
-def _range_reasons(evidence: SweepEvidence) -> list[str]:
-    """Say where the sweep does not hold the resonance: outside, at the edge, or between two points."""
-    below, above = half_widths(evidence)
-    frequency = evidence.frequency.value
-    if below < 0.0 or above < 0.0:
-        return [f"The resonance ({frequency:.6g} kHz) lies outside the sweep: sweep around it."]
-    if min(below, above) < 1.0:
-        side = "lower" if below < above else "upper"
-        message = (
-            f"The resonance ({frequency:.6g} kHz) lies at the {side} edge of the sweep, {min(below, above):.2g} "
-            "half-widths from it: sweep at least one half-width (f0/2Q) to both sides."
-        )
-        return [message]
-    half = frequency / evidence.quality_factor.value / 2.0
-    inside = int(np.sum(np.abs(evidence.sweep.frequency_khz - frequency) < half))
-    if inside < 3:
-        return [f"Only {counted(inside, 'point')} within the half-width of the resonance: sweep in finer steps."]
-    return []
-
-
-def _warnings(evidence: SweepEvidence) -> list[str]:
-    sweep, fit, warnings = evidence.sweep, evidence.fit, []
-    if evidence.frequency.value > _FAST_KHZ:
-        warnings.append(
-            f"A resonance of {evidence.frequency.value:.6g} kHz is beyond any cantilever's: if the frequencies "
-            "are in Hz, name their column frequency_hz."
-        )
-    if sweep.reordered:
-        warnings.append("The frequencies did not rise from point to point: the points were sorted.")
-    if fit.reverse:
-        warnings.append("The phase rises through the resonance: it was taken with the opposite sign.")
-    below, above = half_widths(evidence)
-    if 1.0 <= min(below, above) < 2.0:
-        warnings.append(
-            f"The sweep reaches {below:.1f} half-widths below and {above:.1f} above the resonance: frequency, quality "
-            "factor and background are hard to tell apart."
-        )
-    if fit.errors.origin == "estimated" or fit.errors.scale is not None:
-        how = "estimated from the misfit" if fit.errors.scale is None else f"scaled by {fit.errors.scale:.3g}"
-        warnings.append(f"The points' errors were {how} so that chi2/dof = 1: the goodness of fit cannot be judged.")
-    elif evidence.p_value > 1.0 - 1e-6:
-        warnings.append("The errors look too large: chi2 is improbably small.")
-    return warnings + _residual_warnings(evidence) + _background_warnings(evidence)
-
-
-def _residual_warnings(evidence: SweepEvidence) -> list[str]:
-    correlation, warnings = evidence.autocorrelation, []
-    if 3.0 / np.sqrt(evidence.fit.data) < correlation <= _SYSTEMATIC:
-        warnings.append(
-            f"Neighbouring residuals are correlated ({correlation:+.2f}): something systematic is left, or a filter "
-            "joins neighbouring points."
-        )
-    wider = inflation_of(evidence.fit).tolist()
-    if max(wider) > _WIDER:
-        warnings.append(
-            f"The residuals' correlation widens the errors of frequency_khz {wider[0]:.2g} and of quality_factor "
-            f"{wider[1]:.2g} times; that is in what is stated."
-        )
-    if evidence.repeat is not None:
-        lag, strength = evidence.repeat
-        warnings.append(
-            f"The residuals repeat every {lag} points (correlation {strength:+.2f}): something periodic, such as a "
-            "drive whose frequency is rounded to steps of its own, not noise."
-        )
-    elif abs(evidence.runs_excess) > 4.0:
-        what = "fewer" if evidence.runs_excess < 0 else "more"
-        warnings.append(
-            f"The amplitude's residuals change their sign {what} often than chance allows "
-            f"({abs(evidence.runs_excess):.1f} standard deviations)."
-        )
-    return warnings
+    # what is not identified is said where nothing else explains it
+    return judge(REASONS, evidence) or judge([_UNIDENTIFIED], evidence)[:1], judge(WARNINGS, evidence)
 
 
 def preferred(fit: SweepFit, background: str, alternatives: list[Alternative]) -> str:
@@ -198,20 +134,6 @@ def inflation_of(fit: SweepFit) -> Float[np.ndarray, "2"]:
     wide, narrow = (np.diag(inverse @ middle @ inverse)[:2] for middle in (long_run, independent))
     known = (narrow > 0.0) & (wide > narrow)
     return np.where(known, np.sqrt(np.where(known, wide, 1.0) / np.where(known, narrow, 1.0)), 1.0)
-
-
-def _background_warnings(evidence: SweepEvidence) -> list[str]:
-    """Name the background that describes the sweep better than the one chosen, and what it would make of Q."""
-    own = evidence.fit.chi2 + 2.0 * len(evidence.fit.values)
-    best = _better(evidence.fit, evidence.alternatives)
-    if best is None:
-        return []
-    message = (
-        f"The background '{best.background}' describes the sweep better (AIC lower by {own - best.aic:.0f}) and gives "
-        f"{best.frequency_khz:.7g} kHz and Q = {best.quality_factor:.5g}: choose it with "
-        f"--background {best.background}."
-    )
-    return [message]
 
 
 _LONGEST = 12
@@ -255,3 +177,122 @@ def runs_excess(fit: SweepFit, residual: Float[np.ndarray, " n"]) -> float:
     expected = pairs / total + 1.0
     variance = pairs * (pairs - total) / (total**2 * (total - 1.0))
     return float((runs - expected) / np.sqrt(variance))
+
+
+def _unidentified(evidence: SweepEvidence) -> list[str]:
+    found = {"frequency_khz": evidence.frequency, "quality_factor": evidence.quality_factor}
+    return [
+        f"{name} is not identified: {v.interval_reason}" for name, v in found.items() if v.interval95 == (None, None)
+    ]
+
+
+_UNIDENTIFIED = Rule(_unidentified, "{case}.")
+
+REASONS: Rules[SweepEvidence] = [
+    Rule(
+        lambda e: e.chi2_without - e.fit.chi2 < _PEAK * max(e.per_freedom, 1e-300),
+        "No resonance stands out of the sweep: a parabola explains it about as well.",
+    ),
+    (
+        Rule(lambda e: e.fit.convergence.reason is not None, "Not converged: {e.fit.convergence.reason}."),
+        Rule(
+            lambda e: not np.all(np.isfinite(e.fit.covariance)),
+            "Not identified: the sweep does not determine frequency, quality factor and background together.",
+        ),
+        Rule(
+            lambda e: not e.fit.convergence.converged,
+            "Not converged: chi2 lies an estimated {e.fit.convergence.estimated_distance:.2g} above its minimum.",
+        ),
+    ),
+    (
+        Rule(
+            lambda e: e.reach < 0.0,
+            "The resonance ({e.frequency.value:.6g} kHz) lies outside the sweep: sweep around it.",
+        ),
+        Rule(
+            lambda e: e.reach < 1.0,
+            "The resonance ({e.frequency.value:.6g} kHz) lies at the {e.side} edge of the sweep, {e.reach:.2g} "
+            "half-widths from it: sweep at least one half-width (f0/2Q) to both sides.",
+        ),
+        Rule(
+            lambda e: e.inside < 3,
+            lambda e, _: (
+                f"Only {counted(e.inside, 'point')} within the half-width of the resonance: sweep in finer steps."
+            ),
+        ),
+    ),
+    Rule(
+        lambda e: e.p_value < IMPROBABLE,
+        "The model does not explain the sweep: chi2/dof = {e.per_freedom:.3g} (probability {e.p_value:.1g}). The "
+        "background may be another one, the frequency may have drifted, the resonance may be nonlinear, or the errors "
+        "are too small.",
+    ),
+    Rule(
+        lambda e: e.autocorrelation > _SYSTEMATIC,
+        "Neighbouring residuals are strongly correlated ({e.autocorrelation:+.2f}): the model misses something "
+        "(another background, drift, a second resonance, too fast a sweep), and the errors mean nothing.",
+    ),
+]
+"""What makes a calibration invalid."""
+
+WARNINGS: Rules[SweepEvidence] = [
+    Rule(
+        lambda e: e.frequency.value > _FAST_KHZ,
+        "A resonance of {e.frequency.value:.6g} kHz is beyond any cantilever's: if the frequencies are in Hz, name "
+        "their column frequency_hz.",
+    ),
+    Rule(
+        lambda e: e.sweep.reordered,
+        "The frequencies did not rise from point to point: the points were sorted.",
+    ),
+    Rule(lambda e: e.fit.reverse, "The phase rises through the resonance: it was taken with the opposite sign."),
+    Rule(
+        lambda e: 1.0 <= e.reach < 2.0,
+        "The sweep reaches {e.below:.1f} half-widths below and {e.above:.1f} above the resonance: frequency, quality "
+        "factor and background are hard to tell apart.",
+    ),
+    (
+        Rule(
+            lambda e: e.fit.errors.scale is not None,
+            "The points' errors were scaled by {e.fit.errors.scale:.3g} so that chi2/dof = 1: the goodness of fit "
+            "cannot be judged.",
+        ),
+        Rule(
+            lambda e: e.fit.errors.origin == "estimated",
+            "The points' errors were estimated from the misfit so that chi2/dof = 1: the goodness of fit cannot be "
+            "judged.",
+        ),
+        Rule(lambda e: e.p_value > 1.0 - 1e-6, "The errors look too large: chi2 is improbably small."),
+    ),
+    Rule(
+        lambda e: 3.0 / np.sqrt(e.fit.data) < e.autocorrelation <= _SYSTEMATIC,
+        "Neighbouring residuals are correlated ({e.autocorrelation:+.2f}): something systematic is left, or a filter "
+        "joins neighbouring points.",
+    ),
+    Rule(
+        lambda e: max(e.wider) > _WIDER,
+        "The residuals' correlation widens the errors of frequency_khz {e.wider[0]:.2g} and of quality_factor "
+        "{e.wider[1]:.2g} times; that is in what is stated.",
+    ),
+    (
+        Rule(
+            lambda e: e.repeat is not None,
+            "The residuals repeat every {e.repeat[0]} points (correlation {e.repeat[1]:+.2f}): something periodic, "
+            "such as a drive whose frequency is rounded to steps of its own, not noise.",
+        ),
+        Rule(
+            lambda e: abs(e.runs_excess) > 4.0,
+            lambda e, _: (
+                f"The amplitude's residuals change their sign {'fewer' if e.runs_excess < 0 else 'more'} often than "
+                f"chance allows ({abs(e.runs_excess):.1f} standard deviations)."
+            ),
+        ),
+    ),
+    Rule(
+        lambda e: e.better,
+        "The background '{case[0].background}' describes the sweep better (AIC lower by {case[1]:.0f}) and gives "
+        "{case[0].frequency_khz:.7g} kHz and Q = {case[0].quality_factor:.5g}: choose it with --background "
+        "{case[0].background}.",
+    ),
+]
+"""What a reader should know besides."""

@@ -25,7 +25,7 @@ from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import ROLES, ColumnSource, example_of_columns, laid_out, parse_columns, turns_of
 from fitting.instruments.formats import read_recording
 from fitting.instruments.lag import free_lag_deg, sense_of
-from fitting.instruments.recording import ASSUMED_RESONANCE, UNITS, Known, Recording, Segment
+from fitting.instruments.recording import ASSUMED_RESONANCE, UNITS, Known, Recording, Segment, given_numbers
 from fitting.tables.csv_text import TableError
 
 FORMAT_VERSION = 1
@@ -160,7 +160,10 @@ def read_curves(
         raise ValueError(f"`drive` must be base or force, but is {drive!r}")
     if bin_nm is not None and not 0.0 <= bin_nm < np.inf:
         raise ValueError(f"`bin_nm` must be finite and not below 0, but is {bin_nm!r}")
-    given = {key: _given(key, value) for key, value in numbers.items() if value is not None}
+    of_slope = numbers.get("nm_per_volt") == "slope"
+    given = given_numbers(
+        numbers | ({"nm_per_volt": None} if of_slope else {}), OPTIONS, any_sign=("offset_origin_nm",)
+    )
     wanted = parse_columns(columns) if isinstance(columns, str) and columns else dict(columns or {})
     recording = read_recording(path)
     _refuse_others(recording)
@@ -168,12 +171,11 @@ def read_curves(
     recording, wanted = laid_out(recording, wanted)
     known = dict(recording.known)
     known["drive"] = Known(drive, "", "option --drive") if drive else Known("base", "", _ASSUMED_BASE)
-    known |= {key: one for key, one in given.items() if one.value != "slope"}
+    known |= given
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
         # lock-ins are tuned to the resonance before a curve is taken
         free = known["free_frequency_khz"]
         known["drive_frequency_khz"] = Known(free.value, "kHz", ASSUMED_RESONANCE)
-    of_slope = "nm_per_volt" in given and given["nm_per_volt"].value == "slope"
     places = list(dict.fromkeys(segment.curve for segment in recording.segments))
     curves = []
     for place in places:
@@ -188,23 +190,6 @@ def read_curves(
 
 
 _ASSUMED_BASE = "assumed: shaken at its base by a piezo; --drive force for a photothermal or magnetic drive"
-
-
-def _given(key: str, value: Any) -> Known:
-    """Return an option as something known.
-
-    Raises:
-        ValueError: if there is none of this name, or its value is impossible.
-    """
-    if key not in OPTIONS:
-        raise TypeError(f"there is no option `{key}`; it is one of {', '.join(OPTIONS)}")
-    origin = f"option --{key.replace('_', '-')}"
-    if value == "slope" and key == "nm_per_volt":
-        return Known("slope", "", origin)
-    number, error = value if isinstance(value, tuple) else (float(value), None)
-    if not np.isfinite(number) or (key != "offset_origin_nm" and number <= 0.0) or not (error is None or error > 0.0):
-        raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
-    return Known(float(number), OPTIONS[key], origin, error)
 
 
 def _refuse_others(recording: Recording) -> None:

@@ -449,21 +449,6 @@ def _by_branch(
     return tuple(Segment(1, b, {name: values[mask] for name, values in columns.items()}) for b, mask in masks.items())
 
 
-def _package(name: str, suffix: str) -> Any:
-    """Import a package that reads one format.
-
-    Raises:
-        TableError: if it is missing; the line names the extra.
-    """
-    try:
-        return import_module(name)
-    except ModuleNotFoundError:
-        package = name.partition(".")[0]
-        raise TableError(
-            f"{suffix} files are read by the package {package}; install it with: pip install 'afm-jax[instruments]'"
-        ) from None
-
-
 _IGOR_KEYS = {
     "SpringConstant": ("spring_constant_n_per_m", "N/m"),
     "DriveFrequency": ("drive_frequency_khz", "Hz"),
@@ -476,10 +461,18 @@ _IGOR_UNITS = {"amp": "m", "defl": "m", "zsnsr": "m", "raw": "m", "lvdt": "m", "
 
 
 def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, str], dict[str, Known]]:
-    """Return the numbers of an Igor binary wave, the names of its channels, its note and what that says."""
+    """Return the numbers of an Igor binary wave, the names of its channels, its note and what that says.
+
+    Raises:
+        TableError: if it is damaged, or the package that reads it is missing; the line names the extra.
+    """
     if len(data) < 64 or _igor_points(data) > min(len(data), MOST_VALUES):
         raise cut_off(name, "the header announces more numbers than the file holds")
-    package = _package("igor2.binarywave", ".ibw")
+    try:
+        package: Any = import_module("igor2.binarywave")
+    except ModuleNotFoundError:
+        install = "install it with: pip install 'afm-jax[instruments]'"
+        raise TableError(f".ibw files are read by the package igor2; {install}") from None
     # of a damaged file it would log every number
     logging.getLogger("igor2").setLevel(logging.CRITICAL)
     with warnings.catch_warnings():

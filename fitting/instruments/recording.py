@@ -5,9 +5,10 @@ by those who read it further.
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -163,6 +164,34 @@ def known_from(
         if quantity == HEADER_KEYS[key]:
             # twelve digits: a change of unit must not add others
             found[key] = Known(float(f"{said[0] * factor:.12g}"), _NATIVE.get(quantity, ""), f"{where}: {name}")
+    return found
+
+
+def given_numbers(
+    numbers: Mapping[str, Any], units: Mapping[str, str], *, any_sign: Sequence[str] = ()
+) -> dict[str, Known]:
+    """Return what a caller gives of the instrument, by name.
+
+    Args:
+        numbers: each a number or a pair with its standard error; None: not given.
+        units: of those that may be given.
+        any_sign: those that need not be above 0.
+
+    Raises:
+        TypeError: if there is none of a name.
+        ValueError: if a value is impossible.
+    """
+    found = {}
+    for key, value in numbers.items():
+        if key not in units:
+            raise TypeError(f"there is no option `{key}`; it is one of {', '.join(units)}")
+        if value is None:
+            continue
+        number, error = value if isinstance(value, tuple) else (float(value), None)
+        sound = np.isfinite(number) and (number > 0.0 or key in any_sign) and (error is None or error > 0.0)
+        if not sound:
+            raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
+        found[key] = Known(float(number), units[key], f"option --{key.replace('_', '-')}", error)
     return found
 
 

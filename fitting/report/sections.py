@@ -173,7 +173,17 @@ def page_of(report: Report, lead: Sequence[Part] = (), words: str = "") -> str:
     lead = [with_signs(part) for part in (*map(Text, report.about), *lead)]
     sections = [replace(one, parts=[with_signs(part) for part in one.parts]) for one in report.sections]
     shown = replace(report, sections=sections)
-    return page("page.html.jinja", result=shown, title=report.title, lead=lead, words=in_signs(words or verdict))
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        finalize=_allowed,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("page.html.jinja").render(
+        result=shown, title=report.title, lead=lead, words=in_signs(words or verdict)
+    )
 
 
 def with_signs(part: Part) -> Part:
@@ -190,24 +200,6 @@ def with_signs(part: Part) -> Part:
             return replace(part, head=[*map(signed, head)], rows=cells, words=[*map(signed, words)])
         case _:
             return part
-
-
-def page(template: str, **parts: Any) -> str:
-    """Return a page from a template of this folder.
-
-    Args:
-        template: its file name.
-        parts: what it shows; texts are escaped, what HTML may not hold becomes U+FFFD.
-    """
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        finalize=_allowed,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(template).render(**parts)
 
 
 def _allowed(value: Any) -> Any:

@@ -10,10 +10,10 @@ import csv
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -40,8 +40,6 @@ _SUGGESTIONS = 20
 
 NumberedLines = list[tuple[int, str]]
 """Lines of a file, each with its number."""
-NumberedCells = list[tuple[int, list[str]]]
-"""Their cells."""
 Columns = dict[str, Float[np.ndarray, " rows"]]
 Masks = dict[str, Bool[np.ndarray, " rows"]]
 
@@ -82,6 +80,16 @@ class Faults:
         if column is not None:
             place += f", column {column}"
         self._first = (line, f"{place}: {message}")
+
+    def fail(self, message: str, *, line: int = 0, column: str | None = None) -> NoReturn:
+        """Note a fault, as `add`, with which nothing else can be read.
+
+        Raises:
+            TableError: with the first fault and the number of the others.
+        """
+        self.add(message, line=line, column=column)
+        self.raise_any()
+        raise AssertionError
 
     def raise_any(self) -> None:
         """Raise the first fault, if there is one.
@@ -125,6 +133,15 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:40] + "...")
 
 
+_MUST = {
+    "number": "must be finite",
+    "not negative": "must be finite and not negative",
+    "positive": "must be finite and above 0",
+    "whole": "must be a positive whole number (1, 2, 3, ...)",
+}
+"""What the numbers of a kind of column must be; those of a flag are 0 or 1."""
+
+
 @dataclass(frozen=True)
 class Column:
     """One column that a form of file may have.
@@ -132,29 +149,29 @@ class Column:
     Attributes:
         name: its name in the file.
         unit: its unit in words of a message; empty for a plain number, or where the name says enough.
-        meaning: what its numbers become; empty: the name. Two columns of one meaning say the same.
+        kind: what its numbers must be: "number" (any finite one), "not negative", "positive", "whole" or "flag" (0, 1).
+        meaning: what its numbers become; empty: the name. Columns of one meaning are aliases, of which a file has one.
         needed: what it gives, in a word, if every file needs a column that gives it; else empty.
-        positive: whether its numbers must be above zero.
-        integer: whether its numbers must be whole.
         required: whether every row needs it.
         error: the name of the column that holds its standard errors, for a measured column.
         amplitude: whether it is a measured amplitude: each row needs one, and a relative noise applies to it.
-        flag: of a column of 0 and 1: what 1 says.
+        says: of a flag: what 1 says.
+        convert: makes the unit of the meaning of its numbers; None: they have it.
     """
 
     name: str
     unit: str = ""
+    kind: Literal["number", "not negative", "positive", "whole", "flag"] = "positive"
     meaning: str = ""
     needed: str = ""
-    positive: bool = True
-    integer: bool = False
     required: bool = False
     error: str | None = None
     amplitude: bool = False
-    flag: str = ""
+    says: str = ""
+    convert: Callable[[Float[np.ndarray, " rows"]], Float[np.ndarray, " rows"]] | None = None
 
     @property
-    def says(self) -> str:
+    def becomes(self) -> str:
         """What its numbers become."""
         return self.meaning or self.name
 
@@ -169,10 +186,13 @@ class Form:
         open: whether columns of other names are left alone, not refused.
         blanks: whether cells may be blank (NaN); else every cell is needed.
         example: a row of column names to show, where the row above the numbers is the whole head.
-        separators: what to add where columns are not separated by commas.
+        separator: what stands between cells.
+        separators: what to add where columns are not separated by it.
         fewer: what to do with a row of too few cells.
         more: and with one of too many.
         number: how a number is written.
+        mend: what to do with a number that is impossible.
+        largest: size of any number.
         strange: columns that other files have, and what to do about them.
     """
 
@@ -181,10 +201,13 @@ class Form:
     open: bool = False
     blanks: bool = False
     example: str = ""
+    separator: str = ","
     separators: str = ""
     fewer: str = "fill the row up"
     more: str = "a decimal comma must be a point"
     number: str = "write it like 90.25 or 9.025e1, or remove the row"
+    mend: str = "correct it or remove the row"
+    largest: float = FARTHEST
     strange: Mapping[str, str] = field(default_factory=dict)
 
     def column(self, name: str) -> Column | None:
@@ -195,6 +218,40 @@ class Form:
     def names(self) -> tuple[str, ...]:
         """The names of the table's columns."""
         return tuple(column.name for column in self.columns)
+
+    def check_numbers(
+        self, name: str, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
+    ) -> Bool[np.ndarray, " rows"]:
+        """Note the impossible numbers of a column, and return which they are.
+
+        Args:
+            name: of the column, or what it becomes.
+            values: its numbers, NaN where nothing was measured.
+            lines: where each stands.
+            faults: where the faults are noted.
+        """
+        column = next(one for one in self.columns if name in {one.name, one.becomes})
+        positive = column.kind in {"positive", "not negative", "whole"}
+        # a whole number only has to survive the way through 64-bit floats
+        far = beyond(values, positive=positive, largest=np.inf if column.kind == "whole" else self.largest)
+        bad = np.isinf(values) | far | (np.isnan(values) & (not self.blanks))
+        match column.kind:
+            case "not negative":
+                bad |= values < 0.0
+            case "positive":
+                bad |= values <= 0.0
+            case "whole":
+                bad |= (values <= 0.0) | (values != np.floor(values)) | (values >= 2**53)
+                bad &= ~np.isnan(values)
+            case "flag":
+                bad |= ~np.isnan(values) & (values != 0.0) & (values != 1.0)
+        must = f"must be 1 ({column.says}) or 0" if column.kind == "flag" else _MUST[column.kind]
+        blank = " or leave it blank if it was not measured" if column.error is not None else ""
+        for row in np.flatnonzero(bad):
+            number = repr(float(values[row])).removesuffix(".0")
+            wanted = said_beyond(values[row], self.largest) if far[row] else must
+            faults.add(f"{wanted}, but is {number}; {self.mend}{blank}", line=int(lines[row]), column=name)
+        return bad
 
 
 @dataclass(frozen=True)
@@ -322,6 +379,62 @@ def text_of(data: bytes, path: str | Path, mend: str = _AS_CSV) -> str:
     return text
 
 
+class TextTable(NamedTuple):
+    """What a file with comments and columns says.
+
+    Attributes:
+        columns: the numbers, by what they become, in its unit.
+        names: of the columns that were read.
+        lines: the line of each row.
+        settings: value and error of those that comments make.
+        remarks: the other comments.
+    """
+
+    columns: Columns
+    names: tuple[str, ...]
+    lines: Int[np.ndarray, " rows"]
+    settings: dict[str, tuple[float, float | None]]
+    remarks: tuple[str, ...]
+
+
+def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> TextTable:
+    """Read a text of comments, a row of column names, and rows of numbers.
+
+    Args:
+        text: all of it.
+        form: the columns that it may have.
+        settings: those that comments may make.
+        faults: where faults are noted; with any, the result is not to be used.
+
+    Raises:
+        TableError: at once where there are no rows, or the column names are wrong: the cells cannot be judged then.
+    """
+    comments, rows = split_lines(text)
+    found, remarks = settings_in(comments, settings, faults)
+    check_not_empty(comments, rows, faults)
+    columns, names, lines = columns_of_rows(rows, form, faults)
+    return TextTable(columns, names, lines, found, remarks)
+
+
+def columns_of_rows(
+    rows: NumberedLines, form: Form, faults: Faults
+) -> tuple[Columns, tuple[str, ...], Int[np.ndarray, " rows"]]:
+    """Return columns by what they become, the names of those that were read, and the lines of the rows.
+
+    Raises:
+        TableError: at once where the column names are wrong.
+    """
+    head, rows = named_rows(rows, form, faults)
+    faults.raise_any()
+    columns, _, lines = parse_rows(rows, head.names, form, faults)
+    found = {}
+    for column in form.columns:
+        if column.name in columns:
+            values = columns[column.name]
+            found[column.becomes] = values if column.convert is None else column.convert(values)
+    return found, tuple(columns), lines
+
+
 def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
     """Return comments (without their number sign, stripped) and other lines of a text, numbered, without blank ones."""
     comments, rows = [], []
@@ -436,10 +549,13 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     return None
 
 
-def split_cells(text: str) -> list[str]:
+def _cells(text: str, separator: str) -> list[str]:
     """Return the cells of one line, without the spaces and quotation marks around them."""
+    # instruments end their lines with a tab
+    text = text.rstrip(" ").removesuffix("\t") if separator == "\t" else text
     # The csv module is needed for quotation marks only, and costs more than the rest of the reading.
-    cells = next(csv.reader([text], skipinitialspace=True)) if '"' in text else text.split(",")
+    quotes = '"' in text
+    cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True)) if quotes else text.split(separator)
     return [cell.strip() for cell in cells]
 
 
@@ -456,7 +572,7 @@ def named_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Head, N
     """
     line, text = rows[0]
     _check_delimiter(text, form, line=line, faults=faults)
-    names, found = split_cells(text), faults.count
+    names, found = _cells(text, form.separator), faults.count
     present = check_names(names, form, line=line, faults=faults)
     if not rows[1:] and faults.count == found:
         message = f"there are column names but no rows below them; add a row for each {form.row}"
@@ -472,19 +588,16 @@ def check_not_empty(comments: NumberedLines, rows: NumberedLines, faults: Faults
     """
     if not rows:
         what = "only comments" if comments else "nothing"
-        faults.add(f"the file holds {what}; add a row of column names and rows of numbers")
-        faults.raise_any()
+        faults.fail(f"the file holds {what}; add a row of column names and rows of numbers")
 
 
 def _check_delimiter(names: str, form: Form, *, line: int, faults: Faults) -> None:
-    if "," in names:
+    if form.separator != "," or "," in names:
         return
     for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
         if sign in names.strip():
-            only = Faults(faults.source)
             advice = f"separate them by commas, decimals by points{form.separators}"
-            only.add(f"the columns are separated by {word}; {advice}", line=line)
-            only.raise_any()
+            Faults(faults.source).fail(f"the columns are separated by {word}; {advice}", line=line)
 
 
 def check_names(names: list[str], form: Form, *, line: int = 0, faults: Faults) -> set[str]:
@@ -504,10 +617,10 @@ def check_names(names: list[str], form: Form, *, line: int = 0, faults: Faults) 
             unknown.append((position, name))
         elif name in first:
             faults.add(f"is there twice, as columns {first[name]} and {position}; remove one", line=line, column=name)
-        elif column.says in present:
+        elif column.becomes in present:
             faults.add("says again what another column says; remove one", line=line, column=name)
         else:
-            present |= {column.says, name}
+            present |= {column.becomes, name}
         first.setdefault(name, position)
     # A name that was only misspelt is reported; that its column is then missing is not a second fault.
     meant = _check_unknown(unknown, form, present, line=line, faults=faults)
@@ -526,14 +639,14 @@ def _check_unknown(
             faults.add(form.strange[name], line=line, column=name)
             continue
         suggestion = form.column(nearest_name(name, form.names) or "") if name and count < _SUGGESTIONS else None
-        if form.open and (suggestion is None or suggestion.says in present):
+        if form.open and (suggestion is None or suggestion.becomes in present):
             continue
         if not name:
             faults.add(f"column {position} has no name; name it or remove its comma", line=line)
             continue
         faults.add(_unknown_column(name, suggestion, form, complete=complete), line=line)
         if suggestion is not None:
-            meant |= {suggestion.says, suggestion.name}
+            meant |= {suggestion.becomes, suggestion.name}
     return meant
 
 
@@ -555,7 +668,7 @@ def _check_missing(names: list[str], form: Form, present: set[str], *, line: int
         else:
             there = f" (there are {', '.join(quoted(name) for name in names[:6])})" if form.open and any(names) else ""
             other = " or rename the one that holds it" if form.open else ""
-            message = f"the column {columns[0].name}{_in_unit(columns[0])} is missing{there}; add it{other}"
+            message = f'the column "{columns[0].name}"{_in_unit(columns[0])} is missing{there}; add it{other}'
         faults.add(message, line=line)
 
 
@@ -568,7 +681,7 @@ def _missing(form: Form, present: set[str]) -> dict[str, list[Column]]:
     return {
         what: columns
         for what, columns in givers.items()
-        if not any(present & {column.says, column.error} for column in columns)
+        if not any(present & {column.becomes, column.error} for column in columns)
     }
 
 
@@ -616,39 +729,29 @@ def nearest_name(text: str, known: Iterable[str]) -> str | None:
 def parse_rows(
     rows: NumberedLines, names: list[str], form: Form, faults: Faults
 ) -> tuple[Columns, Masks, Int[np.ndarray, " rows"]]:
-    """Turn lines of text into columns of numbers; arguments and result as of `parse_cells`, all columns of the form."""
-    wanted = [name for name in names if form.column(name) is not None]
-    block = _plain_block(rows, names, wanted, form)
-    if block is not None:
-        lines = np.array([line for line, _ in rows], dtype=np.int64)
-        return block, {name: np.zeros(len(lines), dtype=bool) for name in wanted}, lines
-    cells = []
-    for line, text in rows:
-        if text.count('"') % 2:
-            faults.add("a quotation mark is not closed; close or remove it", line=line)
-        else:
-            cells.append((line, split_cells(text)))
-    return parse_cells(cells, names, wanted, form, faults)
-
-
-def parse_cells(
-    rows: NumberedCells, names: list[str], wanted: Sequence[str], form: Form, faults: Faults
-) -> tuple[Columns, Masks, Int[np.ndarray, " rows"]]:
-    """Turn rows of cells into columns of numbers.
+    """Turn lines of text into columns of numbers, of the names that the form has.
 
     Args:
-        rows: line number and stripped cells of each row.
-        names: the names of the file's columns, checked before.
-        wanted: those that are read; the others may hold anything.
+        rows: the lines below the names, numbered.
+        names: of the file's columns, checked before.
         form: what the file is.
         faults: where the faults are noted.
 
     Returns:
-        Per wanted name the numbers (NaN where a cell is blank or unreadable) and the mask of the unreadable cells; and
-        the line number of each row.
+        By name the numbers (NaN where a cell is blank or unreadable) and the mask of the unreadable cells; and the line
+        number of each row.
     """
+    wanted = {name: column for name in names if (column := form.column(name)) is not None}
+    block = _plain_block(rows, names, wanted, form)
+    if block is not None:
+        lines = np.array([line for line, _ in rows], dtype=np.int64)
+        return block, {name: np.zeros(len(lines), dtype=bool) for name in wanted}, lines
     lines, table = [], []
-    for line, cells in rows:
+    for line, text in rows:
+        if text.count('"') % 2:
+            faults.add("a quotation mark is not closed; close or remove it", line=line)
+            continue
+        cells = _cells(text, form.separator)
         if len(cells) == len(names):
             lines.append(line)
             table.append(cells)
@@ -656,23 +759,23 @@ def parse_cells(
             hint = form.fewer if len(cells) < len(names) else form.more
             faults.add(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
     columns, unreadable = {}, {}
-    for name in wanted:
+    for name, column in wanted.items():
         position = names.index(name)
         texts = [cells[position] for cells in table]
-        column = form.column(name) or Column(name)
         columns[name], unreadable[name] = _parse_column(column, texts, lines, form, faults)
     return columns, unreadable, np.array(lines, dtype=np.int64)
 
 
-def _plain_block(rows: NumberedLines, names: list[str], wanted: list[str], form: Form) -> Columns | None:
+def _plain_block(rows: NumberedLines, names: list[str], wanted: Mapping[str, Column], form: Form) -> Columns | None:
     """Return the wanted columns of a file of nothing but finite numbers at once, None where it holds something else."""
-    if not rows or any((form.column(name) or Column(name)).integer for name in wanted):
+    sign = form.separator
+    if not rows or sign != "," or any(column.kind == "whole" for column in wanted.values()):
         return None
-    if any('"' in text or text.count(",") != len(names) - 1 for _, text in rows):
+    if any('"' in text or text.count(sign) != len(names) - 1 for _, text in rows):
         return None
     positions = [names.index(name) for name in wanted]
     with contextlib.suppress(ValueError):
-        block = np.loadtxt([text for _, text in rows], delimiter=",", usecols=positions, ndmin=2, comments=None)
+        block = np.loadtxt([text for _, text in rows], delimiter=sign, usecols=positions, ndmin=2, comments=None)
         if np.all(np.isfinite(block)):
             return {name: block[:, position].copy() for position, name in enumerate(wanted)}
     return None
@@ -683,12 +786,12 @@ def _parse_column(
 ) -> tuple[Float[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
     numbers = np.full(len(texts), np.nan)
     unreadable = np.zeros(len(texts), dtype=bool)
-    if form.blanks and set("".join(texts)) <= set("0123456789+-" if column.integer else "0123456789+-.eE"):
+    if form.blanks and set("".join(texts)) <= set("0123456789+-" if column.kind == "whole" else "0123456789+-.eE"):
         # Written in these signs, what float() takes is what NUMBER describes, and it takes it much faster.
         with contextlib.suppress(ValueError):
             return np.array([float(text or "nan") for text in texts], dtype=np.float64), unreadable
     for row, text in enumerate(texts):
-        if NUMBER.fullmatch(text) and not (column.integer and set(text) & set(".eE")):
+        if NUMBER.fullmatch(text) and not (column.kind == "whole" and set(text) & set(".eE")):
             numbers[row] = float(text)
         elif text or not form.blanks:
             unreadable[row] = True
@@ -701,7 +804,7 @@ def _unreadable(text: str, column: Column, form: Form) -> str:
         return f"is blank; every {form.row} needs it: fill it in or remove the row"
     if DECIMAL_COMMA.fullmatch(text):
         return f"{quoted(text)} has a decimal comma; write a point"
-    if column.integer:
+    if column.kind == "whole":
         return f"{quoted(text)} is not a positive whole number; write 1, 2, 3, ..."
     absent = text.lower().lstrip("+-") in {"nan", "inf", "infinity", "na", "n/a", "none", "null", ""}
     if form.blanks and not column.required and absent:

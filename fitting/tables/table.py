@@ -58,7 +58,6 @@ from fitting.tables.csv_text import (
     Head,
     Masks,
     TableError,
-    beyond,
     check_not_empty,
     column_of,
     fault_in_number,
@@ -67,7 +66,6 @@ from fitting.tables.csv_text import (
     printable,
     quoted,
     read_text,
-    said_beyond,
     setting_in,
     settings_in,
     split_lines,
@@ -135,14 +133,14 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> dict[str,
     return header
 
 
-_ORDER = Column("order", needed="order", required=True, integer=True)
+_ORDER = Column("order", needed="order", required=True, kind="whole")
 _FREQUENCY = Column("drive_frequency_khz", "kHz", needed="drive frequency", required=True)
-_OFFSET = Column("offset_nm", "nm", needed="offset", required=True, positive=False)
+_OFFSET = Column("offset_nm", "nm", needed="offset", required=True, kind="number")
 _LOCKIN = (
     Column("lockin_amplitude_nm", "nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
     Column("lockin_amplitude_error_nm", "nm"),
 )
-_NO_ORBIT = Column("no_orbit", positive=False, flag="no steady orbit was seen")
+_NO_ORBIT = Column("no_orbit", kind="flag", says="no steady orbit was seen")
 _SAMPLE = (
     _ORDER,
     _FREQUENCY,
@@ -151,7 +149,7 @@ _SAMPLE = (
     Column("peak_amplitude_nm", "nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
     Column("peak_amplitude_error_nm", "nm"),
     *_LOCKIN,
-    Column("phase_deg", "degrees", error="phase_error_deg", positive=False),
+    Column("phase_deg", "degrees", error="phase_error_deg", kind="number"),
     Column("phase_error_deg", "degrees"),
     _NO_ORBIT,
 )
@@ -161,9 +159,9 @@ _TAPPING = (
     Column("free_amplitude_nm", "nm", needed="free amplitude", required=True),
     _OFFSET,
     *_LOCKIN,
-    Column("phase_lag_deg", "degrees", error="phase_lag_error_deg", positive=False),
+    Column("phase_lag_deg", "degrees", error="phase_lag_error_deg", kind="number"),
     Column("phase_lag_error_deg", "degrees"),
-    Column("retract", positive=False, flag="the sample moves away"),
+    Column("retract", kind="flag", says="the sample moves away"),
     _NO_ORBIT,
 )
 
@@ -178,6 +176,8 @@ def _form(columns: tuple[Column, ...], strange: str) -> Form:
         fewer="fill in the others",
         more="remove the others; a decimal comma must be a point",
         number="write it like 174.6 or 1.746e2, without a unit",
+        mend="correct it",
+        largest=LARGEST,
         strange={column.name: strange for column in (*_SAMPLE, *_TAPPING) if column.name not in names},
     )
 
@@ -363,10 +363,11 @@ def check_rows(
     """
     rows = len(lines)
     known_bad = {name: np.zeros(rows, dtype=bool) for name in columns} | (unreadable or {})
-    for column in _ALL:
-        if column.name in columns:
+    form = TAPPING if "free_amplitude_nm" in columns else TABLE
+    for name in form.names:
+        if name in columns:
             # A cell with an impossible number is not to be blamed a second time for what depends on it.
-            known_bad[column.name] |= _check_numbers(column, columns[column.name], lines, faults)
+            known_bad[name] |= form.check_numbers(name, columns[name], lines, faults)
     for column in required(columns):
         for row in np.flatnonzero(np.isnan(columns[column.name]) & ~known_bad[column.name]):
             faults.add("is blank; every row needs it", line=int(lines[row]), column=column.name)
@@ -375,34 +376,6 @@ def check_rows(
     _check_measured(blank, unseen, lines, faults)
     if "free_amplitude_nm" in columns and "order" in columns:
         _check_order(columns, lines, faults)
-
-
-def _check_numbers(
-    column: Column, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
-) -> Bool[np.ndarray, " rows"]:
-    # a whole number only has to survive the way through 64-bit floats
-    far = beyond(values, positive=column.positive, largest=np.inf if column.integer else LARGEST)
-    bad = np.isinf(values) | far
-    what = "must be finite"
-    if column.positive:
-        bad |= values <= 0.0
-        what = "must be finite and above 0"
-    if column.integer:
-        bad |= (values != np.floor(values)) | (values >= 2**53)
-        bad &= ~np.isnan(values)
-        what = "must be a positive whole number (1, 2, 3, ...)"
-    if column.flag:
-        bad |= ~np.isnan(values) & (values != 0.0) & (values != 1.0)
-        what = f"must be 1 ({column.flag}) or 0"
-    for row in np.flatnonzero(bad):
-        number = repr(float(values[row])).removesuffix(".0")
-        must = said_beyond(values[row], LARGEST) if far[row] else what
-        faults.add(f"{must}, but is {number}; correct it{_or_blank(column)}", line=int(lines[row]), column=column.name)
-    return bad
-
-
-def _or_blank(column: Column) -> str:
-    return " or leave it blank if it was not measured" if column.error is not None else ""
 
 
 def _check_measured(
@@ -714,8 +687,7 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     """
     faults = Faults(source)
     if noise is not None and not 0.0 < noise < 1.0:
-        faults.add(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
-        faults.raise_any()
+        faults.fail(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
     comments, rows = split_lines(text)
     check_not_empty(comments, rows, faults)
     header = parse_comments(comments, faults)

@@ -99,6 +99,11 @@ class CurveBranch:
     repulsive: bool
 
     @property
+    def drive(self) -> tuple[float, float]:
+        """Frequency and free amplitude of the rows."""
+        return self.drive_frequency_khz, self.free_amplitude_nm
+
+    @property
     def way(self) -> str:
         """Which way the sample moves."""
         return way_of(self.retract)
@@ -246,24 +251,20 @@ def changes(
         energy: of a tap in aJ, NaN where not known.
         noise: its standard error.
     """
-    parts = ways(curve)
-    drives = dict.fromkeys((curve.drive_frequency_khz[p[0]], curve.free_amplitude_nm[p[0]]) for p in parts)
+    parts: dict[tuple[float, float], dict[bool, np.ndarray]] = {}
+    for part in ways(curve):
+        drive = float(curve.drive_frequency_khz[part[0]]), float(curve.free_amplitude_nm[part[0]])
+        parts.setdefault(drive, {})[bool(curve.retract[part[0]])] = part
     found = []
-    for frequency, amplitude in drives:
-        here = [
-            p
-            for p in parts
-            if (curve.drive_frequency_khz[p[0]], curve.free_amplitude_nm[p[0]]) == (frequency, amplitude)
-        ]
-        into = next((p for p in here if not curve.retract[p[0]]), None)
-        back = next((p for p in here if curve.retract[p[0]]), None)
+    for drive, here in parts.items():
+        into, back = here.get(False), here.get(True)
         for change in ("contact", "half", "branch"):
             ends = [
                 None if p is None else _height(change, curve, p, free=free, repulsive=repulsive) for p in (into, back)
             ]
             if ends[0] is None and ends[1] is None:
                 continue
-            one = Hysteresis(change, float(frequency), float(amplitude), approach=ends[0], retract=ends[1])
+            one = Hysteresis(change, *drive, approach=ends[0], retract=ends[1])
             found.append(_with_energy(one, curve, into, back, energy, noise))
     return found
 

@@ -93,7 +93,7 @@ def branches_of(curve: TappingCurve, fit: EnergyFit, repulsive: Bool[np.ndarray,
                         curve=_curve(curve, fit, number, here, place),
                     )
                 )
-    return tuple(sorted(found, key=lambda b: (b.drive_frequency_khz, b.free_amplitude_nm, b.retract, b.repulsive)))
+    return tuple(sorted(found, key=lambda b: (b.drive, b.retract, b.repulsive)))
 
 
 def _curve(
@@ -161,18 +161,11 @@ def differences_of_ways(branches: tuple[TappingBranch, ...], fit: EnergyFit) -> 
     found = {}
     for i, one in enumerate(branches):
         for j, other in enumerate(branches):
-            same = (one.drive_frequency_khz, one.free_amplitude_nm, one.repulsive) == (
-                other.drive_frequency_khz,
-                other.free_amplitude_nm,
-                other.repulsive,
-            )
-            if one.retract or not other.retract or not same:
+            if one.retract or not other.retract or (one.drive, one.repulsive) != (other.drive, other.repulsive):
                 continue
             a, b = one.curve, other.curve
-            low, high = (
-                max(a.amplitude_ratio[0], b.amplitude_ratio[0]),
-                min(a.amplitude_ratio[-1], b.amplitude_ratio[-1]),
-            )
+            low = max(a.amplitude_ratio[0], b.amplitude_ratio[0])
+            high = min(a.amplitude_ratio[-1], b.amplitude_ratio[-1])
             ratio = np.linspace(low, high, 41)
             if not low < high:
                 continue

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
 
-from afm_jax.least_squares import IMPROBABLE, chi2_tail
+from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, descended
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, lag_of_free_tip
 from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of, virial_noise_of
@@ -50,8 +50,6 @@ _LEAST_SIZE = 1.0
 _MOST_PROCESSES = 5
 """Processes that are tried one after the other, each with the instrument that the last led to."""
 _ROUNDS = 30
-_SHORTEST = 1e-3
-"""Fraction of a step below which the search stays as it is."""
 _RISE = 0.1
 """By which a step may raise chi2: slopes are taken at smooth readings, not at those that chi2 is of."""
 _SETTLED = 1e-3
@@ -608,36 +606,26 @@ class _EnergySearch:
         left.append((shares.average(factor) - shares.mean) / shares.error)
         return np.concatenate(left)
 
-    def _slopes_of_free(self, slopes: _EnergySlopes) -> np.ndarray:
-        """Return the changes of the residuals of the free rows' means."""
-        lags, shares = self.lags, self.shares
-        parts = [lags.average(slopes.free_lag) / lags.error[:, None]]
-        parts.append(shares.average(slopes.factor) / shares.error[:, None])
-        return np.concatenate(parts)
+    def _residuals(
+        self, state: _State, slopes: _EnergySlopes, groups: list, smoothers: list[Smoother]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the residuals in standard errors and their changes by the unknowns.
 
-    def _normal(
-        self, state: _State, slopes: _EnergySlopes, groups: list, trials: list[list[Smoother]]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the normal matrix of the unknowns, the gradient, and the sum of squares of each trial's smoothers."""
-        parts, left, x = self._slopes_of_free(slopes), state.of_free, state.x
-        matrix, gradient = np.diag(self.known.astype(float)) + parts.T @ parts, self.known * x + parts.T @ left
-        matrix, gradient = np.tile(matrix, (len(trials), 1, 1)), np.tile(gradient, (len(trials), 1))
-        total = np.array([self._total(state, groups, smoothers) for smoothers in trials])
-        weights = self._weights(groups)
-        for i, (rows, one, values) in enumerate(zip(groups, state.bins, state.energies, strict=True)):
-            binned = one.average(slopes.energy[rows])
-            for j, smoothers in enumerate(trials):
-                s = smoothers[i].whitened(self._without_scale(smoothers[i], binned, values))
-                matrix[j] += weights[i] * s.T @ s
-                gradient[j] += weights[i] * s.T @ smoothers[i].whitened(values)
-        return matrix, gradient, total
-
-    def _total(self, state: _State, groups: list, smoothers: list[Smoother]) -> float:
-        """Return the sum of squares."""
-        total = float(state.of_free @ state.of_free + np.sum((self.known * state.x) ** 2))
-        for smoother, values, weight in zip(smoothers, state.energies, self._weights(groups), strict=True):
-            total += weight * float(np.sum(smoother.whitened(values) ** 2))
-        return total if np.isfinite(total) else np.inf
+        Those of what is known beforehand, of the free rows' means, and of the binned energies about their functions.
+        """
+        lags, shares, x = self.lags, self.shares, state.x
+        residual = [self.known * x, state.of_free]
+        jacobian = [
+            np.diag(self.known.astype(float)),
+            lags.average(slopes.free_lag) / lags.error[:, None],
+            shares.average(slopes.factor) / shares.error[:, None],
+        ]
+        weights = np.sqrt(self._weights(groups))
+        for rows, bins, one, values, weight in zip(groups, state.bins, smoothers, state.energies, weights, strict=True):
+            binned = self._without_scale(one, bins.average(slopes.energy[rows]), values)
+            residual.append(weight * one.whitened(values))
+            jacobian.append(weight * one.whitened(binned))
+        return np.concatenate(residual), np.concatenate(jacobian)
 
     def _weights(self, groups: list[np.ndarray]) -> list[float]:
         """Return how much each function counts where it tells the instrument by how smooth it is.
@@ -671,27 +659,21 @@ class _EnergySearch:
         return slopes
 
     def _descended(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> np.ndarray:
+        """Return the unknowns at the minimum for given processes."""
         if not len(x):
             return x
 
-        def at(x: np.ndarray) -> tuple[_State, list[Smoother], float]:
-            state = self._state(x, groups, scale)
+        def evaluate(places: np.ndarray, _: np.ndarray) -> Searches:
+            state = self._state(places[0], groups, scale)
             smoothers = [Smoother.of(*pair) for pair in zip(state.bins, processes, strict=True)]
-            return state, smoothers, self._total(state, groups, smoothers)
-
-        state, smoothers, total = at(x)
-        for _ in range(_ROUNDS):
             slopes = self._slopes(state, groups, smoothers)
-            matrix, gradient, _ = (part[0] for part in self._normal(state, slopes, groups, [smoothers]))
-            step = -np.linalg.pinv(matrix, hermitian=True) @ gradient
-            if step @ matrix @ step < _SETTLED**2:
-                break
-            fraction, start, most = 1.0, state.x, total + _RISE
-            state, smoothers, total = at(start + step)
-            while fraction > _SHORTEST and not total < most:
-                fraction *= 0.5
-                state, smoothers, total = at(start + fraction * step)
-        return state.x
+            residual, jacobian = self._residuals(state, slopes, groups, smoothers)
+            chi2 = float(residual @ residual)
+            return Searches(places, residual[None], jacobian[None], np.array([chi2 if np.isfinite(chi2) else np.inf]))
+
+        free = Box(np.full(len(x), -np.inf), np.full(len(x), np.inf), np.zeros((1, len(x)), bool))
+        start = evaluate(x[None], np.arange(1))
+        return descended(evaluate, start, free, settled=_SETTLED**2, most=_ROUNDS, rise=_RISE).place[0]
 
     def _processes(self, x: np.ndarray, groups: list, scale: float) -> list[Process]:
         """Return the processes of the groups, of the size and length that the readings make most probable."""
@@ -718,9 +700,14 @@ class _EnergySearch:
             for bins, some in zip(state.bins, zip(*distinct, strict=True), strict=True)
         ]
         trials = [list(smoothers) for smoothers in zip(*by_group, strict=True)]
-        matrix, gradient, total = self._normal(state, slopes, groups, trials)
+        residual, jacobian = (
+            np.stack(part)
+            for part in zip(*(self._residuals(state, slopes, groups, smoothers) for smoothers in trials), strict=True)
+        )
+        matrix, gradient = np.swapaxes(jacobian, 1, 2) @ jacobian, np.einsum("tnu,tn->tu", jacobian, residual)
         inverse, weights = np.linalg.pinv(matrix, hermitian=True), self._weights(groups)
-        found = np.einsum("tu,tuv,tv->t", gradient, inverse, gradient) - total - np.linalg.slogdet(matrix)[1]
+        found = np.einsum("tu,tuv,tv->t", gradient, inverse, gradient) - np.linalg.slogdet(matrix)[1]
+        found -= np.sum(residual**2, axis=1)
         found -= [sum(w * s.log_determinant for w, s in zip(weights, smoothers, strict=True)) for smoothers in trials]
         known = dict(zip(distinct, found.tolist(), strict=True))
 
@@ -744,8 +731,8 @@ class _EnergySearch:
         smoothers = [Smoother.of(*pair) for pair in zip(state.bins, processes, strict=True)]
         slopes = self._slopes(state, groups, smoothers)
         if covariance is None:
-            matrix, *_ = self._normal(state, slopes, groups, [smoothers])
-            covariance = np.asarray(np.linalg.pinv(matrix[0], hermitian=True))
+            _, jacobian = self._residuals(state, slopes, groups, smoothers)
+            covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True))
         units = self.values(x) - self.values(x - 1e-6) if len(x) else x
         errors = np.sqrt(np.diag(covariance)) * units / 1e-6
         noise = scale * noise_of(self.smoothed, state.smooth)

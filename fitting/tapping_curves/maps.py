@@ -21,7 +21,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of
-from fitting.instruments.recording import ASSUMED_RESONANCE, Known
+from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, USUAL_ERRORS, Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies
@@ -215,15 +215,7 @@ def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -
         "tip_calibration": "",
     }
     known = {key: one for key, one in images.known.items() if key in units}
-    for key, value in given.items():
-        if key not in units:
-            raise TypeError(f"there is no option `{key}`; it is one of {', '.join(units)}")
-        if value is None:
-            continue
-        number, error = value if isinstance(value, tuple) else (float(value), None)
-        if not np.isfinite(number) or (key != "free_phase_deg" and number <= 0.0):
-            raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
-        known[key] = Known(float(number), units[key], f"option --{key.replace('_', '-')}", error)
+    known |= given_numbers(given, units, any_sign=("free_phase_deg",))
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
         known["drive_frequency_khz"] = Known(known["free_frequency_khz"].value, "kHz", ASSUMED_RESONANCE)
         notes.append(f"Drive frequency: {ASSUMED_RESONANCE}.")

@@ -22,8 +22,8 @@ class MeasuredFile:
     Attributes:
         tables: of the curves that may be used, by their number in the file.
         refused: why the others may not, by number.
-        half_widths_nm: of every curve, refused ones too: by how many nm nearer the amplitude falls to half on the way
-            in than it comes back on the way out; by number, as far as both ways show it.
+        half_widths_nm: of every curve, refused ones too: by how many nm nearer the amplitude falls to half on approach
+            than it comes back on retract; by number, as far as both show it.
         notes: what was assumed and found in reading them.
     """
 

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, png_of, svg_of
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.branches import side_of, way_of
 from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
@@ -17,16 +17,26 @@ _SMALL = 9
 _PERIODS = 2.0
 
 
-def tapping_pictures(result: Tapping) -> tuple[list[bytes], list[bytes]]:
-    """Return as PNG and as SVG: the curve, the two frames, energy against speed and the law if they are known."""
-    figures = [curve_figure(result), frames_figure(result)]
+def tapping_figures(result: Tapping) -> dict[str, Figure]:
+    """Return the curve, the two frames, energy against speed and the law if they are known, by what is to be seen."""
+    figures = {
+        "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch with "
+        "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free.": (
+            curve_figure(result)
+        ),
+        "The same motion in two frames. Left, the lab: a shaken tip meets a sample at rest. Right, with its free "
+        "motion taken away: the tip flies freely, and the sample moves up and down with the free amplitude.": (
+            frames_figure(result)
+        ),
+    }
     if result.laws_of_energies:
-        figures.append(speed_figure(result))
+        shows = "Energy of a tap against the tip's speed at the sample, with the lines of two impact laws through it."
+        figures[shows] = speed_figure(result)
     if result.law is not None:
-        from fitting.report.plots import law_figure  # noqa: PLC0415
+        from fitting.report.plots import law_figure  # noqa: PLC0415 - it imports JAX
 
-        figures.append(law_figure(result.law))
-    return [png_of(figure) for figure in figures], [svg_of(figure) for figure in figures]
+        figures["The impact law from the rows with fast impacts, with its 95 % band."] = law_figure(result.law)
+    return figures
 
 
 def curve_figure(result: Tapping) -> Figure:

@@ -7,65 +7,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from afm_jax.least_squares import IMPROBABLE
+from afm_jax.outcomes import judge
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import effective_mass_ng
 from fitting.tables.table import AmplitudeTable
-from fitting.tapping_curves.branches import Hysteresis, free_ends, side_of, way_of
+from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
 from fitting.tapping_curves.curve import USUAL_ERRORS, Rows, TappingCurve
 from fitting.tapping_curves.energy_by_speed import FEWEST_SPEEDS, LawOfEnergies, laws_of_energies
-from fitting.tapping_curves.energy_curve import (
-    FEWEST_ROWS,
-    HEADLINE,
-    TappingBranch,
-    WayDifference,
-    differences_of_ways,
-)
+from fitting.tapping_curves.energy_curve import HEADLINE, TappingBranch, WayDifference, differences_of_ways
 from fitting.tapping_curves.energy_fit import Z95, EnergyFit, Nuisance
+from fitting.tapping_curves.verdict import (
+    ASSUMPTIONS,
+    BRACKET,
+    NO_CONSTANT,
+    NO_FUNCTIONS,
+    REASONS,
+    WARNINGS,
+    drift_of_free_rows,
+)
 
 if TYPE_CHECKING:
     from fitting.fits.result import FitResult
-
-_BRACKET = 0.5
-"""Relative standard error from which a number is only a bracket."""
-_LARGEST_SCALE = 2.0
-"""Scatter of rows in contact, of their errors, that is believed without being asked for: measured curves have up to
-1.8 times that of the free tip."""
-_MOST_SCALE = 3.0
-"""Likewise where it is asked for (`scale_errors`)."""
-_PULLED = 2.0
-"""Distance of a nuisance from what is given, in its errors, from which it is named."""
-_DRIFTING = 5.0
-"""Errors of a drift of the free rows from which it is one."""
-_FOLLOWING = 3.0
-"""Errors of a drift along the rows, of one energy for all taps, from which it is one."""
-_NEGATIVE = 3.0
-"""Standard errors below zero from which an energy is impossible."""
-_ORIGINS = {
-    "noise": "noise",
-    "free_frequency_khz": "free frequency",
-    "quality_factor": "Q",
-    "spring_constant_n_per_m": "spring constant",
-    "tip_calibration": "calibration",
-    "phase_zero_deg": "zero of phase",
-    "free_amplitude": "free amplitude",
-    "harmonics_factor": "harmonics",
-    "harmonics": "harmonics",
-    "phase_drift_deg": "drift of the phase",
-    "free_amplitude_drift": "drift of the free amplitude",
-}
-_ASSUMED = {
-    "free_frequency_khz": "the free frequency",
-    "quality_factor": "Q",
-    "spring_constant_n_per_m": "the spring constant",
-    "tip_calibration": "the calibration",
-}
-
-
-def origin_in_words(name: str) -> str:
-    """Return what an error comes from."""
-    return _ORIGINS.get(name, name)
 
 
 @dataclass(frozen=True)
@@ -229,36 +192,37 @@ class Tapping(Result):
     @property
     def why_not_constant(self) -> str:
         """Why one energy a branch does not explain the rows; empty where it does."""
-        fit = self.fit
-        if fit is None:
-            return "no branch has enough rows of taps that come every period for one energy"
-        if fit.scale == 1.0 and fit.p_value < IMPROBABLE:
-            return (
-                f"one energy a branch does not describe the rows (chi2 {fit.chi2:.0f} for {fit.degrees_of_freedom} "
-                f"degrees of freedom, probability {fit.p_value:.1g})"
-            )
-        if fit.scale > _MOST_SCALE:
-            return f"one energy a branch describes the rows only with errors {fit.scale:.1f} times as large"
-        if fit.torn:
-            return f"for one energy a branch {_torn_in_words(fit.torn)}"
-        return self._following
+        return next(iter(judge([NO_CONSTANT], self)), "")
 
     @property
-    def _following(self) -> str:
-        """What says that rows about one energy follow their order, which the table does not state as that in time."""
-        if self.followed is not None and self.followed.p_value > IMPROBABLE:
-            for one in self.followed.nuisances:
-                if one.kind in {"phase_drift_deg", "free_amplitude_drift"} and (
-                    abs(one.value) > _FOLLOWING * one.standard_error
-                ):
-                    factor, unit = (1.0, "degrees") if "phase" in one.kind else (100.0, "%")
-                    return (
-                        "the rows follow their order in the table about one energy, as a "
-                        f"{origin_in_words(one.kind)} of {factor * one.value:+.2g} +- "
-                        f"{factor * one.standard_error:.1g} {unit} would make them: if they stand as they were "
-                        "measured, say so by '# rows = in order of time', and the drift is fitted along"
-                    )
-        return ""
+    def why_not_functions(self) -> str:
+        """Why the energy along the branches is not determined; empty where it is."""
+        return next(iter(judge([NO_FUNCTIONS], self)), "")
+
+    @property
+    def drift(self) -> list[str]:
+        """What says that the free tip drifted along rows whose order in time the table does not state, if it did."""
+        return drift_of_free_rows(self.curve, self.rows.free)
+
+    @property
+    def reasons(self) -> list[str]:
+        """What makes the energy no measurement: neither one energy nor one along the branches is determined."""
+        return judge(REASONS, self)
+
+    @property
+    def valid(self) -> bool:
+        """Whether the energy of a tap is determined, as one or along the branches."""
+        return not self.reasons
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a reader should know besides."""
+        return judge(WARNINGS, self)
+
+    @property
+    def assumptions(self) -> list[str]:
+        """What the numbers take for granted."""
+        return judge(ASSUMPTIONS, self)
 
     @property
     def energy(self) -> dict[str, Any]:
@@ -290,7 +254,7 @@ class Tapping(Result):
             "value": value,
             "standard_error": error,
             "interval95": interval,
-            "kind": "bracket" if not error < _BRACKET * value else "fit",
+            "kind": "bracket" if not error < BRACKET * value else "fit",
             "reason": "",
             "assumption": "each tap of the branch takes the same energy",
             "share_of_variance": {name: part / total for name, part in budget.items() if part > 0.0},
@@ -345,30 +309,20 @@ class Tapping(Result):
     def turning_points(self) -> list[dict[str, Any]]:
         """Where attraction gives way to repulsion on each drive and way: between which amplitudes and heights."""
         found = []
-        keys = {(b.drive_frequency_khz, b.free_amplitude_nm, b.retract): None for b in self.branches}
-        for key in keys:
-            sides = [
-                [
-                    b
-                    for b in self.branches
-                    if (b.drive_frequency_khz, b.free_amplitude_nm, b.retract, b.repulsive) == (*key, state)
-                ]
-                for state in (False, True)
-            ]
-            if not all(sides):
+        for drive, retract in dict.fromkeys((b.drive, b.retract) for b in self.branches):
+            here = [b for b in self.branches if (b.drive, b.retract) == (drive, retract)]
+            attractive, repulsive = ([b.curve for b in here if b.repulsive == side] for side in (False, True))
+            if not (attractive and repulsive):
                 continue
-            attractive, repulsive = sides[0][-1].curve, sides[1][0].curve
-            last, first = int(np.argmax(attractive.height_nm)), int(np.argmin(repulsive.height_nm))
+            before, after = attractive[-1], repulsive[0]
+            last, first = int(np.argmax(before.height_nm)), int(np.argmin(after.height_nm))
             found.append(
                 {
-                    "drive_frequency_khz": key[0],
-                    "free_amplitude_nm": key[1],
-                    "branch": way_of(key[2]),
-                    "amplitude_ratio": [
-                        float(repulsive.amplitude_ratio[first]),
-                        float(attractive.amplitude_ratio[last]),
-                    ],
-                    "height_nm": [float(attractive.height_nm[last]), float(repulsive.height_nm[first])],
+                    "drive_frequency_khz": drive[0],
+                    "free_amplitude_nm": drive[1],
+                    "branch": way_of(retract),
+                    "amplitude_ratio": [float(after.amplitude_ratio[first]), float(before.amplitude_ratio[last])],
+                    "height_nm": [float(before.height_nm[last]), float(after.height_nm[first])],
                 }
             )
         return found
@@ -377,12 +331,6 @@ class Tapping(Result):
     def way_differences(self) -> dict[tuple[int, int], WayDifference]:
         """By how much the energy differs between approach and retract, by the numbers of the branches."""
         return {} if self.functions is None else differences_of_ways(self.branches, self.functions)
-
-    @property
-    def _spring_constant_in_words(self) -> str:
-        if self.curve.over_spring_constant:
-            return "spring constant not known: energies and virials are over it, in nm^2 (aJ over N/m)"
-        return f"spring constant {self.curve.spring_constant_n_per_m} N/m"
 
     def in_unit(self, text: str) -> str:
         """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant."""
@@ -462,162 +410,6 @@ class Tapping(Result):
         if self.speeds is None:
             return "no branch has enough rows for an energy; record more heights in contact"
         return self.speeds.why_not or "not fitted"
-
-    @property
-    def why_not_functions(self) -> str:
-        """Why the energy along the branches is not determined; empty where it is."""
-        fit, top = self.functions, self.largest
-        if fit is None or top is None:
-            return "no branch has enough rows in contact for an energy of a tap"
-        low = min((b.curve.energy_aj + _NEGATIVE * b.curve.energy_error_aj).min() for b in self.branches)
-        largest_scale = _MOST_SCALE if self.scale_errors else _LARGEST_SCALE
-        rules = {
-            f"the energy along the branches has no instrument as given: {_torn_in_words(fit.torn)}": bool(fit.torn),
-            f"the rows scatter {fit.scale:.1f} times as much about a smooth energy as their errors say": (
-                fit.scale > largest_scale
-            ),
-            self.drift: bool(self.drift),
-            "energies below zero beyond their errors: frequency, Q or the zero of the phase is wrong": low < 0.0,
-            f"the energy along the branches is only bracketed, {max(top['value'], 0.0):.2g} aJ at its largest with a "
-            f"standard error of {top['standard_error']:.2g}": not top["standard_error"] < _BRACKET * top["value"],
-        }
-        return next((sentence for sentence, holds in rules.items() if holds), "")
-
-    @property
-    def drift(self) -> str:
-        """What says that the free tip drifted along rows whose order in time the table does not state; or empty."""
-        curve, free = self.curve, self.rows.free
-        places = np.flatnonzero(free)
-        if curve.time is not None or len(places) < 2 * FEWEST_ROWS or not free_ends(curve, free):
-            return ""
-        if np.diff(places).max() <= FEWEST_ROWS:
-            # one way only: along it the free tip may feel the sample
-            return ""
-        place = np.arange(curve.rows) / (curve.rows - 1.0)
-        columns = {
-            "phase": (curve.lag_deg, curve.lag_error_deg, "degrees"),
-            "amplitude": (
-                100.0 * curve.amplitude_nm / curve.free_amplitude_nm,
-                100.0 * curve.amplitude_error_nm / curve.free_amplitude_nm,
-                "%",
-            ),
-        }
-        for name, (values, errors, unit) in columns.items():
-            here = free & np.isfinite(values)
-            if here.sum() < 2 * FEWEST_ROWS:
-                continue
-            x, y, w = place[here], values[here], errors[here] ** -2.0
-            x = x - np.average(x, weights=w)
-            slope = float(np.sum(w * x * y) / np.sum(w * x * x))
-            left = y - np.average(y, weights=w) - slope * x
-            scatter = max(1.0, float(np.sum(w * left**2)) / max(len(x) - 2, 1))
-            error = float(np.sqrt(scatter / np.sum(w * x * x)))
-            if abs(slope) > _DRIFTING * error:
-                return (
-                    f"the {name} of the free tip follows the order of the rows, by {slope:+.2g} +- {error:.1g} {unit} "
-                    "over the table: if they stand as they were measured, say so by '# rows = in order of time', and "
-                    "the drift is fitted along"
-                )
-        return ""
-
-    @property
-    def reasons(self) -> list[str]:
-        """What makes the energy no measurement: neither one energy nor one along the branches is determined."""
-        if not self.curve.has_phase and self.bound_aj is not None:
-            return ["without a phase the curve gives no more than an upper bound of the energy of a tap"]
-        energy = self.energy
-        one = energy["reason"]
-        if energy["kind"] == "bracket":
-            chief = max(energy["share_of_variance"], key=lambda name: energy["share_of_variance"][name])
-            low, high = energy["interval95"]
-            one = (
-                f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} aJ; most of that is "
-                f"{origin_in_words(chief)}"
-            )
-        several = energy["kind"] == "several" and not self._open_groups
-        if self.drift:
-            return [self.drift]
-        if not self.why_not_functions or not one or several:
-            return []
-        return list(dict.fromkeys([one, self.why_not_functions]))
-
-    @property
-    def _open_groups(self) -> list[int]:
-        """Numbers of the chief groups whose energy is not determined."""
-        found = {i: self.constant(i) for i in self.chief}
-        return [i for i, (value, error, _) in found.items() if not error < _BRACKET * value]
-
-    @property
-    def valid(self) -> bool:
-        """Whether the energy of a tap is determined, as one or along the branches."""
-        return not self.reasons
-
-    @property
-    def warnings(self) -> list[str]:
-        """What a reader should know besides."""
-        found = []
-        if self.valid and self.curve.has_phase:
-            if self.fit is not None and self.why_not_constant:
-                found.append(f"one energy for all taps is not given: {self.why_not_constant}")
-            if self.why_not_functions:
-                found.append(f"as a function of the amplitude it is not determined: {self.why_not_functions}")
-            for what, fit in (("one energy a branch", self.fit), ("a smooth energy", self.functions)):
-                if fit is not None and fit.scale > 1.0:
-                    found.append(
-                        f"the rows scatter {fit.scale:.2g} times more about {what} than their errors say: its errors "
-                        "are multiplied by that"
-                    )
-            if self.fit is not None and self.described:
-                found += [
-                    f"{origin_in_words(n.kind)} ends {n.pull:+.1f} standard errors from what was given "
-                    f"({n.given} to {n.value:.6g})"
-                    for n in self.fit.nuisances
-                    if abs(n.pull) > _PULLED
-                ]
-            if not self.rows.free.any() and self.curve.phase_zero_deg is None:
-                found.append(
-                    "no row of the free tip fixes the zero of the phase: it is fitted, and the energy hangs on it"
-                )
-        aside = self.set_aside
-        if aside:
-            found.append(f"{len(aside)} of {self.curve.rows} rows are excluded, each by name in the rows")
-        return found
-
-    @property
-    def assumptions(self) -> list[str]:
-        """What the numbers take for granted."""
-        curve = self.curve
-        found = [
-            (
-                f"free frequency {curve.free_frequency_khz} kHz, Q {curve.quality_factor}, "
-                f"{self._spring_constant_in_words}, calibration {curve.tip_calibration}"
-            ),
-        ]
-        if curve.assumed:
-            usual = ", ".join(f"{_ASSUMED[name]} to {100.0 * USUAL_ERRORS[name]:g} %" for name in curve.assumed)
-            found.append(f"given without an error, so usual ones: {usual}")
-        if curve.time is None:
-            found.append("the drive stays as it is along the curve")
-        elif free_ends(curve, self.rows.free):
-            found.append("phase and free amplitude drift evenly along the rows, as free rows at both ends tell")
-        else:
-            found.append("phase and free amplitude drift evenly along the rows, usually by 3 degrees and 2 %")
-        if curve.phase_note:
-            found.append(curve.phase_note)
-        if curve.has_phase:
-            free = bool(self.rows.free.any())
-            zero = (
-                "the zero of the phase from the free rows"
-                if free
-                else f"zero of phase {curve.phase_zero_deg or 'fitted'}"
-            )
-            found.append(
-                f"lag behind {'the base' if curve.drive == 'base' else 'the force on the tip'}, {zero}; heights "
-                "upward, virial positive where attraction prevails"
-            )
-        if not curve.harmonic_amplitudes_nm:
-            found.append("harmonics were not measured: those of one brief impact a period, to 10 %")
-        return found
 
     @property
     def set_aside(self) -> list[dict[str, Any]]:
@@ -755,12 +547,6 @@ def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
         }
         for n in nuisances
     }
-
-
-def _torn_in_words(torn: list[Nuisance]) -> str:
-    """Return which nuisances had to go too far."""
-    parts = [f"{origin_in_words(n.kind)} {n.pull:+.1f} of its errors from what was given" for n in torn]
-    return f"{' and '.join(parts)} would be needed"
 
 
 def _interval(energy: float, error: float, share: float) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TableLike, as_table
 from fitting.tapping_curves.branches import CurveBranch
-from fitting.tapping_curves.energy_curve import HEADLINE, TappingBranch, branches_of
+from fitting.tapping_curves.energy_curve import TappingBranch, branches_of
 from fitting.tapping_curves.energy_fit import Common, fitted_together
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import tapping
@@ -183,10 +183,9 @@ def _scatters(curves: Sequence[Tapping], common: tuple[str, ...]) -> tuple[Curve
 
 
 def _alike(one: TappingBranch, other: TappingBranch) -> bool:
-    return (
-        (one.drive_frequency_khz, one.retract, one.repulsive)
-        == (other.drive_frequency_khz, other.retract, other.repulsive)
-    ) and abs(one.free_amplitude_nm - other.free_amplitude_nm) < _SAME * one.free_amplitude_nm
+    apart = abs(one.free_amplitude_nm - other.free_amplitude_nm)
+    sides = [(b.drive_frequency_khz, b.retract, b.repulsive) for b in (one, other)]
+    return sides[0] == sides[1] and apart < _SAME * one.free_amplitude_nm
 
 
 def _scatter(
@@ -234,26 +233,3 @@ def _scatter(
         energy_own_error_aj=np.sqrt(np.nanmean(own, axis=0)),
         energy_common_error_aj=np.sqrt(np.nanmean(shared, axis=0)),
     )
-
-
-def together_lines(result: TappingTogether) -> list[str]:
-    """Return what the curves say together as lines of text."""
-    from afm_jax.words import text_table, with_error  # noqa: PLC0415
-
-    cells = [
-        [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", f"{at[1]:.2g}", f"{at[2]:.2g}", f"{at[3]:.2g}"]
-        for one in result.scatter
-        for ratio in HEADLINE
-        if (at := one.at(ratio)) is not None
-    ]
-    head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
-    lines = [f"{len(result.curves)} curves of one lever: {'VALID' if result.valid else 'NOT VALID'}"]
-    lines += [f"  - {reason}" for reason in result.reasons]
-    lines += ["", *text_table(head, cells, words=(0,))] if cells else []
-    first = next((one.functions for one in result.curves if one.functions is not None), None)
-    if first is not None and result.common is not None:
-        for one in first.nuisances:
-            if one.name in result.common.names:
-                lines.append(f"  {one.name}, fitted to all: {with_error(one.value, one.standard_error)} ({one.given})")
-        lines.append(f"  probability that curves of one instrument disagree more: {result.common.p_value:.2g}")
-    return [result.curves[0].in_unit(line) for line in lines] if result.curves else lines

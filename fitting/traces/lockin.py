@@ -28,7 +28,7 @@ from fitting.traces.impacts import (
     look_at_periods,
 )
 from fitting.traces.trace import Trace, read_trace
-from fitting.traces.verdict import TraceEvidence, TraceKind, is_flightless, judge
+from fitting.traces.verdict import Lines, TraceEvidence, TraceKind, judge_trace
 
 FORMAT_VERSION = 1
 """Version of the JSON layout; raised when a key changes its meaning or goes."""
@@ -153,11 +153,12 @@ def lockin(trace: Trace | str | os.PathLike[str], *, order: int | None = None) -
     folded = fold(trace, search.order)
     peak = find_peak(folded)
     frequency, origin = _free_frequency(trace, peak)
-    impacts = _impacts(trace, folded, peak, frequency)
+    lines = Lines(folded, trace.settings.drive_amplitude_nm)
+    impacts = ImpactCount(0, (), None) if lines.flightless else _impacts(trace, folded, peak, frequency)
     periods = look_at_periods(folded, peak)
     count = 0 if impacts is None else impacts.impacts or 0
     ringing = find_ringing(trace) if periods.excess > 0.0 or periods.lockin_drift > 0.0 else None
-    verdict = judge(TraceEvidence(trace.settings, search, folded, peak, periods, impacts, order, ringing))
+    verdict = judge_trace(TraceEvidence(lines, search, periods, impacts, order, ringing))
     readings = _Readings(folded, peak, reference)
     repeats = verdict.kind not in _UNREPEATED
     phase, phase_error = readings.phase()
@@ -216,9 +217,7 @@ def _free_frequency(trace: Trace, peak: Peak) -> tuple[float | None, str | None]
 
 
 def _impacts(trace: Trace, folded: Fold, peak: Peak, frequency: float | None) -> ImpactCount | None:
-    """Return the impacts; 0 in a motion without flights, None where the free frequency is not known."""
-    if is_flightless(folded, trace.settings) is not None:
-        return ImpactCount(0, (), None)
+    """Return the impacts of a motion with flights, None where the free frequency is not known."""
     if frequency is None or peak.height_nm <= 0.0:
         return None
     quality = trace.settings.quality_factor

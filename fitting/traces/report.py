@@ -1,10 +1,7 @@
-"""Readings of traces as a person reads them: text for the terminal, files for the drawer (JSON, CSV, PNG).
+"""Readings of traces as a person reads them: sections, the files of --out, and the picture of each trace."""
 
-The picture shows the trace folded onto its response period, and the spectrum with the drive's fractions.
-"""
-
-import json
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, png_of, svg_of
 from afm_jax.scenefile.tables import printable
+from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import write_whole
 from afm_jax.words import with_error
+from fitting.report.sections import Bullets, Part, Report, ReportSection, Text, lines_of, page_of, pictures_of
 from fitting.tables.table import AmplitudeTable, csv_of
 from fitting.traces.lockin import FORMAT_VERSION, LockinResult
 
@@ -38,19 +37,21 @@ def lockin_payload(results: Sequence[LockinResult], table_fault: str | None) -> 
 
 def lockin_summary(result: LockinResult) -> str:
     """Return one reading as text: verdict first, then the values, then notes."""
+    return "\n".join(line for part in lockin_parts(result) for line in lines_of(part))
+
+
+def lockin_parts(result: LockinResult) -> list[Part]:
+    """Return one reading as parts of a section: verdict first, then the values, then notes."""
     trace = result.trace
     size = f"{trace.samples} samples, {1.0 / trace.step_us:.6g} MHz, {trace.drive_periods:.5g} drive periods"
-    lines = [
-        f"{trace.source}: {'STEADY' if result.steady else 'FLAGGED'}: {result.verdict}",
-        f"  {size} of {trace.drive_frequency_khz:.7g} kHz, noise {result.noise_nm:.3g} nm a sample",
-    ]
+    lines = [f"  {size} of {trace.drive_frequency_khz:.7g} kHz, noise {result.noise_nm:.3g} nm a sample"]
     if result.peak_amplitude_nm is not None:
         order = result.order or 1
         response = f"nm at the {'drive' if order == 1 else 'response'}'s {trace.drive_frequency_khz / order:.7g} kHz"
         values = (
             ("peak amplitude", result.peak_amplitude_nm, result.peak_amplitude_error_nm, "nm"),
             ("lock-in amplitude", result.lockin_amplitude_nm, result.lockin_amplitude_error_nm, response),
-            ("phase", result.phase_deg, result.phase_error_deg, f"degrees, modulo {360.0 / (result.order or 1):g}"),
+            ("phase", result.phase_deg, result.phase_error_deg, f"degrees, modulo {360.0 / order:g}"),
         )
         lines += [f"  {name:<18}{with_error(value, error)} {unit}" for name, value, error, unit in values]
     if result.order != 1 and result.drive_lockin_amplitude_nm is not None:
@@ -60,13 +61,14 @@ def lockin_summary(result: LockinResult) -> str:
     if result.free_frequency_khz is not None and result.free_frequency_origin == "trace":
         frequency = f"{result.free_frequency_khz:.4g} kHz"
         lines.append(f"  {'free frequency':<18}{frequency} (from the bending at the top, for counting impacts only)")
-    return "\n".join([*lines, *(f"  - {warning}" for warning in result.warnings)])
+    verdict = Text(f"{trace.source}: {'STEADY' if result.steady else 'FLAGGED'}: {result.verdict}")
+    return [verdict, Text("\n".join(lines), "lines"), Bullets(result.warnings)]
 
 
 def write_lockin(
     results: Sequence[LockinResult], folder: Path, table: AmplitudeTable | None, table_fault: str | None
 ) -> list[Path]:
-    """Write lockin.json, a picture of every trace and, if there is a table, amplitudes.csv into a folder.
+    """Write lockin.html, lockin.json, a picture of every trace and, if there is a table, amplitudes.csv into a folder.
 
     Args:
         results: of all traces.
@@ -80,29 +82,26 @@ def write_lockin(
     Raises:
         OSError: if a file cannot be written.
     """
-    data = folder / "lockin.json"
-    text = json.dumps(lockin_payload(results, table_fault), indent=1, allow_nan=False)
-    write_whole(data, text + "\n")
-    written = [data]
-    for name, result in zip(_picture_names(results), results, strict=True):
-        draw_lockin(result, folder / name)
-        written.append(folder / name)
+    contents: dict[str, str | bytes] = {"lockin.json": strict_json(lockin_payload(results, table_fault)) + "\n"}
+    sections = []
+    for number, result in enumerate(results, 1):
+        stem, figure = Path(result.trace.source).stem or "trace", lockin_figure(result)
+        # traces of one name in different folders
+        name = next(name for k in count(1) if (name := f"lockin_{stem}{f'_{k}' * (k > 1)}.png") not in contents)
+        contents[name] = png_of(figure)
+        shows = "Left, the response periods on top of each other; right, the spectrum with the drive's fractions."
+        parts = [*lockin_parts(result), *pictures_of([svg_of(figure)], [shows])]
+        sections.append(ReportSection(stem, parts, f"{number} {stem}"))
+    flagged = [f"{result.trace.source}: {result.verdict}" for result in results if not result.steady]
+    fault = "" if table_fault is None else f"no amplitude table: {table_fault}"
+    verdict = "VALID" if not flagged else "NOT VALID: these traces are no steady single-impact orbits."
+    report = Report(f"Lock-in readings of {len(results)} traces", not flagged, verdict, flagged, sections)
+    contents["lockin.html"] = page_of(report, [Text(fault)] if fault else [])
     if table is not None:
-        write_whole(folder / "amplitudes.csv", csv_of(table))
-        written.append(folder / "amplitudes.csv")
-    return written
-
-
-def _picture_names(results: Sequence[LockinResult]) -> list[str]:
-    """Return a file name for each trace; traces of the same name in different folders are numbered."""
-    names: list[str] = []
-    for result in results:
-        stem = Path(result.trace.source).stem or "trace"
-        name, number = f"lockin_{stem}.png", 2
-        while name in names:
-            name, number = f"lockin_{stem}_{number}.png", number + 1
-        names.append(name)
-    return names
+        contents["amplitudes.csv"] = csv_of(table)
+    for name, content in contents.items():
+        write_whole(folder / name, content)
+    return [folder / name for name in contents]
 
 
 _FLAGGED = "#B00020"
@@ -111,11 +110,6 @@ _SMALL = 9
 _HIGHEST = 4.0
 """Multiples of the drive frequency in the spectrum."""
 _DECADES = 1e-5
-
-
-def draw_lockin(result: LockinResult, path: Path) -> None:
-    """Draw a reading as a PNG file."""
-    save(lockin_figure(result), path)
 
 
 def lockin_figure(result: LockinResult) -> Figure:

@@ -35,16 +35,11 @@ from fitting.tables.csv_text import (
     FileSetting,
     Form,
     TableError,
-    beyond,
     check_names,
     fault_in_number,
-    named_rows,
-    parse_rows,
     quoted,
     read_bytes,
-    said_beyond,
-    settings_in,
-    split_lines,
+    read_columns,
     text_of,
 )
 from fitting.tables.table import LOWEST_QUALITY_FACTOR
@@ -107,18 +102,6 @@ class TraceSettings:
     rest_nm: float | None = None
 
 
-def settings_of_comments(comments: list[tuple[int, str]], faults: Faults) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the settings that comment lines make, and the other comments.
-
-    Args:
-        comments: line number and text (without the number sign, stripped) of each.
-        faults: where a misspelt key, a value that is no number and a repeated key are noted.
-    """
-    found, remarks = settings_in(comments, SETTINGS, faults)
-    errors = {_ERRORS[key]: error for key, (_, error) in found.items() if error is not None}
-    return {key: value for key, (value, _) in found.items()} | errors, remarks
-
-
 def settings_of_attributes(attributes: Mapping[str, Any], faults: Faults) -> dict[str, float]:
     """Return the settings among the attributes of an HDF5 file; attributes of other names are left alone.
 
@@ -178,18 +161,19 @@ def _checked(name: str, value: float, faults: Faults) -> float:
 
 TRACE = Form(
     (
-        Column("time_us"),
-        Column("deflection_nm", needed="deflection"),
-        Column("position_nm", meaning="deflection_nm"),
-        Column("platform_nm", meaning="platform"),
-        Column("drive", meaning="platform"),
+        Column("time_us", kind="number"),
+        Column("deflection_nm", kind="number", needed="deflection"),
+        Column("position_nm", kind="number", meaning="deflection_nm"),
+        Column("platform_nm", kind="number", meaning="platform"),
+        Column("drive", kind="number", meaning="platform"),
     ),
     "sample",
     open=True,
     example="time_us,deflection_nm",
+    mend="cut the trace there or repair it",
 )
 """The columns that are read, and what each becomes; `drive` is the drive's signal in any unit."""
-ATTRIBUTES = {column.name: column.says for column in TRACE.columns}
+ATTRIBUTES = {column.name: column.becomes for column in TRACE.columns}
 
 
 @dataclass(frozen=True)
@@ -214,23 +198,11 @@ def parse_csv(text: str, faults: Faults) -> ParsedTrace:
     Raises:
         TableError: at once where the column names are wrong: the cells below them cannot be judged.
     """
-    comments, rows = split_lines(text)
-    settings, remarks = settings_of_comments(comments, faults)
-    if not rows:
-        faults.add("there are no samples; add a row of column names and a row for each sample")
-        faults.raise_any()
-    head, rows = named_rows(rows, TRACE, faults)
+    table = read_columns(text, TRACE, SETTINGS, faults)
     faults.raise_any()
-    columns, _, lines = parse_rows(rows, head.names, TRACE, faults)
-    faults.raise_any()
-    attributes = {ATTRIBUTES[name]: column for name, column in columns.items()}
-    return ParsedTrace(attributes, settings, "platform_nm" in columns, int(lines[0]), remarks)
-
-
-def wanted_columns(names: list[str], faults: Faults) -> list[str]:
-    """Return those of the names of data sets that are read, after noting what is missing or said twice."""
-    check_names(names, TRACE, faults=faults)
-    return [name for name in names if name in ATTRIBUTES]
+    settings = {key: value for key, (value, _) in table.settings.items()}
+    settings |= {_ERRORS[key]: error for key, (_, error) in table.settings.items() if error is not None}
+    return ParsedTrace(table.columns, settings, "platform_nm" in table.names, int(table.lines[0]), table.remarks)
 
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -260,9 +232,7 @@ def parse_hdf5(data: bytes, group: str | None, faults: Faults) -> ParsedTrace:
     # whatever a damaged file makes of the package
     except (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
         what = cut_short(" ".join(str(error).split()) or type(error).__name__, 200)
-        faults.add(f"cannot be read as HDF5 ({printable(what)}); save it again")
-        faults.raise_any()
-        raise
+        faults.fail(f"cannot be read as HDF5 ({printable(what)}); save it again")
 
 
 def _h5py(faults: Faults) -> Any:
@@ -270,19 +240,15 @@ def _h5py(faults: Faults) -> Any:
     try:
         return import_module("h5py")
     except ModuleNotFoundError:
-        faults.add("is an HDF5 file, which needs the package h5py; install it with: pip install h5py, or save as CSV")
-        faults.raise_any()
-        raise
+        faults.fail("is an HDF5 file, which needs the package h5py; install it with: pip install h5py, or save as CSV")
 
 
 def _read(h5py: Any, file: Any, group: str | None, faults: Faults, size: int) -> ParsedTrace:
     place = _group(h5py, file, group, faults)
     if not isinstance(place, h5py.Group):
         groups = _groups_with_deflection(h5py, file)
-        faults.add(
-            f"there is no group {quoted(str(group))}; those with deflection_nm are {', '.join(groups) or 'none'}"
-        )
-        faults.raise_any()
+        held = ", ".join(groups) or "none"
+        faults.fail(f"there is no group {quoted(str(group))}; those with deflection_nm are {held}")
     found = {name: _own(h5py, place, name, faults) for name in place if name in ATTRIBUTES}
     faults.raise_any()
     others = [name for name in place if name not in ATTRIBUTES and _is_own_data(h5py, place, name)]
@@ -291,9 +257,9 @@ def _read(h5py: Any, file: Any, group: str | None, faults: Faults, size: int) ->
     inner = [] if has_deflection else _groups_with_deflection(h5py, place)
     if inner:
         choice = f" (there are {', '.join(inner)})" if inner[1:] else ""
-        faults.add(f"there is no data set deflection_nm here; name its group: --group {inner[0]}{choice}")
-        faults.raise_any()
-    wanted = wanted_columns(names, faults)
+        faults.fail(f"there is no data set deflection_nm here; name its group: --group {inner[0]}{choice}")
+    check_names(names, TRACE, faults=faults)
+    wanted = [name for name in names if name in ATTRIBUTES]
     faults.raise_any()
     _check_sizes({name: found[name] for name in wanted}, size, faults)
     faults.raise_any()
@@ -448,11 +414,8 @@ def _check_samples(name: str, values: np.ndarray, trace: Trace, faults: Faults) 
         faults.add(f"has the shape {np.shape(values)}; it must have the deflection's, one number a sample", column=name)
         return
     # blank lines and comments between the samples are rare: the line is right without them
-    far = beyond(np.asarray(values), positive=False)
-    for index in np.flatnonzero(~np.isfinite(values) | far):
-        line = int(index) + (trace.first_line or 1)
-        must = said_beyond(values[index]) if far[index] else "must be finite"
-        faults.add(f"{must}, but is {values[index]}; cut the trace there or repair it", line=line, column=name)
+    lines = np.arange(len(values)) + (trace.first_line or 1)
+    TRACE.check_numbers(name, np.asarray(values, np.float64), lines, faults)
 
 
 def _check_length(trace: Trace, faults: Faults) -> None:

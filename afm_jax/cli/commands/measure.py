@@ -40,9 +40,9 @@ CALIBRATE = Command(
     --noise the errors are estimated from the misfit. frequency_khz is the undamped natural frequency, not that of the
     maximum. A thermal spectrum (NanoSurf .nid, or CSV with asd_nm_per_sqrt_hz or psd_nm2_per_hz and a comment
     `# averages = 1000`) gives the spring constant besides, by equipartition and, with the lever's length and width, by
-    Sader's method; --slope gives the sensitivity from force curves. With --out the report: calibration.txt, .json, .png
-    and (without --slope) calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the edge, not
-    converged, or not explained by the model.
+    Sader's method; --slope gives the sensitivity from force curves. With --out the report: calibration.html, .txt,
+    .json, .png and (without --slope) calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at
+    the edge, not converged, or not explained by the model.
     """,
     options=(
         click.argument("sweep", metavar="SWEEP", type=click.Path(path_type=Path)),
@@ -343,8 +343,8 @@ LOCKIN = Command(
     reference of the phase, platform_nm or drive. Every setting below may stand in the file instead, as a comment
     `# drive_frequency_khz = 180` or an HDF5 attribute; options hold for all traces. Orbits that are not steady with
     one impact are flagged: several impacts, period doubled, chaotic, drifting, ringing, stuck, no response. With --out
-    a picture of every trace, lockin.json, and amplitudes.csv for `afm-jax fit` with the steady ones; traces of one
-    drive give one row, their mean. Exit code 3 if a trace is flagged.
+    lockin.html, lockin.json, a picture of every trace, and amplitudes.csv for `afm-jax fit` with the steady ones;
+    traces of one drive give one row, their mean. Exit code 3 if a trace is flagged.
     """,
     options=(
         click.argument("traces", metavar="TRACE...", nargs=-1, required=True, type=click.Path(path_type=Path)),
@@ -461,7 +461,7 @@ TAPPING = Command(
     they can be known; then the law from the rows with fast impacts, or why not and what to record instead. With --out
     the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law. Several files, or a file of
     several curves, are taken as of one lever: frequency and Q are fitted to all, the scatter from curve to curve stands
-    beside the errors, with --out in together.png; each curve has a folder of its own.
+    beside the errors, with --out in together.html, .txt, .json, .png; each curve has a folder of its own.
     Exit code 3 if the energy of a tap is not determined.
     """,
     options=(
@@ -532,7 +532,7 @@ TAPPING_MAP = Command(
     of curves: arrays (rows, columns, points) with their height_nm, or with --grid a file of curves. Each pixel has its
     own error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said
     once. Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
-    With --out the report: map.png, map.json, map.txt and the arrays. Exit code 3 if most pixels are out of range.
+    With --out the report: map.html, .png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range.
     """,
     options=(
         click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path)),
