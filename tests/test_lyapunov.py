@@ -10,7 +10,7 @@ from click.testing import CliRunner
 import afm_jax as afm
 from afm_jax.cli.main import main
 from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum
-from afm_jax.dynamics.many_tips import Record, follow_contacts, recorded
+from afm_jax.dynamics.many_tips import Record, recorded, tips_after_contacts
 from afm_jax.dynamics.starts import batch_and_tips
 from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start, start_of, state
@@ -124,7 +124,7 @@ def test_the_contact_is_chaotic_at_high_frequency():
     # pairs of close tips, simulated: how far they part from the third contact to the tenth
     longest, lanes, few = 3, 10, 24
     scenes, tips = batch_and_tips(scene, start)
-    _, record = follow_contacts(scenes, tips, skip=40, record=few * lanes, accuracy=1e-6)
+    _, record = tips_after_contacts(scenes, tips, skip=40, record=few * lanes, accuracy=1e-6)
     omega = 2e-3 * np.pi * 180.0 * 5.277
     time, velocity = record.departure_us[0, ::lanes], record.velocity_after_nm_per_us[0, ::lanes]
 
@@ -143,6 +143,19 @@ def test_the_contact_is_chaotic_at_high_frequency():
     growth = np.log(apart[:, -1] / apart[:, longest - 1]) / (lanes - longest)
     assert np.isfinite(growth).all()
     assert np.mean(growth) == pytest.approx(larger, abs=4.0 * np.hypot(error, np.std(growth) / np.sqrt(few)))
+
+
+@pytest.mark.slow
+def test_contacts_that_a_captured_tip_does_not_have_are_told_as_none():
+    # every contact takes some speed, until the tip is slower than the 10.9 nm/us that the bridge keeps
+    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(0.5, 180.0), afm.Contact.paper())
+    scenes, tips = batch_and_tips(scene, start_of(scene, (270.0, 5.0, 60.0)))
+    tips, record = tips_after_contacts(scenes, tips, skip=0, record=100, accuracy=1e-6)
+    assert tips.outcome.tolist() == [Outcome.CAPTURED]
+    left = np.isfinite(record.departure_us[0])
+    assert 5 < left.sum() < 40
+    assert not np.any(left[:60])
+    assert all(np.array_equal(np.isfinite(part[0]), left) for part in record[:6])
 
 
 @pytest.mark.slow

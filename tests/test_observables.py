@@ -9,10 +9,12 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, sing
 from afm_jax.apparatus.drives import BaseDrive, Tone
 from afm_jax.apparatus.scene import drive_of
 from afm_jax.motion.follow import LongRun, follow_long
-from afm_jax.motion.observe import OBSERVABLES, Observables, observe, poincare_section
+from afm_jax.motion.observe import OBSERVABLES, MotionWindow, Observables, observe, poincare_section
 from afm_jax.motion.periodic import close_periods
 from afm_jax.motion.settle import find_repetition, find_repetitions, last_fifth, settled
+from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, start_of, state
+from afm_jax.motion.trajectory import dense_path
 from afm_jax.scenefile.presets import contact_scene, figure10_scene, figure11_scene
 
 TABULATED = ImpactLaw(1.0, 113.6, 0.5, CollisionDelay(0.206, 5.64, 0.726))
@@ -156,6 +158,19 @@ def test_the_platform_gives_what_air_and_impacts_take():
     np.testing.assert_allclose(
         seen.given_by_drives_aj, seen.dissipated_in_air_aj + seen.dissipated_in_contact_aj, rtol=1e-6
     )
+
+
+def test_a_platform_at_rest_gives_nothing_to_a_tip_that_it_stops():
+    # every impact before the capture counts, and the capture: what the tip had is in the air and in the sample
+    scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 180.0), ImpactLaw(0.9, 200.0))
+    start, end = state(0.0, 60.0, 0.0), 60.0
+    simulation = simulate(scene, start, end, max_contacts=20)
+    assert bool(simulation.held)
+    assert int(simulation.count) > 2
+    energy = MotionWindow(dense_path(scene, simulation, 0.0, end), 0.0, end).energy
+    # the Gauss sums over each flight are exact to 1e-12
+    np.testing.assert_allclose(energy.given_aj, 0.0, atol=1e-9 * energy.contact_aj)
+    np.testing.assert_allclose(energy.air_aj + energy.contact_aj, -energy.stored_aj, rtol=1e-9)
 
 
 def test_a_free_cantilever_responds_as_it_must():
