@@ -40,7 +40,6 @@ __all__ = [
     "differences",
     "junction",
     "mp",
-    "own_error",
 ]
 
 
@@ -208,11 +207,3 @@ def capture_difference(p: ContactParameters, name: str, *, step: Number = "1e-8"
         width = mp.mpf(step) * centre
         above, below = (capture_speed(replace(p, **{name: x}), digits=digits) for x in (centre + width, centre - width))
         return (above - below) / (2 * width)
-
-
-def own_error(p: ContactParameters, approach_speed: Number, *, digits: int = DIGITS) -> Collision:
-    """Return how far the collision differs, field by field, from one with 10 more digits and other Taylor steps."""
-    coarse, fine = (collision(p, approach_speed, digits=more) for more in (digits, digits + 10))
-    with mp.workdps(digits + GUARD_DIGITS):
-        errors = [abs(a - b) for a, b in zip(coarse[1:], fine[1:], strict=True)]
-        return Collision(coarse.captured is not fine.captured, *errors)

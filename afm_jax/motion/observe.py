@@ -504,8 +504,8 @@ class EnergyBalance(NamedTuple):
     """Work of all drives on the tip; with a law what closes the balance, else an integral of its own."""
     air_aj: float
     contact_aj: float
-    """Dissipated by the contacts: the sum of their losses, or -int F D' dt over the window where it cuts a resolved one.
-    An impact of a law that ends held has lost all its energy relative to the surface."""
+    """Dissipated by the contacts: the sum of their losses (an impact of a law that ends held has lost all its energy
+    relative to the surface), or -int F D' dt over the window where it cuts a resolved contact."""
     stored_aj: float
     """By how much the tip's kinetic energy and the spring's energy have grown."""
     imbalance: float | None
