@@ -75,20 +75,6 @@ def test_straight_contacts_are_those_of_an_independent_integration(contacts, acc
     np.testing.assert_allclose(np.asarray(leg.deepest_gap_nm)[holds], deepest[holds], rtol=0.0, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_nodes_and_sweeps_converge(contacts):
-    rebound = column(contacts, "rebound_speed_nm_per_us")
-    errors = []
-    for more in (0, 3, 6):
-        leg = crossed(contacts, QuickSetting(7 + more, 5 + more, 6 + more, 7 + more, 1e-2, 3 + more, 2 + more, 0.1))
-        straight = column(contacts, "junctions") == 1
-        held = np.asarray(leg.holds) & straight
-        errors.append(np.median(np.abs(np.asarray(leg.state.gap_rate) / rebound - 1.0)[held]))
-    # geometric: every three nodes and sweeps win more than a digit and a half, down to the reference's own digits
-    assert errors[1] < 0.03 * errors[0]
-    assert errors[2] < max(0.03 * errors[1], 1e-12)
-
-
 def test_a_leg_says_where_it_does_not_hold():
     scene = contact_scene(5.277, 4.0, 0.0)
     driven = driven_by(scene.interaction, scene.cantilever, scene.platform)

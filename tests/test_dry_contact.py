@@ -137,7 +137,13 @@ def test_law_of_a_dry_contact_gives_back_the_speed():
 SCENE = Scene(Cantilever(90.0, 40.0, 1.0), Platform(4.0, 180.0, 0.0), Contact(VanDerWaals() + Viscous(), Dmt()))
 
 
-@pytest.mark.parametrize("contact", [SCENE.interaction, Contact((), Hertz())], ids=["dmt", "hertz"])
+@pytest.mark.parametrize(
+    "contact",
+    [
+        pytest.param(SCENE.interaction, id="dmt"),
+        pytest.param(Contact((), Hertz()), id="hertz", marks=pytest.mark.slow),
+    ],
+)
 def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them(contact):
     scene = Scene(SCENE.cantilever, SCENE.platform, contact)
     simulation = simulate(scene, default_start(scene), 4.5 * float(SCENE.platform.period_us), max_contacts=16)

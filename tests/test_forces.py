@@ -99,9 +99,8 @@ def test_a_sum_does_not_depend_on_order_or_brackets(forces, gap, rate):
     left, right = ((a + b) + c) + d, a + (b + (c + d))
     assert isinstance(left, ForceSum)
     assert left.terms == right.terms
-    expected = sum(float(force(gap, rate)) for force in forces)
-    size = sum(abs(float(force(gap, rate))) for force in forces)
-    assert float(left(gap, rate)) == pytest.approx(expected, rel=0, abs=4e-16 * size * 4)
+    parts = [float(force(gap, rate)) for force in forces]
+    assert float(left(gap, rate)) == pytest.approx(sum(parts), rel=0, abs=4e-16 * np.abs(parts).sum() * 4)
     assert len(left.static.terms) == 3
     assert len(left.dissipative.terms) == 1
 
