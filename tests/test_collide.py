@@ -185,18 +185,6 @@ def test_impossible_speeds_are_outcomes():
     assert "positive finite" in CollisionOutcome.INVALID_START.sentence
 
 
-def test_wrong_calls_are_named():
-    contact = Contact.paper()
-    with pytest.raises(ValueError, match="`mass_ng` must be positive"):
-        collide(contact, 20.0, 0.0)
-    with pytest.raises(ValueError, match="`accuracy` must be at least 1e-11 with diffrax"):
-        collide(contact, 20.0, accuracy=1e-14)
-    with pytest.raises(ValueError, match="`method` must be one of diffrax, collocation, but is 'rk4'"):
-        collide(contact, 20.0, method="rk4")
-    with pytest.raises(ValueError, match=r"speeds' shape \(2,\), but one has \(3,\)"):
-        collide(Contact.paper(viscosity_pa_s=jnp.full(3, 1e-3)), jnp.array([20.0, 30.0]))
-
-
 @pytest.mark.slow
 def test_the_same_program_serves_other_numbers():
     traces = []

@@ -413,12 +413,6 @@ def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
     assert result.stderr == f"afm-jax: not valid: {answer['reason']}\n"
 
 
-def test_a_ramp_does_not_repeat():
-    ramped = Scene(Cantilever(90.0), Platform(2.0, 180.0, offset_rate_nm_per_us=1e-3), ImpactLaw(0.5))
-    with pytest.raises(ValueError, match="ramps"):
-        continue_orbits(ramped, 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0))
-
-
 @pytest.mark.slow
 def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     """Without adhesion loops of no speed close at both ends of the sample's motion; a tip can rest above it only."""

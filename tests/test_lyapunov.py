@@ -174,9 +174,3 @@ def test_the_command_tells_null_where_there_is_no_exponent(tmp_path):
     run = CliRunner().invoke(main, ["lyapunov", str(file), "--json", "--parameter", "platform.amplitude_nm=1:2:3"])
     assert run.exit_code == 3
     assert "free: the tip no longer meets the platform" in json.loads(run.stdout)["reason"]
-
-
-def test_a_scene_without_a_drive_has_no_exponents():
-    scene = afm.Scene(afm.Cantilever(90.0), afm.Platform(0.0, 180.0), afm.ImpactLaw(0.8))
-    with pytest.raises(ValueError, match="`amplitude_nm` of the platform must be positive"):
-        lyapunov_spectrum(scene)

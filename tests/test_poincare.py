@@ -246,8 +246,3 @@ def test_near_grazing_impacts_are_flagged():
     np.testing.assert_array_equal(impacts.near_grazing[sure], (approach < 1e-3 * top)[sure])
     assert 10 < np.sum(impacts.near_grazing[sure]) < np.sum(sure) - 10
     assert not np.any(impacts.near_grazing[impacts.outcome == Outcome.NO_FURTHER_IMPACT])
-
-
-def test_a_sequence_needs_a_positive_length():
-    with pytest.raises(ValueError, match="`impacts` must be a positive integer, but is 0"):
-        iterate_map(bouncing(), 4.0, 60.0, 0)

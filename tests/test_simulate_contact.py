@@ -244,16 +244,3 @@ def test_too_little_room_is_an_outcome():
     simulation = simulate(contact_scene(1.01, 4.0, 0.0), state((0.0, 10.0, 60.0)), 600.0, max_contacts=ROOM)
     assert int(simulation.outcome) == MotionOutcome.CONTACT_LIMIT
     assert int(simulation.count) == ROOM
-
-
-def test_impossible_calls_are_refused():
-    scene = contact_scene(1.01, 4.0, 0.0)
-    with pytest.raises(ValueError, match="inside the sample"):
-        simulate(scene, state((0.0, 4.05, 60.0)), 20.0)
-    with pytest.raises(ValueError, match="duration_us"):
-        simulate(scene, state((0.0, 10.0, 60.0)), 0.0)
-    with pytest.raises(ValueError, match="accuracy"):
-        simulate(scene, state((0.0, 10.0, 60.0)), 20.0, accuracy=1e-15)
-    no_junction = Scene(scene.cantilever, scene.platform, Contact.paper(adhesion_energy_j_per_m2=0.05))
-    with pytest.raises(ValueError, match="no junction"):
-        simulate(no_junction, state((0.0, 10.0, 60.0)), 20.0)
