@@ -14,7 +14,7 @@ from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import next_impact
 from tests.brute_force import Flights
 from tests.reference_examples import DELAY
-from tests.reference_systems import Parameters
+from tests.reference_flight import Parameters
 
 LANES = 512
 """Shape of the batches below: every test fills up to it, so that each structure is compiled once."""

@@ -15,8 +15,7 @@ from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from tests.package_scenes import bouncing
 from tests.reference_examples import scene
-from tests.reference_flight import mp
-from tests.reference_systems import free_flight, platform_motion
+from tests.reference_flight import free_flight, mp, platform_motion
 
 OMEGA = 2e-3 * np.pi * 90.0
 

@@ -15,9 +15,9 @@ from afm_jax.impact.jacobian import eq7, map_jacobian, paper_flight
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import next_impact
 from afm_jax.solve.derivatives import implicit_root
-from tests import reference_systems as reference
+from tests import reference_map
 from tests.reference_examples import SCENES
-from tests.reference_systems import Parameters
+from tests.reference_flight import Parameters
 
 STARTS = [(4.0, 60.0), (0.7, 35.0), (2.2, 120.0)]
 
@@ -43,7 +43,7 @@ def test_written_and_automatic_jacobians_have_twelve_digits(name, start):
     p, scene = SCENES[name], scene_of(SCENES[name])
     guess = float(next_impact(scene, *start).arrival_time_us)
     time, velocity = start
-    exact = np.array(reference.map_jacobian(p, time, velocity, guess).tolist(), dtype=float)
+    exact = np.array(reference_map.map_jacobian(p, time, velocity, guess).tolist(), dtype=float)
     at = jnp.array(start)
     # Condition numbers of these impacts stay below a few hundred.
     for found in (map_jacobian(scene, *start), jax.jacfwd(ends)(at, scene), jax.jacrev(ends)(at, scene)):
@@ -64,7 +64,7 @@ def test_second_derivatives_of_the_impact_time_have_nine_digits(name):
     guess = float(next_impact(scene, time, velocity).arrival_time_us)
 
     def arrival(t, v):
-        return reference.next_impact(p, t, v, guess).arrival_time_us
+        return reference_map.next_impact(p, t, v, guess).arrival_time_us
 
     with mpmath.workdps(60):
         pairs = [(2, 0), (1, 1), (0, 2)]

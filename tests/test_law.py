@@ -13,7 +13,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
 from tests.reference_examples import DELAY, SCENES
-from tests.reference_systems import Parameters, capture_speed, delay_us, rebound_slope, rebound_speed
+from tests.reference_flight import Parameters, capture_speed, delay_us, rebound_slope, rebound_speed
 
 restitution = st.floats(0.3, 1.0)
 losses = st.floats(0.0, 300.0)

@@ -18,6 +18,9 @@ from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.parameter_paths import scene_batch
 
 CHAOTIC, REGULAR, RESTING = 1.4875, (0.99, 1.05, 1.2), 0.2
+LONG = {"impacts": 1000, "transient": 200}
+"""Of all motions here: they share programs."""
+OPTIONS = [f"--{name}={value}" for name, value in LONG.items()]
 
 
 def law_scene(reduced: float, r: float = 0.8) -> afm.Scene:
@@ -54,7 +57,7 @@ def neighbours_grow(scene: afm.Scene, impacts: int, lanes: int) -> tuple[float, 
 @pytest.mark.slow
 def test_exponents_of_orbits_are_the_logarithms_of_their_multipliers():
     scenes = scene_batch(law_scene(1.0), {"platform.reduced_frequency": np.array(REGULAR)})
-    found = lyapunov_spectrum(scenes)
+    found = lyapunov_spectrum(scenes, **LONG)
     assert found.verdicts.names() == ["(1,1)"] * 3
     for lane, reduced in enumerate(REGULAR):
         orbits = afm.single_impact_orbits(law_scene(reduced), 1)
@@ -70,7 +73,7 @@ def test_exponents_of_orbits_are_the_logarithms_of_their_multipliers():
 
 @pytest.mark.slow
 def test_the_larger_exponent_is_the_growth_of_neighbouring_motions():
-    found = lyapunov_spectrum(law_scene(CHAOTIC), impacts=1000, transient=200)
+    found = lyapunov_spectrum(law_scene(CHAOTIC), **LONG)
     larger, error = found.exponents_per_impact[0], found.exponents_per_impact_error[0]
     assert larger > 10.0 * error
     grown, spread = neighbours_grow(law_scene(CHAOTIC), impacts=300, lanes=100)
@@ -92,10 +95,10 @@ def test_a_tip_that_rests_is_followed_like_a_simulation_and_forgets_its_start():
     found = (record.arrival_periods * float(scene.platform.period_us) + record.arrival_us)[0, :100]
     # rests are summed up to 1e-5 of their length
     np.testing.assert_allclose(found, arrivals, rtol=0, atol=1e-6)
-    exponents = lyapunov_spectrum(scene, impacts=400, transient=100)
+    exponents = lyapunov_spectrum(scenes, **LONG)
     assert np.all(np.isneginf(exponents.exponents_per_impact))
-    assert exponents.rested > 0
-    assert "forgets its start" in exponent_verdicts(lyapunov_spectrum(scenes, impacts=400, transient=100))[0]
+    assert exponents.rested[0] > 0
+    assert "forgets its start" in exponent_verdicts(exponents)[0]
 
 
 @pytest.mark.slow
@@ -162,7 +165,7 @@ def test_contacts_that_a_captured_tip_does_not_have_are_told_as_none():
 def test_the_command_tells_null_where_there_is_no_exponent(tmp_path):
     file = tmp_path / "scene.toml"
     afm.save_scene(law_scene(RESTING, r=0.5), file)
-    run = CliRunner().invoke(main, ["lyapunov", str(file), "--json", "--impacts", "100"])
+    run = CliRunner().invoke(main, ["lyapunov", str(file), "--json", *OPTIONS])
     told = json.loads(run.stdout)
     assert told["exponents_per_us"] == [None, None]
     assert told["exponents_per_impact"] == [None, None]
@@ -171,6 +174,8 @@ def test_the_command_tells_null_where_there_is_no_exponent(tmp_path):
     # far above the platform the free motion dies away
     away = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(1.0, 180.0, -30.0), afm.ImpactLaw(0.5))
     afm.save_scene(away, file)
-    run = CliRunner().invoke(main, ["lyapunov", str(file), "--json", "--parameter", "platform.amplitude_nm=1:2:3"])
+    run = CliRunner().invoke(
+        main, ["lyapunov", str(file), "--json", *OPTIONS, "--parameter", "platform.amplitude_nm=1:2:3"]
+    )
     assert run.exit_code == 3
     assert "free: the tip no longer meets the platform" in json.loads(run.stdout)["reason"]

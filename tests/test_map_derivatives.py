@@ -13,9 +13,8 @@ from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.outcomes import Outcome
 from tests.package_scenes import bouncing, scene_of, stacked
 from tests.reference_examples import DELAY, scene
-from tests.reference_flight import mp
-from tests.reference_systems import Parameters
-from tests.reference_systems import next_impact as exact_impact
+from tests.reference_flight import Parameters, mp
+from tests.reference_map import next_impact as exact_impact
 
 START = (4.0, 60.0)
 P = scene(r=0.98, epsilon=100.0, viscous_loss=0.4, delay=DELAY)

@@ -13,7 +13,7 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.map import next_impact
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.outcomes import Outcome
-from tests import reference_systems as reference
+from tests import reference_orbits
 from tests.package_scenes import bouncing, scene_of
 from tests.reference_examples import DELAY, SCENES, scene
 
@@ -69,7 +69,7 @@ def slots_with(orbits: SingleImpactOrbits) -> list[int]:
 
 
 def test_the_cases_cover_what_they_say():
-    found = {name: reference.single_impact_orbits(p, order) for name, (p, order) in CASES.items()}
+    found = {name: reference_orbits.single_impact_orbits(p, order) for name, (p, order) in CASES.items()}
     orbits = [orbit for some in found.values() for orbit in some]
     assert {orbit.stable for orbit in orbits} == {orbit.admissible for orbit in orbits} == {True, False}
     assert not found["no orbit: whole free periods"]
@@ -81,7 +81,7 @@ def test_the_cases_cover_what_they_say():
 @pytest.mark.parametrize("name", CASES)
 def test_orbits_are_those_of_the_reference(name):
     p, order = CASES[name]
-    exact = reference.single_impact_orbits(p, order)
+    exact = reference_orbits.single_impact_orbits(p, order)
     mine = single_impact_orbits(scene_of(p), order)
     slots = slots_with(mine)
     assert len(slots) == len(exact)

@@ -15,8 +15,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.map import NEAR_GRAZING, iterate_map, next_impact
 from afm_jax.outcomes import Outcome
-from tests import brute_force
-from tests import reference_systems as reference
+from tests import brute_force, reference_map
 from tests.flight_families import random_flights
 from tests.package_scenes import bouncing, next_impacts, repeated, scene_of, scenes_of, stacked
 from tests.reference_examples import SCENES, scene
@@ -25,7 +24,7 @@ from tests.reference_examples import SCENES, scene
 @pytest.mark.parametrize("name", SCENES)
 def test_ten_impacts_in_a_row_agree_with_fifty_digits(name):
     p = SCENES[name]
-    exact = reference.iterate(p, 4.0, 60.0, 10)
+    exact = reference_map.iterate(p, 4.0, 60.0, 10)
     rows = iterate_map(scene_of(p), 4.0, 60.0, 10)
     for i, impact in enumerate(exact):
         assert int(rows.outcome[i]) == (Outcome.CAPTURED if impact.captured else Outcome.IMPACT)

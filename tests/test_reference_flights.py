@@ -8,11 +8,7 @@ from scipy.integrate import solve_ivp
 
 from tests.brute_force import Flights, first_impact
 from tests.flight_families import FAMILIES, random_flights
-from tests.reference_systems import (
-    Parameters,
-    constants,
-    propagator,
-)
+from tests.reference_flight import Parameters, constants, propagator
 
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name != "grazing"])

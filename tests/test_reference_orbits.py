@@ -4,14 +4,9 @@ import numpy as np
 import pytest
 
 from tests.reference_examples import DELAY, SCENES, digits, scene
-from tests.reference_flight import mp
-from tests.reference_systems import (
-    constants,
-    iterate,
-    orbits_by_phase,
-    orbits_by_speed,
-    single_impact_orbits,
-)
+from tests.reference_flight import constants, mp
+from tests.reference_map import iterate
+from tests.reference_orbits import orbits_by_phase, orbits_by_speed, single_impact_orbits
 
 
 @pytest.mark.parametrize("name", SCENES)
