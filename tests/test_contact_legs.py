@@ -190,19 +190,6 @@ def test_a_step_in_time_is_that_of_diffrax():
         np.testing.assert_allclose(found, wanted, rtol=1e-14, atol=1e-14)
 
 
-def test_a_step_is_of_order_eight():
-    errors = []
-    for count in (6, 12):
-        state = ContactState(*(jnp.asarray(value) for value in (1.0, -1.0, 0.0, 0.0)))
-        for _ in range(count):
-            state = eighth_order_step(rates, state, jnp.asarray(1.5 / count))
-        errors.append(abs(float(state.x) * 2.5 - 1.0))
-        assert float(state.time_us) == pytest.approx(1.5, rel=1e-14)
-    slope = np.log(errors[0] / errors[1]) / np.log(2.0)
-    # steps of a quarter and an eighth of the time scale leave some of the next order
-    assert slope == pytest.approx(8.0, abs=0.5)
-
-
 @pytest.mark.parametrize("block", [3, 64])
 def test_the_few_get_what_each_would_alone(block):
     # halved until below the limit of its own: Collatz-like work of a very uneven number of passes

@@ -1,7 +1,5 @@
 """Settling and observables, compared with closed forms, with orbits of the impact law, and with made-up sequences."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ from afm_jax.motion.settle import find_repetition, find_repetitions, last_fifth,
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.motion.trajectory import dense_path
-from afm_jax.scenefile.presets import contact_scene, figure10_scene, figure11_scene
+from afm_jax.scenefile.presets import contact_scene
 
 TABULATED = ImpactLaw(1.0, 113.6, 0.5, CollisionDelay(0.206, 5.64, 0.726))
 # physics.md, full contact, Q = 40: n, beta, sigma, peak height
@@ -266,30 +264,6 @@ def test_the_contact_reaches_the_heights_of_the_paper(reduced: float, amplitude:
     assert seen.most_attractive_force_nn is not None
     # the JKR contact pulls with 3/2 pi w R at most: 141.37 nN for w = 0.3 J/m^2, R = 100 nm
     np.testing.assert_allclose(seen.most_attractive_force_nn, -1.5 * np.pi * 0.3 * 100.0, rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_below_resonance_the_amplitude_falls_until_the_tip_sticks():
-    scene = figure10_scene(offset_nm=-0.5, offset_rate_nm_per_us=1e-3)
-    run = follow_long(scene, default_start(scene), 5500.0)
-    assert run.verdict.stuck
-    speeds = poincare_section(scene, run.simulation).approach_speed_nm_per_us
-    assert 10 < len(speeds) < 1000
-    # slower and slower impacts, down towards the capture speed of 10.9 nm/us
-    thirds = np.array_split(speeds, 3)
-    assert thirds[0].mean() > thirds[1].mean() > thirds[2].mean()
-
-
-@pytest.mark.slow
-def test_above_resonance_the_amplitude_rises():
-    scene = figure11_scene(offset_nm=-2.0, offset_rate_nm_per_us=1e-3)
-    run, seen = seen_of(scene, 4000.0 / float(scene.platform.period_us))
-    assert not run.verdict.stuck
-    speeds = poincare_section(scene, run.simulation).approach_speed_nm_per_us
-    fifths = [part.mean() for part in np.array_split(speeds, 5)]
-    assert all(a < b for a, b in pairwise(fifths))
-    # 149.7 nm at 2 nm; the ramp of 1e-3 nm/us lags by 0.14 nm of offset, 3.5 nm of height
-    assert 140.0 < seen.peak_amplitude_nm < 150.0
 
 
 def test_velocities_that_alternate_within_rounding_are_one():

@@ -120,19 +120,6 @@ def test_admissible_orbits_are_fixed_points_of_the_map(name):
             assert inside or float(impact.time_us) < start + period - 1e-3
 
 
-@pytest.mark.parametrize(
-    ("reduced", "amplitude", "offset", "height"),
-    [(1.0001, 2.0, 0.0, 166), (1.01, 4.0, -2.0, 108), (1.01, 4.0, 0.0, 208), (1.01, 4.0, 2.0, 291)],
-)
-def test_peak_heights_without_delay_are_the_known_ones(reduced, amplitude, offset, height):
-    made = scene_of(scene(reduced, amplitude_nm=amplitude, offset_nm=offset))
-    orbits = single_impact_orbits(made, 1)
-    steady = np.asarray(orbits.stable & orbits.admissible)
-    assert np.sum(steady) == 1
-    # Known without decimals.
-    assert float(orbits.peak_amplitude_nm[steady][0]) == pytest.approx(height, abs=0.6)
-
-
 @pytest.mark.parametrize("quality_factor", [None, 1e12])
 def test_resonance_is_closed_form(quality_factor):
     made = Scene(Cantilever(90.0, quality_factor), Platform(2.0, 180.0), ImpactLaw(r=0.8))
