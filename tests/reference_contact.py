@@ -29,6 +29,7 @@ from tests.reference_contact_junction import Junction, junction
 __all__ = [
     "DIGITS",
     "EFFECTS",
+    "PUBLISHED",
     "Collision",
     "ContactParameters",
     "Differences",
@@ -41,6 +42,19 @@ __all__ = [
     "junction",
     "mp",
 ]
+
+
+PUBLISHED = {
+    12: (4.8899, -0.5148),
+    15: (10.1805, -0.0999),
+    20: (16.6251, 0.0167),
+    30: (27.7774, 0.0650),
+    40: (38.2958, 0.0750),
+    60: (58.7902, 0.0778),
+    100: (99.1735, 0.0746),
+    200: (199.4561, 0.0674),
+}
+"""Rebound speed (nm/us) and delay (us) of the paper's contact by an independent program, to the digits it printed."""
 
 
 class Collision(NamedTuple):

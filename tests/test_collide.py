@@ -12,23 +12,13 @@ from afm_jax.solve.lanes import LANES
 from tests import reference_contact as exact
 from tests.collisions_of_eight import collide_in_eights
 
-PUBLISHED = {
-    12: (4.8899, -0.5148),
-    15: (10.1805, -0.0999),
-    20: (16.6251, 0.0167),
-    30: (27.7774, 0.0650),
-    40: (38.2958, 0.0750),
-    60: (58.7902, 0.0778),
-    100: (99.1735, 0.0746),
-    200: (199.4561, 0.0674),
-}
 CAPTURE = 10.938450059496711  # mpmath, 25 digits; test_capture_speed recomputes it
 
 
 @pytest.mark.parametrize("method", ["diffrax", "collocation"])
 def test_published_table_to_all_digits_printed(method):
-    result = collide_in_eights(Contact.paper(), list(PUBLISHED), method=method)
-    rebound, delay = np.array(list(PUBLISHED.values())).T
+    result = collide_in_eights(Contact.paper(), list(exact.PUBLISHED), method=method)
+    rebound, delay = np.array(list(exact.PUBLISHED.values())).T
     # half a unit of the last digit
     np.testing.assert_allclose(result.rebound_speed_nm_per_us, rebound, rtol=0, atol=5.1e-5)
     np.testing.assert_allclose(result.collision_delay_us, delay, rtol=0, atol=5.1e-5)

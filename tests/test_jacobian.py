@@ -10,25 +10,14 @@ from hypothesis import strategies as st
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.jacobian import eq7, map_jacobian, paper_flight
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import next_impact
 from afm_jax.solve.derivatives import implicit_root
 from tests import reference_map
+from tests.package_scenes import scene_of
 from tests.reference_examples import SCENES
-from tests.reference_flight import Parameters
 
 STARTS = [(4.0, 60.0), (0.7, 35.0), (2.2, 120.0)]
-
-
-def scene_of(p: Parameters) -> Scene:
-    delay = None if p.delay is None else CollisionDelay(*p.delay, corrections=False)
-    return Scene(
-        Cantilever(p.frequency_khz, p.quality_factor),
-        Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm),
-        ImpactLaw(r=p.r, epsilon=p.epsilon, viscous_loss=p.viscous_loss, delay=delay),
-    )
 
 
 def ends(start, scene):

@@ -3,6 +3,7 @@
 import pytest
 
 from tests.reference_contact import (
+    PUBLISHED,
     ContactParameters,
     capture_speed,
     collision,
@@ -21,19 +22,6 @@ from tests.reference_contact_forces import (
 PAPER = ContactParameters()
 SOFT = ContactParameters(modulus_gpa=1)  # its junction reaches beyond the bridge
 INVISCID = ContactParameters(effects=("capillary", "structural", "core", "jkr"))
-
-
-# Rebound speed (nm/us) and delay (us) by an independent program, to the digits it printed.
-PUBLISHED = {
-    12: (4.8899, -0.5148),
-    15: (10.1805, -0.0999),
-    20: (16.6251, 0.0167),
-    30: (27.7774, 0.0650),
-    40: (38.2958, 0.0750),
-    60: (58.7902, 0.0778),
-    100: (99.1735, 0.0746),
-    200: (199.4561, 0.0674),
-}
 
 
 def test_collisions_come_out_as_published():

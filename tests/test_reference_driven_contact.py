@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import RK45
 
-from tests.reference_contact import ContactParameters, collision, junction
+from tests.reference_contact import PUBLISHED, ContactParameters, collision, junction
 from tests.reference_driven_contact import BRIDGE, DRY, JUNCTION, ContactRecord, Course, DrivenContact, follow
 from tests.reference_driven_motion import Motion
 from tests.reference_driven_steps import Mark, Steps, follow_to_mark
@@ -15,15 +15,6 @@ from tests.reference_driven_steps import Mark, Steps, follow_to_mark
 PAPER = ContactParameters()
 SOFT = ContactParameters(modulus_gpa=1)  # its junction reaches beyond the bridge
 FAST = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=2 * 5.277 * 90.0)  # figure 8
-
-# Rebound speed (nm/us) and delay (us) of a free tip by an independent program, to the digits it printed.
-PUBLISHED = {
-    12: (4.8899, -0.5148),
-    15: (10.1805, -0.0999),
-    20: (16.6251, 0.0167),
-    60: (58.7902, 0.0778),
-    200: (199.4561, 0.0674),
-}
 
 
 def bounce(system: DrivenContact, velocity: float, contacts: int, **how: Any) -> Course:
