@@ -1,6 +1,7 @@
 """Lyapunov exponents against multipliers, determinants and the growth of neighbouring motions."""
 
 import json
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +19,7 @@ from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.parameter_paths import scene_batch
 
 CHAOTIC, REGULAR, RESTING = 1.4875, (0.99, 1.05, 1.2), 0.2
-LONG = {"impacts": 1000, "transient": 200}
+LONG: dict[str, Any] = {"impacts": 1000, "transient": 200}
 """Of all motions here: they share programs."""
 OPTIONS = [f"--{name}={value}" for name, value in LONG.items()]
 
