@@ -326,7 +326,7 @@ MUTATIONS = {
     "Newton's step taken in full": Mutation(
         "step if self.damping is None else self.damping(x, step)",
         "step",
-        f"{SOLVE}test_equations_of_elements_end_one_by_one_within_their_domain",
+        f"{SOLVE}test_slots_end_one_by_one_within_their_domain",
     ),
     "Newton's method content with a small residual or a small step": Mutation(
         "found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)",

@@ -13,8 +13,8 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import next_impact
 from tests.brute_force import Flights
-from tests.reference_examples import DELAY
-from tests.reference_systems import Parameters
+from tests.reference_examples import DELAY, scene
+from tests.reference_flight import Parameters
 
 LANES = 512
 """Shape of the batches below: every test fills up to it, so that each structure is compiled once."""
@@ -32,17 +32,7 @@ def scene_of(p: Parameters, *, offset_rate_nm_per_us: float = 0.0) -> Scene:
 
 def bouncing(reduced: float = 1.01, **changes: Any) -> Scene:
     """Return a damped scene with a delay, every parameter its own keyword; `delay=None` and others can be replaced."""
-    values: dict[str, Any] = {
-        "frequency_khz": 90.0,
-        "quality_factor": 40.0,
-        "amplitude_nm": 4.0,
-        "offset_nm": -1.0,
-        "r": 0.9981,
-        "epsilon": 122.0,
-        "viscous_loss": 0.3,
-        "delay": DELAY,
-    }
-    return scene_of(Parameters(drive_frequency_khz=180.0 * reduced, **(values | changes)))
+    return scene_of(scene(reduced, **({"viscous_loss": 0.3, "delay": DELAY} | changes)))
 
 
 def stacked(scenes: list[Scene]) -> Scene:

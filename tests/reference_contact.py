@@ -29,6 +29,7 @@ from tests.reference_contact_junction import Junction, junction
 __all__ = [
     "DIGITS",
     "EFFECTS",
+    "PUBLISHED",
     "Collision",
     "ContactParameters",
     "Differences",
@@ -40,8 +41,20 @@ __all__ = [
     "differences",
     "junction",
     "mp",
-    "own_error",
 ]
+
+
+PUBLISHED = {
+    12: (4.8899, -0.5148),
+    15: (10.1805, -0.0999),
+    20: (16.6251, 0.0167),
+    30: (27.7774, 0.0650),
+    40: (38.2958, 0.0750),
+    60: (58.7902, 0.0778),
+    100: (99.1735, 0.0746),
+    200: (199.4561, 0.0674),
+}
+"""Rebound speed (nm/us) and delay (us) of the paper's contact by an independent program, to the digits it printed."""
 
 
 class Collision(NamedTuple):
@@ -208,11 +221,3 @@ def capture_difference(p: ContactParameters, name: str, *, step: Number = "1e-8"
         width = mp.mpf(step) * centre
         above, below = (capture_speed(replace(p, **{name: x}), digits=digits) for x in (centre + width, centre - width))
         return (above - below) / (2 * width)
-
-
-def own_error(p: ContactParameters, approach_speed: Number, *, digits: int = DIGITS) -> Collision:
-    """Return how far the collision differs, field by field, from one with 10 more digits and other Taylor steps."""
-    coarse, fine = (collision(p, approach_speed, digits=more) for more in (digits, digits + 10))
-    with mp.workdps(digits + GUARD_DIGITS):
-        errors = [abs(a - b) for a, b in zip(coarse[1:], fine[1:], strict=True)]
-        return Collision(coarse.captured is not fine.captured, *errors)

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from tests.reference_flight import mp
-from tests.reference_systems import Parameters
+from tests.reference_flight import Parameters, mp
 
 DELAY = (0.206, 5.64, 0.726)  # the contact model's, physics.md
 

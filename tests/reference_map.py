@@ -1,4 +1,4 @@
-"""One impact to the next with 50 digits: the map, its derivative by two methods, and eqs. 5, 7 and 8 as printed."""
+"""One impact to the next with 50 digits: the map, and its derivative by two methods."""
 
 from typing import NamedTuple
 
@@ -149,61 +149,3 @@ def differenced_jacobian(p: Parameters, t1: Number, v1: Number, guess: Number) -
             rise = ahead.velocity_after_nm_per_us - behind.velocity_after_nm_per_us
             jacobian[1, column] = rise / (2 * step)
         return jacobian
-
-
-def _demand_papers_model(p: Parameters) -> None:
-    """Refuse parameters that the printed equations do not cover."""
-    if p.quality_factor is not None or p.delay is not None or p.viscous_loss:
-        raise ValueError("the paper's equations know no air damping, viscous loss or delay: leave them out")
-
-
-@high_precision
-def eq5(p: Parameters, t1: Number, v1: Number, t2: Number) -> Matrix:
-    """Return d(t2, V2)/d(t1, V1') as printed in the paper's eq. 5, 2 x 2 (undamped)."""
-    _demand_papers_model(p)
-    k = constants(p)
-    W, w, beta = k.free, k.drive, k.amplitude
-    C, S = mp.cos(W * (t2 - t1)), mp.sin(W * (t2 - t1))
-    s1, s2 = mp.sin(w * t1), mp.sin(w * t2)
-    A, B = k.offset + beta * mp.cos(w * t1), v1 / W
-    below = A * W * S - B * W * C - beta * w * s2
-    first = [(-beta * w * s1 * C + A * W * S - B * W * C) / below, S / W / below]
-    second = [
-        beta * w * W * s1 * S - W**2 * (A * C + B * S) * beta * w * (s2 - s1 * C) / below,
-        C - W * (A * C + B * S) * S / below,
-    ]
-    return mp.matrix([first, second])
-
-
-@high_precision
-def eq7(p: Parameters, t2: Number, v2: Number) -> Matrix:
-    """Return d(t2, V2')/d(t2, V2) as printed in the paper's eq. 7, 2 x 2; v2 is the velocity before the impact."""
-    _demand_papers_model(p)
-    k = constants(p)
-    fall = v2 + k.amplitude * k.drive * mp.sin(k.drive * t2)
-    ratio = k.r**2 * fall / mp.sqrt(k.r**2 * fall**2 - k.epsilon)
-    return mp.matrix([[1, 0], [k.amplitude * k.drive**2 * mp.cos(k.drive * t2) * (ratio - 1), ratio]])
-
-
-@high_precision
-def eq8_traces(p: Parameters, order: int, phase_rad: Number, after: Number) -> tuple[Number, Number]:
-    """Return the trace T of the paper's eq. 8 on a (1, order) orbit in both printed forms.
-
-    Args:
-        p: without damping, viscous loss and delay.
-        order: drive periods of a response period.
-        phase_rad: omega t at the impact.
-        after: V' in nm/us; V = -V' on an undamped orbit.
-    """
-    _demand_papers_model(p)
-    k = constants(p)
-    c, s = mp.cos(phase_rad), mp.sin(phase_rad)
-    C, S = mp.cos(k.free * order * k.drive_period), mp.sin(k.free * order * k.drive_period)
-    swing, wp, before = k.amplitude * k.drive * s, -k.amplitude * k.drive * s, -after
-    ratio = (before - wp) / (after - wp)
-    bracket = swing - swing * C - (after + swing * C) * k.r**2 * ratio
-    bracket += k.amplitude * k.drive**2 / k.free * c * S * (k.r**2 * ratio - 1)
-    alpha = after / wp
-    gain = k.r**2 * (alpha + 1) / (alpha - 1)
-    short = C - 1 + (alpha - C) * gain + k.drive / k.free * c / s * S * (gain + 1)
-    return 1 + bracket / (wp - before), 1 + short / (1 + alpha)

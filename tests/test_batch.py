@@ -74,20 +74,6 @@ def test_hessian_agrees_with_differences_of_the_gradient():
     np.testing.assert_allclose(np.asarray(jax.jit(jax.hessian(last))(point)), np.stack(rows), rtol=1e-6, atol=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("times", "impacts", "block", "message"),
-    [
-        (jnp.zeros((2, 1)), 1, 1, "must have one shape"),
-        (jnp.zeros(2), 0, 1, "`impacts` must be a positive integer, but is 0"),
-        (jnp.zeros(2), 1, 0, "`block` must be a positive integer, but is 0"),
-        (jnp.zeros(0), 1, 1, "at least one row"),
-    ],
-)
-def test_wrong_arguments_are_named(times: jax.Array, impacts: int, block: int, message: str):
-    with pytest.raises(ValueError, match=message):
-        iterate_batch(regular_scene().scene, times, times + 6.0, impacts, block=block)
-
-
 def test_a_parameter_of_another_length_is_named():
     scene: Scene = eqx.tree_at(lambda one: one.interaction.r, regular_scene().scene, jnp.full(3, 0.5))
     with pytest.raises(ValueError, match=r"shape \(3,\).*match \(2,\)"):

@@ -11,8 +11,8 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, save
 from afm_jax.cli.main import main
 from afm_jax.cli.orbits import COLUMNS
 from tests.reference_examples import SCENES, scene
+from tests.reference_flight import Parameters
 from tests.reference_orbits import single_impact_orbits
-from tests.reference_systems import Parameters
 from tests.strict_reading import strictly
 
 KEYS = {*COLUMNS}

@@ -75,20 +75,6 @@ def test_straight_contacts_are_those_of_an_independent_integration(contacts, acc
     np.testing.assert_allclose(np.asarray(leg.deepest_gap_nm)[holds], deepest[holds], rtol=0.0, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_nodes_and_sweeps_converge(contacts):
-    rebound = column(contacts, "rebound_speed_nm_per_us")
-    errors = []
-    for more in (0, 3, 6):
-        leg = crossed(contacts, QuickSetting(7 + more, 5 + more, 6 + more, 7 + more, 1e-2, 3 + more, 2 + more, 0.1))
-        straight = column(contacts, "junctions") == 1
-        held = np.asarray(leg.holds) & straight
-        errors.append(np.median(np.abs(np.asarray(leg.state.gap_rate) / rebound - 1.0)[held]))
-    # geometric: every three nodes and sweeps win more than a digit and a half, down to the reference's own digits
-    assert errors[1] < 0.03 * errors[0]
-    assert errors[2] < max(0.03 * errors[1], 1e-12)
-
-
 def test_a_leg_says_where_it_does_not_hold():
     scene = contact_scene(5.277, 4.0, 0.0)
     driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
@@ -202,19 +188,6 @@ def test_a_step_in_time_is_that_of_diffrax():
     expected = solver.step(term, 0.0, 1.0, state, None, memory, made_jump=False)[0]
     for found, wanted in zip(eighth_order_step(rates, state, length), expected, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-14, atol=1e-14)
-
-
-def test_a_step_is_of_order_eight():
-    errors = []
-    for count in (6, 12):
-        state = ContactState(*(jnp.asarray(value) for value in (1.0, -1.0, 0.0, 0.0)))
-        for _ in range(count):
-            state = eighth_order_step(rates, state, jnp.asarray(1.5 / count))
-        errors.append(abs(float(state.x) * 2.5 - 1.0))
-        assert float(state.time_us) == pytest.approx(1.5, rel=1e-14)
-    slope = np.log(errors[0] / errors[1]) / np.log(2.0)
-    # steps of a quarter and an eighth of the time scale leave some of the next order
-    assert slope == pytest.approx(8.0, abs=0.5)
 
 
 @pytest.mark.parametrize("block", [3, 64])

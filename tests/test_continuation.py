@@ -32,7 +32,6 @@ from afm_jax.dynamics import curves
 from afm_jax.dynamics.bands import UncertainParameters, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
-from afm_jax.plots.branches import draw_continuation, draw_curves
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.strict_reading import strictly
 
@@ -214,31 +213,6 @@ def test_a_resting_and_a_driven_tip_graze_where_they_must():
     assert only(one, "grazing") == pytest.approx([-size], abs=1e-8)
 
 
-@pytest.fixture
-def feeding(monkeypatch: pytest.MonkeyPatch):
-    """Let every impact feed the motion by a hundredth more than it does: no law of the package does."""
-    true = curves.trace_and_determinant_of
-
-    def more(*arguments):
-        trace, determinant = true(*arguments)
-        return trace, 1.02 * determinant
-
-    monkeypatch.setattr(curves, "trace_and_determinant_of", more)
-    jax.clear_caches()
-    yield
-    jax.clear_caches()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("feeding")
-def test_multipliers_cross_the_circle_at_a_torus_point():
-    given = Scene(Cantilever(90.0), Platform(4.0, 181.8, -1.0), ImpactLaw(0.985))
-    # undamped, without adhesion D = r^2
-    assert only(continue_orbits(given, 1, ParameterRange("interaction.r", 0.98, 0.995)), "torus") == pytest.approx(
-        [1.0 / np.sqrt(1.02)], abs=1e-8
-    )
-
-
 @pytest.mark.slow
 def test_an_impact_that_lasts_feeds_no_motion():
     lasting = ImpactLaw(0.99, 0.0, 0.0, CollisionDelay(0.206, 0.0, 0.0))
@@ -311,17 +285,6 @@ def test_errors_of_special_points_are_those_of_orbits_followed_anew():
     # what is second order is small: bands of +- 1.96 errors are where they should be
     bends = np.abs([up + down - 2.0 * middle for up, down in pairs])
     assert np.all(bends < 0.05 * expected)
-
-
-@pytest.mark.slow
-def test_pictures_are_files_of_their_suffix(doubled: Continuation, tmp_path: Path):
-    for name, magic in (("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")):
-        draw_continuation(
-            doubled, tmp_path / name, bands=[np.full(len(one.parameter), 0.1) for one in doubled.branches]
-        )
-        assert (tmp_path / name).read_bytes().startswith(magic)
-    draw_curves(doubled, tmp_path / "b.png")
-    assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
 
 
 def run(*arguments: str) -> Result:
@@ -442,63 +405,12 @@ def test_where_axes_set_every_parameter_of_a_fit_nothing_is_drawn():
 
 
 @pytest.mark.slow
-def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
-    path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
-    arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--law")
-    for changes, said in (
-        ({"valid": False}, "the fit is not valid"),
-        ({"format": "other"}, "holds no law"),
-        ({"format_version": 1}, "has format_version 1, but 2 is known here; write it anew"),
-    ):
-        result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))
-        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1), result.stderr
-        assert said in result.stderr
-
-
-@pytest.mark.slow
 def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
     path = saved(tmp_path / "scene.toml", scene(0.1, epsilon=5.0))
     result = run(path, "--order", "1", "--parameter", "platform.reduced_frequency=1.3:1.4", "--json")
     answer = strictly(result.stdout)
     assert (result.exit_code, answer["points"]) == (3, [])
     assert result.stderr == f"afm-jax: not valid: {answer['reason']}\n"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--parameter", "platform.amplitude=1:2"), "did you mean platform.amplitude_nm?"),
-        (("--parameter", "platform.amplitude_nm=2:1"), "the range is empty"),
-        (("--parameter", "interaction.r=0:0.9"), "begin the range above 0"),
-        (("--parameter", "interaction.r=0.5:2"), "`r` must be in [0, 1]"),
-        (("--parameter", "interaction.r=0.5:0.9", "--impacts", "65"), "--impacts"),
-        (("--parameter", "interaction.r=0.5:0.9", "--second", "interaction.epsilon=1:2"), "the scene's own value, 0"),
-        (("--parameter", "interaction.r=0.5:0.9", "--picture", "gif"), "must be png, pdf or svg"),
-        pytest.param(
-            ("--parameter", "interaction.r=0.5:0.9", "--law", "scene.toml"), "scene.toml", marks=pytest.mark.slow
-        ),
-    ],
-)
-def test_wrong_requests_are_one_line(arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    path = saved(tmp_path / "scene.toml", scene())
-    result = run(path, "--order", "1", *arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert len(result.stderr.splitlines()) == 1
-    assert said in result.stderr
-
-
-def test_a_scene_without_a_law_is_refused(tmp_path: Path):
-    path = saved(tmp_path / "scene.toml", Scene(Cantilever(90.0), Platform(2.0, 180.0)))
-    result = run(path, "--order", "1", "--parameter", "platform.amplitude_nm=1:2")
-    assert result.exit_code == 2
-    assert 'must be "law" here' in result.stderr
-
-
-def test_a_ramp_does_not_repeat():
-    ramped = Scene(Cantilever(90.0), Platform(2.0, 180.0, offset_rate_nm_per_us=1e-3), ImpactLaw(0.5))
-    with pytest.raises(ValueError, match="ramps"):
-        continue_orbits(ramped, 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0))
 
 
 @pytest.mark.slow
@@ -516,3 +428,31 @@ def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     ends = {end: one.parameter[place] for one in found.branches for place, end in ((0, one.ends[0]), (-1, one.ends[1]))}
     assert "capture" not in ends
     assert abs(ends["no_speed"]) == pytest.approx(beta, abs=1e-3)
+
+
+@pytest.fixture
+def feeding(monkeypatch: pytest.MonkeyPatch):
+    """Let every impact feed the motion by a hundredth more than it does: no law of the package does.
+
+    The test with it is the last of the file: what JAX has compiled for the others is forgotten before and after.
+    """
+    true = curves.trace_and_determinant_of
+
+    def more(*arguments):
+        trace, determinant = true(*arguments)
+        return trace, 1.02 * determinant
+
+    monkeypatch.setattr(curves, "trace_and_determinant_of", more)
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("feeding")
+def test_multipliers_cross_the_circle_at_a_torus_point():
+    given = Scene(Cantilever(90.0), Platform(4.0, 181.8, -1.0), ImpactLaw(0.985))
+    # undamped, without adhesion D = r^2
+    assert only(continue_orbits(given, 1, ParameterRange("interaction.r", 0.98, 0.995)), "torus") == pytest.approx(
+        [1.0 / np.sqrt(1.02)], abs=1e-8
+    )

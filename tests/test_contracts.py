@@ -269,21 +269,6 @@ def test_a_large_batch_of_impacts_equals_small_ones():
     [
         lambda scene: next_impact(scene, TIME, VELOCITY),
         lambda scene: iterate_map(scene, TIME, VELOCITY, 2),
-        lambda scene: map_jacobian(scene, TIME, VELOCITY),
-        lambda scene: single_impact_orbits(scene, 1),
-    ],
-)
-def test_entry_points_ask_for_64_bits(call: Callable[[Scene], Any]):
-    with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64', True") as error:  # noqa: FBT003
-        call(bouncing())
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda scene: next_impact(scene, TIME, VELOCITY),
-        lambda scene: iterate_map(scene, TIME, VELOCITY, 2),
         lambda scene: iterate_batch(scene, np.array([TIME]), np.array([VELOCITY]), 2),
         lambda scene: map_jacobian(scene, TIME, VELOCITY),
         lambda scene: single_impact_orbits(scene, 1),

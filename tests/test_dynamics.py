@@ -173,35 +173,6 @@ def test_a_chart_is_that_of_plain_numpy_at_random_points():
 
 
 @pytest.mark.slow
-def test_a_thousand_random_points_of_a_chart_agree_with_long_iteration():
-    """A tip started beside the orbit comes back to it where the chart says stable, and leaves it elsewhere."""
-    scene, generator = law_scene(1.0), np.random.default_rng(11)
-    x, y = np.sort(generator.uniform(0.52, 4.4, 40)), np.sort(generator.uniform(0.3, 10.0, 25))
-    chart = stability_chart(
-        scene_family(scene, FREQUENCY, "platform.amplitude_nm"), x_values=x, y_values=y, last_order=4
-    )
-    n, beta = (np.ravel(part) for part in chart.points())
-    scenes = scene_batch(scene, {FREQUENCY: n, "platform.amplitude_nm": beta})
-    seen = 0
-    for order in range(1, 5):
-        orbits = jax.jit(jax.vmap(lambda one, order=order: afm.single_impact_orbits(one, order)))(scenes)
-        admissible = np.asarray(orbits.exists & orbits.admissible)
-        stable = admissible & np.asarray(orbits.stable)
-        rank = np.where(stable, orbits.peak_amplitude_nm, np.where(admissible, -1.0, -np.inf))
-        chosen = np.arange(len(n)), np.argmax(rank, axis=1)
-        phase, velocity = (np.asarray(part)[chosen] for part in (orbits.phase_rad, orbits.velocity_after_nm_per_us))
-        size = chart.verdicts.largest_multiplier[order - 1]
-        # so close to a border a thousand impacts do not tell
-        clear = admissible.any(axis=1) & ~(np.abs(np.nan_to_num(size) - 1.0) < 1e-3)
-        time = np.where(clear, phase / np.asarray(scenes.platform.angular_frequency), 0.0)
-        after = afm.iterate_batch(scenes, time, np.where(clear, velocity * (1.0 + 1e-7), 1.0), 1000)
-        apart = np.abs(np.asarray(after.velocity_after_nm_per_us)[:, -1] / velocity - 1.0)
-        assert np.array_equal((apart < 0.5e-7)[clear], chart.verdicts.stable[order - 1][clear]), order
-        seen += int(clear.sum())
-    assert seen > 2000
-
-
-@pytest.mark.slow
 def test_many_tips_begin_on_the_fastest_stable_orbit_of_the_full_search():
     delay = afm.CollisionDelay(0.20774, 5.3795, 0.79532)
     law = afm.ImpactLaw(1.0, 111.5, 0.55, delay)
@@ -245,25 +216,6 @@ def test_the_dimension_of_a_line_is_1_and_of_noise_2():
     noise = np.random.default_rng(1).integers(0, 2, (512, 512))
     assert boundary_dimension(noise)[0] == pytest.approx(2.0, abs=0.02)
     assert np.isnan(boundary_dimension(np.zeros((512, 512), int))[0])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["bifurcation", "{scene}", "--parameter", "interaction.rr=0.5:0.9:10"], "did you mean interaction.r"),
-        (["chart", "{scene}", "--x", "platform.amplitude_nm=1:2:3", "--y", "interaction.r=0.5:2:3"], "`r` must be in"),
-        (["basins", "{scene}", "--grid", "1000"], "COLUMNSxROWS"),
-        (["basins", "{scene}", "--grid", "9999x9999"], "COLUMNSxROWS"),
-        (["bifurcation", "{scene}", "--parameter", "platform.amplitude_nm=3:2:10"], "the range is empty"),
-    ],
-)
-def test_bad_requests_end_in_one_line(tmp_path: Path, arguments: list[str], words: str):
-    file = tmp_path / "scene.toml"
-    afm.save_scene(law_scene(1.0), file)
-    run = CliRunner().invoke(main, [text.format(scene=file) for text in arguments])
-    assert run.exit_code == 2
-    assert words in run.stderr
-    assert run.stderr.strip().count("\n") == 0
 
 
 @pytest.mark.slow

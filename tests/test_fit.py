@@ -23,7 +23,8 @@ from tests.fit_tables import (
     values_of,
     with_amplitudes,
 )
-from tests.reference_systems import Parameters, single_impact_orbits
+from tests.reference_flight import Parameters
+from tests.reference_orbits import single_impact_orbits
 
 
 @pytest.fixture(scope="module")

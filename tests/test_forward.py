@@ -7,7 +7,8 @@ from fitting.forward import Linearised, _filling, linearise
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
 from fitting.tables.table import AmplitudeTable
 from tests.reference_examples import scene
-from tests.reference_systems import Parameters, single_impact_orbits
+from tests.reference_flight import Parameters
+from tests.reference_orbits import single_impact_orbits
 
 VALUES = {"r": 0.98, "epsilon": 100.0, "quality_factor": 38.0}
 ROWS = [(1, 1.01, 4.0, -1.0), (1, 1.03, 3.0, 1.0), (2, 2.02, 4.0, 0.0), (1, 1.01, 0.1, 0.0)]  # the last: no orbit

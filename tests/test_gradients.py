@@ -23,7 +23,7 @@ from fitting.models import Problem, measurement_of
 from fitting.tables.table import AmplitudeTable
 from tests.reference_examples import scene
 from tests.reference_flight import constants, mp, platform, propagator
-from tests.reference_systems import single_impact_orbits
+from tests.reference_orbits import single_impact_orbits
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""

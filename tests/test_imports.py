@@ -210,52 +210,49 @@ def test_the_tests_of_the_imports_see_what_they_must():
     assert LEVELS["apparatus"] < LEVELS["impact"] < LEVELS["effects"] < LEVELS["plots"] < LEVELS["cli"]
 
 
-def test_packages_start_without_jax():
-    # Names are taken when they are used; then JAX is there.
-    code = "import sys, afm_jax, fitting; print('jax' in sys.modules); afm_jax.Cantilever; print('jax' in sys.modules)"
-    assert python(code).split() == ["False", "True"]
+PROGRAM = """
+import importlib, inspect, pkgutil, sys
+import afm_jax, fitting
+print("jax" in sys.modules)
+import jax
+before = dict(jax.config.values)
+import fitting.fits.fit, fitting.report.report
+print("scipy" in sys.modules)
+import afm_jax.plots.motion
+print("matplotlib.pyplot" in sys.modules)
+for package in (afm_jax, fitting):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+print({name for name, value in before.items() if jax.config.values[name] != value})
+for package in (afm_jax, fitting):
+    for name in dir(package):
+        public = getattr(package, name)
+        if callable(public) and not isinstance(public, type):
+            print(name, inspect.signature(public))
+        elif not callable(public):
+            print(name, type(public).__name__)
+print(inspect.signature(afm_jax.Cantilever))
+print(inspect.signature(afm_jax.Cantilever.propagator))
+"""
 
 
-def test_public_signatures_are_short_words():
-    code = (
-        "import inspect, afm_jax, fitting\nfor package in (afm_jax, fitting):\n    for name in dir(package):\n"
-        "        public = getattr(package, name)\n        if callable(public) and not isinstance(public, type):\n"
-        "            print(name, inspect.signature(public))\n"
-        "print(inspect.signature(afm_jax.Cantilever))\nprint(inspect.signature(afm_jax.Cantilever.propagator))"
-    )
-    lines = python(code).splitlines()
+def test_importing_brings_no_more_than_is_used_changes_no_setting_and_takes_no_functions_place():
+    lines = python(PROGRAM).splitlines()
+    # names are taken when they are used; statistics alone take as long as JAX, and posteriors import them
+    jax_is_there, scipy_is_there, pyplot_is_there, changed_settings = lines[:4]
+    assert (jax_is_there, scipy_is_there, pyplot_is_there) == ("False", "False", "False")
+    assert changed_settings == "set()"
+    # `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
+    # the function of that name would be gone
+    assert [line for line in lines if line.endswith(" module")] == ["fitting module"]
+    functions = {line.partition(" (")[0] for line in lines[4:-2] if " (" in line}
+    assert {"fit", "calibrate", "lockin", "invert", "design", "simulate", "collide"} <= functions
+    # signatures are short words
     assert not [line for line in lines if "Union[" in line or "afm_jax." in line or "collections" in line]
     constructor = "(frequency_khz: ArrayLike, quality_factor: ArrayLike | None = None, mass_ng: ArrayLike | None = None"
     assert lines[-2].startswith(constructor)
     assert lines[-1] == "(self, duration_us: ArrayLike) -> Propagator"
-
-
-def test_fits_load_no_scipy_and_pictures_no_pyplot():
-    # its statistics alone take as long as JAX: they are for posteriors, which import them when they need them
-    code = (
-        "import sys, fitting.fits.fit, fitting.report.report\nprint('scipy' in sys.modules)\n"
-        "import afm_jax.plots.motion\nprint('matplotlib.pyplot' in sys.modules)"
-    )
-    assert python(code).split() == ["False", "False"]
-
-
-def test_importing_everything_changes_no_setting_and_takes_no_functions_place():
-    # `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
-    # the function of that name would be gone.
-    code = (
-        "import importlib, pkgutil, jax, afm_jax, fitting\n"
-        "before = dict(jax.config.values)\n"
-        "for package in (afm_jax, fitting):\n"
-        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
-        "        if not module.name.endswith('__main__'):\n"
-        "            importlib.import_module(module.name)\n"
-        "    print([name for name in dir(package) if type(getattr(package, name)).__name__ == 'module'])\n"
-        "result = fitting.fit.__name__, fitting.calibrate.__name__, fitting.lockin.__name__, fitting.invert.__name__\n"
-        "print(*result, fitting.design.__name__, afm_jax.simulate.__name__, afm_jax.collide.__name__)\n"
-        "print({name for name, value in before.items() if jax.config.values[name] != value})"
-    )
-    lines = python(code).splitlines()
-    assert lines == ["['fitting']", "[]", "fit calibrate lockin invert design simulate collide", "set()"]
 
 
 def changes_of_configuration(path: Path) -> list[int]:

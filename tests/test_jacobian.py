@@ -10,25 +10,14 @@ from hypothesis import strategies as st
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.jacobian import eq7, map_jacobian, paper_flight
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import next_impact
 from afm_jax.solve.derivatives import implicit_root
-from tests import reference_systems as reference
+from tests import reference_map
+from tests.package_scenes import scene_of
 from tests.reference_examples import SCENES
-from tests.reference_systems import Parameters
 
 STARTS = [(4.0, 60.0), (0.7, 35.0), (2.2, 120.0)]
-
-
-def scene_of(p: Parameters) -> Scene:
-    delay = None if p.delay is None else CollisionDelay(*p.delay, corrections=False)
-    return Scene(
-        Cantilever(p.frequency_khz, p.quality_factor),
-        Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm),
-        ImpactLaw(r=p.r, epsilon=p.epsilon, viscous_loss=p.viscous_loss, delay=delay),
-    )
 
 
 def ends(start, scene):
@@ -43,19 +32,11 @@ def test_written_and_automatic_jacobians_have_twelve_digits(name, start):
     p, scene = SCENES[name], scene_of(SCENES[name])
     guess = float(next_impact(scene, *start).arrival_time_us)
     time, velocity = start
-    exact = np.array(reference.map_jacobian(p, time, velocity, guess).tolist(), dtype=float)
+    exact = np.array(reference_map.map_jacobian(p, time, velocity, guess).tolist(), dtype=float)
     at = jnp.array(start)
     # Condition numbers of these impacts stay below a few hundred.
     for found in (map_jacobian(scene, *start), jax.jacfwd(ends)(at, scene), jax.jacrev(ends)(at, scene)):
         np.testing.assert_allclose(found, exact, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_central_differences_agree(name):
-    scene, start, step = scene_of(SCENES[name]), np.array(STARTS[0]), 1e-5
-    moved = [(ends(start + d, scene) - ends(start - d, scene)) / (2.0 * step) for d in step * np.eye(2)]
-    # Error of the differences: step^2 times third derivatives, and rounding 1e-16 * 60 / step.
-    np.testing.assert_allclose(np.stack(moved, axis=1), map_jacobian(scene, *start), rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["paper", "damped"])
@@ -64,7 +45,7 @@ def test_second_derivatives_of_the_impact_time_have_nine_digits(name):
     guess = float(next_impact(scene, time, velocity).arrival_time_us)
 
     def arrival(t, v):
-        return reference.next_impact(p, t, v, guess).arrival_time_us
+        return reference_map.next_impact(p, t, v, guess).arrival_time_us
 
     with mpmath.workdps(60):
         pairs = [(2, 0), (1, 1), (0, 2)]
@@ -115,15 +96,6 @@ def test_undamped_map_scales_areas_by_restitution_and_speeds():
 def test_a_captured_tip_has_no_jacobian():
     scene = scene_of(SCENES["paper"])
     assert np.all(np.isnan(map_jacobian(scene, 0.0, 2.0)))
-
-
-def test_batch_equals_single():
-    scene = scene_of(SCENES["delayed"])
-    times, velocities = np.linspace(0.0, 5.0, 9), np.linspace(30.0, 90.0, 9)
-    batch = jax.jit(jax.vmap(map_jacobian, in_axes=(None, 0, 0)))(scene, times, velocities)
-    single = np.stack([map_jacobian(scene, t, v) for t, v in zip(times, velocities, strict=True)])
-    # Compiled differently, rounded differently; condition numbers stay below 1e4.
-    np.testing.assert_allclose(batch, single, rtol=1e-10)
 
 
 def _cubic(x, p):

@@ -12,8 +12,8 @@ from afm_jax.impact.closure import COARSE, OrbitPlace, OrbitProblem, find_roots,
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits, amplitudes, near_fold, orbit_state, steady_orbits
 from tests.reference_examples import DELAY, scene
+from tests.reference_flight import Parameters
 from tests.reference_lasting import closing_impacts, closing_speeds
-from tests.reference_systems import Parameters
 
 DRIVES = [(1, 0.97, 4.0, -1.0), (1, 1.01, 4.0, 1.0), (2, 2.0, 6.0, 0.0), (3, 3.03, 8.0, -0.5), (4, 3.9, 8.0, 1.0)]
 find = jax.jit(lambda problem: find_roots(problem, COARSE))

@@ -1,7 +1,6 @@
 """The impact law: energies, limits, its inverse and its slopes."""
 
 import jax
-import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
 from tests.reference_examples import DELAY, SCENES
-from tests.reference_systems import Parameters, capture_speed, delay_us, rebound_slope, rebound_speed
+from tests.reference_flight import Parameters, capture_speed, delay_us, rebound_slope, rebound_speed
 
 restitution = st.floats(0.3, 1.0)
 losses = st.floats(0.0, 300.0)
@@ -87,23 +86,6 @@ def test_a_captured_tip_has_finite_derivatives(speed):
         assert float(jax.grad(function)(speed)) == 0.0
     slopes = jax.grad(lambda some: some.rebound_speed(speed))(law)
     assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(slopes))
-
-
-def test_batch_equals_loop():
-    law, many = law_of(SCENES["delayed"]), np.linspace(5.0, 200.0, 40)
-    batch = jax.jit(jax.vmap(lambda u: jnp.stack([law.rebound_speed(u), law.collision_delay(u)])))(many)
-    loop = [[float(law.rebound_speed(u)), float(law.collision_delay(u))] for u in many]
-    # Compiled code may fuse multiply and add; terms of the delay cancel.
-    np.testing.assert_allclose(batch, loop, rtol=1e-13)
-
-
-@pytest.mark.parametrize(("name", "value"), [("r", -0.1), ("r", 1.1), ("epsilon", -1.0), ("viscous_loss", -0.1)])
-def test_impossible_values_are_named(name, value):
-    values = {"r": 0.9, "epsilon": 0.0, "viscous_loss": 0.0} | {name: value}
-    with pytest.raises(ValueError, match=f"`{name}` must (not )?be"):
-        ImpactLaw(r=values["r"], epsilon=values["epsilon"], viscous_loss=values["viscous_loss"])
-    with pytest.raises(ValueError, match="`lead_nm` must be a finite number"):
-        CollisionDelay(0.2, float("inf"), 0.7)
 
 
 def test_a_scene_without_law_is_refused():

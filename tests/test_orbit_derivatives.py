@@ -14,10 +14,9 @@ from scipy.optimize import brentq
 from afm_jax.impact.orbits import single_impact_orbits
 from tests.package_scenes import scene_of
 from tests.reference_examples import DELAY, SCENES, scene
-from tests.reference_flight import mp
+from tests.reference_flight import Parameters, capture_speed, constants, mp
 from tests.reference_orbits import _closing_by_speed
-from tests.reference_systems import Parameters, capture_speed, constants
-from tests.reference_systems import single_impact_orbits as exact_orbits
+from tests.reference_orbits import single_impact_orbits as exact_orbits
 from tests.test_map_derivatives import NAMES, leaf_of
 
 pytestmark = pytest.mark.slow

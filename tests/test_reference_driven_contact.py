@@ -1,4 +1,4 @@
-"""The reference of driven contacts against published numbers, mpmath, closed forms, plain SciPy and itself."""
+"""The reference of driven contacts against published numbers, mpmath, closed forms and itself."""
 
 from math import acos, asin, cos, pi, sqrt
 from typing import Any
@@ -7,25 +7,14 @@ import numpy as np
 import pytest
 from scipy.integrate import RK45
 
-from tests.reference_contact import ContactParameters, collision, junction
+from tests.reference_contact import PUBLISHED, ContactParameters, collision, junction
 from tests.reference_driven_contact import BRIDGE, DRY, JUNCTION, ContactRecord, Course, DrivenContact, follow
 from tests.reference_driven_motion import Motion
-from tests.reference_driven_plain import plain_course
 from tests.reference_driven_steps import Mark, Steps, follow_to_mark
 
 PAPER = ContactParameters()
 SOFT = ContactParameters(modulus_gpa=1)  # its junction reaches beyond the bridge
-RESONANT = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=2 * 1.01 * 90.0)
 FAST = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=2 * 5.277 * 90.0)  # figure 8
-
-# Rebound speed (nm/us) and delay (us) of a free tip by an independent program, to the digits it printed.
-PUBLISHED = {
-    12: (4.8899, -0.5148),
-    15: (10.1805, -0.0999),
-    20: (16.6251, 0.0167),
-    60: (58.7902, 0.0778),
-    200: (199.4561, 0.0674),
-}
 
 
 def bounce(system: DrivenContact, velocity: float, contacts: int, **how: Any) -> Course:
@@ -85,51 +74,12 @@ OTHER_STEPS = {"rtol": {"rtol": 1e-10}, "longest step": {"longest_step_us": 2e-4
 
 
 @pytest.mark.parametrize("how", OTHER_STEPS.values(), ids=OTHER_STEPS)
-@pytest.mark.parametrize(("system", "velocity"), [(RESONANT, 150.0), (FAST, 80.0), (FAST, 60.0), (FAST, 40.0)])
-def test_ten_contacts_do_not_depend_on_the_steps(system: DrivenContact, velocity: float, how: dict[str, Any]):
-    mine, other = bounce(system, velocity, 10), bounce(system, velocity, 10, **how)
+def test_ten_contacts_do_not_depend_on_the_steps(how: dict[str, Any]):
+    mine, other = bounce(FAST, 60.0, 10), bounce(FAST, 60.0, 10, **how)
     assert len(mine.contacts) == 10
     assert [c.junctions for c in mine.contacts] == [c.junctions for c in other.contacts]
     assert mine.arrival_times_us == pytest.approx(other.arrival_times_us, rel=0, abs=1e-9)
     assert mine.velocity_nm_per_us == pytest.approx(other.velocity_nm_per_us, rel=0, abs=1e-6)  # 1e-9 us of 200 nm/us^2
-
-
-# Heights and approach speeds that show each kind of contact of figure 8's scene: with a junction, with two, with none.
-KINDS = {1: (270.0, 5.0, 20.0), 2: (30.0, 3.6, 30.0), 0: (255.0, 3.6, 5.0)}
-
-
-@pytest.mark.parametrize("junctions", KINDS)
-def test_plain_scipy_finds_the_same_changes_of_phase(junctions: int):
-    assert compare_with_plain(FAST, KINDS[junctions]).contacts[0].junctions == junctions
-
-
-def test_plain_scipy_agrees_with_every_parameter_of_the_scene():
-    system = DrivenContact(
-        amplitude_nm=7.0,
-        drive_frequency_khz=300.0,
-        offset_nm=1.5,
-        offset_rate_nm_per_us=0.3,
-        frequency_khz=110.0,
-        quality_factor=3.0,
-        mass_ng=1.7,
-        contact=ContactParameters(modulus_gpa=80, viscosity_pa_s=2e-3, tip_radius_nm=80, bridge_breaks_nm=5),
-    )
-    assert len(compare_with_plain(system, (100.0, 6.0, 30.0)).contacts) == 1
-
-
-def compare_with_plain(system: DrivenContact, kind: tuple[float, float, float]) -> Course:
-    """Follow the tip from a phase, a height and an approach speed, which must agree with plain SciPy."""
-    phase, height, approach = kind
-    start = system.start(phase_deg=phase, height_nm=height, velocity_nm_per_us=0.0)
-    start = start._replace(velocity_nm_per_us=Motion(system).platform(start.time_us)[1] - approach)
-    end = start.time_us + 1.5
-    course = follow(system, *start, until_us=end)
-    times, state = plain_course(system, *start, until_us=end)
-    assert course.phase == DRY
-    # both to rtol 1e-12 a step; SciPy's events lie on interpolants, and its steps lose their order at the fold
-    assert [change.time_us for change in course.changes] == pytest.approx(times, rel=0, abs=1e-10)
-    assert [course.position_nm, course.velocity_nm_per_us] == pytest.approx(state, rel=0, abs=1e-8)
-    return course
 
 
 def test_a_soft_junction_breaks_straight_into_the_dry_state():
@@ -200,14 +150,3 @@ def test_no_mark_is_missed_within_a_step(beyond: float):
     within = 3e-8 if beyond < 0.0 else 2e-12
     assert way.end[1] == pytest.approx(cos(time), rel=0, abs=within)
     assert sum(way.lengths) == pytest.approx(time, rel=0, abs=within)
-
-
-def test_impossible_questions_are_refused():
-    with pytest.raises(ValueError, match="quality_factor must be above"):
-        _ = DrivenContact(amplitude_nm=1.0, drive_frequency_khz=1.0, quality_factor=0.5)
-    with pytest.raises(ValueError, match="until_us or contacts"):
-        _ = follow(FAST, 0.0, 9.0, 0.0)
-    with pytest.raises(ValueError, match="must start above"):
-        _ = follow(FAST, 0.0, 4.1, 0.0, contacts=1)
-    with pytest.raises(ValueError, match="must lie in"):
-        _ = follow(FAST, 0.0, 9.0, 0.0, until_us=0.1).sample([0.2])

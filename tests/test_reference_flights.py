@@ -8,15 +8,7 @@ from scipy.integrate import solve_ivp
 
 from tests.brute_force import Flights, first_impact
 from tests.flight_families import FAMILIES, random_flights
-from tests.reference_examples import digits, scene
-from tests.reference_flight import mp
-from tests.reference_systems import (
-    Parameters,
-    constants,
-    flights_of,
-    next_impact,
-    propagator,
-)
+from tests.reference_flight import Parameters, constants, propagator
 
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name != "grazing"])
@@ -107,26 +99,3 @@ def test_brute_force_decides_a_touch_by_the_sign_of_the_shift(shift: float):
         exact = 1 / 0.54 - np.arccos(1 + shift) / (2e-3 * np.pi * 540)
         # arccos near 1 loses half the digits of the shift
         assert impact.arrival_time_us[0] == pytest.approx(exact, abs=1e-8)
-
-
-@pytest.mark.parametrize("offset", [-3.0, 0.0, 2.0])
-def test_impact_on_a_platform_at_rest_is_closed_form(offset: float):
-    p = scene(quality_factor=None, amplitude_nm=0.0, offset_nm=offset, epsilon=0.0)
-    # z = R cos(Omega t - phi) is back at its height after 2 phi/Omega.
-    with mp.workdps(60):
-        free = constants(p).free
-        exact, after = 2 * mp.atan2(30 / free, offset) / free, 30 * mp.mpf(p.r)
-    rough = first_impact(flights_of(p, 0, 30), duration_us=20.0).arrival_time_us[0]
-    assert rough == pytest.approx(float(exact), rel=1e-14)  # the last digit of float64
-    impact = next_impact(p, 0, 30, rough)
-    assert digits(impact.arrival_time_us, exact) > 50
-    assert digits(impact.velocity_after_nm_per_us, after) > 50
-
-
-def test_overdamped_tips_and_bad_starts_are_refused():
-    with pytest.raises(ValueError, match="underdamped"):
-        scene(quality_factor=0.4)
-    with pytest.raises(ValueError, match="does not leave"):
-        first_impact(flights_of(scene(), 0.0, -1.0), duration_us=1.0)
-    with pytest.raises(ValueError, match="family must be"):
-        random_flights(0, 1, "unknown")

@@ -4,12 +4,8 @@ import tomllib
 from pathlib import Path
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
 from afm_jax.scenefile.scenefile import Start, read_scene
@@ -92,32 +88,6 @@ def test_start_is_kept_beside_the_scene(written):
     assert read_scene(path).start is None
 
 
-positive = st.floats(min_value=1e-30, max_value=1e30)
-# no drive is more than 1e4 times as fast as the tip
-frequencies = st.floats(min_value=1e-3, max_value=10.0)
-finite = st.floats(min_value=-1e30, max_value=1e30)
-not_negative = st.floats(min_value=0.0, max_value=1e30)
-scenes = st.builds(
-    Scene,
-    st.builds(Cantilever, frequencies, st.none() | st.floats(min_value=0.5, exclude_min=True), positive),
-    st.builds(Platform, not_negative, frequencies, finite, finite),
-    st.builds(
-        ImpactLaw,
-        st.floats(min_value=0.0, max_value=1.0, exclude_min=True, allow_subnormal=False),
-        not_negative,
-        not_negative,
-        st.none() | st.builds(CollisionDelay, finite, finite, finite, st.booleans()),
-    ),
-)
-
-
-@given(scene=scenes)
-def test_loop_is_exact(scene: Scene, tmp_path_factory: pytest.TempPathFactory):
-    path = tmp_path_factory.getbasetemp() / "loop.toml"
-    save_scene(scene, path)
-    assert eqx.tree_equal(load_scene(path), scene)
-
-
 def test_saved_file_has_the_keys_of_the_format(tmp_path: Path):
     save_scene(Scene(Cantilever(90.0), Platform(4.0, 180.0), ImpactLaw(r=0.5)), tmp_path / "scene.toml")
     assert tomllib.loads((tmp_path / "scene.toml").read_text("utf-8")) == {
@@ -127,26 +97,7 @@ def test_saved_file_has_the_keys_of_the_format(tmp_path: Path):
     }
 
 
-def test_a_batch_of_scenes_is_not_saved(tmp_path: Path):
-    scenes = jax.vmap(lambda f: Scene(Cantilever(90.0), Platform(4.0, f), ImpactLaw(r=0.5)))(jnp.array([1.0, 2.0]))
-    with pytest.raises(ValueError, match=r"has shape \(2,\), but a scene file holds one scene"):
-        save_scene(scenes, tmp_path / "scene.toml")
-    assert not (tmp_path / "scene.toml").exists()
-
-
-FULL = {"cantilever": CANTILEVER, "platform": PLATFORM, "interaction": LAW, "interaction.delay": DELAY, "start": START}
-
-
 def test_files_that_are_no_text_are_named(written, tmp_path: Path):
     assert complaint(written("a = " + "[" * 100_000)).startswith("scene.toml: not TOML")
     assert complaint(tmp_path / "none.toml") == "none.toml: there is no such file"
     assert "cannot be read" in complaint(tmp_path)
-
-
-def test_library_files_load_in_32_bits_too(written):
-    path = written(CANTILEVER + PLATFORM + LAW)
-    with jax.enable_x64(False):  # noqa: FBT003
-        scene = load_scene(path)
-        save_scene(scene, path)
-        assert scene.platform.frequency_khz.dtype == jnp.float32
-        assert eqx.tree_equal(load_scene(path), scene)

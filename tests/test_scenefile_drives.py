@@ -12,7 +12,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
+from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 
 CANTILEVER = "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\n"
@@ -91,6 +91,14 @@ frequencies = st.floats(min_value=1e-3, max_value=10.0)
 finite = st.floats(min_value=-1e30, max_value=1e30)
 not_negative = st.floats(min_value=0.0, max_value=1e30)
 tones = st.none() | st.builds(Tone, not_negative, frequencies, finite)
+cantilevers = st.builds(Cantilever, frequencies, st.floats(0.5, 1e9, exclude_min=True), positive)
+laws = st.builds(
+    ImpactLaw,
+    st.floats(min_value=0.0, max_value=1.0, exclude_min=True, allow_subnormal=False),
+    not_negative,
+    not_negative,
+    st.none() | st.builds(CollisionDelay, finite, finite, finite, st.booleans()),
+)
 
 
 def different(drive: Any) -> bool:
@@ -100,15 +108,16 @@ def different(drive: Any) -> bool:
 
 
 @given(
+    cantilever=cantilevers,
     platform=st.builds(Platform, not_negative, frequencies, finite, finite, tones),
     base=st.none() | st.builds(BaseDrive, not_negative, frequencies, finite, tones),
     force=st.none() | st.builds(ForceDrive, not_negative, frequencies, finite, tones),
-    interaction=st.sampled_from([None, ImpactLaw(0.7, 1.1)]),
+    interaction=st.none() | laws,
 )
-def test_loop_is_exact(platform: Any, base: Any, force: Any, interaction: Any, tmp_path_factory: Any):
+def test_loop_is_exact(cantilever: Any, platform: Any, base: Any, force: Any, interaction: Any, tmp_path_factory: Any):
     assume(all(different(drive) for drive in (platform, base, force)))
     path = tmp_path_factory.getbasetemp() / "drives.toml"
-    scene = Scene(Cantilever(90.0, 40.0), platform, interaction, base, force)
+    scene = Scene(cantilever, platform, interaction, base, force)
     save_scene(scene, path)
     assert eqx.tree_equal(load_scene(path), scene)
 

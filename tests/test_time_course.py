@@ -81,12 +81,3 @@ def test_a_soft_junction_breaks_straight_into_dry_air():
     course = time_course(Contact.paper(modulus_gpa=1.0), 60.0)
     out = course.phase[course.velocity_nm_per_us > 0.0]
     assert set(out) == {Phase.JUNCTION, Phase.DRY}
-
-
-def test_wrong_calls_are_named():
-    with pytest.raises(ValueError, match="`approach_speed_nm_per_us` must be positive"):
-        time_course(Contact.paper(), -2.0)
-    with pytest.raises(ValueError, match="has no junction"):
-        time_course(Contact.paper(adhesion_energy_j_per_m2=0.05), 20.0)
-    with pytest.raises(ValueError, match="turns the tip round"):
-        time_course(Contact.paper(tip_radius_nm=5.0), 3.0)

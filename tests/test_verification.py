@@ -18,7 +18,7 @@ from afm_jax.verify.fifty_digits import exact_impact
 from afm_jax.verify.samples import DAMPED, DELAYED, EPSILON, PAPER, draw_sample
 from tests.reference_examples import SCENES
 from tests.reference_flight import Parameters, mp
-from tests.reference_systems import differenced_jacobian, iterate
+from tests.reference_map import differenced_jacobian, iterate
 
 
 @pytest.fixture(scope="module")

@@ -46,13 +46,15 @@ class UncertainParameters(NamedTuple):
         paths = tuple(other for other in self.paths if other != path)
         return UncertainParameters(paths, self.values[others], self.covariance[np.ix_(others, others)])
 
-    def possible_draws(self, number: int, seed: int = 0) -> Float[np.ndarray, "draws parameters"]:
-        """Return draws that are physical: the coefficient of restitution in (0, 1], nothing else below 0.
+    def possible_draws(self, number: int) -> Float[np.ndarray, "draws parameters"]:
+        """Return draws from the normal distribution that are physical: r in (0, 1], nothing else below 0.
 
         Raises:
             ValueError: if hardly any can be.
         """
-        drawn = self.draws(50 * number, seed)
+        drawn = np.zeros((50 * number, 0))
+        if self.paths:
+            drawn = np.random.default_rng(0).multivariate_normal(self.values, self.covariance, size=50 * number)
         good = np.ones(len(drawn), bool)
         for path, column in zip(self.paths, drawn.T, strict=True):
             good &= (column > 0.0) & (column <= 1.0) if path == "interaction.r" else True
@@ -60,12 +62,6 @@ class UncertainParameters(NamedTuple):
         if good.sum() < number:
             raise ValueError("the law's errors are so wide that hardly any draw is a law: there are no bands")
         return drawn[good][:number]
-
-    def draws(self, number: int, seed: int = 0) -> Float[np.ndarray, "draws parameters"]:
-        """Return values drawn from the normal distribution of this covariance; of no parameters empty rows."""
-        if not self.paths:
-            return np.zeros((number, 0))
-        return np.random.default_rng(seed).multivariate_normal(self.values, self.covariance, size=number)
 
 
 def special_errors(continuation: Continuation, uncertain: UncertainParameters) -> Float[np.ndarray, " special"]:

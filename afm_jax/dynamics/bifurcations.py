@@ -20,7 +20,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import Record, Tips, follow, follow_contacts, skipped
+from afm_jax.dynamics.many_tips import Record, Tips, follow, skipped, tips_after_contacts
 from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
 from afm_jax.motion.start import start_of
@@ -218,7 +218,7 @@ class _Sweeper:
             tips = begin if tips is None else carried(before, scene, begin, tips)
             before = scene
             rows.append(jax.tree.map(np.asarray, tips))
-            tips, _ = follow_contacts(scene, tips, skip=1, record=0, accuracy=self.accuracy)
+            tips, _ = tips_after_contacts(scene, tips, skip=1, record=0, accuracy=self.accuracy)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
 
 

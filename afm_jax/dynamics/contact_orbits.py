@@ -29,7 +29,7 @@ from afm_jax.dynamics.impact_orbits import (
     many_impact_orbits,
     multipliers_of,
 )
-from afm_jax.dynamics.many_tips import follow_contacts, next_contact
+from afm_jax.dynamics.many_tips import next_contact, tips_after_contacts
 from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leaving_tips
 from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_sum, peak_amplitude, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
@@ -188,7 +188,7 @@ def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> lis
     time = period * across
     faster = np.asarray(tips.velocity_nm_per_us - scene.platform.velocity(tips.time_us)) * (0.5 + 3.0 * up)
     tips = tips._replace(time_us=time, velocity_nm_per_us=np.asarray(scene.platform.velocity(time)) + faster)
-    _, record = follow_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=accuracy)
+    _, record = tips_after_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=accuracy)
     turns = record.departure_periods + record.departure_us / period
     rebound = record.velocity_after_nm_per_us - np.asarray(scene.platform.velocity(record.departure_us))
     guesses = []

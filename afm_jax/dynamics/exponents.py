@@ -25,9 +25,9 @@ from afm_jax.dynamics.many_tips import (
     Tips,
     advance,
     departure_jacobians,
-    follow_contacts,
     record_of,
     skipped,
+    tips_after_contacts,
 )
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
@@ -173,7 +173,7 @@ def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient
     """Return the exponents of contact scenes: the motion first, then the Jacobians of all its contacts at once."""
     each = -(-impacts // _PARTS)
     count = (_PARTS + 1) * each + 1
-    tips, record = follow_contacts(scenes, tips, skip=transient, record=max(count, RECORDED + 1), accuracy=accuracy)
+    tips, record = tips_after_contacts(scenes, tips, skip=transient, record=max(count, RECORDED + 1), accuracy=accuracy)
     period, lanes = np.asarray(scenes.platform.period_us), len(tips.time_us)
     verdicts = verdicts_of(record, tips.outcome, period, tolerance=_ARRIVED)
     departure, velocity = record.departure_us, record.velocity_after_nm_per_us

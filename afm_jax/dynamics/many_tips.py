@@ -104,7 +104,7 @@ def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float
         accuracy: of `simulate`, for contacts.
     """
     if isinstance(scenes.interaction, Contact):
-        return follow_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
+        return tips_after_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
     tips, rows = recorded(scenes, skipped(scenes, tips, impacts=skip), impacts=record)
     return tips, Record(*(np.asarray(column).T for column in rows))
 
@@ -234,7 +234,7 @@ def record_of(scenes: Scene, step: MapStep) -> Record:
     )
 
 
-def follow_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float) -> tuple[Tips, Record]:
+def tips_after_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float) -> tuple[Tips, Record]:
     """Return tips some contacts later, and the last contacts.
 
     Args:
@@ -257,7 +257,11 @@ def follow_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, accura
         empty = np.full((len(tips.time_us), record), np.nan)
         return tips, Record(*[empty] * 6, *[np.zeros_like(empty, bool)] * 2)
     columns = [np.concatenate(parts, axis=1)[:, -record:] for parts in zip(*stretches, strict=True)]
-    return tips, Record(*(np.pad(rows, ((0, 0), (record - rows.shape[1], 0)), mode="edge") for rows in columns))
+    # where all tips end early there are fewer than asked for
+    missing = ((0, 0), (record - columns[0].shape[1], 0))
+    return tips, Record(
+        *(np.pad(rows, missing, constant_values=False if rows.dtype == bool else np.nan) for rows in columns)
+    )
 
 
 def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:

@@ -504,7 +504,8 @@ class EnergyBalance(NamedTuple):
     """Work of all drives on the tip; with a law what closes the balance, else an integral of its own."""
     air_aj: float
     contact_aj: float
-    """Dissipated by the contacts: the sum of their losses, or -int F D' dt over the window where it cuts a contact."""
+    """Dissipated by the contacts: the sum of their losses (an impact of a law that ends held has lost all its energy
+    relative to the surface), or -int F D' dt over the window where it cuts a resolved contact."""
     stored_aj: float
     """By how much the tip's kinetic energy and the spring's energy have grown."""
     imbalance: float | None
@@ -526,12 +527,10 @@ def _energy_balance(motion: MotionWindow) -> EnergyBalance:
     energy = 0.5 * mass * ends.velocity_nm_per_us**2 + 0.5 * stiffness * ends.position_nm**2
     stored = float(energy[1] - energy[0])
     contact = float(np.sum(motion.rows.energy_lost_aj[motion.begun]))
-    # a tip that is held to the end has lost what no ledger tells yet
-    ledger_closes = not np.any(motion.rows.kind[motion.begun] == ContactKind.HELD)
     if isinstance(scene.interaction, Law):
-        contact = contact if ledger_closes else 0.0
         return EnergyBalance(air + contact + stored, air, contact, stored, None)
-    if not ledger_closes or np.any(ends.phase):
+    # a contact that the window cuts has lost what its ledger does not tell yet
+    if np.any(motion.rows.kind[motion.begun] == ContactKind.HELD) or np.any(ends.phase):
         contact = -motion.integral(path.force_nn * path.gap_rate_nm_per_us)
     # D' = z' - z_p', whatever else drives the tip
     given = motion.integral(path.force_nn * (v - path.gap_rate_nm_per_us))

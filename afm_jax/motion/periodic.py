@@ -44,8 +44,6 @@ class Orbit(NamedTuple):
     """m: impacts in a response period."""
     contraction: float
     """By which a small distance from it shrinks in a response period."""
-    monodromy: Float[np.ndarray, "2 2"]
-    """Derivative of one response period's map: position in nm, velocity in nm/us."""
     motion: Simulation
     """One response period."""
 
@@ -130,7 +128,7 @@ def _orbit_of(scene: Scene, near: State, periods: int, run: Run) -> Orbit | None
     start = State(near.time_us, *(jnp.asarray(part) for part in periods_closed.starts[1:, 0]))
     motion = run(start, duration)
     contraction = float(periods_closed.contraction[0])
-    return Orbit(start, duration, periods, int(motion.count), contraction, periods_closed.slopes[0], motion)
+    return Orbit(start, duration, periods, int(motion.count), contraction, motion)
 
 
 def _column(state: State) -> Float[np.ndarray, "3 1"]:

@@ -4,9 +4,8 @@
 implicit function theorem, dx/dp = -(df/dx)^-1 df/dp. `newton_rows` solves for many guesses in NumPy where f is itself a
 program, such as a simulation: each round evaluates the rows that are still open, and no others.
 
-A scalar equation for every element of an array is `newton(misfit, guess, parameters, settings, elementwise=True)`. A
-search over a batch of slots of which few hold a guess names those by `where`. A step that must not leave the domain of
-f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`.
+A search over a batch of slots of which few hold a guess names those by `where`. A step that must not leave the domain
+of f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`.
 """
 
 import enum
@@ -20,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.solve.derivatives import implicit_root, implicit_system, solved_columns
+from afm_jax.solve.derivatives import implicit_system, solved_columns
 
 
 class NewtonOutcome(enum.IntEnum):
@@ -70,53 +69,50 @@ def shortened(step: Any, longest: Any) -> Any:
 class Root(NamedTuple):
     """Where a search inside a program ended."""
 
-    x: Float[Array, "..."]
-    outcome: Int[Array, "..."]
-    """A `NewtonOutcome`; of each element where the equations are elementwise."""
-    residual: Float[Array, "..."]
+    x: Float[Array, " n"]
+    outcome: Int[Array, ""]
+    """A `NewtonOutcome`."""
+    residual: Float[Array, " n"]
     """The residual before the last step; infinite where no round was made."""
 
 
 def newton(
     residual: Callable[[Array, Any], Array],
-    guess: Float[Array, "..."],
+    guess: Float[Array, " n"],
     parameters: Any,
     settings: Newton,
     *,
-    jacobian: Callable[[Array, Any], tuple[Array, Array]] | None = None,
-    elementwise: bool = False,
-    where: Bool[Array, "..."] | None = None,
+    where: Bool[Array, ""] | None = None,
 ) -> Root:
     """Return the root of f(x, parameters) = 0 that Newton's method finds from a guess, differentiable.
 
     Args:
         residual: f, a plain function that takes everything that may have a derivative from its parameters.
-        guess: shape (n,); any shape where the equations are elementwise. Its own derivative is ignored.
+        guess: its own derivative is ignored.
         parameters: pytree of arrays.
         settings: rounds, tolerances and limits.
-        jacobian: returns f and df/dx at (x, parameters), shapes (n,) and (n, n); None: by forward differentiation.
-        elementwise: f is a scalar equation for every element of x on its own; df/dx has then the shape of x.
-        where: whether a root is asked for; elsewhere the guess is returned, and no round is made for it.
+        where: whether a root is asked for; if not, the guess is returned, and no round is made for it.
 
     Returns:
         The root with its implicit derivative, also where the search has not converged; 0 where df/dx is singular.
     """
     fixed = lax.stop_gradient(parameters)
     begin = lax.stop_gradient(guess)
-    evaluate = jacobian or _forward(residual, elementwise=elementwise)
 
-    def within(sizes: Array, tolerance: float) -> Array:
-        return sizes <= tolerance if elementwise else jnp.all(sizes <= tolerance)
+    def twice(x: Array) -> tuple[Array, Array]:
+        value = residual(x, fixed)
+        return value, value
 
     def improve(state: tuple[Array, Root]) -> tuple[Array, Root]:
         count, (x, outcome, old) = state
-        value, slopes = evaluate(x, fixed)
-        full = -_quotient(value, slopes) if elementwise else -solved_columns(list(slopes.T), value)
+        slopes, value = jax.jacfwd(twice, has_aux=True)(x)
+        full = -solved_columns(list(slopes.T), value)
         step, sizes = settings.limited(x, full)
         # of two equations the solution is 0 where the matrix is singular
         stands = jnp.all(full == 0.0) & jnp.any(value != 0.0)
-        finite = jnp.isfinite(step) if elementwise else jnp.all(jnp.isfinite(step)) & ~stands
-        found = within(jnp.abs(value), settings.residual_tolerance) & within(sizes, settings.step_tolerance)
+        finite = jnp.all(jnp.isfinite(step)) & ~stands
+        small = jnp.all(jnp.abs(value) <= settings.residual_tolerance)
+        found = small & jnp.all(sizes <= settings.step_tolerance)
         going = outcome == NewtonOutcome.NOT_CONVERGED
         now = jnp.where(found, NewtonOutcome.CONVERGED, outcome)
         now = jnp.where(finite, now, NewtonOutcome.NO_STEP)
@@ -125,37 +121,13 @@ def newton(
         )
 
     def unsettled(state: tuple[Array, Root]) -> Array:
-        return (state[0] < settings.rounds) & jnp.any(state[1].outcome == NewtonOutcome.NOT_CONVERGED)
+        return (state[0] < settings.rounds) & (state[1].outcome == NewtonOutcome.NOT_CONVERGED)
 
     asked = jnp.ones((), bool) if where is None else where
     first = jnp.where(asked, NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NOT_ASKED).astype(jnp.int32)
-    first = jnp.broadcast_to(first, begin.shape) if elementwise else first
     start = Root(begin, first, jnp.full_like(begin, jnp.inf))
     root = lax.while_loop(unsettled, improve, (jnp.zeros((), jnp.int32), start))[1]
-    with_derivative = implicit_root if elementwise else implicit_system
-    return root._replace(x=with_derivative(residual, root.x, parameters))
-
-
-def _forward(residual: Callable[[Array, Any], Array], *, elementwise: bool) -> Callable[[Array, Any], Any]:
-    """Return the function that gives f and df/dx from one evaluation with forward derivatives."""
-
-    def slopes_of_elements(x: Array, parameters: Any) -> tuple[Array, Array]:
-        return jax.jvp(lambda x: residual(x, parameters), (x,), (jnp.ones_like(x),))
-
-    def slopes_of_system(x: Array, parameters: Any) -> tuple[Array, Array]:
-        def twice(x: Array) -> tuple[Array, Array]:
-            value = residual(x, parameters)
-            return value, value
-
-        slopes, value = jax.jacfwd(twice, has_aux=True)(x)
-        return value, slopes
-
-    return slopes_of_elements if elementwise else slopes_of_system
-
-
-def _quotient(value: Array, slope: Array) -> Array:
-    """Return value/slope, NaN where the slope is 0."""
-    return jnp.where(slope != 0.0, value / jnp.where(slope != 0.0, slope, 1.0), jnp.nan)
+    return root._replace(x=implicit_system(residual, root.x, parameters))
 
 
 class LinearisedRows(NamedTuple):

@@ -8,7 +8,7 @@ from afm_jax.impact.map import next_impact
 from afm_jax.outcomes import Outcome
 from tests import brute_force, reference_map
 from tests.package_scenes import scene_of
-from tests.reference_systems import Parameters
+from tests.reference_flight import Parameters
 
 EPS = float(np.finfo(float).eps)
 USUAL = Parameters(

@@ -17,8 +17,7 @@ import pytest
 from afm_jax.outcomes import Outcome
 from tests.hard_cases.maps import EPS, both
 from tests.package_scenes import scene_of
-from tests.reference_flight import constants, high_precision, mp, platform, propagator
-from tests.reference_systems import Parameters
+from tests.reference_flight import Parameters, constants, high_precision, mp, platform, propagator
 
 pytestmark = pytest.mark.slow
 

@@ -17,8 +17,8 @@ from afm_jax.impact.orbits import single_impact_orbits
 from tests.hard_cases.maps import USUAL
 from tests.package_scenes import scene_of
 from tests.reference_flight import mp
-from tests.reference_systems import orbits_by_phase
-from tests.reference_systems import single_impact_orbits as exact_orbits
+from tests.reference_orbits import orbits_by_phase
+from tests.reference_orbits import single_impact_orbits as exact_orbits
 
 pytestmark = pytest.mark.slow
 
