@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float, Int, Shaped
 from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.prior import Prior, size_of
-from fitting.fits.discrepancy import ModelDiscrepancy, rows_of_fit, step_of
-from fitting.fits.estimate import member_after, speed_range
+from fitting.fits.discrepancy import ModelDiscrepancy
+from fitting.fits.law_after import member_after, speed_range
 from fitting.fits.minimum import model_errors_of, padding
 from fitting.fits.objective import BATCH, Objective
+from fitting.fits.step import rows_of_fit, system_of
 from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
 from fitting.simulated.experiment import Drives
@@ -333,7 +334,7 @@ def forecast(
         jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
         slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
         some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
-        step = step_of(some, discrepancy, free)
+        step = system_of(some, discrepancy, free).step()
         covariance = step.covariance
         if not len(prior.measured):
             speeds = rows.approach[:count]

@@ -20,7 +20,8 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw, closest_delay, law_of_dict
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
-from fitting.fits.result import FitResult, closest_loss, nearness, rebound_by_formula
+from fitting.fits.law_after import closest_loss, nearness, rebound_by_formula
+from fitting.fits.result import FitResult
 from fitting.models import Problem
 from fitting.parameters import (
     DELAY_NAMES,

@@ -21,15 +21,20 @@ from fitting.fits.estimate import (
     courses_along_rows,
     estimate_of,
     hanging_on_held,
-    holding,
-    law_with_band,
-    loss_of,
-    speed_range,
 )
 from fitting.fits.intervals import END_OF_RANGE, Interval, profile_intervals, within_range
+from fitting.fits.law_after import holding, speed_range
 from fitting.fits.minimum import minimum_with_model_errors, rescale_errors, settle, starts, untabulated
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest
-from fitting.fits.result import FitResult, FittedParameter, FittedTable, Loss, Scatter
+from fitting.fits.result import (
+    FitResult,
+    FittedParameter,
+    FittedTable,
+    Loss,
+    Scatter,
+    law_with_band,
+    loss_of,
+)
 from fitting.fits.several import Pull
 from fitting.fits.verdict import IMPROBABLE, Evidence, judge_fit, misfits
 from fitting.forward import warm_up

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from afm_jax.impact.law import Law, errors_of, extrapolation_of
 from afm_jax.least_squares import chi2_tail
-from fitting.fits.discrepancy import root_of
+from fitting.fits.law_after import root_of
 from fitting.inversion.result import (
     Coefficient,
     InvertedRows,

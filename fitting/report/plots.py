@@ -9,7 +9,8 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import pixels_of, png_of_pixels, svg_of
 from fitting.fits.comparison import Comparison
-from fitting.fits.result import EV_PER_AJ, FitResult, Loss, rebound_by_formula
+from fitting.fits.law_after import rebound_by_formula
+from fitting.fits.result import EV_PER_AJ, FitResult, Loss
 from fitting.report.words import has_delay
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.

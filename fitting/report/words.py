@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import decimals, interval, known, percent, value_alone
-from fitting.fits.result import FitResult, FittedParameter, WithInterval, nearest_of
+from fitting.fits.law_after import nearest_of
+from fitting.fits.result import FitResult, FittedParameter, WithInterval
 from fitting.fits.verdict import IMPROBABLE, value_at_bound
 from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
 from fitting.tables.several import RepeatedReadings
