@@ -21,7 +21,8 @@ _INNER_STEPS = 25
 _SETTLED = 1e-6
 """Estimated distance of chi2 to its minimum over the others at which these have arrived."""
 END_OF_RANGE = "reaches the end of its range"
-"""Why an interval is open."""
+UNEXPLAINED = "the model does not explain the data"
+"""Why an interval is open, and why there is none."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
 _LOST = 1e3

@@ -36,11 +36,11 @@ from fitting.report.words import (
     losses_in_words,
     nuisances_in_words,
     parting_in_words,
-    prior_in_words,
     remarks_on,
     rounded_values,
     scatter_in_words,
     tables_in_words,
+    trust_in_words,
     value_in_words,
 )
 from fitting.tables.table import AmplitudeTable
@@ -114,7 +114,7 @@ def fit_page(
         ),
     ]
     report = Report(f"Impact law of {result.table.source}", result.valid, "", result.reasons, sections)
-    return page_of(report, _lead(result, comparison), prior_in_words(result))
+    return page_of(report, _lead(result, comparison), trust_in_words(result))
 
 
 def _lead(result: FitResult, comparison: ComparedModels | None) -> list[Part]:

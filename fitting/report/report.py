@@ -84,9 +84,8 @@ def summary(result: FitResult) -> str:
 
 
 def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
-    unit = f"  {parameter.unit}" if parameter.unit else ""
     given = "" if parameter.constraint is None else "  (given: {:g} +- {:g})".format(*parameter.constraint)
-    tail = f"{interval_in_words(parameter)}{unit}{given}"
+    tail = interval_in_words(parameter, parameter.unit) + given
     return [name, value_in_words(parameter), known(parameter.standard_error, ".2g"), tail]
 
 

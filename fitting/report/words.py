@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import decimals, interval, known, percent, value_alone
+from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED
 from fitting.fits.law_after import nearest_of
 from fitting.fits.result import FitResult, FittedParameter, WithInterval
 from fitting.fits.verdict import IMPROBABLE, value_at_bound
@@ -206,16 +207,25 @@ def has_delay(result: FitResult) -> bool:
     return bool(np.any(result.law.collision_delay_us != 0.0))
 
 
-def interval_in_words(parameter: FittedParameter) -> str:
-    """Return '0.9492 to 0.9508', a one-sided limit, or why there is none."""
-    low, high = parameter.interval95
+def interval_in_words(parameter: FittedParameter, unit: str = "") -> str:
+    """Return '0.9492 to 0.9508', 'below 0.000357; 0 is not excluded', or why there is no interval.
+
+    Args:
+        parameter: of a fit.
+        unit: behind the numbers; "": it stands elsewhere.
+    """
+    (low, high), reason = parameter.interval95, parameter.interval_reason or ""
+    behind = f"  {unit}" if unit else ""
     if low is not None and high is not None:
-        return interval(low, high)
-    if high is not None:
-        return f"< {high:.4g} ({parameter.interval_reason})"
-    if low is not None:
-        return f"> {low:.6g} ({parameter.interval_reason})"
-    return f"none: {parameter.interval_reason}"
+        return interval(low, high) + behind
+    if low is None and high is None:
+        # the verdict says why nothing is known
+        return "none" if reason == UNEXPLAINED else f"none: {reason}"
+    side, limit = ("below", high) if low is None else ("above", low)
+    end = reason.partition(f"{END_OF_RANGE}, ")[2]
+    # three digits of how far the limit is from the end of the range
+    digits = decimals(0.1 * abs(limit - float(end or 0.0)))
+    return f"{side} {limit:.{digits}f}{behind}; {f'{end} is not excluded' if end else reason}"
 
 
 def value_in_words(parameter: FittedParameter) -> str:
@@ -296,7 +306,7 @@ def band_in_words(result: FitResult) -> str:
     )
 
 
-def prior_in_words(result: FitResult) -> str:
+def trust_in_words(result: FitResult) -> str:
     """Return whether to trust the fit, on which grounds, and over which speeds."""
     if not result.valid:
         return "Do not take these numbers for a measurement of the law, because:"
