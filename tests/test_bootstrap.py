@@ -13,7 +13,6 @@ from tests.fit_tables import (
     simulated,
     standard_errors_of,
     values_of,
-    with_amplitudes,
 )
 
 pytestmark = pytest.mark.slow
@@ -77,22 +76,6 @@ def test_data_scatter_about_the_fitted_amplitudes_and_constraints(result):
     quality_factor = data.constraint_value[:, 2]
     assert quality_factor.mean() == pytest.approx(values_of(result)[2], abs=5.0 * 0.4 / np.sqrt(4000))
     assert quality_factor.std() == pytest.approx(0.4, rel=5.0 / np.sqrt(8000))
-
-
-def test_a_data_set_is_fitted_as_its_table_would_be(table, result):
-    refit = objective_of(result)
-    data = draw_data(refit, 3, np.random.default_rng(2))
-    found = fit_data_sets(refit, data)
-    assert found.converged.all()
-    for k in range(3):
-        amplitude = data.amplitude_nm[k, : table.rows]
-        quality_factor = float(data.constraint_value[k, 2])
-        alone = fit(with_amplitudes(table, amplitude, result.rows.error_nm, quality_factor=quality_factor), "law")
-        assert found.chi2[k] == pytest.approx(alone.chi2, abs=1e-5)
-        # both stop within an estimated distance of 1e-6: a thousandth of an error
-        errors = standard_errors_of(alone)
-        assert np.abs((found.values[k] - values_of(alone)) / errors).max() < 2e-3
-        assert np.sqrt(np.diag(found.covariance[k])) == pytest.approx(errors, rel=1e-3)
 
 
 def test_the_tables_own_data_give_the_fit(result):

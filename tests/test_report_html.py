@@ -6,15 +6,13 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from afm_jax.cli.main import main
 from afm_jax.saved import load
 from fitting.fits.result import FitResult
 from fitting.report.html import fit_page
 from fitting.report.plots import law_figure, rows_figure, speed_figure
 from fitting.report.report import summary, write_report
-from fitting.report.words import band_width, goodness_in_words
+from fitting.report.words import band_width, goodness_in_words, interval_in_words
 from tests.html_pages import first_screen, formulas, read_page, section_of, table_of, words_of
 from tests.made_fits import SPEEDS, VALUES, made_fit, made_parameter, made_table
 
@@ -165,6 +163,21 @@ def test_probability_is_said_in_words(changes, said):
     assert said in goodness_in_words(made_fit("law", **changes))
 
 
+@pytest.mark.parametrize(
+    ("ends", "reason", "said"),
+    [
+        ((None, 9.169), "lower end: reaches the end of its range, 0", "below 9.17  nm; 0 is not excluded"),
+        ((0.9990182, None), "upper end: reaches the end of its range, 1", "above 0.999018  nm; 1 is not excluded"),
+        ((2.0, None), "upper end: chi2 is not finite on this side", "above 2.00  nm; upper end: chi2 is not finite"),
+        ((None, None), "the data do not determine this parameter", "none: the data do not determine this parameter"),
+        ((None, None), "the model does not explain the data", "none"),
+    ],
+)
+def test_limits_read_plainly(ends, reason, said):
+    parameter = made_parameter("r", 0.95, interval95=ends, interval_reason=reason)
+    assert interval_in_words(parameter, "nm").startswith(said)
+
+
 def test_every_text_is_shown_as_it_is_and_does_nothing():
     hostile = '<script>alert("1")</script> & <img src=x onerror=y> \x0b\x7f'
     table = made_table(remarks=(hostile,), source="strange\udc80 <b>.csv")
@@ -283,16 +296,3 @@ def test_report_is_written_with_its_page(tmp_path):
     assert set(tables) == {"fit_rows.csv"}
     again = load(tmp_path / "fit.json")
     assert summary(again) == written[1].read_text(encoding="utf-8").rstrip("\n")
-
-
-@pytest.mark.slow
-def test_command_writes_the_page_of_the_bundled_table(tmp_path):
-    result = CliRunner().invoke(main, ["fit", "--example", "--out", str(tmp_path)])
-    assert result.exit_code == 0
-    page = read_page((tmp_path / "fit.html").read_text(encoding="utf-8"))
-    # rows, law, residuals over the speed, energy of an impact
-    assert sum(1 for _ in page.iter("img")) == 4
-    seen = first_screen(page)
-    # made with r 0.95 and epsilon 60 (its own comments say so)
-    assert "0.9494 to 0.9507" in seen
-    assert "VALID" in seen.splitlines()
