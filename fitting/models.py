@@ -361,6 +361,25 @@ def problem_of(
     """
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = constraints_of(table, constraints)
+    check_constraints(known, model, own, table.drive)
+    nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
+    return Problem(model, own + nuisances, tuple(effects), table.drive)
+
+
+def check_constraints(
+    known: Mapping[str, tuple[float, float]], model: str, own: tuple[str, ...], drive: str = "sample"
+) -> None:
+    """Check what is known beforehand of a model's parameters and of the instrument.
+
+    Args:
+        known: value and standard error by parameter.
+        model: its name.
+        own: its parameters.
+        drive: what is driven.
+
+    Raises:
+        ValueError: if a constraint is on no parameter, impossible, or says what a delay says already.
+    """
     for name, (value, error) in known.items():
         if name not in (*own, *NUISANCE_NAMES):
             raise ValueError(
@@ -370,13 +389,11 @@ def problem_of(
             raise ValueError(
                 f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
             )
-    if "offset_origin_nm" in known and model.endswith("+delay") and not table.tapping:
+    if "offset_origin_nm" in known and model.endswith("+delay") and drive == "sample":
         raise ValueError(
             "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the constraint on "
             "offset_origin_nm out (delay_offset_nm takes it up), or fit the model 'contact'"
         )
-    nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
-    return Problem(model, own + nuisances, tuple(effects), table.drive)
 
 
 def _joint_task(
@@ -752,10 +769,7 @@ def split_held(
         if name not in CONTACT_PARAMETER or name in own:
             others[name] = (value, error)
             continue
-        if not (np.isfinite(value) and 0.0 < error < np.inf):
-            raise ValueError(
-                f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
-            )
+        check_constraints({name: (value, error)}, "contact", (name,))
         if values.get(name, value) != value:
             raise ValueError(f"{name} is held at {values[name]:g} (`fixed`) and known as {value:g}: say one of the two")
         values[name], errors[name] = value, error

@@ -22,7 +22,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
 from fitting.fits.law_after import closest_loss, nearness, rebound_by_formula
 from fitting.fits.result import FitResult
-from fitting.models import Problem
+from fitting.models import Problem, check_constraints
 from fitting.parameters import (
     DELAY_NAMES,
     MODELS,
@@ -160,7 +160,7 @@ def prior_of_values(  # noqa: PLR0913
         check_parameter(name, value, allowed, optional=True)
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
-    _check_constraints(model, own, known, drive)
+    check_constraints(known, model, own, drive)
     given = dict(values or {})
     for name in given:
         if name not in own:
@@ -275,20 +275,6 @@ def _closest_to(law: Law, model: str, fixed: Mapping[str, float]) -> _Closest:
 
 _INDISTINCT = 1e-6
 """Singular value below which a law's errors do not tell two parameters apart."""
-
-
-def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]], drive: str) -> None:
-    for name, (value, error) in known.items():
-        if name not in (*own, *NUISANCE_NAMES):
-            choice = ", ".join((*own, *NUISANCE_NAMES))
-            raise ValueError(f"`constraints` names {name!r}, which is none of {choice}")
-        if not (np.isfinite(value) and 0.0 < error < np.inf):
-            raise ValueError(f"the constraint on {name} must be a value and a positive error, not {value} +- {error}")
-    if "offset_origin_nm" in known and model.endswith("+delay") and drive == "sample":
-        raise ValueError(
-            "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the error of the offsets' "
-            "origin out, or take the model 'contact'"
-        )
 
 
 def checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.ndarray, " p"]:

@@ -20,7 +20,7 @@ from fitting.fits.discrepancy import Columns, ModelDiscrepancy
 from fitting.fits.step import LinearStep, bounded
 from fitting.forward import AnyImpact, impact_at
 from fitting.models import Measurement, Problem
-from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
+from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
 
 class LawAfter(NamedTuple):
@@ -283,6 +283,21 @@ def rebound_by_formula(values: Mapping[str, float], speeds: Float[np.ndarray, " 
     return np.sqrt(np.maximum(square_by_formula(values, speeds), 0.0))
 
 
+DELAY_TERMS: Mapping[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "delay_hertz": lambda u, w: u**-0.2,  # noqa: ARG005
+    "delay_lead_nm": lambda u, w: 1.0 / u - 1.0 / w,
+    "delay_offset_nm": lambda u, w: -1.0 / u,  # noqa: ARG005
+}
+"""What the parameters of a delay stand before, by approach and rebound speed in nm/us."""
+
+
+def delay_by_formula(
+    values: Mapping[str, float], speeds: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Return the delay in us of the formula of a law's parameters at approach and rebound speeds in nm/us."""
+    return np.sum([values.get(name, 0.0) * term(speeds, rebound) for name, term in DELAY_TERMS.items()], axis=0)
+
+
 class Nearness(NamedTuple):
     """How near formulas of a family come to a law: the largest distance, relative to the rebound speed, and where."""
 
@@ -423,13 +438,13 @@ def closest_member(
     by_loss = {"r": values.get("r", 1.0) * u**2 / w, "epsilon": -0.5 / w, "viscous_loss": -0.5 * u / w}
     slope = np.reshape([by_loss[name] for name in loss], (-1, u.size)).T
     projected(loss, slope, factor[0], 0)
-    late = [name for name in changing if name in DELAY_NAMES]
-    by_delay = {"delay_hertz": u**-0.2, "delay_lead_nm": 1.0 / u - 1.0 / w, "delay_offset_nm": -1.0 / u}
-    time = np.sum([values.get(name, 0.0) * column for name, column in by_delay.items()], axis=0)
-    columns = np.reshape([by_delay[name] for name in late], (-1, u.size)).T
+    late = [name for name in changing if name in DELAY_TERMS]
+    columns = np.reshape([DELAY_TERMS[name](u, w) for name in late], (-1, u.size)).T
     begin, moving = np.array([values[name] for name in late]), np.ones(len(late), dtype=bool)
     ends = np.reshape([(PARAMETERS[name].lowest, PARAMETERS[name].highest) for name in late], (-1, 2))
-    change = bounded(weight[1] * (time - delay), weight[1][:, None] * columns, begin, ends, moving)
+    change = bounded(
+        weight[1] * (delay_by_formula(values, u, w) - delay), weight[1][:, None] * columns, begin, ends, moving
+    )
     values |= dict(zip(late, (begin + change).tolist(), strict=True))
     # the formula's delay changes with its rebound speed
     along = values.get("delay_lead_nm", 0.0) / w[:, None] ** 2 * (slope @ spread[[names.index(name) for name in loss]])

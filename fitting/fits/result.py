@@ -92,6 +92,12 @@ class FittedRows:
     measured_phase_deg: Float[np.ndarray, " rows"] | None = None
     phase_error_deg: Float[np.ndarray, " rows"] | None = None
 
+    @property
+    def reached_nm_per_us(self) -> Float[np.ndarray, " reached"]:
+        """Approach speeds of the rows that are used, as far as they are known."""
+        speeds = self.approach_speed_nm_per_us[self.used]
+        return speeds[np.isfinite(speeds)]
+
 
 @dataclass(frozen=True)
 class FittedTable:
