@@ -4,7 +4,7 @@
 and a `Measurement`, the rows as arrays with the cantilever and the Gaussian constraints.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -108,22 +108,31 @@ class Problem:
         """The names of the model's parameters, without nuisances."""
         return tuple(name for name in self.names if not is_nuisance(name))
 
+    @property
+    def ends(self) -> Float[np.ndarray, "2 p"]:
+        """The lowest and the highest values that the parameters can have."""
+        return np.array([(parameter.lowest, parameter.highest) for parameter in self.parameters]).T
+
+    def _each(
+        self, function: Callable[[Parameter, Numbers], Numbers], columns: Float[np.ndarray, "... p"]
+    ) -> Float[np.ndarray, "... p"]:
+        """Return what a function makes of each parameter's column."""
+        pairs = zip(self.parameters, np.moveaxis(columns, -1, 0), strict=True)
+        return np.stack([function(parameter, column) for parameter, column in pairs], axis=-1)
+
     def values(self, coordinates: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return the parameters' values at optimiser coordinates."""
-        columns = zip(self.parameters, np.moveaxis(coordinates, -1, 0), strict=True)
-        return np.stack([value_at(p, y) for p, y in columns], axis=-1)
+        return self._each(value_at, coordinates)
 
     def values_and_slopes(
         self, coordinates: Float[np.ndarray, "... p"]
     ) -> tuple[Float[np.ndarray, "... p"], Float[np.ndarray, "... p"]]:
         """Return the values and their derivatives by the coordinates."""
-        columns = zip(self.parameters, np.moveaxis(coordinates, -1, 0), strict=True)
-        return self.values(coordinates), np.stack([slope_at(p, y) for p, y in columns], axis=-1)
+        return self.values(coordinates), self._each(slope_at, coordinates)
 
     def coordinates(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return optimiser coordinates of parameter values."""
-        columns = zip(self.parameters, np.moveaxis(values, -1, 0), strict=True)
-        return np.stack([coordinate_of(p, value) for p, value in columns], axis=-1)
+        return self._each(coordinate_of, values)
 
     def known(self, values: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
         """Return the parameters by name."""

@@ -16,8 +16,8 @@ from fitting.fits.objective import BATCH, Objective
 from fitting.fits.step import rows_of_fit, system_of
 from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
-from fitting.simulated.experiment import Drives
-from fitting.tables.table import DRIVES, AmplitudeTable
+from fitting.simulated.experiment import Drives, check_drive
+from fitting.tables.table import AmplitudeTable
 
 MOST = 20_000
 """Drives that a design looks at: some minutes of computing."""
@@ -59,7 +59,7 @@ def drive_grid(  # noqa: PLR0913
         ValueError: if a list is empty or a number impossible, not exactly one of both kinds of frequency is given, or
             there are too many combinations.
     """
-    _check_drive(drive)
+    check_drive(drive)
     check_parameter("free_frequency_khz", free_frequency_khz, "positive", optional=True)
     _check_list("orders", orders, positive=True)
     if any(order != int(order) for order in orders):
@@ -117,11 +117,6 @@ def _frequencies(
         raise ValueError("`detunings` need `free_frequency_khz`, the cantilever's resonance")
     # Rounded to what an instrument is told: a thousandth of a hertz.
     return [round(resonance * free_frequency_khz * detuning, 6) for detuning in detunings]
-
-
-def _check_drive(drive: str) -> None:
-    if drive not in DRIVES:
-        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
 
 
 def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
@@ -205,9 +200,12 @@ def candidates_of(
         largest_nm: peak amplitude that the instrument takes; of a cantilever that is driven itself the free one.
         phase_noise_deg: standard error of the lag in degrees.
     """
-    objective = Objective(_measurement(prior, drives, amplitudes), prior.problem)
-    linear = objective.at_values(prior.draws(BATCH, least=MARGIN))
     count, tapping = len(drives.order), prior.problem.tapping
+    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
+    # of readings of 1 nm with an error of 1 nm the Jacobian is that of the amplitudes
+    one = np.ones((count, read.size))
+    objective = Objective(_measured(prior, drives, np.where(read, one, np.nan), one), prior.problem)
+    linear = objective.at_values(prior.draws(BATCH, least=MARGIN))
     prediction = linear.prediction
     expected = np.asarray(prediction.amplitude_nm)[0]
     # the model's own error goes with what is read
@@ -216,7 +214,6 @@ def candidates_of(
     )
     amplitude, kinds = expected[:count], expected.shape[1]
     own = padding(model_errors.model_error, expected)[:count]
-    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
     stated = _stated(amplitude, noise, phase_noise_deg)
     error = np.where(read, np.hypot(stated, own), np.inf)
     raw = np.asarray(linear.jacobian)[0, : kinds * count].reshape(count, kinds, -1)
@@ -242,14 +239,6 @@ def candidates_of(
         approach_speed_nm_per_us=np.asarray(prediction.approach_speed_nm_per_us)[0, :count],
         slope=np.where(usable[:, None, None], raw, 0.0) / safe[:, :, None],
     )
-
-
-def _measurement(prior: Prior, drives: Drives, amplitudes: str) -> Measurement:
-    """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
-    columns = 3 if prior.problem.tapping else 2
-    one = np.ones((len(drives.order), columns))
-    read = [False, True, True] if prior.problem.tapping else [amplitudes != "lockin", amplitudes != "peak"]
-    return _measured(prior, drives, np.where(read, one, np.nan), one)
 
 
 def _stated(

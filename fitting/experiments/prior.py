@@ -32,8 +32,8 @@ from fitting.parameters import (
     model_parameters,
     paper_values,
 )
+from fitting.simulated.experiment import check_drive
 from fitting.tables.csv_text import TableError, beyond, read_fit_json
-from fitting.tables.table import DRIVES
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
@@ -100,8 +100,7 @@ class Prior(Result):
         normal[0] = 0.0
         width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
         values = self.values + spread * ((normal * width) @ axes.T)
-        ends = [(p.lowest, p.highest) for p in self.problem.parameters]
-        return np.clip(values, *np.array(ends).T)
+        return np.clip(values, *self.problem.ends)
 
 
 def size_of(parameter: Parameter, value: float) -> float:
@@ -150,8 +149,7 @@ def prior_of_values(  # noqa: PLR0913
         ValueError: if a name or value is impossible, the model has no formula that could be close to a law, or the law
             is that of a tip of another mass.
     """
-    if drive not in DRIVES:
-        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
+    check_drive(drive)
     for name, value, allowed in (
         ("free_frequency_khz", free_frequency_khz, "positive"),
         ("quality_factor", quality_factor, "above 0.5"),

@@ -150,8 +150,7 @@ def _followers(objective: Objective, values, covariance, index: int, direction: 
     """Return how the places of the others change, to first order, when one moves by a standard error."""
     variance = covariance[index, index]
     shift = direction * _FIRST_TRIAL * covariance[:, index] / np.sqrt(variance) if variance > 0.0 else 0.0
-    parameters = objective.problem.parameters
-    guess = np.clip(values + shift, [p.lowest for p in parameters], [p.highest for p in parameters])
+    guess = np.clip(values + shift, *objective.problem.ends)
     places = Places(objective)
     moved = places.of_values(np.where(np.isfinite(guess), guess, values))
     return (moved - places.of_values(values)) / _FIRST_TRIAL
@@ -172,14 +171,9 @@ class Places:
 
     def __init__(self, objective: Objective):
         """Keep the objective, and the places that bound it."""
-        self.objective, parameters = objective, objective.problem.parameters
-        self.by_value = np.array([parameter.sign != 0 for parameter in parameters])
-        self.lowest, self.highest = (
-            np.array(
-                [end if p.sign else coordinate_of(p, np.asarray(end)) for p, end in zip(parameters, ends, strict=True)]
-            )
-            for ends in ([p.lowest for p in parameters], [p.highest for p in parameters])
-        )
+        self.objective = objective
+        self.by_value = np.array([parameter.sign != 0 for parameter in objective.problem.parameters])
+        self.lowest, self.highest = self.of_values(objective.problem.ends)
 
     def of_values(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return the places of values."""
@@ -353,9 +347,8 @@ def at_bound(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.n
     """Say which losses vanish within a hundredth of what the data could resolve, and what is at an end of its range."""
     resolution = np.sqrt(np.diag(covariance_of(_fisher(objective, values))))
     resolution = np.where(np.isfinite(resolution), resolution, 0.0)
-    parameters = objective.problem.parameters
-    losses = np.array([np.inf if p.bound is None else p.bound for p in parameters])
-    ends = np.array([(p.lowest, p.highest) for p in parameters]).T
+    losses = np.array([np.inf if p.bound is None else p.bound for p in objective.problem.parameters])
+    ends = objective.problem.ends
     # so near that the steps of the Hessian would leave it
     at_end = np.any(np.abs(values - ends) <= _STEP * resolution, axis=0) & np.isinf(losses)
     return (np.abs(values - losses) < 0.01 * resolution) | at_end
@@ -373,10 +366,6 @@ def _pushes_outward(objective: Objective, coordinates, free) -> bool:
     slope = jacobian.T @ np.asarray(result.residual)[0]
     little = slope**2 < _ENOUGH * np.sum(jacobian**2, axis=0)
     values = objective.problem.values(coordinates)
-    inward = np.array(
-        [
-            1.0 if v - p.lowest < p.highest - v else -1.0
-            for v, p in zip(values, objective.problem.parameters, strict=True)
-        ]
-    )
+    lowest, highest = objective.problem.ends
+    inward = np.where(values - lowest < highest - values, 1.0, -1.0)
     return bool(np.all(((slope * inward >= 0.0) | little)[~free]))

@@ -1,7 +1,6 @@
 """A fit in words: how sure the law is, its formula with the digits that count, whether to trust it."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -21,34 +20,6 @@ _UNLIKELY = 0.05
 _EXACT = 1e-8
 """Relative distance below which two laws are the same."""
 _ROUND = (1.0, 2.0, 3.0, 5.0, 7.0)
-
-
-@runtime_checkable
-class ComparedModels(Protocol):
-    """Several models fitted to the same table.
-
-    `rows` has a mapping for each model: model, chi2, degrees_of_freedom, aic, bic, delta_aic, law_change, and whatever
-    else; `verdict` says in words which one the data prefer.
-    """
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """One mapping for each model."""
-        ...
-
-    @property
-    def verdict(self) -> str:
-        """What the comparison says, in words."""
-        ...
-
-
-@runtime_checkable
-class Sampled(Protocol):
-    """A bootstrap or a posterior: anything that says what it found as plain numbers, lists and mappings."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything; what is a mapping by parameter becomes a table."""
-        ...
 
 
 def repeats_in_words(repeats: RepeatedReadings) -> str:

@@ -189,12 +189,7 @@ def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
         found = plain(objective).at_values(values)
         return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
 
-    parameters = objective.problem.parameters
-    box = Box(
-        np.array([p.lowest for p in parameters]),
-        np.array([p.highest for p in parameters]),
-        np.zeros((sets, len(parameters)), dtype=bool),
-    )
+    box = Box(*objective.problem.ends, np.zeros((sets, refit.values.size), dtype=bool))
     end = descended(look, start, box, settled=_SETTLED, most=_STEPS)
     normal = np.einsum("snp,snq->spq", end.jacobian, end.jacobian)
     return BatchFit(end.place, end.chi2, whole_covariance_of(normal), distance(end, box) <= _SETTLED)
