@@ -4,6 +4,7 @@ Gradient, curvature and distance to the true minimum are asked of a minimum, wha
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -307,15 +308,18 @@ def check_minimum(
     outward = _pushes_outward(objective, coordinates, free)
     if count == 0:
         return Convergence(outward, 0.0, [], 0.0, outward)
+    # a point that is no minimum, at an unknown distance from one
+    adrift = partial(Convergence, converged=False, gradient=np.inf, estimated_distance=np.inf, outward=outward)
     _, jacobian = objective.linearise(coordinates[None])
     values, slopes = objective.problem.values_and_slopes(coordinates)
     known = np.diag((objective.problem.known_by_range(values) * slopes**2)[free])
     fisher = jacobian[0][:, free].T @ jacobian[0][:, free] + known
     if not np.all(np.isfinite(fisher)):
-        return _adrift([], outward=outward, reason="the slopes of the residuals are not finite where the search ended")
+        reason = "the slopes of the residuals are not finite where the search ended"
+        return adrift(hessian_eigenvalues=[], reason=reason)
     curvature, axes = np.linalg.eigh(fisher)
     if curvature[0] <= 1e-14 * curvature[-1]:
-        return _adrift(curvature.tolist(), outward=outward)
+        return adrift(hessian_eigenvalues=curvature.tolist())
     scale = axes / np.sqrt(curvature)
     steps = np.zeros((2 * count + 1, len(coordinates)))
     steps[1 : count + 1, free], steps[count + 1 :, free] = _STEP * scale.T, -_STEP * scale.T
@@ -323,24 +327,12 @@ def check_minimum(
     slope = gradient[:, free] @ scale / 2.0
     hessian = (slope[1 : count + 1] - slope[count + 1 :]) / (2.0 * _STEP)
     if not np.all(np.isfinite(hessian)) or not np.all(np.isfinite(slope[0])):
-        return _adrift([], outward=outward, reason="chi2 has no finite curvature where the search ended")
+        return adrift(hessian_eigenvalues=[], reason="chi2 has no finite curvature where the search ended")
     hessian = 0.5 * (hessian + hessian.T) + scale.T @ known @ scale
     eigenvalues = np.linalg.eigvalsh(hessian)
     distance = float(slope[0] @ np.linalg.solve(hessian, slope[0])) if eigenvalues[0] > 0 else float("inf")
     converged = bool(eigenvalues[0] > 0 and distance < _ENOUGH and outward)
     return Convergence(converged, float(np.abs(2.0 * slope[0]).max()), eigenvalues.tolist(), distance, outward)
-
-
-def _adrift(eigenvalues: list[float], *, outward: bool, reason: str | None = None) -> Convergence:
-    """Return the state of a point that is no minimum, at an unknown distance from one."""
-    return Convergence(
-        converged=False,
-        gradient=float("inf"),
-        hessian_eigenvalues=eigenvalues,
-        estimated_distance=float("inf"),
-        outward=outward,
-        reason=reason,
-    )
 
 
 def at_bound(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:

@@ -189,7 +189,8 @@ def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
         found = plain(objective).at_values(values)
         return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
 
-    box = Box(*objective.problem.ends, np.zeros((sets, refit.values.size), dtype=bool))
+    lowest, highest = objective.problem.ends
+    box = Box(lowest, highest, np.zeros((sets, refit.values.size), dtype=bool))
     end = descended(look, start, box, settled=_SETTLED, most=_STEPS)
     normal = np.einsum("snp,snq->spq", end.jacobian, end.jacobian)
     return BatchFit(end.place, end.chi2, whole_covariance_of(normal), distance(end, box) <= _SETTLED)
