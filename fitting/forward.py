@@ -241,7 +241,7 @@ def linearise(
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
     batch, impacts = batch_of(values, measurement, problem)
-    whole = _of_pairs(batch, sets, impacts, measurement, problem, near, linearise_pairs)
+    whole = _of_pairs(_Pairs(batch, sets, impacts, measurement, problem, near), linearise_pairs)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
@@ -296,7 +296,8 @@ def predict(
         )
         points = joint.values(values)[..., len(joint.problem.own) :]
         known = known._replace(joint=replace(joint, problem=alone))
-    block = _of_pairs(points, len(values), _Impacts(laws, None), known, instrument, near, predict_pairs)
+    pairs = _Pairs(points, len(values), _Impacts(laws, None), known, instrument, near)
+    block = _of_pairs(pairs, predict_pairs)
     return Predicted(np.asarray(block.misfit), block.prediction)
 
 
@@ -329,7 +330,7 @@ def impact_slopes(
         leaf = np.array(where(still))
         leaf[(slice(None), 0, *constant)] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
-        block = _of_pairs(batch, 1, turned, measurement, problem, near, linearise_pairs)
+        block = _of_pairs(_Pairs(batch, 1, turned, measurement, problem, near), linearise_pairs)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     # -1: a larger loss, or epsilon, is a smaller squared speed; of a series the constant term is changed
@@ -436,67 +437,69 @@ def _lanes(problem: Problem) -> int:
     return TAPPED if problem.pulled else SEARCHED if problem.lasting else SOLVED
 
 
-def _of_pairs(
-    points: Float[np.ndarray, "batch ..."],
-    sets: int,
-    impacts: _Impacts,
-    measurement: Measurement,
-    problem: Problem,
-    near: Float[np.ndarray, "..."] | None,
-    program: Callable[..., _Block],
-) -> _Block:
-    """Return what a program finds for every pair of a set and a row, as arrays of shape (sets, rows, ...).
+class _Pairs(NamedTuple):
+    """All pairs of a set of values and a row, on which a program is to run.
 
-    Several tables are taken drive by drive; slopes are by the parameters of a row's own table.
-
-    Args:
+    Attributes:
         points: values of every set, or of every set and table; more sets than are asked for fill it up.
         sets: how many sets there are.
         impacts: of every set.
         measurement: the rows.
         problem: the model.
         near: coordinates of the orbits close by for each row, or each set and row; None: they are searched for.
+    """
+
+    points: Float[np.ndarray, "batch ..."]
+    sets: int
+    impacts: _Impacts
+    measurement: Measurement
+    problem: Problem
+    near: Float[np.ndarray, "..."] | None
+
+
+def _of_pairs(pairs: _Pairs, program: Callable[..., _Block]) -> _Block:
+    """Return what a program finds for every pair of a set and a row, as arrays of shape (sets, rows, ...).
+
+    Several tables are taken drive by drive; slopes are by the parameters of a row's own table.
+
+    Args:
+        pairs: on which it is to run.
         program: `linearise_pairs` or `predict_pairs`.
     """
-    joint, table = measurement.joint, measurement.rows.table
+    joint, table = pairs.measurement.joint, pairs.measurement.rows.table
     if joint is None or table is None:
-        return _of_pairs_of_one_drive(points[:, None], sets, impacts, measurement, problem, near, program)
+        return _of_pairs_of_one_drive(pairs._replace(points=pairs.points[:, None]), program)
     drives = np.array(joint.drives)[table]
     places, blocks = [], []
     for drive in dict.fromkeys(drives.tolist()):
         mine = np.flatnonzero(drives == drive)
-        member, known = replace(joint.problem, drive=drive), None if near is None else np.asarray(near)[..., mine]
-        of_rows = points[:, table[mine]]
-        places.append(mine)
-        blocks.append(
-            _of_pairs_of_one_drive(of_rows, sets, impacts, measurement.of_drive(drive), member, known, program)
+        of_drive = pairs._replace(
+            points=pairs.points[:, table[mine]],
+            measurement=pairs.measurement.of_drive(drive),
+            problem=replace(joint.problem, drive=drive),
+            near=None if pairs.near is None else pairs.near[..., mine],
         )
+        places.append(mine)
+        blocks.append(_of_pairs_of_one_drive(of_drive, program))
     order = np.argsort(np.concatenate(places))
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, order], *blocks)
 
 
-def _of_pairs_of_one_drive(
-    points: Float[np.ndarray, "batch rows p"],
-    sets: int,
-    impacts: _Impacts,
-    measurement: Measurement,
-    problem: Problem,
-    near: Float[np.ndarray, "..."] | None,
-    program: Callable[..., _Block],
-) -> _Block:
+def _of_pairs_of_one_drive(pairs: _Pairs, program: Callable[..., _Block]) -> _Block:
     """Return what `_of_pairs` does of rows under one drive; points are those of every row, or one for all."""
-    columns = jax.tree.map(np.asarray, measurement.rows)
+    sets, impacts, problem = pairs.sets, pairs.impacts, pairs.problem
+    columns = jax.tree.map(np.asarray, pairs.measurement.rows)
     filling, whole = _filling(columns), columns.order.shape[0]
     rows = whole - filling
     number, row = (index.ravel() for index in np.indices((sets, rows)))
     branch = None
-    if near is not None:
-        branch = branch_near(np.broadcast_to(np.asarray(near), (sets, whole))[:, :rows].ravel())
-    point = points[number, row if points.shape[1] > 1 else 0]
+    if pairs.near is not None:
+        branch = branch_near(np.broadcast_to(pairs.near, (sets, whole))[:, :rows].ravel())
+    point = pairs.points[number, row if pairs.points.shape[1] > 1 else 0]
 
     def work(lanes: Any) -> _Block:
         point, number, of_row, branch = lanes
-        lane = measurement._replace(rows=of_row)
+        lane = pairs.measurement._replace(rows=of_row)
         if branch is None:
             branch = located(point, impacts, number, lane, problem)
         return program(point, impacts, number, lane, problem, branch)

@@ -4,7 +4,7 @@
 and a `Measurement`, the rows as arrays with the cantilever and the Gaussian constraints.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -108,22 +108,31 @@ class Problem:
         """The names of the model's parameters, without nuisances."""
         return tuple(name for name in self.names if not is_nuisance(name))
 
+    @property
+    def ends(self) -> Float[np.ndarray, "2 p"]:
+        """The lowest and the highest values that the parameters can have."""
+        return np.array([(parameter.lowest, parameter.highest) for parameter in self.parameters]).T
+
+    def _each(
+        self, function: Callable[[Parameter, Numbers], Numbers], columns: Float[np.ndarray, "... p"]
+    ) -> Float[np.ndarray, "... p"]:
+        """Return what a function makes of each parameter's column."""
+        pairs = zip(self.parameters, np.moveaxis(columns, -1, 0), strict=True)
+        return np.stack([function(parameter, column) for parameter, column in pairs], axis=-1)
+
     def values(self, coordinates: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return the parameters' values at optimiser coordinates."""
-        columns = zip(self.parameters, np.moveaxis(coordinates, -1, 0), strict=True)
-        return np.stack([value_at(p, y) for p, y in columns], axis=-1)
+        return self._each(value_at, coordinates)
 
     def values_and_slopes(
         self, coordinates: Float[np.ndarray, "... p"]
     ) -> tuple[Float[np.ndarray, "... p"], Float[np.ndarray, "... p"]]:
         """Return the values and their derivatives by the coordinates."""
-        columns = zip(self.parameters, np.moveaxis(coordinates, -1, 0), strict=True)
-        return self.values(coordinates), np.stack([slope_at(p, y) for p, y in columns], axis=-1)
+        return self.values(coordinates), self._each(slope_at, coordinates)
 
     def coordinates(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return optimiser coordinates of parameter values."""
-        columns = zip(self.parameters, np.moveaxis(values, -1, 0), strict=True)
-        return np.stack([coordinate_of(p, value) for p, value in columns], axis=-1)
+        return self._each(coordinate_of, values)
 
     def known(self, values: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
         """Return the parameters by name."""
@@ -361,6 +370,25 @@ def problem_of(
     """
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = constraints_of(table, constraints)
+    check_constraints(known, model, own, table.drive)
+    nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
+    return Problem(model, own + nuisances, tuple(effects), table.drive)
+
+
+def check_constraints(
+    known: Mapping[str, tuple[float, float]], model: str, own: tuple[str, ...], drive: str = "sample"
+) -> None:
+    """Check what is known beforehand of a model's parameters and of the instrument.
+
+    Args:
+        known: value and standard error by parameter.
+        model: its name.
+        own: its parameters.
+        drive: what is driven.
+
+    Raises:
+        ValueError: if a constraint is on no parameter, impossible, or says what a delay says already.
+    """
     for name, (value, error) in known.items():
         if name not in (*own, *NUISANCE_NAMES):
             raise ValueError(
@@ -370,13 +398,11 @@ def problem_of(
             raise ValueError(
                 f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
             )
-    if "offset_origin_nm" in known and model.endswith("+delay") and not table.tapping:
+    if "offset_origin_nm" in known and model.endswith("+delay") and drive == "sample":
         raise ValueError(
             "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the constraint on "
             "offset_origin_nm out (delay_offset_nm takes it up), or fit the model 'contact'"
         )
-    nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
-    return Problem(model, own + nuisances, tuple(effects), table.drive)
 
 
 def _joint_task(
@@ -752,10 +778,7 @@ def split_held(
         if name not in CONTACT_PARAMETER or name in own:
             others[name] = (value, error)
             continue
-        if not (np.isfinite(value) and 0.0 < error < np.inf):
-            raise ValueError(
-                f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
-            )
+        check_constraints({name: (value, error)}, "contact", (name,))
         if values.get(name, value) != value:
             raise ValueError(f"{name} is held at {values[name]:g} (`fixed`) and known as {value:g}: say one of the two")
         values[name], errors[name] = value, error

@@ -25,7 +25,7 @@ from jaxtyping import Float
 
 import fitting.examples
 from fitting import fit, posterior, read_table
-from fitting.fits.discrepancy import root_of
+from fitting.fits.law_after import root_of
 from fitting.fits.objective import Objective
 from fitting.sampling.bootstrap import DataSets, Refit, fit_data_sets, shifts
 from fitting.sampling.inference_data import densities, noise_of, posterior_draws, refit_of_rows

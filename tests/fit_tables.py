@@ -16,7 +16,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting import fit
+from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
+from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable, read_table
 
 EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
@@ -32,6 +34,20 @@ def example_amplitudes() -> AmplitudeTable:
 def example_fit() -> FitResult:
     """Return the fit of the bundled table without its phases: made once for all tests of a process, which only read."""
     return fit(example_amplitudes(), model="law")
+
+
+@cache
+def example_objective() -> Objective:
+    """Return chi2 of the bundled table without its phases by the law; tests only ask it."""
+    problem = problem_of(example_amplitudes(), "law")
+    return Objective(measurement_of(example_amplitudes(), problem), problem)
+
+
+@cache
+def fit_of_every_fourth() -> FitResult:
+    """Return the fit of a law's amplitudes with noise of 1 % at every fourth drive of the bundled table."""
+    example = example_amplitudes()
+    return fit(simulated(rows(example, slice(0, None, 4)), ImpactLaw(0.95, 60.0), seed=8), "law")
 
 
 def rows(table: AmplitudeTable, keep: slice | np.ndarray, **changes: Any) -> AmplitudeTable:

@@ -274,8 +274,8 @@ MUTATIONS = {
         "complex(2.0 * self.waveform", "complex(self.waveform", "tests/test_lockin.py::test_a_bounce_in_closed_form"
     ),
     "lead of the regressed delay as a sum": Mutation(
-        "_tau: 1.0 / u - 1.0 / w",
-        "_tau: 1.0 / u + 1.0 / w",
+        "u, w: 1.0 / u - 1.0 / w",
+        "u, w: 1.0 / u + 1.0 / w",
         "tests/test_inversion_law.py::test_values_without_noise_are_exact",
     ),
     "inverted rebound against the platform": Mutation(
@@ -314,9 +314,19 @@ MUTATIONS = {
         "tests/test_lyapunov.py::test_the_larger_exponent_is_the_growth_of_neighbouring_motions",
     ),
     "slow impacts' padding of peak and lock-in as if independent": Mutation(
-        "0.5 * (_TOGETHER - _APART)",
-        "0.0 * (_TOGETHER - _APART)",
+        "_TOGETHER + _APART * np.array([[1.0, -1.0], [-1.0, 1.0]])",
+        "(_TOGETHER + _APART) * np.eye(2)",
         "tests/test_discrepancy.py::test_the_step_is_that_of_one_least_squares_problem",
+    ),
+    "step taken again away from what was computed": Mutation(
+        "residual[:size] += beyond",
+        "residual[:size] -= beyond",
+        "tests/test_discrepancy.py::test_a_settled_step_explains_the_readings_as_computed",
+    ),
+    "closest formula by half of the distance": Mutation(
+        "w**2 - 2.0 * w * rebound",
+        "w**2 - w * rebound",
+        "tests/test_discrepancy.py::test_the_parameters_are_those_of_the_closest_formula_and_as_unsure",
     ),
     "collisions beside capture in few steps": Mutation(
         "_NEAR_CAPTURE = (-0.02, 0.2)",

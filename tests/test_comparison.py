@@ -80,9 +80,7 @@ def test_a_model_that_is_fitted_already_is_not_fitted_again(table, compared, fit
     ("error", "said"),
     [
         (np.linalg.LinAlgError("Eigenvalues did not converge"), "Eigenvalues did not converge"),
-        (OverflowError("math range error"), "math range error"),
         (FloatingPointError(), "FloatingPointError"),
-        (ValueError("the constraint on 'r' is on no parameter"), "the constraint on 'r' is on no parameter"),
         (RuntimeError("XLA ran out of memory."), "XLA ran out of memory."),
     ],
 )
@@ -125,10 +123,6 @@ def test_the_command_says_which_rival_failed(failing):
     done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare"])
     assert done.exit_code == 0
     assert "viscous            failed: Eigenvalues did not converge" in done.stdout
-    done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare", "--json"])
-    answer = strictly(done.stdout)
-    assert answer["valid"] is True
-    assert answer["comparison"]["failed"] == {"viscous": "Eigenvalues did not converge"}
 
 
 @pytest.mark.slow

@@ -129,16 +129,6 @@ def test_readings_and_information_are_those_of_other_orbits(of_law, drives):
     np.testing.assert_allclose(found.slope[usable] / largest, wanted / largest, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_forecast_is_the_error_that_a_fit_reports(of_law):
-    # without noise the fit ends at the believed law, where its errors must be the forecast's
-    exact = other_amplitudes(of_law.drives)
-    result = fit(table_of(of_law.drives, exact), "law")
-    for name, forecast in of_law.expected.items():
-        # the fit's own minimum is good to 1e-5 standard errors
-        np.testing.assert_allclose(error_of(result.parameters[name]), error_of(forecast), rtol=1e-4)
-
-
 def determinant(result: Design, chosen: np.ndarray) -> float:
     """Return the log of the determinant of the covariance of r and epsilon, from the inverse; infinite if singular."""
     information = result.prior.information + result.candidates.information[chosen].sum(axis=0)
@@ -171,8 +161,6 @@ def test_a_choice_for_one_parameter_is_better_for_it(drives, of_law):
         mine, yours = ours.expected[name].standard_error, theirs.expected[name].standard_error
         assert mine is not None
         assert yours is None or mine <= yours
-    with pytest.raises(ValueError, match="`interest` names 'viscosity'"):
-        design(law_prior(), drives, interest=("viscosity",))
     assert of_law.interest == ("r", "epsilon")
 
 
@@ -215,8 +203,10 @@ def test_drives_are_left_out_for_a_reason(drives, of_law):
 def test_a_fit_is_added_to(drives, of_law):
     exact = other_amplitudes(of_law.drives)
     result = fit(table_of(of_law.drives, exact), "law")
-    prior = prior_of_fit(result)
-    again = design(prior, drives, points=3, noise=NOISE)
+    for name, forecast in of_law.expected.items():
+        # without noise the fit ends at the believed law: its own minimum is good to 1e-5 standard errors
+        np.testing.assert_allclose(error_of(result.parameters[name]), error_of(forecast), rtol=1e-4)
+    again = design(prior_of_fit(result), drives, points=3, noise=NOISE)
     for name, parameter in result.parameters.items():
         # a covariance through its correlations and back
         np.testing.assert_allclose(error_of(again.measured_so_far[name]), error_of(parameter), rtol=1e-6)
@@ -233,23 +223,6 @@ def test_an_unsure_cantilever_is_named(drives):
     loose = design(law_prior(constraints={"quality_factor": (40.0, 8.0)}), drives, points=6)
     assert any("Most of the error comes from quality_factor" in warning for warning in loose.warnings)
     assert any("exactly known" in note for note in law_prior(constraints={}).notes)
-
-
-@pytest.mark.parametrize("correlation", [1.0, -1.0, 1.5])
-def test_a_saved_fit_whose_correlations_contradict_each_other_is_refused(correlation):
-    parameter = {"value": 0.95, "standard_error": 0.01, "constraint": None}
-    columns = {name: [1.0] for name in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")}
-    payload = {
-        "format": "afm-jax fit",
-        "format_version": 2,
-        "model": "law",
-        "valid": True,
-        "parameters": {"r": parameter, "epsilon": parameter | {"value": 60.0}},
-        "correlations": {"matrix": [[1.0, correlation], [correlation, 1.0]]},
-        "input": columns | {"free_frequency_khz": 90.0},
-    }
-    with pytest.raises(ValueError, match="correlations contradict each other"):
-        prior_of_fit(payload)
 
 
 @pytest.mark.slow

@@ -9,24 +9,19 @@ from scipy.optimize import approx_fprime, least_squares
 
 from fitting import fit, read_table
 from fitting.examples.make_amplitudes import EXAMPLE
-from fitting.fits.discrepancy import (
+from fitting.fits.discrepancy import ModelDiscrepancy, with_runs
+from fitting.fits.law_after import (
     LawAfter,
     LawBefore,
-    ModelDiscrepancy,
-    StepRows,
     closest_member,
     containing,
-    descending_part,
     law_after,
-    longest_run,
+    nearest_of,
     root_of,
-    settled_step,
-    step_of,
-    system_of,
-    with_runs,
 )
 from fitting.fits.objective import Objective
-from fitting.fits.result import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, nearest_of, scaled
+from fitting.fits.result import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, scaled
+from fitting.fits.step import StepRows, descending_part, longest_run, settled_step, system_of
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE
@@ -45,7 +40,7 @@ VALUES = {
 }
 PROBLEM = Problem("viscous+delay", tuple(VALUES))
 LEFT_OUT = ModelDiscrepancy(PROBLEM, VALUES, (20.0, 200.0))
-ROWS = 12
+ROWS, FREE = 12, np.ones(6, dtype=bool)
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +98,7 @@ def stacked(rows: StepRows):
 def test_the_step_is_that_of_one_least_squares_problem(rows):
     matrix, right = stacked(rows)
     best = np.linalg.lstsq(matrix, -right, rcond=None)[0]
-    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    step = system_of(rows, LEFT_OUT, FREE).step()
     assert step.names == (*VALUES, LOSS_SHAPE, DELAY_SHAPE)
     np.testing.assert_allclose(step.change, best[:8], rtol=1e-6)
     np.testing.assert_allclose(step.unknown, best[8:], rtol=1e-5, atol=1e-7)
@@ -114,7 +109,8 @@ def test_the_step_is_that_of_one_least_squares_problem(rows):
 
 def test_chi2_leaves_what_belongs_to_the_rows_at_its_most_likely(rows):
     """The sum of squares with the remainders as unknowns of their own, minimised over these."""
-    step, system = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool)), system_of(rows, LEFT_OUT)
+    system = system_of(rows, LEFT_OUT, FREE)
+    step = system.step()
     misfit = np.random.default_rng(8).normal(size=2 * ROWS)
     half = step.partly(0.5)
     of_rows = system.unknown[:, system.of_law :]
@@ -127,11 +123,12 @@ def test_chi2_leaves_what_belongs_to_the_rows_at_its_most_likely(rows):
     shapes = [(half.values[6 + i] - mean) / error for i, (mean, error) in enumerate(LEFT_OUT.priors.values())]
     rest = np.concatenate([[known], shapes, half.unknown[: system.of_law]])
     assert system.chi2(half, misfit) == pytest.approx(float(square[0]) + float(rest @ rest), rel=1e-9)
-    np.testing.assert_allclose(system.alone(misfit)[0], misfit + of_rows @ likely, atol=1e-9)
+    np.testing.assert_allclose(system.alone(misfit), misfit + of_rows @ likely, atol=1e-9)
 
 
 def test_to_first_order_chi2_after_the_step_is_that_of_the_step(rows):
-    step, system = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool)), system_of(rows, LEFT_OUT)
+    system = system_of(rows, LEFT_OUT, FREE)
+    step = system.step()
     size, law = 2 * ROWS, slice(0, system.of_law)
     misfit = system.residual[:size] + system.jacobian[:size] @ step.change + system.unknown[:, law] @ step.unknown[law]
     assert system.chi2(step, misfit) == pytest.approx(step.chi2, rel=1e-9)
@@ -139,7 +136,8 @@ def test_to_first_order_chi2_after_the_step_is_that_of_the_step(rows):
 
 @pytest.mark.parametrize(("falls_from", "share"), [(1.0, 1.0), (0.25, 0.25), (0.0, 0.0)])
 def test_a_step_is_damped_until_chi2_falls(rows, falls_from, share):
-    step, system = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool)), system_of(rows, LEFT_OUT)
+    system = system_of(rows, LEFT_OUT, FREE)
+    step = system.step()
     size, law = 2 * ROWS, slice(0, system.of_law)
 
     def predicted(parts):
@@ -155,7 +153,7 @@ def test_a_step_is_damped_until_chi2_falls(rows, falls_from, share):
         nothing: Any = np.zeros((2, 1))
         return Predicted(np.array(found).reshape(len(parts), ROWS, 2), Prediction(*(nothing,) * 7))
 
-    found = descending_part(step, system, predicted)
+    found = descending_part(system, predicted)
     np.testing.assert_allclose(found.step.change, share * step.change)
     np.testing.assert_allclose(found.step.unknown, share * step.unknown)
     assert (found.stuck is None) == (share > 0.0)
@@ -166,8 +164,8 @@ def test_a_step_is_damped_until_chi2_falls(rows, falls_from, share):
 
 def test_a_settled_step_explains_the_readings_as_computed(rows):
     """Readings bend with the law: the first step's do not fit, the settled one's misfit is that of a fit to them."""
-    free = np.ones(6, dtype=bool)
-    step, system = step_of(rows, LEFT_OUT, free), system_of(rows, LEFT_OUT)
+    system = system_of(rows, LEFT_OUT, FREE)
+    step = system.step()
     looks = []
 
     def bent(part):
@@ -179,17 +177,14 @@ def test_a_settled_step_explains_the_readings_as_computed(rows):
         nothing: Any = np.zeros((2, 1))
         return Predicted(np.array([bent(part) for part in parts]).reshape(2, ROWS, 2), Prediction(*(nothing,) * 7))
 
-    def again(beyond):
-        residual = rows.residual.copy()
-        residual[: 2 * ROWS] += beyond
-        return step_of(rows._replace(residual=residual), LEFT_OUT, free)
-
-    first = descending_part(step, system, predicted)
-    found = settled_step(first, system, predicted, again)
+    first = descending_part(system, predicted)
+    found = settled_step(first, system, predicted)
     chi2 = [system.chi2(one.step, bent(one.step)) for one in (first, found)]
     assert chi2[1] < chi2[0]
     # its root: the step from there leads back to it
-    last = again(bent(found.step) - system.misfit(found.step))
+    residual = rows.residual.copy()
+    residual[: 2 * ROWS] += bent(found.step) - system.misfit(found.step)
+    last = system_of(rows._replace(residual=residual), LEFT_OUT, FREE).step()
     error = np.sqrt(np.diag(step.covariance))
     np.testing.assert_allclose(last.change / error, found.step.change / error, atol=0.1)
     assert len(looks) <= 8
@@ -199,7 +194,7 @@ def test_a_settled_step_explains_the_readings_as_computed(rows):
 def test_the_law_after_the_step_is_the_formula_with_its_discrepancy(rows):
     """By hand, of a step large enough that first order is visibly not it."""
     u, values = np.geomspace(25.0, 180.0, 7), np.array(list(VALUES.values()))
-    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    step = system_of(rows, LEFT_OUT, FREE).step()
     before, moved = (
         LawBefore(loss_and_delay(at, u), np.zeros((2, 7, 6)), 10.9, np.zeros(6)) for at in (values, step.values[:6])
     )
@@ -220,7 +215,7 @@ def test_the_band_is_that_of_the_whole_covariance(rows):
     w = np.sqrt(u**2 - 0.5 * u - 113.6)
     slope = np.zeros((2, 3, 6))
     slope[0, :, 0], slope[0, :, 1] = -0.5 / w, -0.5 * u / w
-    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    step = system_of(rows, LEFT_OUT, FREE).step()
     found = law_after(step, LEFT_OUT, u, LawBefore(np.stack([w, 0.0 * w]), slope, 10.9, np.zeros(6)))
     columns = LEFT_OUT.columns(u, w)
     square = np.concatenate([2.0 * w[:, None] * slope[0], columns.shape[0], columns.unknown[0]], axis=1)
@@ -232,20 +227,21 @@ def test_the_band_is_that_of_the_whole_covariance(rows):
 
 def test_residuals_that_run_together_over_the_speed_are_seen_and_only_widen(rows):
     """A bump of the loss that no column of the model has, beside independent residuals of half an error."""
-    random, free = np.random.default_rng(8), np.ones(6, dtype=bool)
+    random = np.random.default_rng(8)
     calm = rows._replace(residual=np.append(0.5 * random.normal(size=2 * ROWS), 0.0))
-    steps = [longest_run(calm, LEFT_OUT, free)]
+    steps = [longest_run(calm, system_of(calm, LEFT_OUT, FREE))]
     bump = np.exp(-0.5 * (np.log(rows.approach / 60.0) / 0.2) ** 2) * (rows.approach**2 - rows.rebound**2)
     for height in (0.1, 1.0):
         bent = calm.residual.copy()
         bent[: 2 * ROWS] += height * (rows.slopes.by_square * bump[:, None]).ravel()
-        steps.append(longest_run(calm._replace(residual=bent), LEFT_OUT, free))
+        other = calm._replace(residual=bent)
+        steps.append(longest_run(other, system_of(other, LEFT_OUT, FREE)))
     assert steps[0] < 3.0
     assert steps[2] > 10.0
     assert with_runs(LEFT_OUT, 2.0) == LEFT_OUT
     shares = [with_runs(LEFT_OUT, run).short for run in (2.2, 3.0, 5.0, 50.0)]
     np.testing.assert_allclose(shares, [0.0, 0.2, 0.7, 1.0])
-    narrow, wide = (step_of(rows, one, free) for one in (LEFT_OUT, with_runs(LEFT_OUT, 5.0)))
+    narrow, wide = (system_of(rows, one, FREE).step() for one in (LEFT_OUT, with_runs(LEFT_OUT, 5.0)))
     assert np.all(np.diag(wide.covariance) >= np.diag(narrow.covariance))
     assert wide.chi2 < narrow.chi2
 
@@ -276,9 +272,9 @@ def test_the_parameters_are_those_of_the_closest_formula_and_as_unsure(rows):
     u, values = np.geomspace(25.0, 180.0, 30), np.array(list(VALUES.values()))
     slope = np.asarray(approx_fprime(values, lambda at: loss_and_delay(at, u).ravel(), 1e-6)).reshape(2, 30, 6)
     before = LawBefore(loss_and_delay(values, u), slope, 10.9, np.zeros(6))
-    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    step = system_of(rows, LEFT_OUT, FREE).step()
     after = law_after(step, LEFT_OUT, u, before)
-    found = closest_member(step, LEFT_OUT, u, before, np.ones(6, dtype=bool))
+    found = closest_member(step, LEFT_OUT, u, before, FREE)
     assert found is not None
     width = np.linalg.norm(after.factor, axis=2)
     error = np.sqrt(np.diag(found.covariance))

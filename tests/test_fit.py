@@ -6,18 +6,17 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from afm_jax import ImpactLaw
-from afm_jax.cli.values import example_path
-from fitting import fit, read_table
+from fitting import fit
 from fitting.examples.make_amplitudes import TRUTH, example_table
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
-from fitting.models import measurement_of, problem_of
 from fitting.report.report import summary
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
     example_amplitudes,
     example_fit,
+    example_objective,
     rows,
     simulated,
     values_of,
@@ -38,9 +37,8 @@ def law() -> FitResult:
 
 
 @pytest.fixture(scope="module")
-def objective(table) -> Objective:
-    problem = problem_of(table, "law")
-    return Objective(measurement_of(table, problem), problem)
+def objective() -> Objective:
+    return example_objective()
 
 
 def test_the_bundled_table_is_what_its_script_makes(table):
@@ -128,16 +126,6 @@ def test_profile_interval_ends_are_where_scipy_finds_chi2_risen_by_3_84(law, obj
 
 
 @pytest.mark.slow
-def test_other_models_are_refused_by_their_chi2(table):
-    for model in ("restitution", "viscous"):
-        result = fit(table, model=model)
-        assert not result.valid
-        assert result.p_value < 1e-10
-        assert all(parameter.interval95 == (None, None) for parameter in result.parameters.values())
-        assert all(parameter.standard_error is None for parameter in result.parameters.values())
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("held", "model"), [({"viscous_loss": 0.0}, "law"), ({"r": 1.0}, "viscous"), ({"epsilon": 61.0}, None)]
 )
@@ -161,23 +149,6 @@ def test_a_full_law_with_one_loss_held_is_the_law_without_it(table, held, model)
 
 
 @pytest.mark.slow
-def test_chi2_rises_as_the_profile_says_where_r_is_held(law, table):
-    for end in law.parameters["r"].interval95:
-        held = fit(table, "law", fixed={"r": end})
-        assert held.chi2 - law.chi2 == pytest.approx(3.8415, rel=5e-3)
-        assert held.degrees_of_freedom == law.degrees_of_freedom + 1
-
-
-@pytest.mark.slow
-def test_full_law_with_a_delay_and_r_of_1_is_the_viscous_law_with_a_delay():
-    contact = read_table(example_path())
-    full, plain = fit(contact, "full+delay", fixed={"r": 1.0}), fit(contact, "viscous+delay")
-    assert list(full.parameters) == list(plain.parameters)
-    np.testing.assert_allclose(values_of(full), values_of(plain), rtol=1e-4)
-    assert (full.valid, full.chi2) == (plain.valid, pytest.approx(plain.chi2, rel=1e-6))
-
-
-@pytest.mark.slow
 def test_full_law_is_found_from_its_amplitudes(table):
     truth = ImpactLaw(0.97, 60.0, 2.0)
     found = fit(simulated(table, truth, seed=None), "full")
@@ -198,21 +169,18 @@ def test_scaled_errors_bring_chi2_to_its_degrees_of_freedom(table):
     # three rounds; the constraint on Q, which is not scaled, moves the rest by less than this
     assert scaled.chi2 - pull**2 == pytest.approx(2 * table.rows - 2, rel=1e-5)
     assert np.isnan(scaled.p_value)
+    assert scaled.valid
+    for name, truth in TRUTH.items():
+        low, high = scaled.parameters[name].interval95
+        assert low is not None
+        assert high is not None
+        assert low < truth < high
     assert any("errors were scaled by" in warning for warning in scaled.warnings)
 
 
 def test_a_fit_is_reproducible(table, law):
     again = fit(table, model="law")
     assert again.to_dict() == law.to_dict()
-
-
-def test_the_law_without_delay_does_not_explain_contact_data(contact_table_path):
-    result = fit(read_table(contact_table_path), model="law")
-    assert not result.valid
-    assert result.chi2 / result.degrees_of_freedom > 100.0
-    assert result.p_value < 1e-100
-    assert result.parameters["r"].interval95 == (None, None)
-    assert "does not explain" in result.reasons[0]
 
 
 def test_unknown_models_and_too_few_amplitudes_are_errors(table):

@@ -13,9 +13,8 @@ from fitting.fits.fit import find_fit, summarise
 from fitting.fits.intervals import check_minimum, covariance
 from fitting.fits.objective import FINE, PLAIN, Objective, polish
 from fitting.fits.result import FitResult
-from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import example_amplitudes, example_fit, standard_errors_of, values_of
+from tests.fit_tables import example_amplitudes, example_fit, example_objective, standard_errors_of, values_of
 from tests.strict_reading import strictly
 
 FREE = np.ones(3, dtype=bool)
@@ -33,9 +32,8 @@ def law() -> FitResult:
 
 
 @pytest.fixture(scope="module")
-def objective(table) -> Objective:
-    problem = problem_of(table, "law")
-    return Objective(measurement_of(table, problem), problem)
+def objective() -> Objective:
+    return example_objective()
 
 
 def differenced(objective: Objective, values: np.ndarray) -> np.ndarray:

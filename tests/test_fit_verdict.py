@@ -10,7 +10,7 @@ from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
 from fitting.fits.verdict import Evidence, correlation_excess, judge_fit
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import amplitudes_and_errors, example_amplitudes, with_amplitudes
+from tests.fit_tables import example_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
 
 
@@ -166,21 +166,15 @@ def with_residuals(given: Evidence, residual: np.ndarray, **changes) -> Evidence
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"robust": True}, {"scale_errors": True}, {"robust": True, "scale_errors": True}])
-def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact(options):
+def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact():
     """The contact's r is 0.998; the best instantaneous law has 0.76 and most rows far off."""
-    result = fit(read_table(CONTACT_TABLE), model="law", **options)
+    result = fit(read_table(CONTACT_TABLE), model="law", robust=True, scale_errors=True)
     assert not result.valid
     (reason,) = [text for text in result.reasons if text.startswith("The model does not explain the data: ")]
     assert "try the model with +delay" in reason
     assert "--robust" not in " ".join(result.reasons + result.warnings)
-    if "scale_errors" in options:
-        # which of many bad minima is the best depends on roundings: 54, or 101
-        assert re.search(r"errors would have to be (\d\d[\d.]*) times", reason)
-    else:
-        assert "neighbouring residuals in the table's order are correlated" in reason
-        # likewise, of 55 or of 57 rows
-        assert re.search(r"5\d of 57 rows are off by more than 4 errors", reason)
+    # which of many bad minima is the best depends on roundings: 54, or 101
+    assert re.search(r"errors would have to be (\d\d[\d.]*) times", reason)
     assert all(parameter.standard_error is None for parameter in result.parameters.values())
     assert all(parameter.interval95 == (None, None) for parameter in result.parameters.values())
     assert np.isnan(result.law.rebound_high_nm_per_us).all()
@@ -191,7 +185,6 @@ def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact(options)
     [
         ("restitution", {"robust": True}, "14 of 82 rows are off by more than 4 errors"),
         ("restitution", {"scale_errors": True}, "residuals over the approach speed are correlated"),
-        ("viscous", {"robust": True}, "without outliers chi2/dof = "),
         pytest.param(
             "viscous",
             {"scale_errors": True},
@@ -206,21 +199,13 @@ def test_a_law_that_the_amplitudes_are_not_made_by_stays_invalid_with_every_opti
     assert said in result.reasons[0]
 
 
-@pytest.mark.parametrize("options", [{"robust": True}, {"scale_errors": True}])
-def test_the_right_law_stays_valid_with_outliers_and_with_misstated_errors(options):
-    table = example_amplitudes()
-    amplitude, error = amplitudes_and_errors(table)
-    if "robust" in options:
-        amplitude[[5, 20, 30, 60], [0, 0, 1, 0]] *= [1.3, 1.08, 0.75, 1.5]
-    else:
-        error = 0.4 * error
-    result = fit(with_amplitudes(table, amplitude, error), model="law", **options)
-    assert result.valid
-    for name, truth in {"r": 0.95, "epsilon": 60.0}.items():
-        low, high = result.parameters[name].interval95
-        assert low is not None
-        assert high is not None
-        assert low < truth < high
+def test_a_robust_fit_whose_other_rows_are_not_explained_is_not_valid():
+    given = evidence("law", made_table(40), robust=True)
+    residual = 2.0 * np.random.default_rng(6).choice([-1.0, 1.0], size=(40, 2))
+    residual[3] = 40.0
+    (reason,) = judge_fit(with_residuals(given, residual))[0]
+    # 78 readings of two errors each
+    assert "without outliers chi2/dof = 4.11 (probability" in reason
 
 
 def test_correlated_residuals_invalidate_though_chi2_is_as_it_should_be():

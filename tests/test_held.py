@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS
-from fitting.fits.discrepancy import HeldEffect, ModelDiscrepancy, step_of
+from fitting.fits.discrepancy import HeldEffect, ModelDiscrepancy
+from fitting.fits.step import system_of
 from fitting.models import Held, Problem, held_of, split_held
 from tests.test_discrepancy import LEFT_OUT, VALUES, rows
 
@@ -53,7 +54,7 @@ def test_the_error_of_what_is_held_is_one_more_unknown_of_the_law(rows):
     jacobian[:-1, 0] = -rows.slopes.by_square.ravel()
     rows = rows._replace(jacobian=jacobian)
     other = ModelDiscrepancy(problem, VALUES, LEFT_OUT.speeds, held=(of_epsilon,))
-    alone, held = step_of(rows, LEFT_OUT, free), step_of(rows, other, free)
+    alone, held = (system_of(rows, one, free).step() for one in (LEFT_OUT, other))
     # a standard error of it takes 7 off the squared rebound speed, as 7 of epsilon do, which it makes up for
     assert held.covariance[0, 0] - alone.covariance[0, 0] == pytest.approx(49.0, rel=1e-4)
     assert held.values[0] == pytest.approx(alone.values[0], rel=1e-6)

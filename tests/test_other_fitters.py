@@ -3,18 +3,15 @@
 import numpy as np
 import pytest
 
-from afm_jax.impact.law import ImpactLaw
-from fitting import fit
 from fitting.sampling.bootstrap import objective_of
-from tests.fit_tables import example_amplitudes, rows, simulated, standard_errors_of, values_of
+from tests.fit_tables import fit_of_every_fourth, standard_errors_of, values_of
 
 NAMES = ("r", "epsilon", "quality_factor")
 
 
 @pytest.fixture(scope="module")
 def result():
-    example = example_amplitudes()
-    return fit(simulated(rows(example, np.arange(0, example.rows, 4)), ImpactLaw(0.95, 60.0), seed=8), "law")
+    return fit_of_every_fourth()
 
 
 @pytest.fixture(scope="module")

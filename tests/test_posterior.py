@@ -16,6 +16,7 @@ from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chai
 from tests.fit_tables import (
     amplitudes_and_errors,
     example_amplitudes,
+    fit_of_every_fourth,
     rows,
     simulated,
     standard_errors_of,
@@ -39,8 +40,7 @@ def exact_q():
 
 @pytest.fixture(scope="module")
 def law():
-    example = example_amplitudes()
-    return fit(simulated(rows(example, EVERY_FOURTH), ImpactLaw(0.95, 60.0), seed=8), "law")
+    return fit_of_every_fourth()
 
 
 @pytest.fixture(scope="module")

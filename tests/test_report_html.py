@@ -6,37 +6,18 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from afm_jax.cli.main import main
 from afm_jax.saved import load
+from fitting.fits.comparison import Comparison
 from fitting.fits.result import FitResult
 from fitting.report.html import fit_page
 from fitting.report.plots import law_figure, rows_figure, speed_figure
 from fitting.report.report import summary, write_report
-from fitting.report.words import band_width, goodness_in_words
+from fitting.report.words import band_width, goodness_in_words, interval_in_words
+from fitting.sampling.bootstrap import Bootstrap
+from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
 from tests.html_pages import first_screen, formulas, read_page, section_of, table_of, words_of
 from tests.made_fits import SPEEDS, VALUES, made_fit, made_parameter, made_table
-
-
-@dataclasses.dataclass(frozen=True)
-class Models:
-    """A comparison as `fitting` makes them: rows and a verdict."""
-
-    rows: list[dict[str, Any]]
-    verdict: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Samples:
-    """A bootstrap or posterior: whatever `to_dict` says."""
-
-    found: dict[str, Any]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what was found."""
-        return self.found
-
 
 EMPTY = b'<svg xmlns="http://www.w3.org/2000/svg"/>'
 
@@ -165,6 +146,21 @@ def test_probability_is_said_in_words(changes, said):
     assert said in goodness_in_words(made_fit("law", **changes))
 
 
+@pytest.mark.parametrize(
+    ("ends", "reason", "said"),
+    [
+        ((None, 9.169), "lower end: reaches the end of its range, 0", "below 9.17  nm; 0 is not excluded"),
+        ((0.9990182, None), "upper end: reaches the end of its range, 1", "above 0.999018  nm; 1 is not excluded"),
+        ((2.0, None), "upper end: chi2 is not finite on this side", "above 2.00  nm; upper end: chi2 is not finite"),
+        ((None, None), "the data do not determine this parameter", "none: the data do not determine this parameter"),
+        ((None, None), "the model does not explain the data", "none"),
+    ],
+)
+def test_limits_read_plainly(ends, reason, said):
+    parameter = made_parameter("r", 0.95, interval95=ends, interval_reason=reason)
+    assert interval_in_words(parameter, "nm").startswith(said)
+
+
 def test_every_text_is_shown_as_it_is_and_does_nothing():
     hostile = '<script>alert("1")</script> & <img src=x onerror=y> \x0b\x7f'
     table = made_table(remarks=(hostile,), source="strange\udc80 <b>.csv")
@@ -212,38 +208,26 @@ def test_a_long_table_stays_a_page_and_says_what_is_missing():
 
 
 def test_other_models_and_samples_are_shown():
+    known = {"degrees_of_freedom": 6, "bic": 9.5, "valid": True}
     rows = [
-        {"model": "law", "chi2": 5.0, "degrees_of_freedom": 6, "aic": 9.0, "delta_aic": 0.0, "law_change": 0.0},
-        {
-            "model": "viscous",
-            "chi2": 7.25,
-            "degrees_of_freedom": 6,
-            "aic": 11.25,
-            "delta_aic": 2.25,
-            "law_change": 0.01,
-        },
+        known | {"model": "law", "chi2": 5.0, "aic": 9.0, "delta_aic": 0.0, "law_change": 0.0},
+        known | {"model": "viscous", "chi2": 7.25, "aic": 11.25, "delta_aic": 2.25, "law_change": 0.01},
     ]
-    found = {
-        "seed": 1234,
-        "standard_error": {"r": 0.0125, "epsilon": 2.5},
-        "parameters": {"r": {"interval95": [0.9, 0.99]}, "epsilon": {"interval95": [50.0, 70.0]}},
-        "grid": {"axes": {"r": [0.1] * 50, "epsilon": [0.1] * 50}, "density": [[0.1, 0.2]] * 50},
-    }
-    chains = {"chains": {"seed": 77, "r_hat": {"r": 1.31, "epsilon": None}}, "grid": None, "converged": False}
-    models = Models(rows, "The data do not tell r < 1 from viscous loss.")
-    page = page_of(made_fit("law"), comparison=models, bootstrap=Samples(found), posterior=Samples(chains))
-    root = read_page(page)
+    models = Comparison(rows, "The data do not tell r < 1 from viscous loss.", {})
+    drawn = np.linspace(0.9, 0.99, 41)[:, None] * [1.0, 70.0]
+    boot = Bootstrap(("r", "epsilon"), np.array([0.95, 60.0]), drawn, 2, 1234)
+    chains = PosteriorChains(drawn[None], np.array([1.31, np.nan]), np.array([50.0, 60.0]), 0, 77)
+    found = posterior_of_chains(chains, ("r", "epsilon"), ())
+    root = read_page(page_of(made_fit("law"), comparison=models, bootstrap=boot, posterior=found))
     assert models.verdict in first_screen(root)
     assert [row[1] for row in table_of(root, "Models of")] == ["chi2", "5", "7.25"]
     ours, others = section_of(root, "bootstrap"), section_of(root, "posterior")
-    assert table_of(ours, "By parameter") == [
-        ["parameter", "standard error", "95 % interval"],
-        ["r", "0.0125", "0.9 to 0.99"],
-        ["epsilon", "2.5", "50 to 70"],
-    ]
-    assert table_of(others, "By parameter")[1:] == [["r", "1.31"], ["epsilon", "-"]]
+    head, first, _ = table_of(ours, "By parameter")
+    assert head == ["parameter", "standard error", "bias", "95 % interval", "basic 95 % interval"]
+    assert first[3] == "0.90225 to 0.98775"
+    assert [row[-2:] for row in table_of(others, "By parameter")][1:] == [["1.31", "50"], ["-", "60"]]
     # the samples themselves are no reading matter, the seeds are
-    assert table_of(ours, "Besides")[1:] == [["seed", "1234"]]
+    assert dict(table_of(ours, "Besides")[1:]) == {"samples": "41", "failures": "2", "seed": "1234"}
     assert dict(table_of(others, "Besides"))["chains seed"] == "77"
     assert "Not converged" in words_of(others)
     assert "Not converged" not in words_of(ours)
@@ -283,16 +267,3 @@ def test_report_is_written_with_its_page(tmp_path):
     assert set(tables) == {"fit_rows.csv"}
     again = load(tmp_path / "fit.json")
     assert summary(again) == written[1].read_text(encoding="utf-8").rstrip("\n")
-
-
-@pytest.mark.slow
-def test_command_writes_the_page_of_the_bundled_table(tmp_path):
-    result = CliRunner().invoke(main, ["fit", "--example", "--out", str(tmp_path)])
-    assert result.exit_code == 0
-    page = read_page((tmp_path / "fit.html").read_text(encoding="utf-8"))
-    # rows, law, residuals over the speed, energy of an impact
-    assert sum(1 for _ in page.iter("img")) == 4
-    seen = first_screen(page)
-    # made with r 0.95 and epsilon 60 (its own comments say so)
-    assert "0.9494 to 0.9507" in seen
-    assert "VALID" in seen.splitlines()

@@ -15,11 +15,11 @@ from afm_jax.cli.main import main
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.saved import save
 from fitting.experiments.prior import prior_of_fit
-from fitting.fits.discrepancy import StepSystem
 from fitting.fits.fit import fit
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult, FittedTable, Scatter
 from fitting.fits.several import Parts, departures_of, parts_of, pulls_of, scatter_between
+from fitting.fits.step import StepParameters, StepSystem
 from fitting.models import Problem, measurement_of
 from fitting.report.html import fit_page
 from fitting.report.report import row_records, summary
@@ -50,12 +50,15 @@ def linear_sets(seed: int, scatter: np.ndarray, own: float = 0.3) -> tuple[StepS
     jacobian = np.concatenate([slope, np.zeros((table.size + 2 + TABLES, 2 + TABLES))])
     jacobian[-TABLES:, 2:] = np.eye(TABLES) / own
     place = np.column_stack([np.zeros(TABLES, int), np.ones(TABLES, int), 2 + np.arange(TABLES)])
-    return StepSystem(residual, jacobian, np.zeros((of.size, 0)), np.eye(of.size)), table, place
+    names, values = ("a", "b", *map(str, range(TABLES))), np.zeros(2 + TABLES)
+    ends = np.full((values.size, 2), [-np.inf, np.inf])
+    parameters = StepParameters(names, values, ends, np.ones(values.size, dtype=bool))
+    return StepSystem(residual, jacobian, np.zeros((of.size, 0)), np.eye(of.size), parameters), table, place
 
 
 def parts_with(system: StepSystem, table: np.ndarray, place: np.ndarray, scatter: np.ndarray | None) -> Parts:
     departing = None if scatter is None else departures_of(system, table, np.arange(2), scatter)
-    return parts_of(system, table, place, np.ones(2 + TABLES, dtype=bool), 2, departing)
+    return parts_of(system, table, place, 2, departing)
 
 
 def test_pulls_are_those_of_fits_without_the_table():

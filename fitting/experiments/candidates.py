@@ -9,14 +9,15 @@ from jaxtyping import Bool, Float, Int, Shaped
 from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.prior import Prior, size_of
-from fitting.fits.discrepancy import ModelDiscrepancy, rows_of_fit, step_of
-from fitting.fits.estimate import member_after, speed_range
+from fitting.fits.discrepancy import ModelDiscrepancy
+from fitting.fits.law_after import member_after, speed_range
 from fitting.fits.minimum import model_errors_of, padding
 from fitting.fits.objective import BATCH, Objective
+from fitting.fits.step import rows_of_fit, system_of
 from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
-from fitting.simulated.experiment import Drives
-from fitting.tables.table import DRIVES, AmplitudeTable
+from fitting.simulated.experiment import Drives, check_drive
+from fitting.tables.table import AmplitudeTable
 
 MOST = 20_000
 """Drives that a design looks at: some minutes of computing."""
@@ -58,7 +59,7 @@ def drive_grid(  # noqa: PLR0913
         ValueError: if a list is empty or a number impossible, not exactly one of both kinds of frequency is given, or
             there are too many combinations.
     """
-    _check_drive(drive)
+    check_drive(drive)
     check_parameter("free_frequency_khz", free_frequency_khz, "positive", optional=True)
     _check_list("orders", orders, positive=True)
     if any(order != int(order) for order in orders):
@@ -116,11 +117,6 @@ def _frequencies(
         raise ValueError("`detunings` need `free_frequency_khz`, the cantilever's resonance")
     # Rounded to what an instrument is told: a thousandth of a hertz.
     return [round(resonance * free_frequency_khz * detuning, 6) for detuning in detunings]
-
-
-def _check_drive(drive: str) -> None:
-    if drive not in DRIVES:
-        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
 
 
 def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
@@ -204,9 +200,12 @@ def candidates_of(
         largest_nm: peak amplitude that the instrument takes; of a cantilever that is driven itself the free one.
         phase_noise_deg: standard error of the lag in degrees.
     """
-    objective = Objective(_measurement(prior, drives, amplitudes), prior.problem)
-    linear = objective.at_values(prior.draws(BATCH, least=MARGIN))
     count, tapping = len(drives.order), prior.problem.tapping
+    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
+    # of readings of 1 nm with an error of 1 nm the Jacobian is that of the amplitudes
+    one = np.ones((count, read.size))
+    objective = Objective(_measured(prior, drives, np.where(read, one, np.nan), one), prior.problem)
+    linear = objective.at_values(prior.draws(BATCH, least=MARGIN))
     prediction = linear.prediction
     expected = np.asarray(prediction.amplitude_nm)[0]
     # the model's own error goes with what is read
@@ -215,7 +214,6 @@ def candidates_of(
     )
     amplitude, kinds = expected[:count], expected.shape[1]
     own = padding(model_errors.model_error, expected)[:count]
-    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
     stated = _stated(amplitude, noise, phase_noise_deg)
     error = np.where(read, np.hypot(stated, own), np.inf)
     raw = np.asarray(linear.jacobian)[0, : kinds * count].reshape(count, kinds, -1)
@@ -241,14 +239,6 @@ def candidates_of(
         approach_speed_nm_per_us=np.asarray(prediction.approach_speed_nm_per_us)[0, :count],
         slope=np.where(usable[:, None, None], raw, 0.0) / safe[:, :, None],
     )
-
-
-def _measurement(prior: Prior, drives: Drives, amplitudes: str) -> Measurement:
-    """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
-    columns = 3 if prior.problem.tapping else 2
-    one = np.ones((len(drives.order), columns))
-    read = [False, True, True] if prior.problem.tapping else [amplitudes != "lockin", amplitudes != "peak"]
-    return _measured(prior, drives, np.where(read, one, np.nan), one)
 
 
 def _stated(
@@ -333,7 +323,7 @@ def forecast(
         jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
         slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
         some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
-        step = step_of(some, discrepancy, free)
+        step = system_of(some, discrepancy, free).step()
         covariance = step.covariance
         if not len(prior.measured):
             speeds = rows.approach[:count]

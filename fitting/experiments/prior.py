@@ -20,8 +20,9 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw, closest_delay, law_of_dict
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
-from fitting.fits.result import FitResult, closest_loss, nearness, rebound_by_formula
-from fitting.models import Problem
+from fitting.fits.law_after import closest_loss, nearness, rebound_by_formula
+from fitting.fits.result import FitResult
+from fitting.models import Problem, check_constraints
 from fitting.parameters import (
     DELAY_NAMES,
     MODELS,
@@ -31,8 +32,8 @@ from fitting.parameters import (
     model_parameters,
     paper_values,
 )
+from fitting.simulated.experiment import check_drive
 from fitting.tables.csv_text import TableError, beyond, read_fit_json
-from fitting.tables.table import DRIVES
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
@@ -99,8 +100,7 @@ class Prior(Result):
         normal[0] = 0.0
         width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
         values = self.values + spread * ((normal * width) @ axes.T)
-        ends = [(p.lowest, p.highest) for p in self.problem.parameters]
-        return np.clip(values, *np.array(ends).T)
+        return np.clip(values, *self.problem.ends)
 
 
 def size_of(parameter: Parameter, value: float) -> float:
@@ -149,8 +149,7 @@ def prior_of_values(  # noqa: PLR0913
         ValueError: if a name or value is impossible, the model has no formula that could be close to a law, or the law
             is that of a tip of another mass.
     """
-    if drive not in DRIVES:
-        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
+    check_drive(drive)
     for name, value, allowed in (
         ("free_frequency_khz", free_frequency_khz, "positive"),
         ("quality_factor", quality_factor, "above 0.5"),
@@ -159,7 +158,7 @@ def prior_of_values(  # noqa: PLR0913
         check_parameter(name, value, allowed, optional=True)
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
-    _check_constraints(model, own, known, drive)
+    check_constraints(known, model, own, drive)
     given = dict(values or {})
     for name in given:
         if name not in own:
@@ -274,20 +273,6 @@ def _closest_to(law: Law, model: str, fixed: Mapping[str, float]) -> _Closest:
 
 _INDISTINCT = 1e-6
 """Singular value below which a law's errors do not tell two parameters apart."""
-
-
-def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]], drive: str) -> None:
-    for name, (value, error) in known.items():
-        if name not in (*own, *NUISANCE_NAMES):
-            choice = ", ".join((*own, *NUISANCE_NAMES))
-            raise ValueError(f"`constraints` names {name!r}, which is none of {choice}")
-        if not (np.isfinite(value) and 0.0 < error < np.inf):
-            raise ValueError(f"the constraint on {name} must be a value and a positive error, not {value} +- {error}")
-    if "offset_origin_nm" in known and model.endswith("+delay") and drive == "sample":
-        raise ValueError(
-            "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the error of the offsets' "
-            "origin out, or take the model 'contact'"
-        )
 
 
 def checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.ndarray, " p"]:

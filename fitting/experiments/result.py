@@ -1,12 +1,13 @@
 """A designed experiment: which points to measure next, and how well the parameters will then be known."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.results import Result, public_result
+from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.experiments.candidates import LEFT_OUT, Candidates
 from fitting.experiments.prior import Prior
@@ -145,8 +146,8 @@ class Design(Result):
             "criterion": self.criterion,
             "noise": self.noise,
             "points": self.points(),
-            "expected": {name: _entry(forecast) for name, forecast in self.expected.items()},
-            "measured_so_far": {name: _entry(forecast) for name, forecast in self.measured_so_far.items()},
+            "expected": {name: plain(asdict(forecast)) for name, forecast in self.expected.items()},
+            "measured_so_far": {name: plain(asdict(forecast)) for name, forecast in self.measured_so_far.items()},
             "candidates": int(self.candidates.usable.sum()),
             "left_out": self.candidates.left_out,
             "prior": {
@@ -173,16 +174,6 @@ def _forecast(parameter: Parameter, value: float, error: float) -> Forecast:
     half = TWO_SIDED_95 * error
     interval = max(value - half, parameter.lowest), min(value + half, parameter.highest)
     return Forecast(value, parameter.unit, error, interval, None)
-
-
-def _entry(forecast: Forecast) -> dict[str, Any]:
-    return {
-        "value": forecast.value,
-        "unit": forecast.unit,
-        "standard_error": forecast.standard_error,
-        "interval95": list(forecast.interval95),
-        "reason": forecast.reason,
-    }
 
 
 def _finite(number: float) -> float | None:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.results import Result, public_result
@@ -187,22 +186,18 @@ def _row(model: str, found: Found, result: FitResult, common: ModelErrors) -> di
 def _law_change(result: FitResult, reference: FitResult) -> float:
     """Return the largest relative difference of two laws over the speeds that the reference measured."""
     law, other = reference.law, result.law
-    inside = (law.approach_speed_nm_per_us >= other.approach_speed_nm_per_us[0]) & (
-        law.approach_speed_nm_per_us <= other.approach_speed_nm_per_us[-1]
+    points, theirs, reached = (
+        law.approach_speed_nm_per_us,
+        other.approach_speed_nm_per_us,
+        reference.rows.reached_nm_per_us,
     )
-    measured = _measured(reference)
-    inside &= (law.approach_speed_nm_per_us >= measured.min()) & (law.approach_speed_nm_per_us <= measured.max())
-    speeds = law.approach_speed_nm_per_us[inside]
+    low, high = max(theirs[0], reached.min(initial=np.inf)), min(theirs[-1], reached.max(initial=0.0))
+    inside = (points >= low) & (points <= high)
+    speeds = points[inside]
     if not speeds.size:
         return float("nan")
-    theirs = np.interp(speeds, other.approach_speed_nm_per_us, other.rebound_speed_nm_per_us)
-    return float(np.max(np.abs(theirs / law.rebound_speed_nm_per_us[inside] - 1.0)))
-
-
-def _measured(result: FitResult) -> Float[np.ndarray, " rows"]:
-    speeds = result.rows.approach_speed_nm_per_us
-    known = speeds[result.rows.used & np.isfinite(speeds)]
-    return known if known.size else np.array([0.0, np.inf])
+    rebound = np.interp(speeds, theirs, other.rebound_speed_nm_per_us)
+    return float(np.max(np.abs(rebound / law.rebound_speed_nm_per_us[inside] - 1.0)))
 
 
 def _verdict(rows: list[dict[str, Any]], failed: dict[str, str]) -> str:

@@ -5,7 +5,6 @@ At the minimum of chi2 the model is taken at its word. Where impacts last, `esti
 not linearised, leads to the law. Of several tables it also says how far each one's law is from that of the others.
 """
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -14,53 +13,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.impact.lasting_impact import PulledImpact
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
-from afm_jax.solve.lanes import filled
-from fitting.fits.discrepancy import (
-    ClosestMember,
-    Descended,
-    LawAfter,
-    LawBefore,
-    LinearStep,
-    ModelDiscrepancy,
-    StepRows,
-    StepSystem,
-    closest_member,
-    containing,
-    descending_part,
-    effects_of_held,
-    law_after,
-    longest_run,
-    root_of,
-    rows_of_fit,
-    seen_in_taps,
-    settled_step,
-    step_of,
-    system_of,
-    with_runs,
-)
+from fitting.fits.discrepancy import ModelDiscrepancy, effects_of_held, seen_in_taps, with_runs
 from fitting.fits.intervals import Convergence, at_bound, check_minimum, covariance
+from fitting.fits.law_after import ClosestMember, ModelLaw, member_after, points_of_law, speed_range
 from fitting.fits.minimum import ATTRACTED, Minimum, ModelErrors
 from fitting.fits.objective import ROBUST, Objective, soft_square
-from fitting.fits.result import (
-    EV_PER_AJ,
-    NO_MASS,
-    FittedLaw,
-    FittedParameter,
-    FittedRows,
-    Loss,
-    WithInterval,
-    energy_lost,
-    interval_of,
-    nearness,
-    rebound_by_formula,
-    scaled,
-    table_of_law,
-)
+from fitting.fits.result import FittedRows, table_of_law
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
-from fitting.forward import AnyImpact, Linearised, Predicted, impact_at, predict
-from fitting.models import Held, Measurement, Problem, readings_of
+from fitting.fits.step import (
+    Descended,
+    LinearStep,
+    StepRows,
+    StepSystem,
+    descending_part,
+    longest_run,
+    rows_of_fit,
+    settled_step,
+    system_of,
+)
+from fitting.forward import Linearised, Predicted, predict
+from fitting.models import Held, Problem, readings_of
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
@@ -153,9 +126,7 @@ class AtMinimum(NamedTuple):
         """Names of the law's parameters that are not at their bound."""
         return [name for name, free in zip(self.problem.own, self.free, strict=False) if free]
 
-    def law(
-        self, covariance: Float[np.ndarray, "k k"], after: tuple[LinearStep, ModelDiscrepancy] | None
-    ) -> "ModelLaw":
+    def law(self, covariance: Float[np.ndarray, "k k"], after: tuple[LinearStep, ModelDiscrepancy] | None) -> ModelLaw:
         """Return the law after a step from the minimum, with a covariance of its parameters."""
         return ModelLaw(self.problem, self.objective.measurement, self.values, covariance, after)
 
@@ -172,7 +143,7 @@ class FitEstimate(NamedTuple):
         independent_residual: residuals in errors without the most likely part that rows share: remainders of the
             corrections, and deviations of the tables' laws.
         after: the step, as much of it as lowers chi2, and the discrepancy that it leads to; None: there is none.
-        step_rows: the rows as the step sees them.
+        system: the rows as the step sees them, without deviations of several tables' laws.
         stuck: chi2 that no part of the step lowers, and what the whole step takes it to to first order; None elsewhere.
         runs: what was found of residuals that run together over the speed.
         contact_share: largest share of a drive's period that the tip is in contact.
@@ -186,14 +157,14 @@ class FitEstimate(NamedTuple):
     rows: FittedRows
     independent_residual: Float[np.ndarray, "rows k"]
     after: tuple[LinearStep, ModelDiscrepancy] | None = None
-    step_rows: StepRows | None = None
+    system: StepSystem | None = None
     stuck: tuple[float, float] | None = None
     runs: "Runs | None" = None
     contact_share: float = 0.0
     tables: "TablesCompared | None" = None
 
     @property
-    def law(self) -> "ModelLaw":
+    def law(self) -> ModelLaw:
         """The law with its errors."""
         return self.at.law(self.covariance, self.after)
 
@@ -243,36 +214,25 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
     rows = _rows_to_step_from(at)
     if rows is None:
         return estimate
-    discrepancy, runs = _discrepancy_of(at, rows)
-    system = system_of(rows, discrepancy)
+    discrepancy, system, runs = _discrepancy_of(at, rows)
     tables = _compare_tables(at, system)
     used = np.isfinite(at.speeds)
     # Hertz time in us times the drive's frequency in kHz; 1e-3 makes it a share of the period
     contact_share = float(np.max(1e-3 * rows.hertz_time[: used.size][used] * table.drive_frequency_khz[used]))
-    estimate = estimate._replace(step_rows=rows, runs=runs, tables=tables, contact_share=contact_share)
-    departing = () if tables is None else tables.departing
-    if not (at.problem.lasting or departing):
+    estimate = estimate._replace(system=system, runs=runs, tables=tables, contact_share=contact_share)
+    if tables is not None and tables.departing:
+        # where laws scatter between tables: values by the most likely scatter, covariance by the cautious one
+        likely, cautious = tables.departing
+        system = replace(system.with_unknowns(likely), stated=system.with_unknowns(cautious).covariance)
+    elif not at.problem.lasting:
         return estimate
-    # where laws scatter between tables: values by the most likely scatter, covariance by the cautious one
-    step, *cautious = (step_of(rows, discrepancy, at.free, sizes) for sizes in departing or (None,))
-    step = step._replace(covariance=(*cautious, step)[0].covariance)
-    system = system.with_unknowns(departing[0] if departing else None)
 
     def predicted(steps: list[LinearStep]) -> Predicted:
         return _predicted_after(at, steps, discrepancy)
 
-    def again(beyond: Float[np.ndarray, " readings"]) -> LinearStep:
-        """Return the step for readings whose residuals at the fit are larger by what is beyond first order."""
-        residual = rows.residual.copy()
-        residual[: beyond.size] += beyond
-        likely = departing[0] if departing else None
-        return step_of(rows._replace(residual=residual), discrepancy, at.free, likely)._replace(
-            covariance=step.covariance
-        )
-
-    part = descending_part(step, system, predicted)
+    part = descending_part(system, predicted)
     if at.problem.lasting and not at.problem.pulled:
-        part = settled_step(part, system, predicted, again)
+        part = settled_step(part, system, predicted)
     return _after_step(estimate, part, discrepancy, system)
 
 
@@ -351,8 +311,8 @@ def _rows_to_step_from(at: AtMinimum) -> StepRows | None:
     return rows if all(np.isfinite(part).all() for part in (rows.residual, rows.jacobian, *rows.slopes)) else None
 
 
-def _discrepancy_of(at: AtMinimum, rows: StepRows) -> tuple[ModelDiscrepancy, Runs | None]:
-    """Return what the model leaves out at its fitted values, wider where residuals run together over the speed."""
+def _discrepancy_of(at: AtMinimum, rows: StepRows) -> tuple[ModelDiscrepancy, StepSystem, Runs | None]:
+    """Return what the model leaves out, wider where residuals run together over the speed, and the rows with it."""
     problem, values = at.problem, at.settings["fixed"] | dict(zip(at.problem.names, at.values.tolist(), strict=True))
     mass = float(at.found.stated.measurement.cantilever.mass_ng)
     discrepancy = ModelDiscrepancy(problem, values, speed_range(at.speeds), mass)
@@ -362,13 +322,16 @@ def _discrepancy_of(at: AtMinimum, rows: StepRows) -> tuple[ModelDiscrepancy, Ru
         if problem.pulled:
             effects = seen_in_taps(effects, at.objective, at.values)
         discrepancy = replace(discrepancy, held=effects)
+    system = system_of(rows, discrepancy, at.free)
     if not problem.lasting or problem.pulled or at.scattering:
-        return discrepancy, None
-    before = longest_run(rows, discrepancy, at.free)
-    residual = step_of(rows, discrepancy, at.free).residual
+        return discrepancy, system, None
+    before = beside = longest_run(rows, system)
+    residual = system.step().residual.reshape(rows.measurement_error.shape)
     discrepancy = with_runs(discrepancy, before)
-    beside = longest_run(rows, discrepancy, at.free) if discrepancy.short else before
-    return discrepancy, Runs(before, beside, residual)
+    if discrepancy.short:
+        system = system_of(rows, discrepancy, at.free)
+        beside = longest_run(rows, system)
+    return discrepancy, system, Runs(before, beside, residual)
 
 
 def _compare_tables(at: AtMinimum, system: StepSystem) -> TablesCompared | None:
@@ -377,17 +340,16 @@ def _compare_tables(at: AtMinimum, system: StepSystem) -> TablesCompared | None:
     joint, table = measurement.joint, measurement.rows.table
     if joint is None or table is None:
         return None
-    free = np.append(at.free, np.ones(system.jacobian.shape[1] - at.free.size, dtype=bool))
     own = len(at.problem.own)
-    parts = parts_of(system, table, joint.place, free, own)
+    parts = parts_of(system, table, joint.place, own)
     if not at.scattering:
         return TablesCompared(pulls_of(parts))
     unit = departures_of(system, table, parts.law, np.ones(parts.law.size))
-    between = scatter_between(parts_of(system, table, joint.place, free, own, unit))
+    between = scatter_between(parts_of(system, table, joint.place, own, unit))
     if not np.isfinite(between.value).all():
         return TablesCompared(pulls_of(parts))
     departing = tuple(departures_of(system, table, parts.law, size) for size in (between.value, between.cautious))
-    parts = parts_of(system, table, joint.place, free, own, departing[0])
+    parts = parts_of(system, table, joint.place, own, departing[0])
     departed = parts.solved()[1][-departing[0].shape[1] :].reshape(len(joint.drives), -1)
     return TablesCompared(pulls_of(parts), between, departed * between.value, departing)
 
@@ -417,7 +379,7 @@ def _after_step(
         approach_speed_nm_per_us=np.where(exists, prediction.approach_speed_nm_per_us, np.nan),
         orbits=np.where(exists, at.rows.orbits, 0),
     )
-    independent = system.alone(misfit.ravel())[0].reshape(misfit.shape)[:count]
+    independent = system.alone(misfit.ravel()).reshape(misfit.shape)[:count]
     return estimate._replace(
         values=member.values,
         covariance=member.covariance,
@@ -443,7 +405,7 @@ def _predicted_after(at: AtMinimum, parts: list[LinearStep], discrepancy: ModelD
         shape = measurement.rows.measured.shape
         predictions = []
         for point, part in zip(values, parts, strict=True):
-            there = measurement._replace(fixed=discrepancy.fixed_after(part, measurement.fixed))
+            there = measurement._replace(fixed=discrepancy.fixed_after(part.unknown, measurement.fixed))
             plain = Objective(there, problem, near=at.objective.near).at_values(point[None])
             misfit = plain.residual[:, : shape[0] * shape[1]].reshape(1, *shape)
             predictions.append(Predicted(misfit, plain.prediction))
@@ -475,13 +437,12 @@ _MUCH = 0.25
 def hanging_on_held(estimate: FitEstimate) -> dict[str, tuple[str, ...]]:
     """Return, by the name of a fitted parameter, the held parameters whose error gives over 25 % of its variance."""
     hanging: dict[str, tuple[str, ...]] = {}
-    if estimate.after is None or estimate.step_rows is None:
+    if estimate.after is None or estimate.system is None:
         return hanging
-    at, discrepancy, whole = estimate.at, estimate.after[1], np.diag(estimate.covariance)
-    for effect in discrepancy.held:
-        rest = replace(discrepancy, held=tuple(other for other in discrepancy.held if other is not effect))
-        without = np.diag(step_of(estimate.step_rows, rest, at.free).covariance)
-        for i, name in enumerate(at.problem.own):
+    system, held, whole = estimate.system, estimate.after[1].held, np.diag(estimate.covariance)
+    for place, effect in enumerate(held, start=system.of_law - len(held)):
+        without = np.diag(system.without(place).covariance)
+        for i, name in enumerate(estimate.at.problem.own):
             if np.isfinite(whole[i]) and whole[i] - without[i] > _MUCH * whole[i]:
                 hanging[name] = (*hanging.get(name, ()), effect.held.name)
     return hanging
@@ -540,230 +501,6 @@ def _slope_along(at: AtMinimum, along: Float[np.ndarray, " n"]) -> tuple[float, 
         return 0.0, 0.0
     slope = -float(apart @ residual) / length
     return slope, slope * np.sqrt(length)
-
-
-AtSpeeds = Callable[[Float[np.ndarray, " n"]], LawAfter]
-"""A law with its errors, of approach speeds in nm/us."""
-
-
-class ModelLaw(NamedTuple):
-    """The law of a model at fitted values, after the step to the model discrepancy if there is one.
-
-    Attributes:
-        problem: the model.
-        measurement: gives the contact's fixed parameters.
-        values: fitted values.
-        covariance: of the values, or of those after the step; infinite entries give an open band (NaN).
-        after: the step from these values, and the discrepancy; None: the model is taken at its word.
-    """
-
-    problem: Problem
-    measurement: Measurement
-    values: Float[np.ndarray, " p"]
-    covariance: Float[np.ndarray, "k k"]
-    after: tuple[LinearStep, ModelDiscrepancy] | None = None
-
-    def at(self, speeds: Float[np.ndarray, " n"]) -> LawAfter:
-        """Return the law at approach speeds in nm/us."""
-        before = law_before(self.problem, self.measurement, self.values, speeds)
-        if self.after is None:
-            root = root_of(self.covariance)[: before.slope.shape[2]]
-            return LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
-        step, discrepancy = self.after
-        moved = law_before(self.problem, self.measurement, step.values[: len(self.problem.names)], speeds)
-        law = law_after(step, discrepancy, speeds, before, moved)
-        if np.all(np.isfinite(self.covariance)):
-            return law
-        return law._replace(
-            factor=np.full_like(law.factor, np.nan), capture_factor=np.full_like(law.capture_factor, np.nan)
-        )
-
-
-def holding(law: ModelLaw, other: ModelLaw | None) -> AtSpeeds:
-    """Return a law whose band holds that of another one too, which may as well be the true one."""
-    return law.at if other is None else lambda speeds: containing(law.at(speeds), other.at(speeds))
-
-
-def law_with_band(
-    law: AtSpeeds,
-    approach_speeds: Float[np.ndarray, " rows"],
-    *,
-    lasting: bool,
-    formula: ImpactLaw | None,
-    mass_ng: float | None = None,
-    origin: str = "",
-) -> FittedLaw:
-    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
-
-    Args:
-        law: with its errors.
-        approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
-        lasting: impacts take time.
-        formula: of the model's family, whose delay is the one that the law's is written beside; None: the closest one.
-        mass_ng: of the tip; None: not known.
-        origin: what the law comes from, in words.
-    """
-    speeds, points = points_of_law(law, approach_speeds)
-    return FittedLaw(
-        speeds,
-        *points.law,
-        capture_speed_nm_per_us=points.capture,
-        delay=None if formula is None else formula.delay,
-        lasting=lasting,
-        errors=(np.moveaxis(points.factor, 0, 1), points.capture_factor),
-        mass_ng=mass_ng,
-        origin=origin,
-    )
-
-
-_POINTS, _FEWEST_POINTS = 121, 4
-
-
-def points_of_law(
-    law: AtSpeeds, approach_speeds: Float[np.ndarray, " rows"]
-) -> tuple[Float[np.ndarray, " points"], LawAfter]:
-    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach in nm/us, and beyond its capture.
-
-    Args:
-        law: with its errors.
-        approach_speeds: of the rows, NaN where a row has none.
-    """
-    slow, fast = speed_range(approach_speeds)
-    speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
-    points = law(speeds)
-    if np.count_nonzero(points.law[0] > 0.0) < _FEWEST_POINTS:
-        # a law that captures nearly all of these tips
-        speeds = np.geomspace(0.8 * slow, 3.0 * max(points.capture, fast), _POINTS)
-        points = law(speeds)
-    return speeds, points
-
-
-def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, float]:
-    """Return slowest and fastest of the known speeds; 1.25 and 83 nm/us where there is none."""
-    known = approach_speeds[np.isfinite(approach_speeds)]
-    return (float(known.min()), float(known.max())) if known.size else (1.25, 250.0 / 3.0)
-
-
-def loss_of(
-    law: AtSpeeds,
-    measured: tuple[float, float],
-    mass_ng: float | None,
-    parameters: Mapping[str, FittedParameter],
-    formula: Mapping[str, float] | None,
-) -> Loss:
-    """Return what impacts take: energies at measured speeds, and what the printed parameters say.
-
-    Args:
-        law: with its errors.
-        measured: slowest and fastest approach in nm/us.
-        mass_ng: of the tip; None: not known.
-        parameters: of the fit.
-        formula: values of the model's formula, those that are held included; None: it has none.
-    """
-    three = np.geomspace(*measured, 3)
-    # two digits, and within what was measured
-    three = np.clip([float(f"{speed:.2g}") for speed in three], *measured)
-    points = law(np.resize(three, _POINTS))
-    error = np.linalg.norm(points.factor[0], axis=1)
-    energies = [
-        energy_lost(float(u), float(w), float(e), mass_ng)
-        for u, w, e in zip(three, points.law[0, :3], error[:3], strict=True)
-    ]
-    r, epsilon = (
-        WithInterval(known.value, known.interval95) if known is not None else None
-        for known in (parameters.get("r"), parameters.get("epsilon"))
-    )
-    delta = None if epsilon is None or mass_ng is None else scaled(epsilon, 0.5 * mass_ng)
-    off = None
-    if formula is not None:
-        speeds = np.geomspace(*measured, _POINTS)
-        off = nearness(speeds, law(speeds).law[0], rebound_by_formula(formula, speeds))
-    return Loss(
-        energies=tuple(dict.fromkeys(energies)),
-        energies_reason=NO_MASS if mass_ng is None else None,
-        r=r,
-        epsilon_nm2_per_us2=epsilon,
-        delta_aj=delta,
-        delta_ev=None if delta is None else scaled(delta, EV_PER_AJ),
-        formula_off=None if off is None else off.off,
-        formula_off_at_nm_per_us=None if off is None else off.at_nm_per_us,
-        capture_speed_nm_per_us=interval_of(points.capture, float(np.linalg.norm(points.capture_factor)), lowest=0.0),
-    )
-
-
-def member_after(
-    step: LinearStep,
-    discrepancy: ModelDiscrepancy,
-    measurement: Measurement,
-    values: Float[np.ndarray, " p"],
-    speeds: Float[np.ndarray, " n"],
-    free: Bool[np.ndarray, " p"],
-    *,
-    computed: bool = True,
-) -> ClosestMember | None:
-    """Return the model's law that is closest to the law after a step; None where the step is all there is.
-
-    Args:
-        step: the step.
-        discrepancy: by the model.
-        measurement: gives the contact's fixed parameters.
-        values: from which the step was taken.
-        speeds: approach speeds in nm/us of the rows that are used.
-        free: which of the values are not at their bound.
-        computed: the law after the step is computed; False: to first order.
-    """
-    problem = discrepancy.problem
-    if problem.model == "contact" or not problem.lasting:
-        return None
-    # one program for rows of any number up to that of a law's points
-    whole_speeds = filled(speeds, speeds.size + -speeds.size % _POINTS)
-
-    def law_at(point: Float[np.ndarray, " p"]) -> LawBefore:
-        whole = law_before(problem, measurement, point, whole_speeds)
-        return whole._replace(law=whole.law[:, : speeds.size], slope=whole.slope[:, : speeds.size])
-
-    moved = law_at(step.values[: len(problem.names)]) if computed else None
-    return closest_member(step, discrepancy, speeds, law_at(values), free, moved)
-
-
-def law_before(
-    problem: Problem, measurement: Measurement, values: Float[np.ndarray, " p"], speeds: Float[np.ndarray, " n"]
-) -> LawBefore:
-    """Return the law of a model's values at approach speeds in nm/us, with its slopes by the values."""
-    impact, slopes = impact_at(values, measurement, problem)
-    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
-    count = speeds.size
-    return LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
-
-
-@jax.jit
-def law_and_slope(
-    impact: AnyImpact, slopes: AnyImpact, speeds: Float[Array, " n"]
-) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
-    """Return rebound speeds in nm/us and delays in us at approach speeds, and their derivatives by the parameters.
-
-    The two rows are speed and delay; behind the approach speeds there is one more column, with the capture speed in
-    nm/us in both rows.
-
-    Args:
-        impact: what is fitted.
-        slopes: its derivatives by the parameters, along a first axis.
-        speeds: in nm/us.
-    """
-
-    def law(impact):
-        if isinstance(impact, Law):
-            capture = jnp.full((2, 1), impact.capture_speed_nm_per_us)
-            leaving = jnp.stack([impact.rebound_speed(speeds), impact.collision_delay(speeds)])
-            return jnp.concatenate([leaving, capture], axis=1)
-        impact = impact.free if isinstance(impact, PulledImpact) else impact
-        leaving = jax.vmap(impact.speeds)(speeds)
-        # below the table the contact captures
-        free = speeds > impact.lowest
-        there = jnp.stack([jnp.where(free, leaving.rebound, 0.0), jnp.where(free, leaving.delay, 0.0)])
-        return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
-
-    return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
 
 
 @jax.jit

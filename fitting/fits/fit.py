@@ -21,15 +21,20 @@ from fitting.fits.estimate import (
     courses_along_rows,
     estimate_of,
     hanging_on_held,
-    holding,
-    law_with_band,
-    loss_of,
-    speed_range,
 )
-from fitting.fits.intervals import END_OF_RANGE, Interval, profile_intervals, within_range
+from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED, Interval, profile_intervals, within_range
+from fitting.fits.law_after import holding, speed_range
 from fitting.fits.minimum import minimum_with_model_errors, rescale_errors, settle, starts, untabulated
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest
-from fitting.fits.result import FitResult, FittedParameter, FittedTable, Loss, Scatter
+from fitting.fits.result import (
+    FitResult,
+    FittedParameter,
+    FittedTable,
+    Loss,
+    Scatter,
+    law_with_band,
+    loss_of,
+)
 from fitting.fits.several import Pull
 from fitting.fits.verdict import IMPROBABLE, Evidence, judge_fit, misfits
 from fitting.forward import warm_up
@@ -233,7 +238,7 @@ def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
     at, problem, rows = estimate.at, estimate.at.problem, estimate.rows
     robust, scale = at.found.objective.robust, at.settings["error_scale"]
     judged = at.freedom > 0 and scale is None and not robust
-    unexplained = [Interval(None, None, "the model does not explain the data")] * len(at.values)
+    unexplained = [Interval(None, None, UNEXPLAINED)] * len(at.values)
     discrepancy = None if estimate.after is None else estimate.after[1]
     unwidened = None
     if estimate.runs is not None:

@@ -4,6 +4,7 @@ Gradient, curvature and distance to the true minimum are asked of a minimum, wha
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,7 +22,8 @@ _INNER_STEPS = 25
 _SETTLED = 1e-6
 """Estimated distance of chi2 to its minimum over the others at which these have arrived."""
 END_OF_RANGE = "reaches the end of its range"
-"""Why an interval is open."""
+UNEXPLAINED = "the model does not explain the data"
+"""Why an interval is open, and why there is none."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
 _LOST = 1e3
@@ -149,8 +151,7 @@ def _followers(objective: Objective, values, covariance, index: int, direction: 
     """Return how the places of the others change, to first order, when one moves by a standard error."""
     variance = covariance[index, index]
     shift = direction * _FIRST_TRIAL * covariance[:, index] / np.sqrt(variance) if variance > 0.0 else 0.0
-    parameters = objective.problem.parameters
-    guess = np.clip(values + shift, [p.lowest for p in parameters], [p.highest for p in parameters])
+    guess = np.clip(values + shift, *objective.problem.ends)
     places = Places(objective)
     moved = places.of_values(np.where(np.isfinite(guess), guess, values))
     return (moved - places.of_values(values)) / _FIRST_TRIAL
@@ -171,14 +172,9 @@ class Places:
 
     def __init__(self, objective: Objective):
         """Keep the objective, and the places that bound it."""
-        self.objective, parameters = objective, objective.problem.parameters
-        self.by_value = np.array([parameter.sign != 0 for parameter in parameters])
-        self.lowest, self.highest = (
-            np.array(
-                [end if p.sign else coordinate_of(p, np.asarray(end)) for p, end in zip(parameters, ends, strict=True)]
-            )
-            for ends in ([p.lowest for p in parameters], [p.highest for p in parameters])
-        )
+        self.objective = objective
+        self.by_value = np.array([parameter.sign != 0 for parameter in objective.problem.parameters])
+        self.lowest, self.highest = self.of_values(objective.problem.ends)
 
     def of_values(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return the places of values."""
@@ -312,15 +308,18 @@ def check_minimum(
     outward = _pushes_outward(objective, coordinates, free)
     if count == 0:
         return Convergence(outward, 0.0, [], 0.0, outward)
+    # a point that is no minimum, at an unknown distance from one
+    adrift = partial(Convergence, converged=False, gradient=np.inf, estimated_distance=np.inf, outward=outward)
     _, jacobian = objective.linearise(coordinates[None])
     values, slopes = objective.problem.values_and_slopes(coordinates)
     known = np.diag((objective.problem.known_by_range(values) * slopes**2)[free])
     fisher = jacobian[0][:, free].T @ jacobian[0][:, free] + known
     if not np.all(np.isfinite(fisher)):
-        return _adrift([], outward=outward, reason="the slopes of the residuals are not finite where the search ended")
+        reason = "the slopes of the residuals are not finite where the search ended"
+        return adrift(hessian_eigenvalues=[], reason=reason)
     curvature, axes = np.linalg.eigh(fisher)
     if curvature[0] <= 1e-14 * curvature[-1]:
-        return _adrift(curvature.tolist(), outward=outward)
+        return adrift(hessian_eigenvalues=curvature.tolist())
     scale = axes / np.sqrt(curvature)
     steps = np.zeros((2 * count + 1, len(coordinates)))
     steps[1 : count + 1, free], steps[count + 1 :, free] = _STEP * scale.T, -_STEP * scale.T
@@ -328,7 +327,7 @@ def check_minimum(
     slope = gradient[:, free] @ scale / 2.0
     hessian = (slope[1 : count + 1] - slope[count + 1 :]) / (2.0 * _STEP)
     if not np.all(np.isfinite(hessian)) or not np.all(np.isfinite(slope[0])):
-        return _adrift([], outward=outward, reason="chi2 has no finite curvature where the search ended")
+        return adrift(hessian_eigenvalues=[], reason="chi2 has no finite curvature where the search ended")
     hessian = 0.5 * (hessian + hessian.T) + scale.T @ known @ scale
     eigenvalues = np.linalg.eigvalsh(hessian)
     distance = float(slope[0] @ np.linalg.solve(hessian, slope[0])) if eigenvalues[0] > 0 else float("inf")
@@ -336,25 +335,12 @@ def check_minimum(
     return Convergence(converged, float(np.abs(2.0 * slope[0]).max()), eigenvalues.tolist(), distance, outward)
 
 
-def _adrift(eigenvalues: list[float], *, outward: bool, reason: str | None = None) -> Convergence:
-    """Return the state of a point that is no minimum, at an unknown distance from one."""
-    return Convergence(
-        converged=False,
-        gradient=float("inf"),
-        hessian_eigenvalues=eigenvalues,
-        estimated_distance=float("inf"),
-        outward=outward,
-        reason=reason,
-    )
-
-
 def at_bound(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:
     """Say which losses vanish within a hundredth of what the data could resolve, and what is at an end of its range."""
     resolution = np.sqrt(np.diag(covariance_of(_fisher(objective, values))))
     resolution = np.where(np.isfinite(resolution), resolution, 0.0)
-    parameters = objective.problem.parameters
-    losses = np.array([np.inf if p.bound is None else p.bound for p in parameters])
-    ends = np.array([(p.lowest, p.highest) for p in parameters]).T
+    losses = np.array([np.inf if p.bound is None else p.bound for p in objective.problem.parameters])
+    ends = objective.problem.ends
     # so near that the steps of the Hessian would leave it
     at_end = np.any(np.abs(values - ends) <= _STEP * resolution, axis=0) & np.isinf(losses)
     return (np.abs(values - losses) < 0.01 * resolution) | at_end
@@ -372,10 +358,6 @@ def _pushes_outward(objective: Objective, coordinates, free) -> bool:
     slope = jacobian.T @ np.asarray(result.residual)[0]
     little = slope**2 < _ENOUGH * np.sum(jacobian**2, axis=0)
     values = objective.problem.values(coordinates)
-    inward = np.array(
-        [
-            1.0 if v - p.lowest < p.highest - v else -1.0
-            for v, p in zip(values, objective.problem.parameters, strict=True)
-        ]
-    )
+    lowest, highest = objective.problem.ends
+    inward = np.where(values - lowest < highest - values, 1.0, -1.0)
     return bool(np.all(((slope * inward >= 0.0) | little)[~free]))

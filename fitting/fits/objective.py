@@ -166,8 +166,8 @@ class Objective:
         result: Linearised = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts) if parts[1:] else parts[0]
         if not self.robust:
             return result
-        softened, slope = _softened(np.asarray(result.residual))
-        return result._replace(residual=softened, jacobian=np.asarray(result.jacobian) * slope[:, :, None])
+        residual, slope = softened(np.asarray(result.residual))
+        return result._replace(residual=residual, jacobian=np.asarray(result.jacobian) * slope[:, :, None])
 
     def _near(self, sets: slice) -> Float[np.ndarray, "..."] | None:
         """Return where the orbits of some of the sets are followed from."""
@@ -265,7 +265,7 @@ def polish(
     return Polished(starts + np.einsum("spq,sq->sp", scale, z), value, count)
 
 
-def _softened(
+def softened(
     residual: Float[np.ndarray, "sets n"],
 ) -> tuple[Float[np.ndarray, "sets n"], Float[np.ndarray, "sets n"]]:
     """Return residuals whose squares are the soft squares, and their slope by the plain ones."""

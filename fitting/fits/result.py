@@ -4,9 +4,9 @@ Energies, r and delta with their intervals (`Loss`) are the quantities that peop
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.impact.law import CollisionDelay, Origin, TabulatedLaw
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
+from fitting.fits.law_after import LAW_POINTS, AtSpeeds, nearness, points_of_law, rebound_by_formula
 from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
@@ -90,6 +91,12 @@ class FittedRows:
     predicted_phase_deg: Float[np.ndarray, " rows"] | None = None
     measured_phase_deg: Float[np.ndarray, " rows"] | None = None
     phase_error_deg: Float[np.ndarray, " rows"] | None = None
+
+    @property
+    def reached_nm_per_us(self) -> Float[np.ndarray, " reached"]:
+        """Approach speeds of the rows that are used, as far as they are known."""
+        speeds = self.approach_speed_nm_per_us[self.used]
+        return speeds[np.isfinite(speeds)]
 
 
 @dataclass(frozen=True)
@@ -472,80 +479,80 @@ def energy_lost(speed: float, rebound: float, error: float, mass_ng: float | Non
     return EnergyLost(speed, taken, scaled(taken, EV_PER_AJ))
 
 
-def rebound_by_formula(values: Mapping[str, float], speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return u_out of the formula of a law's parameters at approach speeds in nm/us; 0 where the tip is captured."""
-    square = (values.get("r", 1.0) * speeds) ** 2 - values.get("viscous_loss", 0.0) * speeds
-    return np.sqrt(np.maximum(square - values.get("epsilon", 0.0), 0.0))
-
-
-class Nearness(NamedTuple):
-    """How near formulas of a family come to a law: the largest distance, relative to the rebound speed, and where."""
-
-    off: float
-    at_nm_per_us: float
-
-
-def nearness(
-    speeds: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], formula: Float[np.ndarray, " n"]
-) -> Nearness:
-    """Return how far rebound speeds of a formula are from those of a law, 0 where the tip is captured."""
-    off = np.where(rebound > 0.0, np.abs(formula / np.where(rebound > 0.0, rebound, 1.0) - 1.0), 0.0)
-    worst = int(np.argmax(off))
-    return Nearness(float(off[worst]), float(speeds[worst]))
-
-
-_COLUMNS = {"r": 2, "viscous_loss": 1, "epsilon": 0}
-"""Powers of the speed: u_in^2 - u_out^2 = (1 - r^2) u^2 + c u + epsilon, each term a loss."""
-
-
-def closest_loss(
-    family: Sequence[str],
-    speeds: Float[np.ndarray, " n"],
-    rebound: Float[np.ndarray, " n"],
-    weight: Float[np.ndarray, " n"],
-    fixed: Mapping[str, float],
-) -> dict[str, float]:
-    """Return the parameters of the formula closest to a law from anywhere, to first order; no loss is negative.
-
-    Least squares in u_out^2 over 2 u_out of the law, a problem without other minima. `closest_member` polishes from
-    parameters close by, with errors.
+def law_with_band(
+    law: AtSpeeds,
+    approach_speeds: Float[np.ndarray, " rows"],
+    *,
+    lasting: bool,
+    formula: ImpactLaw | None,
+    mass_ng: float | None = None,
+    origin: str = "",
+) -> FittedLaw:
+    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
     Args:
-        family: of r, viscous_loss and epsilon those that are looked for.
-        speeds: approach speeds in nm/us.
-        rebound: of the law, all positive.
-        weight: of each.
-        fixed: values of others of them.
+        law: with its errors.
+        approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
+        lasting: impacts take time.
+        formula: of the model's family, whose delay is the one that the law's is written beside; None: the closest one.
+        mass_ng: of the tip; None: not known.
+        origin: what the law comes from, in words.
     """
-    from scipy.optimize import nnls  # noqa: PLC0415 (half a second that most fits do not need)
-
-    if not family:
-        return {}
-    lost = speeds**2 - rebound**2
-    for name in [name for name in _COLUMNS if name in fixed]:
-        lost = lost - (1.0 - fixed[name] ** 2 if name == "r" else fixed[name]) * speeds ** _COLUMNS[name]
-    steep = 0.5 * weight / rebound
-    matrix = steep[:, None] * np.stack([speeds ** _COLUMNS[name] for name in family], axis=1)
-    scale = np.linalg.norm(matrix, axis=0)
-    size, _ = nnls(matrix / scale, steep * lost)
-    terms = zip(family, (size / scale).tolist(), strict=True)
-    return {name: max(1.0 - term, 0.0) ** 0.5 if name == "r" else term for name, term in terms}
+    speeds, points = points_of_law(law, approach_speeds)
+    return FittedLaw(
+        speeds,
+        *points.law,
+        capture_speed_nm_per_us=points.capture,
+        delay=None if formula is None else formula.delay,
+        lasting=lasting,
+        errors=(np.moveaxis(points.factor, 0, 1), points.capture_factor),
+        mass_ng=mass_ng,
+        origin=origin,
+    )
 
 
-def nearest_of(
-    family: Sequence[str],
-    speeds: Float[np.ndarray, " n"],
-    rebound: Float[np.ndarray, " n"],
-    half_width: Float[np.ndarray, " n"],
-) -> Nearness:
-    """Return how near the laws of a family of losses come to a law, in rebound speeds over the half-width of its band.
+def loss_of(
+    law: AtSpeeds,
+    measured: tuple[float, float],
+    mass_ng: float | None,
+    parameters: Mapping[str, FittedParameter],
+    formula: Mapping[str, float] | None,
+) -> Loss:
+    """Return what impacts take: energies at measured speeds, and what the printed parameters say.
 
     Args:
-        family: of r, viscous_loss and epsilon those that the family has.
-        speeds: approach speeds in nm/us.
-        rebound: of the law.
-        half_width: of its band.
+        law: with its errors.
+        measured: slowest and fastest approach in nm/us.
+        mass_ng: of the tip; None: not known.
+        parameters: of the fit.
+        formula: values of the model's formula, those that are held included; None: it has none.
     """
-    free = (rebound > 0.0) & (half_width > 0.0)
-    u, w = speeds[free], rebound[free]
-    return nearness(u, w, rebound_by_formula(closest_loss(family, u, w, 1.0 / half_width[free], {}), u))
+    three = np.geomspace(*measured, 3)
+    # two digits, and within what was measured
+    three = np.clip([float(f"{speed:.2g}") for speed in three], *measured)
+    points = law(np.resize(three, LAW_POINTS))
+    error = np.linalg.norm(points.factor[0], axis=1)
+    energies = [
+        energy_lost(float(u), float(w), float(e), mass_ng)
+        for u, w, e in zip(three, points.law[0, :3], error[:3], strict=True)
+    ]
+    r, epsilon = (
+        WithInterval(known.value, known.interval95) if known is not None else None
+        for known in (parameters.get("r"), parameters.get("epsilon"))
+    )
+    delta = None if epsilon is None or mass_ng is None else scaled(epsilon, 0.5 * mass_ng)
+    off = None
+    if formula is not None:
+        speeds = np.geomspace(*measured, LAW_POINTS)
+        off = nearness(speeds, law(speeds).law[0], rebound_by_formula(formula, speeds))
+    return Loss(
+        energies=tuple(dict.fromkeys(energies)),
+        energies_reason=NO_MASS if mass_ng is None else None,
+        r=r,
+        epsilon_nm2_per_us2=epsilon,
+        delta_aj=delta,
+        delta_ev=None if delta is None else scaled(delta, EV_PER_AJ),
+        formula_off=None if off is None else off.off,
+        formula_off_at_nm_per_us=None if off is None else off.at_nm_per_us,
+        capture_speed_nm_per_us=interval_of(points.capture, float(np.linalg.norm(points.capture_factor)), lowest=0.0),
+    )

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import chi2_tail, covariance_of
-from fitting.fits.discrepancy import StepSystem
 from fitting.fits.intervals import CHI2_95
+from fitting.fits.step import StepSystem
 
 _LEAST_SHARE = 1e-9
 """Variance that a table takes from a direction of the law, over the variance there, below which it says nothing."""
@@ -61,7 +61,6 @@ def parts_of(
     system: StepSystem,
     table: Int[np.ndarray, " rows"],
     place: Int[np.ndarray, "tables p"],
-    free: Bool[np.ndarray, " k"],
     own: int,
     departing: Float[np.ndarray, "readings m"] | None = None,
 ) -> Parts:
@@ -71,11 +70,10 @@ def parts_of(
         system: the fit.
         table: which each row is of.
         place: of each table's parameters, as of `Joint`.
-        free: which parameters, shapes included, are not at their bound.
         own: how many parameters the law has; they come first.
         departing: how the readings' residuals change with the departures, as of `departures_of`.
     """
-    size, count, tables = system.unknown.shape[0], system.jacobian.shape[1], len(place)
+    size, count, tables, free = system.unknown.shape[0], system.jacobian.shape[1], len(place), system.parameters.free
     of = np.repeat(table, size // len(table))
     holders = np.array([np.isin(np.arange(count), row) for row in place])
     owner = np.where(holders.sum(axis=0) == 1, np.argmax(holders, axis=0), tables)

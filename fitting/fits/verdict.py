@@ -207,7 +207,7 @@ def _one_sided(evidence: Evidence) -> list[str]:
         return []
     far = np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)]
     side = "above" if excess > 0.0 else "below"
-    said = f"residuals are far off to one side ({excess:+.1f} standard deviations of their cubes)"
+    said = f"residuals are far off to one side ({excess:+.3g} standard deviations of their cubes)"
     return [f"{said}: predicted {side} what was read for {_lines(evidence, np.sort(far))}"]
 
 

@@ -14,7 +14,8 @@ from jaxtyping import Float
 
 from afm_jax.impact.law import Law, errors_of, extrapolation_of
 from afm_jax.least_squares import chi2_tail
-from fitting.fits.discrepancy import root_of
+from fitting.fits import law_after
+from fitting.fits.law_after import root_of
 from fitting.inversion.result import (
     Coefficient,
     InvertedRows,
@@ -161,9 +162,7 @@ LOSS_TERMS: dict[str, dict[str, Formula]] = {
 }
 """By parameter: of u_in^2 - u_out^2 = epsilon + c u_in, and = epsilon + (1 - r^2) u_in^2 (eq. 6)."""
 DELAY_TERMS: dict[str, Formula] = {
-    "delay_hertz": lambda u, _w, _tau: u**-0.2,
-    "delay_lead_nm": lambda u, w, _tau: 1.0 / u - 1.0 / w,
-    "delay_offset_nm": lambda u, _w, _tau: -1.0 / u,
+    name: lambda u, w, _tau, term=term: term(u, w) for name, term in law_after.DELAY_TERMS.items()
 }
 """Of the delay law a u^(-1/5) - b (1/u_out - 1/u_in) - d/u_in."""
 

@@ -22,26 +22,6 @@ from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
 from fitting.parameters import LAWS
 from fitting.report.sections import Bullets, Part, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
 
-ROW_COLUMNS = (
-    "line",
-    "order",
-    "drive_frequency_khz",
-    "drive_amplitude_nm",
-    "offset_nm",
-    "approach_speed_nm_per_us",
-    "approach_speed_error_nm_per_us",
-    "approach_speed_systematic_nm_per_us",
-    "rebound_speed_nm_per_us",
-    "rebound_speed_error_nm_per_us",
-    "rebound_speed_systematic_nm_per_us",
-    "collision_delay_us",
-    "collision_delay_error_us",
-    "collision_delay_systematic_us",
-    "speed_correlation",
-    "chi2",
-    "regressed",
-    "note",
-)
 _FORMULAS = {
     "viscous": LAWS["viscous"].formula,
     "restitution": f"{LAWS['law'].formula}  (eq. 6)",
@@ -115,7 +95,8 @@ def write_inversion(
         picture=png_of(figure),
         page=page_of(report, pictures_of([svg_of(figure)], [shows])),
     )
-    write_table("invert.csv", result.records(), ROW_COLUMNS)
+    records = result.records()
+    write_table("invert.csv", records, tuple(records[0]))
     if result.law is None:
         return written
     law = folder / "law.csv"

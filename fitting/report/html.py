@@ -1,6 +1,6 @@
 """A fit as one HTML file: what the page shows, section by section."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from afm_jax.words import known, plain_words
+from fitting.fits.comparison import Comparison
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FitResult, FittedRows
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS
@@ -25,8 +26,6 @@ from fitting.report.sections import (
 from fitting.report.words import (
     PULLS,
     SHARE_OF_BAND,
-    ComparedModels,
-    Sampled,
     band_in_words,
     goodness_in_words,
     has_delay,
@@ -36,13 +35,15 @@ from fitting.report.words import (
     losses_in_words,
     nuisances_in_words,
     parting_in_words,
-    prior_in_words,
     remarks_on,
     rounded_values,
     scatter_in_words,
     tables_in_words,
+    trust_in_words,
     value_in_words,
 )
+from fitting.sampling.bootstrap import Bootstrap
+from fitting.sampling.posterior_result import Posterior
 from fitting.tables.table import AmplitudeTable
 
 _MOST_ROWS = 1500
@@ -50,8 +51,6 @@ _MOST_ROWS = 1500
 _TIED = 0.9
 _FAR = 3.0
 """Residual in standard errors from which a row is marked."""
-_LONGEST = 12
-"""Lists longer than that are samples, not findings."""
 _MINUS = "\N{MINUS SIGN}"
 _APPROACH = Markup("u<sub>in</sub> (nm/µs)")
 _COMPARED = {
@@ -62,6 +61,7 @@ _COMPARED = {
     "bic": "BIC",
     "delta_aic": "AIC above the best",
     "law_change": "change of the law",
+    "valid": "valid",
 }
 _CHECKS = {
     "converged": "gradient, curvature and distance are those of a minimum",
@@ -76,9 +76,9 @@ def fit_page(
     result: FitResult,
     pictures: Sequence[bytes],
     *,
-    comparison: ComparedModels | None = None,
-    bootstrap: Sampled | None = None,
-    posterior: Sampled | None = None,
+    comparison: Comparison | None = None,
+    bootstrap: Bootstrap | None = None,
+    posterior: Posterior | None = None,
 ) -> str:
     """Return the page; it is well-formed XML too.
 
@@ -99,8 +99,8 @@ def fit_page(
         ReportSection("Correlations", [_correlations(result)]),
         *([ReportSection("Tables", tables, "Tables")] if tables else []),
         *([] if comparison is None else [_compared(comparison)]),
-        *([] if bootstrap is None else [_sampled("Bootstrap", bootstrap, list(result.parameters))]),
-        *([] if posterior is None else [_sampled("Posterior", posterior, list(result.parameters))]),
+        *([] if bootstrap is None else [_sampled("Bootstrap", bootstrap)]),
+        *([] if posterior is None else [_sampled("Posterior", posterior)]),
         ReportSection("Rows", [_rows(result)], "Rows"),
         ReportSection("Minimum", [_minimum(result)]),
         ReportSection("Inputs", [part for table in result.table.tables for part in _input(table)], "Inputs"),
@@ -114,10 +114,10 @@ def fit_page(
         ),
     ]
     report = Report(f"Impact law of {result.table.source}", result.valid, "", result.reasons, sections)
-    return page_of(report, _lead(result, comparison), prior_in_words(result))
+    return page_of(report, _lead(result, comparison), trust_in_words(result))
 
 
-def _lead(result: FitResult, comparison: ComparedModels | None) -> list[Part]:
+def _lead(result: FitResult, comparison: Comparison | None) -> list[Part]:
     """Return what stands below the verdict: the law in formulas, what the data say of it, and how sure that is."""
     held, parting = held_in_words(result), parting_in_words(result)
     parts: list[Part] = [] if result.valid else [Text("What was tried:")]
@@ -270,73 +270,44 @@ def _correlations(result: FitResult) -> Table:
     return Table(f"Beyond {_TIED:g} in magnitude in bold; - where a variance is not known", ["", *names], rows)
 
 
-def _compared(comparison: ComparedModels) -> ReportSection:
-    others = dict.fromkeys(name for row in comparison.rows for name in row if name not in _COMPARED)
-    names = [*(name for name in _COMPARED if any(name in row for row in comparison.rows)), *others]
-    rows = [[plain_words(row.get(name)) for name in names] for row in comparison.rows]
-    table = Table("Models of the same amplitudes", [_COMPARED.get(name, name) for name in names], rows)
+def _compared(comparison: Comparison) -> ReportSection:
+    rows = [[plain_words(row[name]) for name in _COMPARED] for row in comparison.rows]
+    table = Table("Models of the same amplitudes", list(_COMPARED.values()), rows)
     return ReportSection("Comparison of models", [Text(comparison.verdict), table], "Comparison of models")
 
 
-def _sampled(title: str, sampled: Sampled, parameters: Sequence[str]) -> ReportSection:
+def _sampled(title: str, sampled: Bootstrap | Posterior) -> ReportSection:
     """Return what a bootstrap or a posterior found: a row for each parameter, and everything else by name.
 
     Args:
         title: the section's heading.
         sampled: what was found.
-        parameters: the fit's parameters; a mapping with these keys is a column.
     """
     found = sampled.to_dict()
-    flat = {name: value for name, value in _flat(found, parameters).items() if value is not None and not _long(value)}
-    columns = {name: value for name, value in flat.items() if _by_parameter(value, parameters)}
-    others = {_title(name): value for name, value in flat.items() if name not in columns}
-    rows = [[name, *(_cell(column.get(name)) for column in columns.values())] for name in parameters]
+    by_parameter, chains = found.pop("parameters"), found.pop("chains", {})
+    diagnostics = {name: chains.pop(name) for name in ("r_hat", "effective_samples") if name in chains}
+    rows = [
+        [name, *map(_cell, (*columns.values(), *(each[name] for each in diagnostics.values())))]
+        for name, columns in by_parameter.items()
+    ]
+    head = ["parameter", *map(_title, (*next(iter(by_parameter.values())), *diagnostics))]
+    others = found | {f"chains {name}": value for name, value in chains.items()}
+    others = {_title(name): value for name, value in others.items() if name != "correlations"}
     parts: list[Part] = []
     if found.get("converged") is False:
         parts.append(Text(Markup("<strong>Not converged: do not use these numbers.</strong>")))
-    if columns:
-        parts.append(Table("By parameter", ["parameter", *map(_title, columns)], rows))
-    if others:
-        parts.append(pairs("Besides", ("", "value"), others))
-    return ReportSection(title, parts)
+    return ReportSection(title, [*parts, Table("By parameter", head, rows), pairs("Besides", ("", "value"), others)])
 
 
 def _title(name: str) -> str:
-    return name.removeprefix("parameters ").replace("interval95", "95 % interval").replace("_", " ")
+    return name.replace("interval95", "95 % interval").replace("_", " ")
 
 
 def _cell(value: Any) -> str:
     """Return a value, or an interval as '0.9 to 0.99'."""
-    if isinstance(value, (list, tuple)) and len(value) == 2:
+    if isinstance(value, list):
         return " to ".join(map(plain_words, value))
     return "-" if value is None else plain_words(value)
-
-
-def _flat(found: Mapping[str, Any], parameters: Sequence[str], before: str = "") -> dict[str, Any]:
-    """Return what was found with the names of nested mappings joined, down to mappings by parameter."""
-    flat = {}
-    for name, value in found.items():
-        if isinstance(value, Mapping) and value and not _by_parameter(value, parameters):
-            flat |= _flat(value, parameters, f"{before}{name} ")
-        elif _by_parameter(value, parameters) and all(isinstance(item, Mapping) for item in value.values()):
-            inner = dict.fromkeys(key for item in value.values() for key in item)
-            flat |= {f"{before}{name} {key}": {p: item.get(key) for p, item in value.items()} for key in inner}
-        else:
-            flat[f"{before}{name}"] = value
-    return flat
-
-
-def _by_parameter(value: Any, parameters: Sequence[str]) -> bool:
-    return isinstance(value, Mapping) and bool(value) and set(value) <= set(parameters)
-
-
-def _long(value: Any) -> bool:
-    """Say whether a value holds more numbers than one reads."""
-    if isinstance(value, Mapping):
-        return any(map(_long, value.values()))
-    if not isinstance(value, (list, tuple)):
-        return False
-    return len(value) > _LONGEST or any(isinstance(item, (list, tuple)) for item in value)
 
 
 def _rows(result: FitResult) -> Table:

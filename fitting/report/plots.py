@@ -9,8 +9,9 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import pixels_of, png_of_pixels, svg_of
 from fitting.fits.comparison import Comparison
-from fitting.fits.result import EV_PER_AJ, FitResult, Loss, rebound_by_formula
-from fitting.report.words import has_delay
+from fitting.fits.law_after import rebound_by_formula
+from fitting.fits.result import EV_PER_AJ, FitResult, Loss
+from fitting.report.words import has_delay, values_of_formula
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
@@ -86,8 +87,7 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
         axes.fill_between(speed, least, most, color=COLOURS[0], alpha=0.3, lw=0, label="95 % band")
     axes.plot(speed, lost, color=COLOURS[0], label="fitted law" if result.valid else "fit, not a measurement")
     if loss.formula_off is not None:
-        values = (result.settings.get("fixed") or {}) | {name: one.value for name, one in result.parameters.items()}
-        rebound = rebound_by_formula(values, speed)
+        rebound = rebound_by_formula(values_of_formula(result), speed)
         label = "formula with the fitted parameters"
         axes.plot(speed, half * (speed**2 - rebound**2), color=COLOURS[1], ls="--", label=label)
     known = [
@@ -372,8 +372,7 @@ def draw_delay(axes: Axes, result: FitResult) -> None:
 
 def _mark_speeds(axes: Axes, result: FitResult, label: str | None = None) -> None:
     """Mark on the lower edge the speeds of the rows that were used."""
-    reached = result.rows.approach_speed_nm_per_us[result.rows.used]
-    reached = reached[np.isfinite(reached)]
+    reached = result.rows.reached_nm_per_us
     edge = axes.get_xaxis_transform()
     axes.plot(reached, np.full_like(reached, 0.02), "|", color="black", ms=6, mew=0.7, transform=edge, label=label)
 
@@ -388,8 +387,7 @@ def _frame_measured(axes: Axes, result: FitResult) -> None:
 
 def _frame(axes: Axes, result: FitResult, columns: Sequence[np.ndarray]) -> None:
     """Let the values at the measured speeds, and 0, decide an axis' height."""
-    law, rows = result.law, result.rows
-    reached = rows.approach_speed_nm_per_us[rows.used & np.isfinite(rows.approach_speed_nm_per_us)]
+    law, reached = result.law, result.rows.reached_nm_per_us
     if not reached.size:
         return
     inside = (law.approach_speed_nm_per_us >= reached.min()) & (law.approach_speed_nm_per_us <= reached.max())

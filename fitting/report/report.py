@@ -11,12 +11,11 @@ from afm_jax.saved import saved
 from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.whole_files import write_whole
 from afm_jax.words import known
+from fitting.fits.comparison import Comparison
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
 from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, text_of
 from fitting.report.words import (
     PULLS,
-    ComparedModels,
-    Sampled,
     band_in_words,
     formulas,
     held_in_words,
@@ -30,6 +29,8 @@ from fitting.report.words import (
     tables_in_words,
     value_in_words,
 )
+from fitting.sampling.bootstrap import Bootstrap
+from fitting.sampling.posterior_result import Posterior
 from fitting.tables.several import SeveralTables
 
 _MANY_PARAMETERS = 3
@@ -84,9 +85,8 @@ def summary(result: FitResult) -> str:
 
 
 def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
-    unit = f"  {parameter.unit}" if parameter.unit else ""
     given = "" if parameter.constraint is None else "  (given: {:g} +- {:g})".format(*parameter.constraint)
-    tail = f"{interval_in_words(parameter)}{unit}{given}"
+    tail = interval_in_words(parameter, parameter.unit) + given
     return [name, value_in_words(parameter), known(parameter.standard_error, ".2g"), tail]
 
 
@@ -165,9 +165,9 @@ def write_report(
     folder: Path,
     write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None],
     *,
-    comparison: ComparedModels | None = None,
-    bootstrap: Sampled | None = None,
-    posterior: Sampled | None = None,
+    comparison: Comparison | None = None,
+    bootstrap: Bootstrap | None = None,
+    posterior: Posterior | None = None,
 ) -> list[Path]:
     """Write fit.html, fit.txt, fit.json, fit.png, the law as law.csv and the table fit_rows.csv into a folder.
 

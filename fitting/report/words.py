@@ -1,13 +1,14 @@
 """A fit in words: how sure the law is, its formula with the digits that count, whether to trust it."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import decimals, interval, known, percent, value_alone
-from fitting.fits.result import FitResult, FittedParameter, WithInterval, nearest_of
+from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED
+from fitting.fits.law_after import delay_by_formula, nearest_of, rebound_by_formula
+from fitting.fits.result import FitResult, FittedParameter, WithInterval
 from fitting.fits.verdict import IMPROBABLE, value_at_bound
 from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
 from fitting.tables.several import RepeatedReadings
@@ -19,34 +20,6 @@ _UNLIKELY = 0.05
 _EXACT = 1e-8
 """Relative distance below which two laws are the same."""
 _ROUND = (1.0, 2.0, 3.0, 5.0, 7.0)
-
-
-@runtime_checkable
-class ComparedModels(Protocol):
-    """Several models fitted to the same table.
-
-    `rows` has a mapping for each model: model, chi2, degrees_of_freedom, aic, bic, delta_aic, law_change, and whatever
-    else; `verdict` says in words which one the data prefer.
-    """
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """One mapping for each model."""
-        ...
-
-    @property
-    def verdict(self) -> str:
-        """What the comparison says, in words."""
-        ...
-
-
-@runtime_checkable
-class Sampled(Protocol):
-    """A bootstrap or a posterior: anything that says what it found as plain numbers, lists and mappings."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything; what is a mapping by parameter becomes a table."""
-        ...
 
 
 def repeats_in_words(repeats: RepeatedReadings) -> str:
@@ -178,8 +151,7 @@ def parting_in_words(result: FitResult) -> str:
         column[inside]
         for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us)
     )
-    fixed = result.settings.get("fixed") or {}
-    formula, _ = _formula(fixed | {name: p.value for name, p in result.parameters.items()}, speeds[inside])
+    formula = rebound_by_formula(values_of_formula(result), speeds[inside])
     if not inside.any() or not np.isfinite(half).all() or np.all(np.abs(formula - rebound) <= half):
         return f"{said}, within the band."
     own = result.model.removesuffix("+delay")
@@ -200,21 +172,38 @@ def held_in_words(result: FitResult) -> str:
     return f"Held fixed: {held}" if held else ""
 
 
+def values_of_formula(result: FitResult) -> dict[str, float]:
+    """Return the numbers of a fit's formula, those that were held included."""
+    return (result.settings.get("fixed") or {}) | {name: one.value for name, one in result.parameters.items()}
+
+
 def has_delay(result: FitResult) -> bool:
     """Say whether the model's impacts last."""
     return bool(np.any(result.law.collision_delay_us != 0.0))
 
 
-def interval_in_words(parameter: FittedParameter) -> str:
-    """Return '0.9492 to 0.9508', a one-sided limit, or why there is none."""
-    low, high = parameter.interval95
+def interval_in_words(parameter: FittedParameter, unit: str = "") -> str:
+    """Return '0.9492 to 0.9508', 'below 0.000357; 0 is not excluded', or why there is no interval.
+
+    Args:
+        parameter: of a fit.
+        unit: behind the numbers; "": it stands elsewhere.
+    """
+    (low, high), reason = parameter.interval95, parameter.interval_reason or ""
+    behind = f"  {unit}" if unit else ""
     if low is not None and high is not None:
-        return interval(low, high)
+        return interval(low, high) + behind
     if high is not None:
-        return f"< {high:.4g} ({parameter.interval_reason})"
-    if low is not None:
-        return f"> {low:.6g} ({parameter.interval_reason})"
-    return f"none: {parameter.interval_reason}"
+        side, limit = "below", high
+    elif low is not None:
+        side, limit = "above", low
+    else:
+        # the verdict says why nothing is known
+        return "none" if reason == UNEXPLAINED else f"none: {reason}"
+    end = reason.partition(f"{END_OF_RANGE}, ")[2]
+    # three digits of how far the limit is from the end of the range
+    digits = decimals(0.1 * abs(limit - float(end or 0.0)))
+    return f"{side} {limit:.{digits}f}{behind}; {f'{end} is not excluded' if end else reason}"
 
 
 def value_in_words(parameter: FittedParameter) -> str:
@@ -256,8 +245,7 @@ def band_width(result: FitResult) -> BandWidth | None:
 
     The band is known at the law's points; between them it is interpolated, at the slowest and fastest row.
     """
-    reached = result.rows.approach_speed_nm_per_us[result.rows.used]
-    reached = reached[np.isfinite(reached)]
+    reached = result.rows.reached_nm_per_us
     if not reached.size:
         return None
     slowest, fastest = float(reached.min()), float(reached.max())
@@ -295,7 +283,7 @@ def band_in_words(result: FitResult) -> str:
     )
 
 
-def prior_in_words(result: FitResult) -> str:
+def trust_in_words(result: FitResult) -> str:
     """Return whether to trust the fit, on which grounds, and over which speeds."""
     if not result.valid:
         return "Do not take these numbers for a measurement of the law, because:"
@@ -383,9 +371,8 @@ def _close_enough(result: FitResult, values: dict[str, float]) -> bool:
         return True
     speed = law.approach_speed_nm_per_us
     measured = (speed >= width.slowest_nm_per_us) & (speed <= width.fastest_nm_per_us)
-    fixed = result.settings.get("fixed") or {}
-    rounded = _formula(fixed | values, speed[measured])
-    exact = _formula(fixed | {name: p.value for name, p in result.parameters.items()}, speed[measured])
+    exact_values = values_of_formula(result)
+    exact, rounded = (_formula(known, speed[measured]) for known in (exact_values, exact_values | values))
     bands = (
         law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us,
         law.delay_high_us - law.collision_delay_us,
@@ -398,13 +385,10 @@ def _formula(
     values: dict[str, float], approach_speed_nm_per_us: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return rebound speed in nm/us and delay in us as the formulas of the page say; zero where the tip is captured."""
-    u = approach_speed_nm_per_us
-    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * u - values.get("epsilon", 0.0)
-    free = square > 0.0
-    w = np.sqrt(np.where(free, square, 1.0))
-    lead, offset = values.get("delay_lead_nm", 0.0), values.get("delay_offset_nm", 0.0)
-    delay = values.get("delay_hertz", 0.0) * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u
-    return np.where(free, w, 0.0), np.where(free, delay, 0.0)
+    rebound = rebound_by_formula(values, approach_speed_nm_per_us)
+    free = rebound > 0.0
+    delay = delay_by_formula(values, approach_speed_nm_per_us, np.where(free, rebound, 1.0))
+    return rebound, np.where(free, delay, 0.0)
 
 
 def law_points(result: FitResult) -> list[list[str]]:

@@ -16,8 +16,9 @@ from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from afm_jax.results import Result, public_result
+from afm_jax.strict_json import plain as in_json
 from fitting.fits.intervals import at_bound, covariance
-from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
+from fitting.fits.objective import Objective, softened
 from fitting.fits.result import FitResult
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
 from fitting.tables.several import SeveralTables
@@ -188,12 +189,8 @@ def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
         found = plain(objective).at_values(values)
         return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
 
-    parameters = objective.problem.parameters
-    box = Box(
-        np.array([p.lowest for p in parameters]),
-        np.array([p.highest for p in parameters]),
-        np.zeros((sets, len(parameters)), dtype=bool),
-    )
+    lowest, highest = objective.problem.ends
+    box = Box(lowest, highest, np.zeros((sets, refit.values.size), dtype=bool))
     end = descended(look, start, box, settled=_SETTLED, most=_STEPS)
     normal = np.einsum("snp,snq->spq", end.jacobian, end.jacobian)
     return BatchFit(end.place, end.chi2, whole_covariance_of(normal), distance(end, box) <= _SETTLED)
@@ -216,14 +213,10 @@ def plain(objective: Objective) -> Objective:
 
 def _searches(objective: Objective, values, residual, jacobian) -> Searches:
     """Return the searches with the loss applied: residuals whose squares add up to it."""
-    square = soft_square(residual, ROBUST if objective.robust else PLAIN)
     if objective.robust:
-        soft = np.copysign(np.sqrt(square), residual)
-        safe = np.where(residual == 0.0, 1.0, soft)
-        root = np.sqrt(1.0 + (residual / ROBUST) ** 2)
-        slope = np.where(residual == 0.0, 1.0, residual / (root * safe))
-        residual, jacobian = soft, jacobian * slope[:, :, None]
-    return Searches(values, residual, jacobian, square.sum(axis=1))
+        residual, slope = softened(residual)
+        jacobian = jacobian * slope[:, :, None]
+    return Searches(values, residual, jacobian, np.sum(residual**2, axis=1))
 
 
 FEWEST = 40
@@ -284,7 +277,6 @@ class Bootstrap(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the single samples as plain lists, numbers and strings."""
-        plain = np.where(np.isfinite(self.correlations), self.correlations, np.inf).tolist()
         return {
             "samples": len(self.samples),
             "failures": self.failures,
@@ -298,7 +290,7 @@ class Bootstrap(Result):
                 }
                 for name in self.names
             },
-            "correlations": [[None if entry == np.inf else entry for entry in row] for row in plain],
+            "correlations": in_json(self.correlations),
         }
 
 

@@ -213,10 +213,7 @@ class LogDensity(eqx.Module):
             return value, gradient @ tangents[0]
 
         values, log_prior = self.space.values_and_log_prior(z)
-        lowest, highest = (
-            jnp.asarray(ends)
-            for ends in zip(*((p.lowest, p.highest) for p in self.space.problem.parameters), strict=True)
-        )
+        lowest, highest = jnp.asarray(self.space.problem.ends)
         inside = jnp.all((values >= lowest) & (values <= highest))
         return jnp.where(inside, log_likelihood(jnp.clip(values, lowest, highest)) + log_prior, -jnp.inf)
 

@@ -392,9 +392,18 @@ def _rounded(values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
     return np.array([float(f"{value:.6g}") for value in values])
 
 
-def _check(drives: Drives, drive: str, noise: float, phase_noise_deg: float | None) -> None:
+def check_drive(drive: str) -> None:
+    """Check what is driven.
+
+    Raises:
+        ValueError: if it is neither the sample nor the cantilever.
+    """
     if drive not in DRIVES:
         raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
+
+
+def _check(drives: Drives, drive: str, noise: float, phase_noise_deg: float | None) -> None:
+    check_drive(drive)
     if drive != "sample" and np.any(np.asarray(drives.order) != 1):
         raise ValueError(f"`drives` must have the order 1 where the {drive} is driven: that is what is read")
     if not 0.0 < noise < 1.0:
