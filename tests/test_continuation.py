@@ -32,7 +32,8 @@ from afm_jax.dynamics import curves
 from afm_jax.dynamics.bands import UncertainParameters, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
-from afm_jax.plots.branches import draw_continuation, draw_curves
+from afm_jax.plots.branches import continuation_figure, curves_figure
+from afm_jax.plots.picture_style import save
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.strict_reading import strictly
 
@@ -316,12 +317,10 @@ def test_errors_of_special_points_are_those_of_orbits_followed_anew():
 @pytest.mark.slow
 def test_pictures_are_files_of_their_suffix(doubled: Continuation, tmp_path: Path):
     for name, magic in (("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")):
-        draw_continuation(
-            doubled, tmp_path / name, bands=[np.full(len(one.parameter), 0.1) for one in doubled.branches]
-        )
+        bands = [np.full(len(one.parameter), 0.1) for one in doubled.branches]
+        save(continuation_figure(doubled, bands=bands), tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(magic)
-    draw_curves(doubled, tmp_path / "b.png")
-    assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
+    assert curves_figure(doubled).axes[0].lines
 
 
 def run(*arguments: str) -> Result:

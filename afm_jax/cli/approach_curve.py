@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from afm_jax.cli.columns import TableColumn, printed_table
-from afm_jax.cli.command import NamedScene, Output, later
+from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome, approach_curve
 from afm_jax.scenefile.scenefile import scene_tables
@@ -15,7 +15,6 @@ from fitting.tables.table import write_table
 
 NOISE, PHASE_NOISE_DEG = 0.003, 0.2
 """Errors of curve.csv, relative and in degrees, where none are asked for."""
-draw_curve = later("afm_jax.plots.approach_curve:draw_approach_curve")
 
 _COLUMNS = (
     TableColumn("height\n(nm)", "height_nm"),
@@ -72,7 +71,7 @@ def approach(
         tables={"curve_points.csv": points},
         files={
             "curve.csv": partial(write_table, table_of_curve(curve, **errors)),
-            "curve.png": partial(draw_curve, curve),
+            "curve.png": picture_of("approach_curve:approach_curve_figure", curve),
         }
         if repeats
         else {},

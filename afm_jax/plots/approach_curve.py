@@ -1,13 +1,13 @@
 """Picture of an approach curve: amplitude and lag against the sample's height, approach and retract."""
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 
 _OTHERS = {
     CurveOutcome.OTHER_ORBIT: ("D", "another orbit"),
@@ -16,11 +16,6 @@ _OTHERS = {
     CurveOutcome.BROKE_OFF: ("P", "broke off"),
 }
 """Marks of heights at which the tip neither taps once a period nor is free."""
-
-
-def draw_approach_curve(curve: ApproachCurve, path: Path) -> None:
-    """Write the picture of an approach curve as PDF, SVG or PNG."""
-    save(approach_curve_figure(curve), path)
 
 
 def approach_curve_figure(curve: ApproachCurve) -> Figure:
@@ -56,14 +51,18 @@ def _draw(axes: Axes, curve: ApproachCurve, values: np.ndarray) -> None:
         those = curve.outcome == kind
         if those.any():
             read = np.isfinite(values[those])
-            heights = curve.height_nm[those]
-            axes.plot(heights[read], values[those][read], marker, color=DARK, ms=6, mfc="none", label=label)
-            axes.plot(
-                heights[~read],
-                np.full(np.count_nonzero(~read), 0.03),
-                marker,
-                color=DARK,
-                ms=6,
-                transform=axes.get_xaxis_transform(),
-                label=None if read.any() else label,
-            )
+            # what has no value stands at the foot
+            for part, height, transform in (
+                (read, values[those][read], axes.transData),
+                (~read, np.full(np.count_nonzero(~read), 0.04), axes.get_xaxis_transform()),
+            ):
+                if part.any():
+                    style: dict[str, Any] = {
+                        "color": DARK,
+                        "ms": 6,
+                        "mfc": "none",
+                        "transform": transform,
+                        "label": label,
+                    }
+                    axes.plot(curve.height_nm[those][part], height, marker, ls="", **style)
+                    label = None  # noqa: PLW2901

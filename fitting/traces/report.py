@@ -85,7 +85,7 @@ def write_lockin(
     write_whole(data, text + "\n")
     written = [data]
     for name, result in zip(_picture_names(results), results, strict=True):
-        draw_lockin(result, folder / name)
+        save(lockin_figure(result), folder / name)
         written.append(folder / name)
     if table is not None:
         write_whole(folder / "amplitudes.csv", csv_of(table))
@@ -111,11 +111,6 @@ _SMALL = 9
 _HIGHEST = 4.0
 """Multiples of the drive frequency in the spectrum."""
 _DECADES = 1e-5
-
-
-def draw_lockin(result: LockinResult, path: Path) -> None:
-    """Draw a reading as a PNG file."""
-    save(lockin_figure(result), path)
 
 
 def lockin_figure(result: LockinResult) -> Figure:
