@@ -66,11 +66,12 @@ def collisions_figure(
     label_axes(middle, x="", y="collision delay (µs)")
     label_axes(lower, x=r"approach speed  $u_{in}$ (nm/µs)", y="energy lost (aJ)")
     middle.axhline(0.0, color=GRID, lw=0.8)
+    lower.margins(y=0.2)
     lower.set_ylim(bottom=0.0)
     for axes in panels:
         axes.grid(color=GRID, alpha=0.25)
     upper.legend(fontsize=10, loc="upper left")
-    lower.legend(fontsize=10, loc="center right")
+    lower.legend(fontsize=10, loc="upper right", ncols=3)
     figure.suptitle(title or f"Collisions of {counted(usable.size, 'free tip')}", fontsize=12)
     return figure
 

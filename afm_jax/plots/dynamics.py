@@ -168,9 +168,12 @@ def exponents_figure(
         label = r"the tip rests: both are $-\infty$"
         axes.plot(values[gone], np.full(gone.sum(), _STRIP / 2), "|", label=label, **style)
         axes.axhline(low - 0.3, color=DARK, linewidth=0.8)
+        axes.annotate(r"$-\infty$", (-0.01, _STRIP / 2), xycoords="axes fraction", ha="right", va="center", fontsize=11)
     margin = 0.5 if len(values) == 1 else 0.0
     strip = _STRIP / (1.0 - _STRIP) * (high + 0.2 - (low - 0.3)) if gone.any() else 0.0
     axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.3 - strip, high + 0.2))
+    # no ticks in the strip
+    axes.set_yticks([tick for tick in axes.get_yticks() if low - 0.3 <= tick <= high + 0.2])
     axes.grid(color=GRID, alpha=0.25)
     axes.axhline(0.0, color="black", linewidth=1.0)
     label_axes(axes, x=label_of(path) if path else "number of the motion", y="Lyapunov exponent per impact")
@@ -203,7 +206,7 @@ def bifurcation_figure(
     panels = figure.subplots(2, 1, sharex=True)
     for sweep in sweeps:
         colour, word = (BLUE, "ramped up") if sweep.upward else (ACCENT, "ramped down")
-        size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [6.0, 3.0, 3.0, 1.0]))
+        size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [8.0, 5.0, 4.0, 1.0]))
         for axes, part in zip(panels, (sweep.height_nm, sweep.strobe_height_nm), strict=True):
             there = np.isfinite(part)
             at = np.repeat(sweep.values, there.sum(axis=1))
