@@ -523,7 +523,7 @@ def spectrum_figure(look: Look) -> Figure:
         for multiple in range(1, int(right / found.response_khz + 1e-9) + 1):
             axes.axvline(multiple * found.response_khz, color=BLUE, linewidth=1.0, linestyle=":", label=label)
             label = None
-    label = "further tone"
+    label = "second frequency"
     for tone in _further_tones_khz(look.scene, drive):
         axes.axvline(tone, color="#009E73", linewidth=3.0, linestyle=(0, (3, 1)), alpha=0.7, label=label)
         label = None
