@@ -2,7 +2,7 @@
 
 At each height the whole scene is followed in time until it repeats. From there the sample moves to the next height, by
 so little in a drive period that the motion follows: an approach keeps its branch as far as it goes, and hysteresis
-shows.
+shows. A tip that is captured on the way, as laws with adhesion capture slow ones, begins anew at the height after.
 """
 
 import math
@@ -22,7 +22,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase
 from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.observe import Observables, observe
-from afm_jax.motion.record import MotionOutcome, Simulation, State
+from afm_jax.motion.record import MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import is_stuck, settled, window_of
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.trajectory import DensePath, dense_path
@@ -49,8 +49,8 @@ class CurveOutcome(OutcomeInWords):
     FREE = 1, "The tip does not meet the sample."
     OTHER_ORBIT = 2, "The motion repeats, but not with one contact in every drive period."
     NOT_SETTLED = 3, "The motion did not settle in the time it was given; amplitude and lag are means of its end."
-    CAPTURED = 4, "The sample captured the tip; the next height is approached with the last motion that was free."
-    BROKE_OFF = 5, "The simulation broke off; the next height is approached with the last motion that was free."
+    CAPTURED = 4, "The sample captured the tip; at the next height it begins anew, swinging as it last did."
+    BROKE_OFF = 5, "The simulation broke off; at the next height the tip begins anew, swinging as it last did."
 
 
 class Motion(NamedTuple):
@@ -58,6 +58,8 @@ class Motion(NamedTuple):
 
     height_nm: float
     state: State
+    lost: bool = False
+    """Whether it did not get to the next height: then it begins there at once, the sample being put there."""
 
 
 class HeightReading(NamedTuple):
@@ -207,7 +209,7 @@ def _followed(
     motion = _free_motion(scene, float(course[0]))
     for height in course.tolist():
         reading, end = _at_height(scene, motion, height, longest_periods, settings)
-        motion = motion if end is None else Motion(height, end)
+        motion = motion._replace(lost=True) if end is None else Motion(height, end)
         yield reading
 
 
@@ -215,11 +217,15 @@ def _free_motion(scene: Scene, height_nm: float) -> Motion:
     """Return the free tip in its steady motion over a sample at a height, or as far up as does not touch it."""
     _, response = surface_of(scene)
     assert response is not None  # something drives the tip  # noqa: S101
-    felt = float(scene.interaction.bridge_forms_nm) if isinstance(scene.interaction, Contact) else 0.0
     times = np.linspace(0.0, drive_of(scene).period_us, _TIMES)
     top = times[np.argmax(np.asarray(response.position_and_velocity(times)[0]))]
     state = _state(top, *response.position_and_velocity(top))
-    return Motion(min(height_nm, -_free_height_nm(scene) - felt - _CLEARANCE_NM), state)
+    return Motion(min(height_nm, -_free_height_nm(scene) - _felt_nm(scene) - _CLEARANCE_NM), state)
+
+
+def _felt_nm(scene: Scene) -> float:
+    """Return the gap below which a flying tip meets the sample."""
+    return float(scene.interaction.bridge_forms_nm) if isinstance(scene.interaction, Contact) else 0.0
 
 
 def _state(*parts: ArrayLike) -> State:
@@ -239,8 +245,9 @@ def _at_height(
         settings: of `follow_long`.
     """
     period_us = drive_of(scene).period_us
-    start = begin.state
-    if begin.height_nm != height_nm:
+    start, here = begin.state, _with_sample(scene, height_nm, 0.0)
+    clear = float(to_gap(*surface_of(here), start)[0]) > _felt_nm(scene)
+    if begin.height_nm != height_nm and not (begin.lost and clear):
         periods = math.ceil(abs(height_nm - begin.height_nm) / (_MOVED * _free_height_nm(scene)))
         rate = (height_nm - begin.height_nm) / (periods * period_us)
         moving = _with_sample(scene, begin.height_nm - rate * float(start.time_us), rate)
@@ -253,7 +260,6 @@ def _at_height(
         start = _top_of_swing(dense, end_us - period_us, end_us, period_us)
         if start is None:
             return HeightReading(CurveOutcome.CAPTURED, "the sample holds the tip on the way there"), None
-    here = _with_sample(scene, height_nm, 0.0)
 
     def over(motion: Simulation) -> bool:
         return is_stuck(here, motion) or settled(here, motion, tolerance=TOLERANCE).settled
