@@ -253,13 +253,15 @@ def _at_height(
         moving = _with_sample(scene, begin.height_nm - rate * float(start.time_us), rate)
         on_the_way = follow_long(moving, start, periods * period_us, **settings)
         reading = _why_over(on_the_way)
-        if reading is not None:
+        if reading is None:
+            end_us = float(on_the_way.simulation.final.time_us)
+            dense = dense_path(moving, on_the_way.simulation, end_us - period_us, end_us)
+            start = _top_of_swing(dense, end_us - period_us, end_us, period_us)
+            if start is None:
+                return HeightReading(CurveOutcome.CAPTURED, "the sample holds the tip on the way there"), None
+        elif reading.outcome == CurveOutcome.CAPTURED or not clear:
             return reading, None
-        end_us = float(on_the_way.simulation.final.time_us)
-        dense = dense_path(moving, on_the_way.simulation, end_us - period_us, end_us)
-        start = _top_of_swing(dense, end_us - period_us, end_us, period_us)
-        if start is None:
-            return HeightReading(CurveOutcome.CAPTURED, "the sample holds the tip on the way there"), None
+        # a way that broke off is left out: the tip begins at the height at once
 
     def over(motion: Simulation) -> bool:
         return is_stuck(here, motion) or settled(here, motion, tolerance=TOLERANCE).settled
