@@ -110,7 +110,7 @@ def test_the_line_at_half_the_drive_is_that_of_the_orbit(every_other_period):
 
 def test_subharmonics_of_the_drive_are_marked(every_other_period):
     (axes,) = spectrum_figure(look_at(*every_other_period)).axes
-    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    labels = axes.get_legend_handles_labels()[1]
     assert "subharmonics, drive/2" in labels
     marks = [float(np.asarray(line.get_xdata())[0]) for line in axes.get_lines() if line.get_linestyle() == ":"]
     np.testing.assert_allclose(marks, 181.8 * np.arange(1, len(marks) + 1), rtol=1e-12)

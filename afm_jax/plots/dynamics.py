@@ -248,7 +248,7 @@ def _shade(axes: Axes, sweep: Sweep, where: Bool[np.ndarray, " values"], **style
     edges = cell_edges(sweep.values)
     changes = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
     for begin, end in zip(changes[::2], changes[1::2], strict=True):
-        axes.axvspan(edges[begin], edges[end], alpha=0.15, lw=0.0, **style)
+        axes.axvspan(float(edges[begin]), float(edges[end]), alpha=0.15, lw=0.0, **style)
 
 
 def chart_figure(
@@ -277,7 +277,9 @@ def chart_figure(
     bar = figure.colorbar(mesh, ax=left, ticks=orders)
     bar.ax.set_yticklabels([f"(1,{order})" for order in orders])
     several = (stable.sum(axis=0) > 1).astype(float)
-    known = [Patch(facecolor="white", edgecolor=DARK, label=f"no stable orbit of one impact, N up to {chart.orders}")]
+    known: list[Any] = [
+        Patch(facecolor="white", edgecolor=DARK, label=f"no stable orbit of one impact, N up to {chart.orders}")
+    ]
     if several.any() and not several.all():
         known.append(Line2D([], [], color="black", linewidth=1.0, label="within: several orders are stable"))
         left.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)

@@ -1,6 +1,7 @@
 """The pictures of a fit: measured and predicted amplitudes, residuals, and the law with its band."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -63,8 +64,9 @@ def law_figure(result: FitResult) -> Figure:
     panels = {"law": draw_law, "band": draw_band, "losses": draw_losses}
     panels |= {"delay": draw_delay} if has_delay(result) else {}
     # without a delay the law has all of the upper row
-    rows = [["law", "losses"], ["band", "delay"]] if has_delay(result) else [["law", "law"], ["band", "losses"]]
-    for name, axes in figure.subplot_mosaic(rows).items():
+    rows = "law losses; band delay" if has_delay(result) else "law law; band losses"
+    mosaic: list[Any] = [row.split() for row in rows.split("; ")]
+    for name, axes in figure.subplot_mosaic(mosaic).items():
         panels[name](axes, result)
     return figure
 
