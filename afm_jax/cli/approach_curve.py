@@ -31,7 +31,7 @@ def approach(
     scene: NamedScene,
     heights: tuple[float, ...],
     settings: dict[str, Any],
-    errors: dict[str, float],
+    errors: dict[str, Any],
 ) -> Output:
     """Return the approach curve of a scene.
 

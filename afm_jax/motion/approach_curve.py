@@ -156,7 +156,7 @@ def approach_curve(
     for reading in _followed(scene, course, longest_periods, settings):
         readings.append(reading)
         report(len(readings), len(course))
-    columns = dict(zip(HeightReading._fields, map(np.array, zip(*readings, strict=True)), strict=True))
+    columns: dict[str, Any] = dict(zip(HeightReading._fields, map(np.array, zip(*readings, strict=True)), strict=True))
     columns["reasons"] = tuple(columns.pop("reason").tolist())
     step = np.diff(course)
     ratio = drive.frequency_khz / scene.cantilever.frequency_khz
