@@ -66,7 +66,7 @@ def collisions_figure(
     label_axes(middle, x="", y="collision delay (µs)")
     label_axes(lower, x=r"approach speed  $u_{in}$ (nm/µs)", y="energy lost (aJ)")
     middle.axhline(0.0, color=GRID, lw=0.8)
-    lower.margins(y=0.2)
+    lower.margins(y=0.35)
     lower.set_ylim(bottom=0.0)
     for axes in panels:
         axes.grid(color=GRID, alpha=0.25)

@@ -21,7 +21,7 @@ _WIDTH_INCHES, DPI = 6.4, 190.0
 """Narrow enough that letters can still be read on a screen of 420 pixels."""
 _KINDS = ("peak", "lock-in", "phase")
 _EXCLUDED = "#999999"
-_ROW_AXIS = "drive frequency (kHz), for each order N to scale; rows of one frequency beside each other"
+_ROW_AXIS = "drive frequency (kHz), for each order N to scale;\nrows of one frequency beside each other"
 _HEIGHT = "height of the sample over the tip's rest position (nm)"
 _MUCH = 5.0
 """How much the loss must change to be drawn on a logarithmic axis."""
@@ -269,7 +269,7 @@ def _name_frequencies(axes: Axes, result: FitResult) -> None:
             here = (order == one) & (frequency == different[chosen])
             ticks.append(float(places[here].mean()))
             names.append(f"{different[chosen]:.4g}")
-    axes.set_xticks(ticks, names)
+    axes.set_xticks(ticks, names, rotation=35, ha="right", rotation_mode="anchor")
     for number in range(1, len(np.unique(order))):
         axes.axvline(number, color="0.7", lw=0.8)
 
