@@ -131,7 +131,7 @@ def test_picture_shows_curve_capture_delay_and_losses(out: Path, paper: dict[str
     panels = collisions_figure(rows, paper["capture_speed_nm_per_us"]).axes
     drawn = [{line.get_label(): np.asarray(line.get_ydata())[1:] for line in axes.lines} for axes in panels]
     np.testing.assert_array_equal(drawn[0]["contact"], paper["rebound_speed_nm_per_us"][1:])
-    np.testing.assert_array_equal(panels[1].lines[0].get_ydata()[1:], paper["collision_delay_us"][1:])
+    np.testing.assert_array_equal(np.asarray(panels[1].lines[0].get_ydata())[1:], paper["collision_delay_us"][1:])
     for label, name in (
         ("liquid bridge", "bridge_hysteresis_aj"),
         ("solid junction", "junction_hysteresis_aj"),
