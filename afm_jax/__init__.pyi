@@ -32,6 +32,8 @@ from afm_jax.impact.map import iterate_map as iterate_map
 from afm_jax.impact.map import next_impact as next_impact
 from afm_jax.impact.orbits import SingleImpactOrbits as SingleImpactOrbits
 from afm_jax.impact.orbits import single_impact_orbits as single_impact_orbits
+from afm_jax.motion.approach_curve import ApproachCurve as ApproachCurve
+from afm_jax.motion.approach_curve import approach_curve as approach_curve
 from afm_jax.motion.record import ContactKind as ContactKind
 from afm_jax.motion.record import MotionOutcome as MotionOutcome
 from afm_jax.motion.record import Simulation as Simulation

@@ -35,6 +35,7 @@ from fitting.sampling.posterior import posterior as posterior
 from fitting.sampling.posterior_result import Posterior as Posterior
 from fitting.simulated.experiment import SimulatedExperiment as SimulatedExperiment
 from fitting.simulated.experiment import simulate_experiment as simulate_experiment
+from fitting.simulated.experiment import table_of_curve as table_of_curve
 from fitting.tables.csv_text import TableError as TableError
 from fitting.tables.table import AmplitudeTable as AmplitudeTable
 from fitting.tables.table import read_table as read_table

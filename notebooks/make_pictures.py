@@ -20,7 +20,7 @@ PICTURES = {
     "tapping": "tapping fitting/examples/tapping_resonance.csv --out report",
     "tapping_frames": "tapping fitting/examples/tapping_resonance.csv --out report",
     "sweep": "sweep sweep.toml --out swept --plot",
-    "collide": "collide --speeds 12,15,20,60 --out collide",
+    "collide": "collide --speeds 6:10:1,11:14:0.25,15:60:1 --out collide",
 }
 """The command that writes each picture; scene and sweep are those of the pages."""
 

@@ -27,7 +27,7 @@ from afm_jax import results, saved
 from afm_jax.contact.collide import _rows
 from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
-from afm_jax.plots.collisions import draw_collisions
+from afm_jax.plots.collisions import collisions_figure
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from fitting.fits.comparison import Comparison
 from tests.fit_tables import EXAMPLE
@@ -413,20 +413,18 @@ def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_pat
     # a captured tip has been deep; one that never began has not
     assert table["deepest_gap_nm"].isna().tolist() == [False, False, False, True]
     assert table["approach_speed_nm_per_us"].tolist() == [40.0, 5.0, 20.0, -1.0]
-    upper, lower = found.plot(tmp_path / "collide.png").axes
+    upper, middle, lower = found.plot(tmp_path / "collide.png").axes
     drawn = {line.get_label(): line.get_xydata() for line in upper.lines}
     assert drawn["captured"].tolist() == [[5.0, 0.0]]
     np.testing.assert_array_equal(drawn["contact"], [[5.0, np.nan], [20.0, 3.0], [40.0, 1.0]])
-    np.testing.assert_array_equal(lower.lines[0].get_ydata(), [np.nan, 3.0, 1.0])
+    for axes in (middle, lower):
+        np.testing.assert_array_equal(axes.lines[0].get_ydata(), [np.nan, 3.0, 1.0])
 
 
-def test_the_command_draws_the_picture_of_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    drawn = []
-    monkeypatch.setattr("afm_jax.plots.collisions.save", lambda figure, _: drawn.append(figure))
+def test_the_command_draws_the_picture_of_the_result():
     found = collisions_of_four()
     rows = _rows({name: np.asarray(part) for name, part in found._asdict().items()})
-    draw_collisions(rows, None, tmp_path / "collide.png", title="a title")
-    for one, other in zip(drawn[0].axes, found.plot().axes, strict=True):
+    for one, other in zip(collisions_figure(rows).axes, found.plot().axes, strict=True):
         assert (one.get_xlabel(), one.get_ylabel()) == (other.get_xlabel(), other.get_ylabel())
         for line, its in zip(one.lines, other.lines, strict=True):
             assert (line.get_label(), line.get_linestyle()) == (its.get_label(), its.get_linestyle())

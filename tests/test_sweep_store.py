@@ -15,7 +15,7 @@ import xarray
 from scipy.stats import qmc
 
 from afm_jax import compilation_cache
-from afm_jax.plots.sweeps import draw_sweep
+from afm_jax.plots.sweeps import sweep_figure
 from afm_jax.sweeps.axes import axes_of
 from afm_jax.sweeps.plan import plan_of
 from afm_jax.sweeps.store import FORMAT_VERSION, STORE, SweepStore, locked
@@ -324,14 +324,10 @@ def test_a_worker_with_other_versions_is_refused(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize("log", [False, True])
-def test_a_picture_shows_all_that_was_swept(log: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):  # noqa: FBT001
-    kept = []
-    monkeypatch.setattr("afm_jax.plots.sweeps.save", lambda figure, _: kept.append(figure))
+def test_a_picture_shows_all_that_was_swept(log: bool):  # noqa: FBT001
     line = {"parameter": "x", "log": [1.0, 16.0, 5]} if log else {"parameter": "x", "linear": [1.0, 16.0, 5]}
     found = dataset_of(plan_of(plan().given | {"axes": [line, {"parameter": "y", "linear": [0.0, 10.0, 11]}]}), None)
-    for shown in (found.isel(y=0, drop=True), found):
-        draw_sweep(shown, ["sum_nm"], tmp_path / "sweep.png")
-    lines, plane = (figure.axes[0] for figure in kept)
+    lines, plane = (sweep_figure(shown, ["sum_nm"]).axes[0] for shown in (found.isel(y=0, drop=True), found))
     assert lines.get_xscale() == plane.get_yscale() == ("log" if log else "linear")
     assert plane.get_xscale() == "linear"
     assert lines.get_xlim()[0] < 1.0
@@ -342,13 +338,9 @@ def test_a_picture_shows_all_that_was_swept(log: bool, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize(("last", "labels"), [(16.0, [1, 2, 5, 10]), (1600.0, [1, 10, 100, 1000])])
-def test_labels_of_a_logarithmic_axis_leave_room(
-    last: float, labels: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    kept = []
-    monkeypatch.setattr("afm_jax.plots.sweeps.save", lambda figure, _: kept.append(figure))
+def test_labels_of_a_logarithmic_axis_leave_room(last: float, labels: list[int]):
     axes = [{"parameter": "x", "log": [1.0, last, 5]}, {"parameter": "y", "list": [1.0]}]
-    draw_sweep(dataset_of(plan_of(plan().given | {"axes": axes}), None).isel(y=0, drop=True), ["sum_nm"], tmp_path)
-    panel = kept[0].axes[0]
+    found = dataset_of(plan_of(plan().given | {"axes": axes}), None).isel(y=0, drop=True)
+    panel = sweep_figure(found, ["sum_nm"]).axes[0]
     low, high = panel.get_xlim()
     assert [at for at in panel.get_xticks() if low <= at <= high] == pytest.approx(labels)

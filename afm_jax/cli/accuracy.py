@@ -9,9 +9,9 @@ from afm_jax.accuracy.collisions import cheapest_collision
 from afm_jax.accuracy.impacts import cheapest_settings
 from afm_jax.accuracy.overview import cheapest
 from afm_jax.bench import timing
-from afm_jax.cli.accuracy_scene import accuracy_picture, scene_study
+from afm_jax.cli.accuracy_scene import scene_study
 from afm_jax.cli.columns import Cell, columns_of, rows_table
-from afm_jax.cli.command import Output
+from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES
 
@@ -175,7 +175,7 @@ def overview_study(session: Session, *, quick: bool) -> Output:
         payload={"rows": rows, "references": references, "cheapest": choices},
         text=[rows_table("The fastest way to a wanted error (one core)", cells, choices), *told],
         tables={"accuracy.csv": columns_of(rows, OVERVIEW_COLUMNS)},
-        files={"accuracy.png": accuracy_picture("overview_figure", rows, references)},
+        files={"accuracy.png": picture_of("accuracy:overview_figure", rows, references)},
         json_file="accuracy.json",
     )
 
@@ -208,7 +208,7 @@ def map_study(session: Session, wanted_error_us: float, *, quick: bool) -> Outpu
             *(cheapest_sentence(choice, wanted_error_us) for choice in choices),
         ],
         tables={"accuracy.csv": columns_of(rows, COLUMNS)},
-        files={"accuracy.png": accuracy_picture("accuracy_figure", rows, wanted_error_us)},
+        files={"accuracy.png": picture_of("accuracy:accuracy_figure", rows, wanted_error_us)},
         json_file="accuracy.json",
     )
 
@@ -244,7 +244,7 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> Output:
         payload={**result, "accuracy": accuracy, "cheapest": best},
         text=[rows_table(title, cells, rows), reference, sentence],
         tables={"accuracy.csv": columns_of(rows, COLLIDE_COLUMNS)},
-        files={"accuracy.png": accuracy_picture("collide_accuracy_figure", rows)},
+        files={"accuracy.png": picture_of("accuracy:collide_accuracy_figure", rows)},
         json_file="accuracy.json",
     )
 

@@ -1,7 +1,6 @@
 """`afm-jax accuracy SCENE.toml`: error against time of one scene's settings, and of simpler models of it."""
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ from afm_jax.accuracy.scenes import ladder_duration
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench import timing
 from afm_jax.cli.columns import Cell, columns_of, rows_table
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import scene_and_start
 from afm_jax.contact.collide import capture_speed
@@ -85,18 +84,9 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> O
             "accuracy.csv": columns_of(result["rows"], COLUMNS),
             "ladder.csv": columns_of(result["ladder"], LADDER_COLUMNS),
         },
-        files={"accuracy.png": accuracy_picture("scene_accuracy_figure", result)},
+        files={"accuracy.png": picture_of("accuracy:scene_accuracy_figure", result)},
         json_file="accuracy.json",
     )
-
-
-def accuracy_picture(figure: str, *arguments: Any) -> Callable[[Path], object]:
-    """Return a function that draws a figure of `afm_jax.plots.accuracy` into a file."""
-
-    def draw(path: Path) -> None:
-        later("afm_jax.plots.picture_style:save")(later(f"afm_jax.plots.accuracy:{figure}")(*arguments), path)
-
-    return draw
 
 
 def scene_to_study(name: str) -> tuple[Scene, State]:

@@ -1,19 +1,16 @@
 """`afm-jax basins SCENE.toml --grid 1000x1000`: which start, in drive phase and rebound speed, ends where."""
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from afm_jax.cli.command import NamedScene, Output, later
+from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.fitted_law import as_drawn
 from afm_jax.cli.session import Session
 from afm_jax.dynamics.bands import drawn_shares
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
 from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind
 from afm_jax.scenefile.scenefile import scene_tables
-
-draw_basins = later("afm_jax.plots.dynamics:draw_basins")
 
 
 def basins(
@@ -47,7 +44,7 @@ def basins(
         text=_lines(result, attractors),
         impact_speeds=np.concatenate([attractor.approach_speed_nm_per_us for attractor in result.attractors]),
         tables={"basins.csv": _starts(result), "attractors.csv": _points(result)},
-        files={f"basins.{picture}": partial(draw_basins, result)},
+        files={f"basins.{picture}": picture_of("dynamics:basins_figure", result, scene.scene)},
         not_valid=_why_not_valid(result),
     )
 
@@ -70,7 +67,9 @@ def _attractors(result: Basins, band: np.ndarray | None) -> list[dict[str, Any]]
 
 
 def _lines(result: Basins, attractors: list[dict[str, Any]]) -> list[str]:
-    lines = []
+    speeds = result.rebound_speed_nm_per_us
+    box = f"{len(result.phase_rad)} drive phases of a period x {len(speeds)} rebound speeds"
+    lines = [f"Starts: {box} from {speeds[0]:.4g} to {speeds[-1]:.4g} nm/us (--speeds chooses others)"]
     for attractor in attractors:
         line = "{name}: {0:.4g} +- {1:.2g} % of the starts".format(
             100.0 * attractor["share"], 100.0 * attractor["share_error"], name=attractor["name"]

@@ -6,15 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.cli.command import NamedScene, Output, later
+from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.fitted_law import as_drawn
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.bands import verdict_probability
 from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
 from afm_jax.scenefile.scenefile import scene_tables
-
-draw_bifurcations = later("afm_jax.plots.dynamics:draw_bifurcations")
 
 _NONE_WENT_ON = (
     "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"
@@ -75,7 +73,7 @@ def bifurcation(  # noqa: PLR0913
         text=[_summary(sweep) for sweep in sweeps],
         impact_speeds=np.concatenate([sweep.approach_nm_per_us.ravel() for sweep in sweeps]),
         tables=_tables(swept.path, sweeps, probabilities),
-        files={f"bifurcation.{picture}": lambda path: draw_bifurcations(swept.path, sweeps, path, probabilities)},
+        files={f"bifurcation.{picture}": picture_of("dynamics:bifurcation_figure", sweeps, swept.path, probabilities)},
         not_valid=payload["reason"],
     )
 

@@ -6,15 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.cli.command import NamedScene, Output, later
+from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.charts import StabilityChart, stability_chart, stable_probability
 from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.whole_files import whole_folder
-
-draw_chart = later("afm_jax.plots.dynamics:draw_chart")
 
 _MOST_POINTS = 4_000_000
 
@@ -47,7 +45,7 @@ def chart(  # noqa: PLR0913
         tables={} if zarr else {"chart.csv": _columns(result, across.path, up.path, arrays)},
         files={
             **({"chart.zarr": partial(_write_zarr, result, across.path, up.path, arrays)} if zarr else {}),
-            f"chart.{picture}": lambda path: draw_chart(across.path, up.path, result, path, probability),
+            f"chart.{picture}": picture_of("dynamics:chart_figure", result, across.path, up.path, probability),
         },
         not_valid=payload["reason"],
     )

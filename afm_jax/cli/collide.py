@@ -3,13 +3,11 @@
 from typing import Any
 
 from afm_jax.cli.columns import TableColumn, columns_of, printed_table
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.contact_law import make_law as law_of
 from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
 from afm_jax.contact.collide import collisions
-
-draw_collisions = later("afm_jax.plots.collisions:draw_collisions")
 
 COLUMNS = (
     "approach_speed_nm_per_us",
@@ -74,7 +72,7 @@ def collide(
             *sentences(payload),
         ],
         tables={"collide.csv": columns_of(rows, COLUMNS)},
-        files={"collide.png": lambda to: draw_collisions(rows, result.capture_speed_nm_per_us, to, title=title)},
+        files={"collide.png": picture_of("collisions:collisions_figure", rows, result.capture_speed_nm_per_us, title)},
         json_file="collide.json",
         not_valid=f"{len(result.unresolved)} of {len(rows)} collisions: {result.unresolved[0]}"
         if result.unresolved

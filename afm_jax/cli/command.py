@@ -95,6 +95,15 @@ def later(function: str) -> Callable[..., Any]:
     return call
 
 
+def picture_of(figure: str, *arguments: Any, **options: Any) -> Callable[[Path], None]:
+    """Return a function that draws a figure of `afm_jax.plots`, "module:function" of some arguments, into a file."""
+
+    def draw(path: Path) -> None:
+        later("afm_jax.plots.picture_style:save")(later(f"afm_jax.plots.{figure}")(*arguments, **options), path)
+
+    return draw
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """A command of `afm-jax`.

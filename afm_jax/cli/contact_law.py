@@ -7,14 +7,12 @@ import numpy as np
 from rich.table import Table
 
 from afm_jax.cli.columns import TableColumn, printed_table
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
 from afm_jax.contact.law_of_contact import FREE, ContactDelay, ContactLaw, fit_delay, fit_law
 from afm_jax.contact.law_of_contact import make_law as table_of
 from afm_jax.scenefile.law_files import save_law, save_law_csv
-
-draw_contact_law = later("afm_jax.plots.collisions:draw_contact_law")
 
 MODEL_KEYS = (
     "model",
@@ -91,7 +89,7 @@ def make_law(
         files={
             "law.json": lambda path: save_law(law, path),
             "law.csv": lambda path: save_law_csv(law, path),
-            "law.png": lambda path: draw_contact_law(laws, delay, path),
+            "law.png": picture_of("collisions:contact_law_figure", laws, delay),
         },
         json_file="collide.json",
         not_valid=f"the fit of {', '.join(lost)} did not converge; try another --speed-range" if lost else None,

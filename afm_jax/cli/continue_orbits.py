@@ -7,7 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from afm_jax.cli.columns import TableColumn, columns_of, printed_table
-from afm_jax.cli.command import NamedScene, Output, later
+from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.orbits import IMPACT_COLUMNS, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
@@ -18,9 +18,6 @@ from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve
 from afm_jax.dynamics.sticking_orbits import follow_sticking
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import counted
-
-draw_continuation = later("afm_jax.plots.branches:draw_continuation")
-draw_curves = later("afm_jax.plots.branches:draw_curves")
 
 POINT_COLUMNS = (
     "branch",
@@ -110,9 +107,9 @@ def _output(scene: NamedScene, followed: Continuation, picture: str) -> Output:
         "law_parameters": None if unknowns is None else list(unknowns.paths),
         "reason": reason,
     }
-    files = {f"branches.{picture}": lambda path: draw_continuation(followed, path, bands=bands, errors=errors)}
+    files = {f"branches.{picture}": picture_of("branches:continuation_figure", followed, bands=bands, errors=errors)}
     if followed.curves:
-        files[f"curves.{picture}"] = lambda path: draw_curves(followed, path)
+        files[f"curves.{picture}"] = picture_of("branches:curves_figure", followed)
     return Output(
         payload=payload,
         text=_text(followed, special, curves),

@@ -7,15 +7,13 @@ from typing import Any
 from rich.table import Table
 
 from afm_jax.cli.columns import TableColumn, columns_of, printed_table
-from afm_jax.cli.command import NamedScene, Output, later
+from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction, periods_read, study_effects
 from afm_jax.motion.start import default_start, start_of
 from afm_jax.scenefile.scenefile import Start, as_in_file, save_scene, scene_tables
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.words import counted, known
-
-draw_effects = later("afm_jax.plots.effects:draw_effects")
 
 CHANGES = ("peak_amplitude", "lockin_amplitude", "lockin_phase_deg", "energy_per_impact")
 """What is compared; all but the phase relative to the full scene."""
@@ -65,7 +63,11 @@ def effects(
         payload=payload,
         text=[_of_full(payload), _table(payload["effects"]), *_sentences(payload)],
         tables={"effects.csv": columns_of([_flat(effect) for effect in payload["effects"]], COLUMNS)},
-        files={"effects.png": lambda to: draw_effects(payload["effects"], payload["full"], payload["accuracy"], to)},
+        files={
+            "effects.png": picture_of(
+                "effects:effects_figure", payload["effects"], payload["full"], payload["accuracy"]
+            )
+        },
         json_file="effects.json",
     )
 

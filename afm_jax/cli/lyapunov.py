@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from afm_jax.cli.command import NamedScene, Output, later
+from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.bands import drawn_exponents
@@ -14,8 +14,6 @@ from afm_jax.motion.start import start_of
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.words import with_error
-
-draw_exponents = later("afm_jax.plots.dynamics:draw_exponents")
 
 _TOLD = (
     "exponents_per_us",
@@ -63,7 +61,7 @@ def lyapunov(
         ((path, along),) = values.items()
         payload |= {"parameter": path, "values": along}
         text = [_summary(many, str(ranges[0]))]
-        files[f"lyapunov.{picture}"] = lambda to: draw_exponents(path, along, many.exponents_per_impact, to, band)
+        files[f"lyapunov.{picture}"] = picture_of("dynamics:exponents_figure", many, path, along, band)
     else:
         text = _text(result, verdicts[0])
         if band is not None:

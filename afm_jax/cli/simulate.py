@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
+from afm_jax.cli.approach_curve import NOISE, PHASE_NOISE_DEG, approach
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.commands.simulate import DEFAULT_PERIODS
 from afm_jax.cli.session import Session
@@ -52,8 +53,15 @@ def simulation(  # noqa: PLR0913
     accuracy: float,
     method: str,
     samples: str | None,
+    heights: tuple[float, ...] | None,
+    noise: float | None,
+    phase_noise_deg: float | None,
 ) -> Output:
-    """Return a scene followed in time, and what an instrument reads of it."""
+    """Return a scene followed in time, and what an instrument reads of it; with heights an approach curve."""
+    if heights is not None:
+        settings = {"longest_periods": periods and math.ceil(periods), "accuracy": accuracy, "method": method}
+        errors = {"noise": noise or NOISE, "phase_noise_deg": phase_noise_deg or PHASE_NOISE_DEG}
+        return approach(session, scene, heights, settings, errors)
     until_settled = until_settled or (duration_us is None and periods is None)
     period_us = drive_of(scene.scene).period_us
     longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period_us

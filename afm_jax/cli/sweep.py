@@ -272,12 +272,13 @@ def _tell_estimate(session: Session, plan: "SweepPlan") -> None:
 def _draw(session: Session, plan: "SweepPlan") -> None:
     import xarray  # noqa: PLC0415
 
-    from afm_jax.plots.sweeps import draw_sweep  # noqa: PLC0415
+    from afm_jax.plots.picture_style import save  # noqa: PLC0415
+    from afm_jax.plots.sweeps import sweep_figure  # noqa: PLC0415
     from afm_jax.sweeps.store import STORE  # noqa: PLC0415
 
     assert session.out is not None  # asked before  # noqa: S101
     target = session.out / "sweep.png"
     with xarray.open_zarr(str(session.out / STORE)) as found:
         names = [variable.name for variable in plan.recorder.variables[:2]]
-        draw_sweep(found, names, target)
+        save(sweep_figure(found, names), target)
     session.note(f"wrote {target}")

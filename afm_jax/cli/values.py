@@ -226,6 +226,21 @@ class Grid(ValueKind):
         return columns, rows
 
 
+class Course(ValueKind):
+    """Numbers evenly spaced between two ends, from:to:count, in the order in which they are gone through."""
+
+    name = "course"
+
+    def read(self, text: str) -> tuple[float, ...]:
+        """Return the numbers, both ends among them."""
+        parts = re.fullmatch(r"([^:]+):([^:]+):([0-9]{1,4})", text)
+        first, last = (_number_or_nan(parts[1]), _number_or_nan(parts[2])) if parts else (math.nan, math.nan)
+        count = int(parts[3]) if parts else 0
+        if not (math.isfinite(first) and math.isfinite(last)) or first == last or count < 2:
+            raise ValueError(f"must be from:to:count as in -50:-4:24, but is {cut_short(text, 60)}")
+        return tuple(first + (last - first) * index / (count - 1) for index in range(count))
+
+
 PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11", "dry")
 """Names of `afm_jax.scenefile.presets.PRESETS`, stated here too because help and completion must not wait for JAX."""
 

@@ -1,7 +1,6 @@
 """Pictures of continuations: branches with their special points and bands, and curves in two parameters."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -12,11 +11,11 @@ from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.plots.dynamics import label_of
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 from afm_jax.units import TWO_SIDED_95
 
 _MARKS = {
-    "fold": ("o", ACCENT),
+    "fold": ("o", "black"),
     "period_doubling": ("s", "#009E73"),
     "torus": ("D", "#CC79A7"),
     "grazing": ("^", "#56B4E9"),
@@ -27,17 +26,6 @@ _MARKS = {
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
 
 
-def draw_continuation(
-    found: Continuation,
-    path: Path,
-    *,
-    bands: Sequence[Float[np.ndarray, " points"]] | None = None,
-    errors: Float[np.ndarray, " special"] | None = None,
-) -> None:
-    """Write the picture of a continuation as PDF, SVG or PNG; arguments as of `continuation_figure`."""
-    save(continuation_figure(found, bands=bands, errors=errors), path)
-
-
 def continuation_figure(
     found: Continuation,
     *,
@@ -45,6 +33,8 @@ def continuation_figure(
     errors: Float[np.ndarray, " special"] | None = None,
 ) -> Figure:
     """Return peak amplitude against the parameter: stable solid, unstable dashed, not admissible dotted and light.
+
+    Marks of special points are hollow: the branch goes on through them.
 
     Args:
         found: what is shown.
@@ -70,8 +60,9 @@ def continuation_figure(
             xerr=half,
             fmt=marker,
             color=colour,
-            markersize=7,
-            markeredgecolor="white",
+            markersize=8,
+            markerfacecolor="none",
+            markeredgewidth=1.8,
             capsize=3,
             zorder=4,
             label=_once(point.kind.replace("_", " "), labels),
@@ -105,7 +96,7 @@ def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint
     known = np.array([*state, *[-1] * len(special)])[rank]
     left, right = known[:-1], known[1:]
     lines = np.where(left < 0, right, np.where(right < 0, left, np.minimum(left, right)))
-    styles = ((":", GRID, "passes through the sample"), ("--", BLUE, "unstable"), ("-", BLUE, "stable"))
+    styles = ((":", GRID, "passes through the sample"), ("--", ACCENT, "unstable"), ("-", BLUE, "stable"))
     begin = 0
     for end in [*(np.flatnonzero(np.diff(lines)) + 1).tolist(), len(lines)]:
         if lines[begin] >= 0:
@@ -129,12 +120,11 @@ def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " point
         begin = end
 
 
-def draw_curves(found: Continuation, path: Path) -> None:
-    """Draw the curves of special points in two parameters, with cusps and meetings marked.
+def curves_figure(found: Continuation) -> Figure:
+    """Return the curves of special points in two parameters, with cusps and meetings marked.
 
     Args:
         found: what is shown.
-        path: PDF, SVG or PNG file, by its suffix.
 
     Raises:
         ValueError: if nothing was followed in two parameters.
@@ -165,4 +155,4 @@ def draw_curves(found: Continuation, path: Path) -> None:
     axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))
     if labels:
         axes.legend(fontsize=10, frameon=False)
-    save(figure, path)
+    return figure

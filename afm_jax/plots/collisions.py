@@ -1,89 +1,88 @@
 """The pictures of collisions: rebound speed and delay against approach speed; the laws fitted to them, their errors."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.contact.collide import Collision
 from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw
-from afm_jax.plots.picture_style import ACCENT, DARK, GRID, label_axes, new_figure, save
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 from afm_jax.results import known_columns
 from afm_jax.words import counted
 
 
-def draw_collisions(
-    rows: Sequence[Mapping[str, Any]], capture_speed_nm_per_us: float | None, path: Path, *, title: str
-) -> None:
-    """Write the picture of collisions as a PNG file.
+def collisions_figure(
+    found: Collision | Sequence[Mapping[str, Any]], capture_speed_nm_per_us: float | None = None, title: str = ""
+) -> Figure:
+    """Return rebound speed, delay and losses of collisions over the approach speed; where tips are captured is shaded.
+
+    Rebound speed, delay and losses are unknown where a tip does not leave. From a dozen tips on they are joined by
+    lines: fewer say too little of what lies between.
 
     Args:
-        rows: of `afm_jax.contact.collide.Collisions`.
-        capture_speed_nm_per_us: drawn as a line; None: there is none.
-        path: PNG file.
+        found: collisions, or rows of `afm_jax.contact.collide.Collisions`.
+        capture_speed_nm_per_us: where the captured range ends; None: at the fastest captured tip.
         title: of the picture.
     """
-    approach, rebound, delay = (np.array([row[name] for row in rows], dtype=float) for name in _DRAWN)
-    captured = np.array([bool(row["captured"]) for row in rows])
-    save(_collisions(approach, rebound, delay, captured, capture_speed_nm_per_us, title), path)
-
-
-def collisions_figure(found: Collision) -> Figure:
-    """Return the picture of collisions that `afm-jax collide` draws, too."""
-    columns = {name: array.ravel() for name, (array, _) in known_columns(found).items()}
-    title = f"Collisions of {counted(columns['captured'].size, 'free tip')}"
-    approach, rebound, delay = (columns[name] for name in _DRAWN)
-    return _collisions(approach, rebound, delay, columns["captured"], None, title)
-
-
-_DRAWN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
-
-
-def _collisions(
-    approach: Float[np.ndarray, " tips"],
-    rebound: Float[np.ndarray, " tips"],
-    delay: Float[np.ndarray, " tips"],
-    captured: Bool[np.ndarray, " tips"],
-    capture_speed_nm_per_us: float | None,
-    title: str,
-) -> Figure:
-    """Return rebound speed above and delay below, with u_out = u_in, the capture speed, and captured tips on the axis.
-
-    Rebound speed and delay are NaN where a tip has none; tips with speeds of their own are joined by lines.
-    """
-    usable = np.isfinite(approach) & (approach > 0.0)
-    approach, rebound, delay, captured = (part[usable] for part in (approach, rebound, delay, captured))
-    ranking = np.argsort(approach, kind="stable")
-    approach, rebound, delay, captured = (part[ranking] for part in (approach, rebound, delay, captured))
-    figure = new_figure(8.0, 7.2)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
-    ends = np.array([0.0, 1.03 * max(np.max(approach, initial=0.0), np.finfo(float).tiny)])
-    upper.plot(ends, ends, color=GRID, lw=1.2, ls="--", label=r"no loss, $u_{out} = u_{in}$")
-    joined = bool(np.all(np.diff(approach) > 0.0))
-    style = {"color": DARK, "lw": 1.4, "ls": "-" if joined else "", "ms": 4}
-    style["marker"] = "o" if len(approach) <= 60 or not joined else ""
-    upper.plot(approach, rebound, label="contact", **style)
-    lower.plot(approach, delay, **style)
-    lower.axhline(0.0, color=GRID, lw=0.8)
-    if captured.any():
+    if isinstance(found, Collision):
+        columns = {name: array.astype(float).ravel() for name, (array, _) in known_columns(found).items()}
+    else:
+        columns = {name: np.array([row[name] for row in found], float) for name in (*_DRAWN, *_LOSSES)}
+    usable = np.flatnonzero(columns["approach_speed_nm_per_us"] > 0.0)
+    usable = usable[np.argsort(columns["approach_speed_nm_per_us"][usable], kind="stable")]
+    columns = {name: array[usable] for name, array in columns.items()}
+    approach, rebound, delay, captured = (columns[name] for name in _DRAWN)
+    figure = new_figure(8.0, 9.0)
+    panels = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1.0, 1.0))
+    upper, middle, lower = panels
+    end = 1.03 * max(np.max(approach, initial=0.0), np.finfo(float).tiny)
+    upper.plot([0.0, end], [0.0, end], color=GRID, lw=1.2, ls="--", label=r"no loss, $u_{out} = u_{in}$")
+    joined = bool(np.all(np.diff(approach) > 0.0)) and len(approach) >= _FEWEST_JOINED
+    style = {
+        "lw": 1.6,
+        "ls": "-" if joined else "",
+        "ms": 4,
+        "marker": "o" if len(approach) <= 60 or not joined else "",
+    }
+    upper.plot(approach, rebound, color=DARK, label="contact", **style)
+    middle.plot(approach, delay, color=DARK, **style)
+    for name, (label, colour) in _LOSSES.items():
+        lower.plot(approach, columns[name], color=colour, label=label, **style)
+    is_captured = captured == 1.0
+    if is_captured.any():
         style = {"color": ACCENT, "ms": 7, "label": "captured", "clip_on": False}
-        upper.plot(approach[captured], np.zeros(captured.sum()), "x", **style)
-    if capture_speed_nm_per_us:
-        for axes in (upper, lower):
-            axes.axvline(capture_speed_nm_per_us, color=ACCENT, lw=1.2, ls=":")
-        upper.plot([], [], color=ACCENT, lw=1.2, ls=":", label=f"capture speed, {capture_speed_nm_per_us:.4g} nm/µs")
-    upper.set(xlim=ends, ylim=(0.0, ends[1]))
+        upper.plot(approach[is_captured], np.zeros(is_captured.sum()), "x", **style)
+    held_below = capture_speed_nm_per_us or np.max(approach[is_captured], initial=0.0)
+    if held_below:
+        exact = f" {capture_speed_nm_per_us:.4g} nm/µs" if capture_speed_nm_per_us else ""
+        label = f"captured below{exact}" if exact else "captured"
+        for axes in panels:
+            axes.axvspan(0.0, held_below, color=ACCENT, alpha=0.13, lw=0.0, label=label if axes is upper else None)
+    upper.set(xlim=(0.0, end), ylim=(0.0, end))
     label_axes(upper, x="", y=r"rebound speed  $u_{out}$ (nm/µs)")
-    label_axes(lower, x=r"approach speed  $u_{in}$ (nm/µs)", y="collision delay (µs)")
-    for axes in (upper, lower):
+    label_axes(middle, x="", y="collision delay (µs)")
+    label_axes(lower, x=r"approach speed  $u_{in}$ (nm/µs)", y="energy lost (aJ)")
+    middle.axhline(0.0, color=GRID, lw=0.8)
+    lower.margins(y=0.35)
+    lower.set_ylim(bottom=0.0)
+    for axes in panels:
         axes.grid(color=GRID, alpha=0.25)
-    upper.legend(fontsize=10, loc="lower right")
-    figure.suptitle(title, fontsize=12)
+    upper.legend(fontsize=10, loc="upper left")
+    lower.legend(fontsize=10, loc="upper right", ncols=3)
+    figure.suptitle(title or f"Collisions of {counted(usable.size, 'free tip')}", fontsize=12)
     return figure
+
+
+_FEWEST_JOINED = 12
+_DRAWN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "captured")
+_LOSSES = {
+    "bridge_hysteresis_aj": ("liquid bridge", BLUE),
+    "junction_hysteresis_aj": ("solid junction", ACCENT),
+    "viscous_loss_aj": ("viscous", "#009E73"),
+}
 
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
@@ -91,19 +90,18 @@ _COLOURS = {"law": "#D55E00", "viscous": "#0072B2", "full": "#009E73"}
 _NAMES = {"law": r"$r$, $\epsilon$", "viscous": r"$\epsilon$, $c$", "full": r"$r$, $\epsilon$, $c$"}
 
 
-def draw_contact_law(laws: Sequence[ContactLaw], delay: ContactDelay, path: Path) -> None:
-    """Draw the relative errors of the laws on the left, delay, lag, lead and delay law on the right.
+def contact_law_figure(laws: Sequence[ContactLaw], delay: ContactDelay) -> Figure:
+    """Return the relative errors of the laws on the left, delay, lag, lead and delay law on the right.
 
     Args:
         laws: at the same speeds.
         delay: of the same contact.
-        path: PNG file.
     """
     figure = new_figure(11.0, 5.0)
     left, right = figure.subplots(1, 2)
     _draw_laws(left, laws)
     _draw_delay(right, delay)
-    save(figure, path)
+    return figure
 
 
 def law_figure(law: ContactLaw) -> Figure:

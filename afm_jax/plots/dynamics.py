@@ -2,31 +2,35 @@
 
 import re
 from collections.abc import Sequence
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from afm_jax.dynamics.basins import Basins
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import surface_of
+from afm_jax.dynamics.basins import Attractor, Basins
 from afm_jax.dynamics.bifurcations import Sweep
 from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.dynamics.exponents import Lyapunov
 from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
+from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.impact.orbits import SingleImpactOrbits
+from afm_jax.motion.record import State, to_gap
 from afm_jax.plots.picture_style import (
     ACCENT,
     BLUE,
     DARK,
     GRID,
+    SKY,
     cell_edges,
     label_axes,
     new_figure,
-    save,
-    with_zero_line,
 )
 from afm_jax.results import unit_of, words_of
 
@@ -127,128 +131,124 @@ _FEW = 100
 """Orbits up to which marks are large."""
 
 
-def draw_exponents(
-    path: str,
-    values: Float[np.ndarray, " values"],
-    exponents: Float[np.ndarray, "values 2"],
-    target: Path,
-    band: Float[np.ndarray, "values 2"] | None = None,
-) -> None:
-    """Write the picture of exponents against a parameter, whose path is given, as PNG, PDF or SVG; see `_exponents`."""
-    save(_exponents(label_of(path), values, exponents, band), target)
-
-
-def exponents_figure(found: Lyapunov) -> Figure:
-    """Return the picture of the exponents of one motion, or of many in their order."""
-    exponents = np.asarray(found.exponents_per_impact, float).reshape(-1, 2)
-    return _exponents("number of the motion", np.arange(1.0, len(exponents) + 1.0), exponents)
-
-
-def _exponents(
-    label: str,
-    values: Float[np.ndarray, " values"],
-    exponents: Float[np.ndarray, "values 2"],
+def exponents_figure(
+    found: Lyapunov,
+    path: str = "",
+    values: Float[np.ndarray, " values"] | None = None,
     band: Float[np.ndarray, "values 2"] | None = None,
 ) -> Figure:
-    """Return both Lyapunov exponents per impact in a row; where they are minus infinity there is a tick below.
+    """Return both Lyapunov exponents per impact, of one motion or of many: chaos is what lies above the line at 0.
+
+    Where the tip rests they are minus infinity: such motions have a tick in a strip below the axis.
 
     Args:
-        label: what the values are.
-        values: of the parameter.
-        exponents: per impact.
+        found: the exponents.
+        path: of the parameter along which the motions are; empty: they are numbered.
+        values: of that parameter.
         band: within which 95 % of the larger one's draws lie.
     """
+    exponents = np.asarray(found.exponents_per_impact, float).reshape(-1, 2)
+    values = np.arange(1.0, len(exponents) + 1.0) if values is None else values
     figure = new_figure(9.0, 4.8)
     axes: Axes = figure.subplots()
-    size = 8.0 if len(values) < 10 else max(0.5, min(3.0, 3000.0 / len(values)))
+    size = 8.0 if len(values) < 10 else max(0.8, min(3.0, 3000.0 / len(values)))
     if band is not None:
         finite = np.where(np.isfinite(band), band, np.nan)
         axes.fill_between(values, finite[:, 0], finite[:, 1], color=ACCENT, alpha=0.25, linewidth=0.0)
-    axes.plot(values, exponents[:, 1], ".", ms=size, color=BLUE, label="smaller exponent", rasterized=True)
-    axes.plot(values, exponents[:, 0], ".", ms=size, color=ACCENT, label="larger exponent", rasterized=True)
+    # of many motions both are equal: the smaller one shows around the larger one
+    axes.plot(
+        values, exponents[:, 1], ".", ms=2.5 * size, color=SKY, mew=0.0, label="smaller exponent", rasterized=True
+    )
+    axes.plot(values, exponents[:, 0], ".", ms=size, color=ACCENT, mew=0.0, label="larger exponent", rasterized=True)
     finite = exponents[np.isfinite(exponents)]
-    low = float(np.quantile(finite, 0.01)) - 0.3 if finite.size else -1.0
-    high = float(finite.max()) + 0.2 if finite.size else 1.0
+    low, high = (float(np.quantile(finite, 0.01)), float(finite.max())) if finite.size else (-1.0, 1.0)
     gone = np.isneginf(exponents[:, 0])
     if gone.any():
-        axes.plot(values[gone], np.full(gone.sum(), low), ".", color=DARK, ms=size, label="the tip rests or sticks")
+        style = {"transform": axes.get_xaxis_transform(), "color": DARK, "ms": 9.0, "rasterized": True}
+        label = r"the tip rests: both are $-\infty$"
+        axes.plot(values[gone], np.full(gone.sum(), _STRIP / 2), "|", label=label, **style)
+        axes.axhline(low - 0.3, color=DARK, linewidth=0.8)
+        axes.annotate(r"$-\infty$", (-0.01, _STRIP / 2), xycoords="axes fraction", ha="right", va="center", fontsize=11)
     margin = 0.5 if len(values) == 1 else 0.0
-    axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.1, high))
-    with_zero_line(axes)
-    axes.axhline(0.0, color=GRID, linewidth=1.2)
-    label_axes(axes, x=label, y="Lyapunov exponent per impact")
+    strip = _STRIP / (1.0 - _STRIP) * (high + 0.2 - (low - 0.3)) if gone.any() else 0.0
+    axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.3 - strip, high + 0.2))
+    # no ticks in the strip
+    axes.set_yticks([tick for tick in axes.get_yticks() if low - 0.3 <= tick <= high + 0.2])
+    axes.grid(color=GRID, alpha=0.25)
+    axes.axhline(0.0, color="black", linewidth=1.0)
+    label_axes(axes, x=label_of(path) if path else "number of the motion", y="Lyapunov exponent per impact")
     legend = figure.legend(loc="outside upper center", ncols=3, fontsize=11, frameon=False)
     for handle in legend.get_lines():
         handle.set_markersize(10.0)
     return figure
 
 
-def draw_bifurcations(
-    path: str,
-    sweeps: Sequence[Sweep],
-    target: Path,
-    probabilities: Sequence[Float[np.ndarray, " values"]] | None = None,
-) -> None:
-    """Write a bifurcation diagram over a parameter, whose path is given, as PNG, PDF or SVG; see `_bifurcations`."""
-    save(_bifurcations(label_of(path), sweeps, probabilities), target)
+_STRIP = 0.07
+"""Height of the strip for exponents of minus infinity, of the axis."""
 
 
-def bifurcation_figure(sweep: Sweep) -> Figure:
-    """Return the bifurcation diagram of one sweep, as `afm-jax bifurcation` draws it."""
-    return _bifurcations("parameter", [sweep])
-
-
-def _bifurcations(
-    label: str,
-    sweeps: Sequence[Sweep],
+def bifurcation_figure(
+    sweeps: Sweep | Sequence[Sweep],
+    path: str = "",
     probabilities: Sequence[Float[np.ndarray, " values"]] | None = None,
 ) -> Figure:
     """Return a bifurcation diagram: height at impact, and the tip's height whenever the drive's phase is 0.
 
+    Where the motion ended the ground has the ramp's colour.
+
     Args:
-        label: what the values are.
-        sweeps: up, down or both; where both are, the one down lies over the one up.
-        probabilities: of each sweep's verdicts; where one is below 95 % there is a grey ground.
+        sweeps: one ramp of the parameter, or up and down; where both are, the one down lies over the one up.
+        path: of the parameter.
+        probabilities: of each ramp's verdicts; where one is below 95 % there is a grey ground.
     """
+    sweeps = [sweeps] if isinstance(sweeps, Sweep) else sweeps
     figure = new_figure(9.0, 8.0)
     panels = figure.subplots(2, 1, sharex=True)
     for sweep in sweeps:
-        colour, word = (BLUE, "swept up") if sweep.upward else (ACCENT, "swept down")
-        parts = (sweep.height_nm, sweep.strobe_height_nm)
-        for axes, part in zip(panels, parts, strict=True):
+        colour, word = (BLUE, "ramped up") if sweep.upward else (ACCENT, "ramped down")
+        size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [8.0, 5.0, 4.0, 1.0]))
+        for axes, part in zip(panels, (sweep.height_nm, sweep.strobe_height_nm), strict=True):
             there = np.isfinite(part)
             at = np.repeat(sweep.values, there.sum(axis=1))
-            size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [6.0, 3.0, 3.0, 1.0]))
-            style = {"ms": size, "alpha": 0.5, "rasterized": True}
-            axes.plot(at, part[there], ".", color=colour, mew=0.0, label=word, **style)
+            axes.plot(at, part[there], ".", color=colour, mew=0.0, ms=size, alpha=0.5, label=word, rasterized=True)
+            for kind, (what, hatch) in _ENDED.items():
+                _shade(axes, sweep, sweep.verdicts.kind == kind, color=colour, hatch=hatch, label=f"{word}: {what}")
     for sweep, sure in zip(sweeps, probabilities or (), strict=False):
         for axes in panels:
-            ground = axes.get_xaxis_transform()
-            axes.fill_between(sweep.values, 0.0, 1.0, where=sure < 0.95, color=GRID, alpha=0.3, lw=0, transform=ground)
+            _shade(axes, sweep, sure < _SURE, color=GRID, label="verdict uncertain")
     label_axes(panels[0], x="", y="height at impact (nm)")
-    label_axes(panels[1], x=label, y="height at drive phase 0 (nm)")
+    label_axes(panels[1], x=label_of(path) if path else "parameter", y="height at drive phase 0 (nm)")
     # also where the tip is stuck and there is nothing to draw
     ends = [end for sweep in sweeps for end in (sweep.values.min(), sweep.values.max())]
     margin = 0.5 * (max(ends) - min(ends)) / len(sweeps[0].values)
     panels[0].set_xlim(min(ends) - margin, max(ends) + margin)
     for axes in panels:
         axes.grid(color=GRID, alpha=0.25)
-    handles, labels = panels[0].get_legend_handles_labels()
-    legend = figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=11, frameon=False)
+    named = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
+    legend = figure.legend(
+        named.values(), named.keys(), loc="outside upper center", ncols=2, fontsize=11, frameon=False
+    )
     for handle in legend.get_lines():
         handle.set(markersize=10.0, alpha=1.0)
     return figure
 
 
-def draw_chart(
-    x: str,
-    y: str,
-    chart: StabilityChart,
-    target: Path,
-    probability: Float[np.ndarray, "orders points"] | None = None,
-) -> None:
-    """Write a chart of stable single-impact orbits over two parameters, whose paths are given, as PNG, PDF or SVG."""
-    save(chart_figure(chart, label_of(x), label_of(y), probability), target)
+_SURE = 0.95
+"""Share of drawn laws with a verdict from which on it counts as sure."""
+_ENDED = {
+    MotionKind.STUCK: ("the platform holds the tip", None),
+    MotionKind.FREE: ("the tip has flown away", "//"),
+    MotionKind.UNRESOLVED: ("not followed to the end", "xx"),
+}
+"""What is said of motions without impacts to draw, and their ground."""
+
+
+def _shade(axes: Axes, sweep: Sweep, where: Bool[np.ndarray, " values"], **style: Any) -> None:
+    """Give the ground of a panel a colour at some of a ramp's values."""
+    edges = cell_edges(sweep.values)
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
+    for begin, end in zip(changes[::2], changes[1::2], strict=True):
+        axes.axvspan(float(edges[begin]), float(edges[end]), alpha=0.15, lw=0.0, **style)
 
 
 def chart_figure(
@@ -257,12 +257,12 @@ def chart_figure(
     y: str = "second parameter",
     probability: Float[np.ndarray, "orders points"] | None = None,
 ) -> Figure:
-    """Return a picture of a chart: the lowest stable order, and how stable its orbit is.
+    """Return a picture of a chart: the lowest stable order, and how stable its orbit is; white where none is stable.
 
     Args:
         chart: the chart.
-        x: what its columns are.
-        y: what its rows are.
+        x: path of the parameter of its columns.
+        y: path of that of its rows.
         probability: that an orbit of each order is stable; dashed where that of one is 2.5 or 97.5 %.
     """
     figure = new_figure(12.0, 5.2)
@@ -277,30 +277,37 @@ def chart_figure(
     bar = figure.colorbar(mesh, ax=left, ticks=orders)
     bar.ax.set_yticklabels([f"(1,{order})" for order in orders])
     several = (stable.sum(axis=0) > 1).astype(float)
+    known: list[Any] = [
+        Patch(facecolor="white", edgecolor=DARK, label=f"no stable orbit of one impact, N up to {chart.orders}")
+    ]
     if several.any() and not several.all():
+        known.append(Line2D([], [], color="black", linewidth=1.0, label="within: several orders are stable"))
         left.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)
-    left.set_title("lowest stable order (black line: several coexist)", fontsize=12)
+    left.set_title("lowest stable order N", fontsize=12)
     for row in () if probability is None else probability.reshape(stable.shape):
         if row.min() < row.max():
             style = {"colors": DARK, "linewidths": 0.8, "linestyles": "dashed"}
             left.contour(chart.x_values, chart.y_values, row, levels=[0.025, 0.975], **style)
     sizes = chart.verdicts.largest_multiplier.reshape(stable.shape)
     lowest_size = np.take_along_axis(sizes, np.maximum(lowest - 1, 0)[None], axis=0)[0]
-    mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=0.0, vmax=1.0, rasterized=True)
-    figure.colorbar(mesh, ax=right, label="size of its larger multiplier")
-    right.set_title("how stable", fontsize=12)
-    label_axes(left, x=x, y=y)
-    label_axes(right, x=x, y="")
+    least = float(np.nanmin(lowest_size)) if np.isfinite(lowest_size).any() else 0.0
+    # a wide tongue is damped alike throughout: the colours show how it loses its stability at the edges
+    mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=min(least, 0.99), vmax=1.0, rasterized=True)
+    figure.colorbar(mesh, ax=right, label="size of its larger multiplier; 1: stability is lost")
+    right.set_title("how stable its orbit is", fontsize=12)
+    label_axes(left, x=label_of(x), y=label_of(y))
+    label_axes(right, x=label_of(x), y="")
+    figure.legend(handles=known, loc="outside lower center", ncols=2, fontsize=11, frameon=False)
     return figure
 
 
-def draw_basins(basins: Basins, target: Path) -> None:
-    """Write the picture of basins as PNG, PDF or SVG."""
-    save(basins_figure(basins), target)
+def basins_figure(basins: Basins, scene: Scene | None = None) -> Figure:
+    """Return a picture of which start ends where, with the impacts of the orbits where the scene is known.
 
-
-def basins_figure(basins: Basins) -> Figure:
-    """Return a picture of which start ends where, and the points of the orbits."""
+    Args:
+        basins: of the scene.
+        scene: whose platform tells with which rebound speed the orbits leave it.
+    """
     figure = new_figure(8.4, 6.0)
     axes: Axes = figure.subplots()
     number = min(len(basins.attractors), len(KINDS))
@@ -308,12 +315,41 @@ def basins_figure(basins: Basins) -> Figure:
     edges = cell_edges(degrees), cell_edges(basins.rebound_speed_nm_per_us)
     shown = np.minimum(basins.attractor, number - 1)
     axes.pcolormesh(*edges, shown, cmap=ListedColormap(KINDS[:number]), vmin=-0.5, vmax=number - 0.5, rasterized=True)
-    handles = [
-        Patch(color=KINDS[index], label=f"{attractor.name}: {100.0 * share:.3g} %")
+    handles: list[Any] = [
+        Patch(color=KINDS[index], label=f"{attractor.name}: {100.0 * share:.3g} % of the starts")
         for index, (attractor, share) in enumerate(zip(basins.attractors, basins.share, strict=True))
         if index < number
     ]
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xticks=range(0, 361, 90))
+    if scene is not None:
+        handles += [_mark_orbits(axes, basins.attractors[:number], scene)]
     label_axes(axes, x="drive phase at the start (deg)", y=r"rebound speed at the start (nm/$\mu$s)")
-    figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=11, frameon=False)
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=11, frameon=False)
     return figure
+
+
+def _mark_orbits(axes: Axes, attractors: Sequence[Attractor], scene: Scene) -> Line2D:
+    """Mark the impacts of orbits, at the edge where they are faster than all starts; return the legend's mark."""
+    top = axes.get_ylim()[1]
+    surface, response = surface_of(scene)
+    omega = drive_of(scene).angular_frequency
+    style = {"color": "white", "markeredgecolor": "black", "ms": 11.0, "clip_on": False, "zorder": 5}
+    for attractor, colour in zip(attractors, KINDS, strict=False):
+        state = State(attractor.phase_rad / omega, np.zeros_like(attractor.phase_rad), attractor.velocity_nm_per_us)
+        speeds = np.asarray(to_gap(surface, response, state)[1])
+        for phase, speed in zip(np.degrees(attractor.phase_rad), speeds, strict=True):
+            axes.plot(phase, min(speed, top), "o" if speed <= top else "^", **style)
+            if speed > top:
+                said = f"{attractor.name} at {speed:.3g} nm/µs"
+                place = {
+                    "xytext": (10, -16),
+                    "textcoords": "offset points",
+                    "ha": "left" if phase < _RIGHT else "right",
+                }
+                box = {"facecolor": "white", "edgecolor": colour, "boxstyle": "round,pad=0.2"}
+                axes.annotate(said, (phase, top), fontsize=10, bbox=box, **place)
+    return Line2D([], [], ls="", marker="o", label="impacts of the orbits", **{**style, "clip_on": True})
+
+
+_RIGHT = 250.0
+"""Phase in degrees from which on there is no room for words to the right."""

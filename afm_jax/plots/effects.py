@@ -1,29 +1,26 @@
 """The picture of a scene's effects: what leaving each out changes, beside what it saves."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 
 _LEAST = 1e-6
 """Relative changes below are drawn as this."""
 
 
-def draw_effects(
-    effects: Sequence[Mapping[str, Any]], full: Mapping[str, Any], accuracy: float | None, path: Path
-) -> None:
-    """Draw a bar of change and one of cost for every effect.
+def effects_figure(effects: Sequence[Mapping[str, Any]], full: Mapping[str, Any], accuracy: float | None) -> Figure:
+    """Return a bar of change and one of cost for every effect.
 
     Args:
         effects: as in the JSON object of `afm-jax effects`.
         full: the full scene there.
         accuracy: drawn as a line; None: none was wanted.
-        path: PNG file.
     """
     figure = new_figure(11.0, 2.0 + 0.55 * max(len(effects), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
@@ -33,7 +30,7 @@ def draw_effects(
     left.set_yticks(rows, [effect["name"].replace("_", " ") for effect in effects])
     left.set_ylim(len(effects) - 0.4, -0.6)
     figure.suptitle("Leaving out one effect", fontsize=12)
-    save(figure, path)
+    return figure
 
 
 def _draw_changes(axes: Axes, effects: Sequence[Mapping[str, Any]], accuracy: float | None) -> None:

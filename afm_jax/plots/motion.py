@@ -13,7 +13,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.motion.observe import peaks_between_contacts, poincare_section
 from afm_jax.motion.record import ContactKind, Contacts, Simulation
-from afm_jax.motion.settle import Settled, settled, window_of
+from afm_jax.motion.settle import Settled, is_stuck, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
 from afm_jax.plots.picture_style import (
     ACCENT,
@@ -77,16 +77,15 @@ def draw_motion(
         ValueError: if the simulation is a batch, or did not get beyond its start.
     """
     look = look_at(scene, simulation, verdict=verdict, dense=dense)
-    drawings = {"time_course": draw_course, "spectrum": draw_spectrum}
+    figures = {"time_course": course_figure, "spectrum": spectrum_figure}
     if look.touched:
-        drawings |= {"gap": draw_gap}
-        drawings |= {"poincare": draw_section} if look.left else {}
-        drawings |= {"force_gap": draw_force_gap} if isinstance(scene.interaction, Contact) else {}
+        figures |= {"gap": gap_figure}
+        figures |= {"poincare": section_figure} if look.left else {}
+        figures |= {"force_gap": force_gap_figure} if isinstance(scene.interaction, Contact) else {}
     files = []
-    for name, draw in drawings.items():
-        path = folder / f"{name}.png"
-        draw(look, path)
-        files.append(path)
+    for name, figure in figures.items():
+        files.append(folder / f"{name}.png")
+        save(figure(look), files[-1])
     return files
 
 
@@ -257,15 +256,15 @@ def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
             label = None
 
 
-def draw_course(look: Look, path: Path) -> None:
-    """Draw the time course as a PNG file."""
+def course_figure(look: Look) -> Figure:
+    """Return the time course, of many contacts with the peaks of the whole motion below."""
     overview = int(look.used.sum()) >= _MANY
     picture = new_figure(9.0, 7.0 if overview else 4.6)
     axes = picture.subplots(1 + overview, 1, squeeze=False)[:, 0]
     _course(axes[0], look)
     if overview:
         _peaks(axes[1], look)
-    save(picture, path)
+    return picture
 
 
 def _course(axes: Axes, look: Look) -> None:
@@ -292,8 +291,11 @@ def _title(look: Look) -> str:
     if not look.touched:
         what = "the tip never meets the sample" if look.scene.interaction is not None else "a free cantilever"
         return f"Last periods; {what}"
-    held = bool(look.simulation.held) and not np.isfinite(look.departure_us[-1])
-    return f"The last contacts of {int(look.used.sum())}" + (", the tip held in the last one" if held else "")
+    shown = int(look.used.sum())
+    if np.isfinite(look.departure_us[-1]):
+        return f"The last contacts of {shown}"
+    end = "the sample holds the tip" if is_stuck(look.scene, look.simulation) else "the last one not over at the end"
+    return f"The last contacts of {shown}, {end}"
 
 
 def _peaks(axes: Axes, look: Look) -> None:
@@ -312,9 +314,9 @@ def _peaks(axes: Axes, look: Look) -> None:
     axes.legend(loc="upper right", fontsize=10, framealpha=1.0)
 
 
-def draw_gap(look: Look, path: Path) -> None:
-    """Draw the gap as a PNG file: around the last contacts; of impacts that take no time, over the flights between."""
-    save(_gap_of_contacts(look) if isinstance(look.scene.interaction, Contact) else _gap_of_flights(look), path)
+def gap_figure(look: Look) -> Figure:
+    """Return the gap around the last contacts; of impacts that take no time, over the flights between."""
+    return _gap_of_contacts(look) if isinstance(look.scene.interaction, Contact) else _gap_of_flights(look)
 
 
 def _gap_of_flights(look: Look) -> Figure:
@@ -385,8 +387,8 @@ def _marks(contact: Contact) -> dict[str, float]:
     }
 
 
-def draw_force_gap(look: Look, path: Path) -> None:
-    """Draw the force against the gap through the last contacts as a PNG file: all of it, and the attractive part."""
+def force_gap_figure(look: Look) -> Figure:
+    """Return the force against the gap through the last contacts: all of it, and the attractive part."""
     picture = new_figure(12.0, 5.0)
     whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
     rows = np.arange(look.arrival_us.size)[-_CURVES:]
@@ -394,7 +396,8 @@ def draw_force_gap(look: Look, path: Path) -> None:
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
         path_of_row = look.between(*_around(look, int(row)))
         lost = float(np.asarray(look.contacts.energy_lost_aj)[look.used][row])
-        label = f"contact {row + 1}: {lost:.1f} aJ lost"
+        over = np.isfinite(look.departure_us[row])
+        label = f"contact {row + 1}: " + (f"{lost:.1f} aJ lost" if over else "not over")
         least = min(least, float(path_of_row.force_nn.min()))
         for axes in (whole, part):
             axes.plot(path_of_row.gap_nm, path_of_row.force_nn, color=colour, linewidth=width, label=label)
@@ -423,15 +426,15 @@ def draw_force_gap(look: Look, path: Path) -> None:
     part.legend(loc="lower right", fontsize=10, framealpha=1.0)
     whole.set_title("Force against gap", fontsize=12, loc="left")
     part.set_title("the attractive part, with its loops", fontsize=12, loc="left")
-    save(picture, path)
+    return picture
 
 
 _LEAST_SHOWN = 0.02
 """Least height of the section's axis, either way, of the largest velocity."""
 
 
-def draw_section(look: Look, path: Path) -> None:
-    """Draw the section as a PNG file, the order in time as a shade."""
+def section_figure(look: Look) -> Figure:
+    """Return the Poincaré section, the order in time as a shade."""
     section = poincare_section(look.scene, look.simulation)
     picture = new_figure(7.5, 5.4)
     axes = picture.subplots()
@@ -453,7 +456,7 @@ def draw_section(look: Look, path: Path) -> None:
     axes.legend(loc="best", fontsize=10, framealpha=1.0)
     narrow = f", within {2.0 * spread:.1e} nm/µs" if half > 1.1 * spread and phase.size > 1 else ""
     axes.set_title(f"Poincaré section, {phase.size} departures{narrow}", fontsize=12, loc="left")
-    save(picture, path)
+    return picture
 
 
 class Spectrum(NamedTuple):
@@ -495,14 +498,14 @@ def spectrum_of(look: Look) -> Spectrum:
     )
 
 
-def draw_spectrum(look: Look, path: Path) -> None:
-    """Draw the spectrum as a PNG file."""
+def spectrum_figure(look: Look) -> Figure:
+    """Return the spectrum, with the drive, a second tone, the response and the free vibration marked."""
     found = spectrum_of(look)
     picture = new_figure(9.0, 5.0)
     axes = picture.subplots()
     drive = 1e3 / look.drive.period_us
     slow = min(found.response_khz, 2.0 * float(look.scene.cantilever.frequency_khz))
-    top = max(_HIGHEST * slow, 2.2 * drive)
+    top = max(_HIGHEST * slow, 2.2 * drive, *(1.1 * tone for tone in _further_tones_khz(look.scene, drive)))
     shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= top * (1.0 + 1e-9))
     frequency, amplitude = found.frequency_khz[shown], found.amplitude_nm[shown]
     floor = max(float(amplitude.max()) * _DECADES, 1e-12)
@@ -520,6 +523,11 @@ def draw_spectrum(look: Look, path: Path) -> None:
         for multiple in range(1, int(right / found.response_khz + 1e-9) + 1):
             axes.axvline(multiple * found.response_khz, color=BLUE, linewidth=1.0, linestyle=":", label=label)
             label = None
+    label = "second frequency"
+    for tone in _further_tones_khz(look.scene, drive):
+        axes.axvline(tone, color="#009E73", linewidth=3.0, linestyle=(0, (3, 1)), alpha=0.7, label=label)
+        label = None
+        right = max(right, tone)
     free = float(look.scene.cantilever.frequency_khz)
     if free <= right:
         axes.axvline(free, color=DARK, linewidth=1.4, linestyle="--", label="free frequency")
@@ -529,4 +537,12 @@ def draw_spectrum(look: Look, path: Path) -> None:
     axes.legend(loc="upper right", fontsize=10, ncols=3, framealpha=1.0)
     kind = f"{found.periods} response periods" if found.repeats else f"{found.periods} drive periods, nothing repeats"
     axes.set_title(f"Spectrum of the deflection ({kind})", fontsize=12, loc="left")
-    save(picture, path)
+    return picture
+
+
+def _further_tones_khz(scene: Scene, drive_khz: float) -> list[float]:
+    """Return the frequencies that drive a scene besides the drive's."""
+    second = () if scene.platform.second is None else (scene.platform.second,)
+    tones = (*second, *(tone for part in (scene.base, scene.force) if part is not None for tone in part.tones))
+    frequencies = {float(tone.frequency_khz) for tone in tones if float(tone.amplitude) != 0.0}
+    return sorted(one for one in frequencies if abs(one - drive_khz) > 1e-9 * drive_khz)

@@ -18,6 +18,7 @@ DARK = "#3b4a5a"
 ACCENT = "#b34700"
 """A dark orange that stands off white, black and DARK for every kind of colour vision."""
 BLUE = "#0072B2"
+SKY = "#56B4E9"
 GRID = "#9aa5b1"
 _FONT = 11.0
 _DPI = 200.0

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from afm_jax.plots.dynamics import label_of
-from afm_jax.plots.picture_style import GRID, cell_edges, label_axes, new_figure, save
+from afm_jax.plots.picture_style import GRID, cell_edges, label_axes, new_figure
 from afm_jax.sweeps.axes import dimension_of
 
 if TYPE_CHECKING:
@@ -25,13 +24,12 @@ _MOST_IN_BETWEEN = 100.0
 """Ratio of the ends up to which there is room for labels between powers of ten."""
 
 
-def draw_sweep(found: "xarray.Dataset", names: Sequence[str], target: Path) -> None:
-    """Draw variables of a sweep side by side, one below the other what has further values at each point.
+def sweep_figure(found: "xarray.Dataset", names: Sequence[str]) -> Figure:
+    """Return variables of a sweep side by side, one below the other what has further values at each point.
 
     Args:
         found: the results, along one or two axes.
         names: of the variables.
-        target: PNG, PDF or SVG file.
 
     Raises:
         ValueError: if there are more axes.
@@ -60,7 +58,7 @@ def draw_sweep(found: "xarray.Dataset", names: Sequence[str], target: Path) -> N
                 _plane(figure, panel, thin, along, axes, layers[row], label)
             else:
                 panel.set_visible(False)
-    save(figure, target)
+    return figure
 
 
 def _logarithmic(found: "xarray.Dataset") -> list[str]:

@@ -1,6 +1,7 @@
 """The pictures of a fit: measured and predicted amplitudes, residuals, and the law with its band."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,11 +17,12 @@ from fitting.report.words import has_delay, values_of_formula
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
 ALARM = "#B00020"
-SMALL = 8
-_WIDTH_INCHES, DPI = 10.0, 120.0
+SMALL = 9
+_WIDTH_INCHES, DPI = 6.4, 190.0
+"""Narrow enough that letters can still be read on a screen of 420 pixels."""
 _KINDS = ("peak", "lock-in", "phase")
 _EXCLUDED = "#999999"
-_ROW_AXIS = "drive frequency (kHz), for each order N to scale; rows of one frequency beside each other"
+_ROW_AXIS = "drive frequency (kHz), for each order N to scale;\nrows of one frequency beside each other"
 _HEIGHT = "height of the sample over the tip's rest position (nm)"
 _MUCH = 5.0
 """How much the loss must change to be drawn on a logarithmic axis."""
@@ -49,21 +51,24 @@ def rows_figure(result: FitResult) -> Figure:
     for panel, axes in zip(draw, panels, strict=True):
         panel(axes, result)
     named = [one for axes in panels for one in zip(*axes.get_legend_handles_labels(), strict=True)]
-    figure.legend(*zip(*named, strict=True), fontsize=SMALL, ncols=5, loc="outside lower center")
+    figure.legend(*zip(*named, strict=True), fontsize=SMALL, ncols=3, loc="outside lower center")
     goodness = f"chi²/dof = {result.chi2:.4g}/{result.degrees_of_freedom}"
     title = f"Impact law from {result.table.rows} rows, model {result.model}, {goodness}"
     colour = "black" if result.valid else ALARM
-    figure.suptitle(title if result.valid else f"NOT VALID    {title}", color=colour, fontsize=12)
+    figure.suptitle(title if result.valid else f"NOT VALID    {title}", color=colour, fontsize=11)
     return figure
 
 
 def law_figure(result: FitResult) -> Figure:
     """Return the figure of the law: rebound speed, its band, energy lost, and the delay where impacts last."""
-    draw = [draw_law, draw_band, draw_losses, *([draw_delay] if has_delay(result) else [])]
-    shape, height = ((2, 2), 6.4) if len(draw) == 4 else ((1, 3), 3.6)
-    figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
-    for panel, axes in zip(draw, figure.subplots(*shape).ravel(), strict=True):
-        panel(axes, result)
+    figure = Figure(figsize=(_WIDTH_INCHES, 5.6), layout="constrained")
+    panels = {"law": draw_law, "band": draw_band, "losses": draw_losses}
+    panels |= {"delay": draw_delay} if has_delay(result) else {}
+    # without a delay the law has all of the upper row
+    rows = "law losses; band delay" if has_delay(result) else "law law; band losses"
+    mosaic: list[Any] = [row.split() for row in rows.split("; ")]
+    for name, axes in figure.subplot_mosaic(mosaic).items():
+        panels[name](axes, result)
     return figure
 
 
@@ -209,7 +214,7 @@ def draw_residuals_by_speed(axes: Axes, result: FitResult) -> None:
             axes.plot(speed, residual, "o", ms=3.5, color=COLOURS[kind], label=_KINDS[kind])
     if (np.isfinite(speed) & np.isfinite(result.rows.residual).any(axis=1)).any():
         log_speed_axis(axes)
-        axes.legend(fontsize=SMALL, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        axes.legend(fontsize=SMALL, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
     axes.set_ylabel("residual (errors)")
     axes.set_xlabel(_APPROACH)
 
@@ -264,7 +269,7 @@ def _name_frequencies(axes: Axes, result: FitResult) -> None:
             here = (order == one) & (frequency == different[chosen])
             ticks.append(float(places[here].mean()))
             names.append(f"{different[chosen]:.4g}")
-    axes.set_xticks(ticks, names)
+    axes.set_xticks(ticks, names, rotation=35, ha="right", rotation_mode="anchor")
     for number in range(1, len(np.unique(order))):
         axes.axvline(number, color="0.7", lw=0.8)
 

@@ -21,6 +21,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome
 from afm_jax.motion.follow import state_after, where_to_go_on
 from afm_jax.motion.observe import observe
 from afm_jax.motion.periodic import close_periods, ends_in_flight
@@ -359,6 +360,48 @@ def simulate_experiment(  # noqa: PLR0913
     return SimulatedExperiment(table=with_noise(exact, draws), exact=exact, left_out=left_out)
 
 
+@checked
+def table_of_curve(
+    curve: ApproachCurve, *, noise: float = 0.003, phase_noise_deg: float = 0.2, seed: int = 0
+) -> AmplitudeTable:
+    """Return an approach curve as an instrument gives it: with noise, as `tapping` reads it.
+
+    Heights at which the tip neither taps once in a drive period nor is free have no amplitude (`no_orbit`).
+
+    Args:
+        curve: of `afm_jax.approach_curve`.
+        noise: standard error of an amplitude relative to it.
+        phase_noise_deg: standard error of a lag.
+        seed: of the noise.
+
+    Raises:
+        ValueError: if the noise is not between 0 and 1, or that of the lag not between 0 and 90 degrees.
+    """
+    _check_noise(noise, phase_noise_deg)
+    check_count("seed", seed, 0)
+    cantilever, count = curve.scene.cantilever, len(curve.height_nm)
+    told = np.isin(curve.outcome, (CurveOutcome.TAPS, CurveOutcome.FREE))
+    amplitude = np.where(told, curve.amplitude_nm, np.nan)
+    known = cantilever.quality_factor
+    exact = AmplitudeTable(
+        drive=curve.drive,
+        drive_frequency_khz=np.full(count, curve.drive_frequency_khz),
+        free_amplitude_nm=np.full(count, curve.free_amplitude_nm),
+        offset_nm=curve.height_nm,
+        lockin_amplitude_nm=amplitude,
+        lockin_amplitude_error_nm=noise * amplitude,
+        phase_lag_deg=np.where(told, curve.phase_lag_deg, np.nan),
+        phase_lag_error_deg=np.where(told, phase_noise_deg, np.nan),
+        retract=curve.retract.astype(float),
+        no_orbit=(~told).astype(float),
+        free_frequency_khz=float(cantilever.frequency_khz),
+        quality_factor=None if known is None else float(known),
+        mass_ng=float(cantilever.mass_ng),
+        remarks=(f"simulated; noise of {100.0 * noise:g} % and {phase_noise_deg:g} degrees, seed {seed}",),
+    )
+    return with_noise(exact, np.random.default_rng(seed).normal(size=(3, count)))
+
+
 def with_noise(exact: AmplitudeTable, draws: Float[np.ndarray, "3 rows"]) -> AmplitudeTable:
     """Return a table with its errors times standard normal draws added, rounded to six digits as an instrument prints.
 
@@ -406,11 +449,15 @@ def _check(drives: Drives, drive: str, noise: float, phase_noise_deg: float | No
     check_drive(drive)
     if drive != "sample" and np.any(np.asarray(drives.order) != 1):
         raise ValueError(f"`drives` must have the order 1 where the {drive} is driven: that is what is read")
-    if not 0.0 < noise < 1.0:
-        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
-    if phase_noise_deg is not None and not 0.0 < phase_noise_deg < 90.0:
-        raise ValueError(f"`phase_noise_deg` must be between 0 and 90, but is {phase_noise_deg!r}")
+    _check_noise(noise, phase_noise_deg)
     if not len(drives.order) or np.any(np.asarray(drives.order) < 1):
         raise ValueError("`drives` must hold at least one drive, and orders of 1 or more")
     if np.any(np.asarray(drives.frequency_khz) <= 0.0) or np.any(np.asarray(drives.amplitude_nm) <= 0.0):
         raise ValueError("`drives` must have positive frequencies and amplitudes")
+
+
+def _check_noise(noise: float, phase_noise_deg: float | None) -> None:
+    if not 0.0 < noise < 1.0:
+        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+    if phase_noise_deg is not None and not 0.0 < phase_noise_deg < 90.0:
+        raise ValueError(f"`phase_noise_deg` must be between 0 and 90, but is {phase_noise_deg!r}")

@@ -10,7 +10,7 @@ import click
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Ends, Finite, Grid, Share, ValueKind
+from afm_jax.cli.values import Course, Ends, Finite, Grid, Share, ValueKind
 
 BASINS = Command(
     name="basins",
@@ -292,6 +292,15 @@ def _check_simulation(session: Session, options: Options) -> None:
         raise click.UsageError("--duration-us and --periods say the same: give one of them")
     if options["samples"] and session.out is None:
         raise click.UsageError("--samples writes a trace: say into which folder by --out DIR")
+    if options["heights"] is not None:
+        if options["duration_us"] is not None or options["samples"]:
+            raise click.UsageError(
+                "--heights follows every height until it settles: leave out --duration-us, --samples"
+            )
+        return
+    for option, name in (("--noise", "noise"), ("--phase-noise-deg", "phase_noise_deg")):
+        if options[name] is not None:
+            raise click.UsageError(f"{option} is that of an approach curve: give --heights, too")
 
 
 SIMULATE = Command(
@@ -307,9 +316,20 @@ SIMULATE = Command(
     drive's frequency and at the response's, which is 1/N of it where the motion repeats after N drive periods. With
     --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
     exit code 3 if the simulation broke off.
+
+    With --heights the sample goes through heights over the rest position of a cantilever driven by [force] or [base],
+    and back: amplitude and lag against height, each followed from the motion before until it settles (--periods at
+    most). With --out curve.csv, with noise as `afm-jax tapping` reads it, curve_points.csv without, curve.json and
+    curve.png; exit code 3 if the tip settles at no height.
     """,
     options=(
         SCENE,
+        click.option(
+            "--heights",
+            type=Course(),
+            metavar="FROM:TO:COUNT",
+            help="Record an approach curve, both ways: heights of the sample in nm, negative below the rest position.",
+        ),
         click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow the scene, in us."),
         click.option("--periods", type=Finite(), metavar="P", help="How long, in periods of the drive."),
         flag(
@@ -344,6 +364,18 @@ SIMULATE = Command(
             type=click.Choice(["uniform"]),
             help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
             "time, as `afm-jax lockin` reads it.",
+        ),
+        click.option(
+            "--noise",
+            type=Share("a relative error"),
+            metavar="SHARE",
+            help="With --heights: of the amplitudes in curve.csv; else 0.3%.",
+        ),
+        click.option(
+            "--phase-noise-deg",
+            type=Finite(positive=True),
+            metavar="X",
+            help="With --heights: of the lags in curve.csv; else 0.2.",
         ),
         LAW,
     ),

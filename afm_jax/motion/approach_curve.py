@@ -1,0 +1,324 @@
+"""An approach curve: amplitude and lag of a driven tip against the sample's height, approach and retract.
+
+At each height the whole scene is followed in time until it repeats. From there the sample moves to the next height, by
+so little in a drive period that the motion follows: an approach keeps its branch as far as it goes, and hysteresis
+shows. A tip that is captured on the way, as laws with adhesion capture slow ones, begins anew at the height after.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Bool, Float, Int
+
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of, require_one_frequency
+from afm_jax.apparatus.surface import drive_per_free_height, force_per_height, surface_of
+from afm_jax.checks import check_count, checked, require_float64
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import Phase
+from afm_jax.motion.follow import LongRun, follow_long
+from afm_jax.motion.observe import Observables, observe
+from afm_jax.motion.record import MotionOutcome, Simulation, State, to_gap
+from afm_jax.motion.settle import is_stuck, settled, window_of
+from afm_jax.motion.simulate import DEFAULT_ACCURACY
+from afm_jax.motion.trajectory import DensePath, dense_path
+from afm_jax.outcomes import OutcomeInWords
+from afm_jax.results import ResultTuple, public_result
+
+TOLERANCE = 1e-6
+"""What may remain to the steady motion, relative: a hundredth of the phase errors of good instruments."""
+_FEWEST_PERIODS = 2000
+_RINGING = 20.0
+"""Drive periods, in units of Q, that a height is given at most: a transient of a free tip has e^-63 left of it."""
+_TIMES = 513
+"""Times of a response period among which the tip is highest."""
+_MOVED = 5e-4
+"""How far the sample moves in a drive period, of the free tip's height."""
+_CLEARANCE_NM = 1.0
+"""Between sample and free tip where the motion begins, beyond where the sample is felt."""
+
+
+class CurveOutcome(OutcomeInWords):
+    """What came of the motion at one height."""
+
+    TAPS = 0, "The tip taps once in every drive period."
+    FREE = 1, "The tip does not meet the sample."
+    OTHER_ORBIT = 2, "The motion repeats, but not with one contact in every drive period."
+    NOT_SETTLED = 3, "The motion did not settle in the time it was given; amplitude and lag are means of its end."
+    CAPTURED = 4, "The sample captured the tip; at the next height it begins anew, swinging as it last did."
+    BROKE_OFF = 5, "The simulation broke off; at the next height the tip begins anew, swinging as it last did."
+
+
+class Motion(NamedTuple):
+    """A motion to go on from: the tip at the top of its swing over a sample at a height in nm."""
+
+    height_nm: float
+    state: State
+    lost: bool = False
+    """Whether it did not get to the next height: then it begins there at once, the sample being put there."""
+
+
+class HeightReading(NamedTuple):
+    """What is read at one height; NaN and 0 where there is nothing to read."""
+
+    outcome: CurveOutcome
+    reason: str
+    amplitude_nm: float = math.nan
+    phase_lag_deg: float = math.nan
+    dissipated_in_contact_aj: float = math.nan
+    virial_aj: float = math.nan
+    contacts: int = 0
+    periods: int = 0
+
+
+@public_result(picture="afm_jax.plots.approach_curve:approach_curve_figure", outcome=CurveOutcome)
+class ApproachCurve(ResultTuple):
+    """Amplitude and lag against the sample's height; NumPy arrays, a point a height, in the order they were followed.
+
+    Under a moving base amplitude and lag are of the deflection, behind the base; else of the height, behind the force.
+    """
+
+    height_nm: Float[np.ndarray, " points"]
+    """Of the sample over the tip's rest position: negative below it."""
+    retract: Bool[np.ndarray, " points"]
+    """Whether the sample moved away to get here."""
+    amplitude_nm: Float[np.ndarray, " points"]
+    """At the drive's frequency; NaN where nothing could be read."""
+    phase_lag_deg: Float[np.ndarray, " points"]
+    """From 0 to 360."""
+    dissipated_in_contact_aj: Float[np.ndarray, " points"]
+    """Energy lost to the sample in a drive period."""
+    virial_aj: Float[np.ndarray, " points"]
+    """Mean of force times height; positive where attraction prevails."""
+    contacts: Int[np.ndarray, " points"]
+    """Contacts until the motion repeats; 0 also where it does not."""
+    periods: Int[np.ndarray, " points"]
+    """Drive periods until the motion repeats; 0 where it does not."""
+    outcome: Int[np.ndarray, " points"]
+    """A `CurveOutcome` each."""
+    reasons: tuple[str, ...]
+    """The outcome of each point in words, with its numbers."""
+    scene: Scene
+    """The scene, its sample at the height of its file."""
+    drive: str
+    """What is driven: "force" (on the tip) or "base"."""
+    drive_frequency_khz: float
+    free_amplitude_nm: float
+    """Of the free tip, in closed form."""
+    free_phase_lag_deg: float
+
+
+@checked
+def approach_curve(
+    scene: SceneLike,
+    heights_nm: Sequence[float] | Float[np.ndarray, " heights"],
+    *,
+    both_ways: bool = True,
+    longest_periods: int | None = None,
+    accuracy: float = DEFAULT_ACCURACY,
+    method: str = "collocation",
+    report: Callable[[int, int], None] = lambda _done, _total: None,
+) -> ApproachCurve:
+    """Return amplitude and lag of a driven tip at a series of heights of the sample, each followed until it repeats.
+
+    The first height begins with the steady motion of the free tip.
+
+    Args:
+        scene: with a force on the tip or a moving base, of one frequency, over a sample at rest.
+        heights_nm: of the sample over the tip's rest position, in the order to be followed.
+        both_ways: go back through the heights as well.
+        longest_periods: drive periods after which a motion counts as not settling; None: 2000, and at least 20 Q.
+        accuracy: of each contact, as for `simulate`.
+        method: as for `simulate`.
+        report: told after each height how many of how many are done.
+
+    Raises:
+        ValueError: if nothing or more than the cantilever is driven, the sample moves, or there are no heights.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    scene = as_scene(scene)
+    require_float64(scene)
+    drive = _only_drive(scene)
+    course = np.asarray(heights_nm, float).ravel()
+    if not course.size or not np.isfinite(course).all():
+        raise ValueError("`heights_nm` must be finite numbers, at least one")
+    if longest_periods is None:
+        longest_periods = max(_FEWEST_PERIODS, math.ceil(_RINGING * float(scene.cantilever.quality_factor or 0.0)))
+    check_count("longest_periods", longest_periods)
+    if both_ways:
+        course = np.concatenate([course, course[-2::-1]])
+    settings = {"accuracy": accuracy, "method": method}
+    readings = []
+    for reading in _followed(scene, course, longest_periods, settings):
+        readings.append(reading)
+        report(len(readings), len(course))
+    columns: dict[str, Any] = dict(zip(HeightReading._fields, map(np.array, zip(*readings, strict=True)), strict=True))
+    columns["reasons"] = tuple(columns.pop("reason").tolist())
+    step = np.diff(course)
+    ratio = drive.frequency_khz / scene.cantilever.frequency_khz
+    gamma = complex(*map(float, force_per_height(ratio, scene.cantilever.quality_factor)))
+    # the free tip where its height is real: the drive is gamma times that, the deflection against a base the rest
+    free = _free_height_nm(scene) * (1.0 if scene.base is None else 1.0 - gamma)
+    return ApproachCurve(
+        height_nm=course,
+        retract=np.concatenate([step[:1] < 0.0, step < 0.0]) if step.size else np.zeros(1, bool),
+        scene=scene,
+        drive="force" if scene.base is None else "base",
+        drive_frequency_khz=float(drive.frequency_khz),
+        free_amplitude_nm=float(abs(free)),
+        free_phase_lag_deg=float(np.degrees(np.angle(gamma) - np.angle(free)) % 360.0),
+        **columns,
+    )
+
+
+def _only_drive(scene: Scene) -> BaseDrive | ForceDrive:
+    """Return what drives the cantilever of a scene, of which there must be one thing with one frequency.
+
+    Raises:
+        ValueError: if not; says how to mend it.
+    """
+    need = "an approach curve is that of a cantilever driven over a sample at rest: "
+    require_one_frequency(scene)
+    if scene.base is not None and scene.force is not None:
+        raise ValueError(f"{need}the scene has both [base] and [force]; leave one out")
+    drive = scene.force if scene.base is None else scene.base
+    if drive is None:
+        raise ValueError(f"{need}give the scene a [force] or a [base] (here the sample drives the tip)")
+    if float(scene.platform.amplitude_nm) != 0.0 or float(scene.platform.offset_rate_nm_per_us) != 0.0:
+        raise ValueError(f"{need}set `platform.amplitude_nm` and `platform.offset_rate_nm_per_us` to 0")
+    if not float(drive.tones[0].amplitude) > 0.0:
+        raise ValueError(f"{need}the amplitude of its drive must be above 0")
+    return drive
+
+
+def _free_height_nm(scene: Scene) -> float:
+    """Return the amplitude of the free tip's height."""
+    drive = scene.force or scene.base
+    assert drive is not None  # as `_only_drive` says  # noqa: S101
+    return float(drive.tones[0].amplitude / drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive)))
+
+
+def _followed(
+    scene: Scene, course: Float[np.ndarray, " points"], longest_periods: int, settings: dict[str, Any]
+) -> Iterator[HeightReading]:
+    """Give what is read at each height, one after the other."""
+    motion = _free_motion(scene, float(course[0]))
+    for height in course.tolist():
+        reading, end = _at_height(scene, motion, height, longest_periods, settings)
+        motion = motion._replace(lost=True) if end is None else Motion(height, end)
+        yield reading
+
+
+def _free_motion(scene: Scene, height_nm: float) -> Motion:
+    """Return the free tip in its steady motion over a sample at a height, or as far up as does not touch it."""
+    _, response = surface_of(scene)
+    assert response is not None  # something drives the tip  # noqa: S101
+    times = np.linspace(0.0, drive_of(scene).period_us, _TIMES)
+    top = times[np.argmax(np.asarray(response.position_and_velocity(times)[0]))]
+    state = _state(top, *response.position_and_velocity(top))
+    return Motion(min(height_nm, -_free_height_nm(scene) - _felt_nm(scene) - _CLEARANCE_NM), state)
+
+
+def _felt_nm(scene: Scene) -> float:
+    """Return the gap below which a flying tip meets the sample."""
+    return float(scene.interaction.bridge_forms_nm) if isinstance(scene.interaction, Contact) else 0.0
+
+
+def _state(*parts: ArrayLike) -> State:
+    return State(*(jnp.asarray(part, float) for part in parts))
+
+
+def _at_height(
+    scene: Scene, begin: Motion, height_nm: float, longest_periods: int, settings: dict[str, Any]
+) -> tuple[HeightReading, State | None]:
+    """Return what is read at a height, and the tip at the top of its swing there; None where it does not fly any more.
+
+    Args:
+        scene: the scene, at any height.
+        begin: where to come from.
+        height_nm: of the sample over the rest position.
+        longest_periods: drive periods after which the motion counts as not settling.
+        settings: of `follow_long`.
+    """
+    period_us = drive_of(scene).period_us
+    start, here = begin.state, _with_sample(scene, height_nm, 0.0)
+    clear = float(to_gap(*surface_of(here), start)[0]) > _felt_nm(scene)
+    if begin.height_nm != height_nm and not (begin.lost and clear):
+        periods = math.ceil(abs(height_nm - begin.height_nm) / (_MOVED * _free_height_nm(scene)))
+        rate = (height_nm - begin.height_nm) / (periods * period_us)
+        moving = _with_sample(scene, begin.height_nm - rate * float(start.time_us), rate)
+        on_the_way = follow_long(moving, start, periods * period_us, **settings)
+        reading = _why_over(on_the_way)
+        if reading is None:
+            end_us = float(on_the_way.simulation.final.time_us)
+            dense = dense_path(moving, on_the_way.simulation, end_us - period_us, end_us)
+            start = _top_of_swing(dense, end_us - period_us, end_us, period_us)
+            if start is None:
+                return HeightReading(CurveOutcome.CAPTURED, "the sample holds the tip on the way there"), None
+        elif reading.outcome == CurveOutcome.CAPTURED or not clear:
+            return reading, None
+        # a way that broke off is left out: the tip begins at the height at once
+
+    def over(motion: Simulation) -> bool:
+        return is_stuck(here, motion) or settled(here, motion, tolerance=TOLERANCE).settled
+
+    run = follow_long(here, start, longest_periods * period_us, enough=over, **settings)
+    reading = _why_over(run)
+    if reading is not None:
+        return reading, None
+    verdict = settled(here, run.simulation, tolerance=TOLERANCE)
+    window = window_of(here, run.simulation, verdict)
+    dense = dense_path(here, run.simulation, window.from_us, window.to_us)
+    seen = observe(here, run.simulation, verdict=verdict, dense=dense)
+    top = _top_of_swing(dense, window.from_us, window.to_us, period_us)
+    return _reading_of(seen, deflection=scene.base is not None), top
+
+
+def _with_sample(scene: Scene, height_nm: float, rate: float) -> Scene:
+    """Return a scene with its sample at a height at time 0 and a rate in nm/us."""
+    return eqx.tree_at(
+        lambda each: (each.platform.offset_nm, each.platform.offset_rate_nm_per_us),
+        scene,
+        (jnp.asarray(height_nm), jnp.asarray(rate)),
+    )
+
+
+def _why_over(run: LongRun) -> HeightReading | None:
+    """Return what to say of a motion that does not go on; None where it does."""
+    ended = MotionOutcome(int(run.simulation.outcome))
+    if ended not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
+        return HeightReading(CurveOutcome.BROKE_OFF, ended.sentence)
+    return HeightReading(CurveOutcome.CAPTURED, run.verdict.reason) if run.verdict.stuck else None
+
+
+def _top_of_swing(dense: DensePath, from_us: float, to_us: float, period_us: float) -> State | None:
+    """Return the tip in flight where it is highest between two times, its time in the first drive period."""
+    path = dense.at(np.linspace(from_us, to_us, _TIMES))
+    heights = np.where(path.phase == Phase.DRY, path.position_nm, -np.inf)
+    top = int(np.argmax(heights))
+    if not np.isfinite(heights[top]):
+        return None
+    return _state(path.time_us[top] % period_us, path.position_nm[top], path.velocity_nm_per_us[top])
+
+
+def _reading_of(seen: Observables, *, deflection: bool) -> HeightReading:
+    """Return what is kept of the observables of a motion: of the deflection or of the height."""
+    verdict = seen.settled
+    known: dict[tuple[int | None, int | None], CurveOutcome] = {(1, 1): CurveOutcome.TAPS, (0, 1): CurveOutcome.FREE}
+    repeats = known.get((verdict.contacts, verdict.periods), CurveOutcome.OTHER_ORBIT)
+    amplitude = seen.deflection_drive_lockin_amplitude_nm if deflection else seen.drive_lockin_amplitude_nm
+    assert amplitude is not None and seen.phase_lag_deg is not None  # the cantilever is driven  # noqa: S101, PT018
+    return HeightReading(
+        repeats if verdict.settled else CurveOutcome.NOT_SETTLED,
+        verdict.reason,
+        amplitude_nm=amplitude,
+        phase_lag_deg=seen.phase_lag_deg,
+        dissipated_in_contact_aj=seen.dissipated_in_contact_aj,
+        virial_aj=seen.virial_aj,
+        contacts=verdict.contacts or 0,
+        periods=verdict.periods or 0,
+    )
