@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, data
 import numpy as np
 
 from afm_jax.checks import is_array
+from afm_jax.columns import text_of_parts
 from afm_jax.saved import fields_of, is_abstract, is_record, save
 
 if TYPE_CHECKING:
@@ -66,6 +67,11 @@ class Result:
 
     def _repr_html_(self) -> str:
         return html_of(self)
+
+    def text(self) -> str:
+        """Return what the command that computes this result prints; of a result without one its fields in 20 lines."""
+        printed = getattr(self, "printed", None)
+        return text_of(self) if printed is None else text_of_parts(printed())
 
     def plot(self, path: str | Path | None = None) -> "Figure":
         """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given."""

@@ -7,7 +7,7 @@ import pytest
 from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
 from afm_jax.accuracy.overview import cheapest, impacts, orbits, overview_row
 from afm_jax.bench import timing as own_process
-from afm_jax.cli.accuracy import COLUMNS, OVERVIEW_FULL
+from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
 from afm_jax.plots.accuracy import accuracy_figure
 from tests.answers import answer, table
 from tests.run_here import run_here
@@ -29,7 +29,7 @@ def test_every_scene_and_setting_has_its_row(study: dict):
     assert {row["scene"] for row in study["rows"]} == {"regular", "grazing", "order 5"}
     assert len(study["rows"]) == 3 * (2 * 3 + 1)
     for row in study["rows"]:
-        assert set(row) <= set(COLUMNS)
+        assert set(row) <= set(MAP.columns)
     assert study["reference_error_us"] < 1e-40  # fifty digits
 
 
@@ -101,7 +101,7 @@ def test_command_writes_table_picture_and_one_json_object(tmp_path: Path, monkey
     own = {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"}
     assert own | {"format", "format_version"} == set(payload)
     assert {path.name for path in tmp_path.iterdir()} == {"accuracy.json", "accuracy.csv", "accuracy.png"}
-    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(COLUMNS)
+    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(MAP.columns)
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene
 from afm_jax.accuracy.scenes import contact_accuracy, fidelity_ladder, law_accuracy
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.bench import timing as own_process
-from afm_jax.cli.accuracy_scene import COLUMNS, LADDER_COLUMNS, fitted_law, scene_to_study
+from afm_jax.cli.accuracy_scene import LADDER, SETTINGS, fitted_law, scene_to_study
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import State
@@ -149,8 +149,8 @@ def test_law_of_a_scene_is_fitted_over_its_own_speeds(contact_file: str):
 def test_command_tells_all_of_a_law_scene(law_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
     payload = answer(tmp_path, "accuracy", law_file, "--quick", "--contacts", 5)
-    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(COLUMNS)
-    assert tuple(table(tmp_path / "ladder.csv")[0]) == tuple(LADDER_COLUMNS)
+    assert tuple(table(tmp_path / "accuracy.csv")[0]) == SETTINGS.columns
+    assert tuple(table(tmp_path / "ladder.csv")[0]) == LADDER.columns
     assert (tmp_path / "accuracy.png").exists()
     assert {"rows", "ladder", "reference_error_us", "reference_error_nm", "law"} <= set(payload)
     assert payload["contacts"] == 5

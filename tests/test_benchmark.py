@@ -23,7 +23,7 @@ from tests.run_here import run_here
 def test_one_core_measures_what_it_says():
     rows = one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)["rows"]
     for row in rows:
-        assert set(row) <= set(PARTS[0].columns)
+        assert set(row) <= set(PARTS[0].table.columns)
         assert row["impacts_per_second"] == pytest.approx(1e6 / row["microseconds_per_impact"], rel=1e-12)
     maps = [row for row in rows if row["what"].startswith("next_impact")]
     assert [(row["scene"], row["batch"], row["block"]) for row in maps] == [
@@ -136,7 +136,7 @@ def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: 
     assert payload["contact_rows"] == []
     assert not (tmp_path / "bench_contact.csv").exists()
     rows = table(tmp_path / "bench.csv")
-    assert tuple(rows[0]) == PARTS[0].columns
+    assert tuple(rows[0]) == PARTS[0].table.columns
     assert len(rows) == len(payload["rows"])
 
 

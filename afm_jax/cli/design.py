@@ -56,7 +56,7 @@ def planned(  # noqa: PLR0913
             largest_nm=largest_nm,
             phase_noise_deg=phase_noise_deg,
         )
-    return Output.of(result, partial(design_summary, result), partial(write_design, result))
+    return Output.of_report(result, partial(design_summary, result), partial(write_design, result))
 
 
 def _with_defaults(lists: Mapping[str, tuple[int, ...] | tuple[float, ...] | None], *, tapping: bool) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Commands about the motions of a scene."""
 
 import math
+import os
 import re
 from importlib import import_module
 from pathlib import Path
@@ -11,6 +12,7 @@ from afm_jax.cli.command import Command, Options
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Ends, Finite, Grid, Share, ValueKind
+from afm_jax.compilation_cache import available_cores
 
 BASINS = Command(
     name="basins",
@@ -351,6 +353,21 @@ SIMULATE = Command(
 )
 
 
+def _check_sweep(session: Session, options: Options) -> None:
+    """Check where results go and that they can be written; let JAX have every core, unless the user says how many."""
+    if options["workers"] is not None and options["scheduler"] is not None:
+        raise click.UsageError("--scheduler has workers of its own: leave --workers out")
+    if session.out is None and not options["dry_run"]:
+        raise click.UsageError("--out is missing: name a folder for the results, or ask for a --dry-run")
+    if options["dry_run"] and options["plot"]:
+        raise click.UsageError("--dry-run computes nothing to --plot: leave one of them out")
+    import_module("xarray")
+    import_module("zarr")
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "host_platform_device_count" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
+
+
 SWEEP = Command(
     name="sweep",
     group="simulate",
@@ -388,7 +405,7 @@ SWEEP = Command(
         flag("--plot", "Draw a sweep of one or two axes, sweep.png."),
         LAW,
     ),
-    computes=False,
+    check=_check_sweep,
 )
 
 COMMANDS = (BASINS, BIFURCATION, CHART, CONTINUE, EFFECTS, LYAPUNOV, ORBITS, SIMULATE, SWEEP)
