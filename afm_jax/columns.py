@@ -1,6 +1,5 @@
 """Rows of a result as columns of a CSV file, and as a table to print."""
 
-import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -9,9 +8,6 @@ from afm_jax.words import known
 
 if TYPE_CHECKING:
     from rich.table import Table
-
-WIDTH_OF_A_PIPE = 10_000
-"""Columns of text that nobody looks at in a terminal: no line is broken, no table turned."""
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], names: Iterable[str] | None = None) -> dict[str, list[Any]]:
@@ -72,16 +68,3 @@ def _printed(row: Any, cell: Cell, form: str) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return value if isinstance(value, str) else known(value, form)
-
-
-def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
-    """Return sentences and tables to print as one text; None says nothing."""
-    from rich.console import Console  # noqa: PLC0415 (help is there without it)
-
-    console = Console(file=io.StringIO(), width=WIDTH_OF_A_PIPE)
-    for part in parts:
-        if isinstance(part, str):
-            console.print(part, markup=False, highlight=False, soft_wrap=True)
-        elif part is not None:
-            console.print(part)
-    return console.file.getvalue().rstrip("\n")  # pyright: ignore[reportAttributeAccessIssue]

@@ -8,26 +8,29 @@ can be told too.
 import enum
 import html
 import importlib
+import io
 import math
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, dataclass_transform, get_args
 
 import numpy as np
 
 from afm_jax.checks import is_array
-from afm_jax.columns import text_of_parts
 from afm_jax.saved import fields_of, is_abstract, is_record, save
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+    from rich.table import Table
     from xarray import Dataset
 
 Kind = TypeVar("Kind", bound=type)
 MOST_LINES = 20
 _WIDTH = 110
+_UNBROKEN = 10_000
+"""Columns of a text in which no line is broken."""
 _SHOWN = 5
 UNITS = {
     "nm_per_us": "nm/us",
@@ -138,6 +141,19 @@ def text_of(self: Any) -> str:
     return "\n".join(
         [f"{type(self).__name__}:", *(f"  {name:<{_widest(self)}}  {text}" for name, text in _lines(self))]
     )
+
+
+def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
+    """Return sentences and tables to print as one text; None says nothing."""
+    from rich.console import Console  # noqa: PLC0415 (help is there without it)
+
+    console = Console(file=io.StringIO(), width=_UNBROKEN)
+    for part in parts:
+        if isinstance(part, str):
+            console.print(part, markup=False, highlight=False, soft_wrap=True)
+        elif part is not None:
+            console.print(part)
+    return console.file.getvalue().rstrip("\n")  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def html_of(self: Any) -> str:

@@ -29,7 +29,8 @@ from afm_jax.cli.main import NotValid
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES, example_path
-from afm_jax.columns import printed_table, text_of_parts
+from afm_jax.columns import printed_table
+from afm_jax.results import text_of_parts
 from afm_jax.scenefile.presets import PRESETS
 from afm_jax.words import lines_at_most, text_table
 from tests.fresh_python import python

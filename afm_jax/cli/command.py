@@ -14,6 +14,7 @@ A result says itself: `to_dict()` is the JSON object, `printed()` what is writte
 columns of CSV files by the files' names, `reason` is why it is not valid.
 """
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -28,7 +29,7 @@ from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session, session_options, write_json
 from afm_jax.cli.values import scene_and_start
-from afm_jax.compilation_cache import silence_xla
+from afm_jax.compilation_cache import available_cores, silence_xla
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
@@ -151,6 +152,13 @@ class Command:
         for option in reversed((*self.options, *session_options(self.out_file))):
             function = option(function)
         return click.command(self.name, help=self.help)(function)
+
+
+def use_all_cores() -> None:
+    """Let JAX have a device for every core, before it starts, unless the user has said how many there are."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "host_platform_device_count" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
 
 
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:

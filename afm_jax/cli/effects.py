@@ -4,6 +4,7 @@ from pathlib import Path
 
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
+from afm_jax.effects.effect_table import EffectTable
 from afm_jax.effects.study import study_effects
 from afm_jax.motion.start import default_start, start_of
 from afm_jax.scenefile.scenefile import as_in_file, save_scene
@@ -33,15 +34,16 @@ def effects(
             only=None if only is None else [name.strip() for name in only.split(",")],
             report=report,
         )
-    told = study.to_dict() | {"start": start._asdict()}
+    table = EffectTable(study)
+    told = table.to_dict() | {"start": start._asdict()}
     if write is not None and study.reduction is not None:
         save_scene(study.reduction.scene, write, start=start)
         session.note(f"wrote {write}")
         told["reduced"]["file"] = write
     return Output(
         payload=told,
-        text=study.printed(),
-        tables=study.tables(),
+        text=table.printed(),
+        tables=table.tables(),
         files={"effects.png": lambda to: draw_effects(told["effects"], told["full"], told["accuracy"], to)},
         json_file="effects.json",
     )

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.columns import WIDTH_OF_A_PIPE, columns_of, csv_cells
+from afm_jax.columns import columns_of, csv_cells
 from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import check_plain, write_whole
@@ -81,6 +81,8 @@ def write_json(path: Path, payload: Mapping[str, Any]) -> None:
     write_whole(path, strict_json(labelled(payload)) + "\n")
 
 
+WIDTH_OF_A_PIPE = 10_000
+"""Columns of text that nobody looks at in a terminal: no line is broken, no table turned."""
 _SECONDS_BETWEEN_NOTES = 2.0
 
 

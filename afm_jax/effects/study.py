@@ -6,10 +6,9 @@ full scene is. What the two readings differ by is what the effect changes; what 
 it costs.
 """
 
-import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,11 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.stages import Compiled
-from rich.table import Table
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
-from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.effects.scene_effects import SceneEffect, effects_in
 from afm_jax.motion.follow import follow_in_pieces, joined, why_over
 from afm_jax.motion.observe import MotionWindow
@@ -31,9 +28,7 @@ from afm_jax.motion.settle import last_fifth
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import dense_path
-from afm_jax.scenefile.scenefile import scene_tables
-from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
-from afm_jax.words import counted, known
+from afm_jax.units import within_turn
 
 PERIODS_AT_MOST = 400.0
 """Drive periods after which a motion that has not settled is given up."""
@@ -79,13 +74,6 @@ class Cost(NamedTuple):
     program: Operations
     scatter_us: float = 0.0
     """Standard deviation of that time from one repetition to the next."""
-
-    def to_dict(self) -> dict[str, float | None]:
-        """Return the cost by the keys of the JSON object."""
-        return dict(zip(_COSTS, (self.time_us, *self.program), strict=True))
-
-
-_COSTS = ("time_us_per_period", "operations", "transcendentals")
 
 
 class View(NamedTuple):
@@ -138,28 +126,6 @@ class EffectReport(NamedTuple):
     cost: Cost | None
     """Of the scene without it."""
 
-    def to_dict(self, full: Cost, *, needed: bool) -> dict[str, Any]:
-        """Return what is told of the effect; the cost of the full scene says what leaving it out saves."""
-        effect, whole = self.effect, full.to_dict()
-        cost = dict.fromkeys(_COSTS) if self.cost is None else self.cost.to_dict()
-        saved = {
-            f"saved_{name}": None if spent is None or whole[name] is None else whole[name] - spent
-            for name, spent in cost.items()
-        }
-        return {
-            "name": effect.name,
-            "description": effect.sentence,
-            "strength": effect.strength or None,
-            "required": effect.required is not None,
-            "zero_strength": effect.is_zero,
-            "needed": needed,
-            "change": self.change._asdict(),
-            "reason": self.reason,
-            **cost,
-            **saved,
-            "saved_time_scatter_us": None if self.cost is None else math.hypot(full.scatter_us, self.cost.scatter_us),
-        }
-
 
 class Reduction(NamedTuple):
     """What the wanted accuracy of the amplitude does not need."""
@@ -181,121 +147,6 @@ class EffectStudy(NamedTuple):
     cost: Cost
     effects: list[EffectReport]
     reduction: Reduction | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object of `afm-jax effects`."""
-        reading, orbit, reduction = self.observed.reading, self.observed.orbit, self.reduction
-        assert reading is not None  # a study has one  # noqa: S101
-        left_out = () if reduction is None else reduction.left_out
-        frequency = self.view.drive.angular_frequency / RAD_PER_US_PER_KHZ
-        told = {
-            "duration_us": self.view.duration_us,
-            "compared": "steady orbits" if orbit is not None else "last fifth of the duration",
-            "full": {
-                **reading._asdict(),
-                "lockin_frequency_khz": frequency / periods_read(self.scene, orbit),
-                "drive_periods": None if orbit is None else orbit.periods,
-                "contraction": None if orbit is None else orbit.contraction,
-                **self.cost.to_dict(),
-            },
-            "effects": [
-                report.to_dict(self.cost, needed=report.effect.name not in left_out) for report in self.effects
-            ],
-        }
-        if reduction is None:
-            return told | {"accuracy": None, "not_needed": [], "joint_change": None, "reduced": None}
-        return told | {
-            "accuracy": reduction.accuracy,
-            "not_needed": list(left_out),
-            "joint_change": reduction.change._asdict(),
-            "reduced": {"scene": scene_tables(reduction.scene), "file": None, **reduction.cost.to_dict()},
-        }
-
-    def printed(self) -> list[str | Table]:
-        """Return what `afm-jax effects` prints: the full scene, a table of effects, and which are not needed."""
-        told = self.to_dict()
-        cells: dict[str, Cell] = {
-            "effect": "name",
-            "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
-            "lock-in\nchange": lambda effect: _percent(effect["change"]["lockin_amplitude"]),
-            "phase\ndeg": lambda effect: known(effect["change"]["lockin_phase_deg"]),
-            "loss/impact\nchange": lambda effect: _percent(effect["change"]["energy_per_impact"]),
-            "time\nus/period": "time_us_per_period:.4g",
-            "saved": _saved_time,
-            "operations\nsaved": "saved_operations:.0f",
-            "": _remark,
-        }
-        table = printed_table("Without the effect", cells, told["effects"])
-        return [_of_full(told), table, *_sentences(told)]
-
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of effects.csv, a row an effect."""
-        rows = [
-            {**effect, **{f"change_{name}": value for name, value in effect["change"].items()}}
-            for effect in self.to_dict()["effects"]
-        ]
-        columns = (
-            *("name", "description", "strength", "required", "zero_strength", "needed"),
-            *(f"change_{name}" for name in Change._fields),
-            *_COSTS,
-            *(f"saved_{name}" for name in _COSTS),
-            *("saved_time_scatter_us", "reason"),
-        )
-        return {"effects.csv": columns_of(rows, columns)}
-
-
-def _of_full(told: Mapping[str, Any]) -> str:
-    full = told["full"]
-    motion = (
-        f"steady orbit, {counted(full['impacts'], 'impact')} in {counted(full['drive_periods'], 'drive period')}"
-        if full["drive_periods"] is not None
-        else f"no steady orbit, {full['impacts']} impacts in the {told['compared']}"
-    )
-    lost = full["energy_per_impact_aj"]
-    lockin = f"lock-in at {full['lockin_frequency_khz']:.6g} kHz {full['lockin_amplitude_nm']:.5g} nm"
-    return (
-        f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, {lockin} "
-        f"at {full['lockin_phase_deg']:.4g} deg{f', {lost:.4g} aJ lost per impact' if lost is not None else ''}; "
-        f"{known(full['time_us_per_period'], '.4g')} us of processor time per drive period, "
-        f"{full['operations']:.0f} operations."
-    )
-
-
-def _saved_time(effect: Mapping[str, Any]) -> str:
-    saved, scatter = effect["saved_time_us_per_period"], effect["saved_time_scatter_us"]
-    return "within timing noise" if saved and abs(saved) <= scatter else known(saved)
-
-
-def _remark(effect: Mapping[str, Any]) -> str:
-    if effect["required"]:
-        return "required"
-    if effect["zero_strength"]:
-        return "without effect: its strength is zero"
-    if effect["change"]["peak_amplitude"] is None:
-        return "no steady motion"
-    return "" if effect["needed"] else "not needed"
-
-
-def _sentences(told: Mapping[str, Any]) -> Iterator[str]:
-    for effect in told["effects"]:
-        if effect["reason"] is not None:
-            yield f"{effect['name']}: {'' if effect['required'] else 'without it: '}{effect['reason']}."
-    if told["accuracy"] is None:
-        return
-    wanted, left_out = f"{100.0 * told['accuracy']:g} %", told["not_needed"]
-    if not left_out:
-        yield f"For amplitudes to {wanted} every effect that can be left out is needed."
-        return
-    joint = told["joint_change"]
-    yield (
-        f"For amplitudes to {wanted} these are not needed: {', '.join(left_out)}. Without all of them the peak changes "
-        f"by {_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
-        f"{known(told['reduced']['time_us_per_period'], '.4g')} us per drive period."
-    )
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100.0 * share:+z.3g} %"
 
 
 def study_effects(

@@ -1,18 +1,16 @@
 """Commands about the motions of a scene."""
 
 import math
-import os
 import re
 from importlib import import_module
 from pathlib import Path
 
 import click
 
-from afm_jax.cli.command import Command, Options
+from afm_jax.cli.command import Command, Options, use_all_cores
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Ends, Finite, Grid, Share, ValueKind
-from afm_jax.compilation_cache import available_cores
 
 BASINS = Command(
     name="basins",
@@ -363,9 +361,7 @@ def _check_sweep(session: Session, options: Options) -> None:
         raise click.UsageError("--dry-run computes nothing to --plot: leave one of them out")
     import_module("xarray")
     import_module("zarr")
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "host_platform_device_count" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
+    use_all_cores()
 
 
 SWEEP = Command(
