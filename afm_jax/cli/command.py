@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.ending import NotValid, is_inner
+from afm_jax.cli.ending import NotValid, in_options, is_inner
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session, session_options, write_json
 from afm_jax.cli.values import scene_and_start
@@ -91,12 +91,13 @@ class Output:
                 its impacts may be extrapolated, `impact_speeds_nm_per_us`.
             **more: pictures, and what else the output has.
         """
+        reason = None if result.reason is None else in_options(result.reason)
         told = {
-            "payload": {**result.to_dict(), "reason": result.reason},
+            "payload": {**result.to_dict(), "reason": reason},
             "text": result.printed(),
             "tables": result.tables(),
             "impact_speeds": getattr(result, "impact_speeds_nm_per_us", None),
-            "not_valid": result.reason,
+            "not_valid": reason,
         }
         return cls(**told | more)
 

@@ -432,7 +432,7 @@ class ContactLaws(NamedTuple):
     def reason(self) -> str | None:
         """Which fits of a formula did not converge; None where all did."""
         lost = [law.model for law in self.formulas if not law.converged]
-        return f"the fit of {', '.join(lost)} did not converge; try another --speed-range" if lost else None
+        return f"the fit of {', '.join(lost)} did not converge; try another speed range" if lost else None
 
     def _delay_rows(self) -> list[dict[str, float]]:
         """Return the delay at a few speeds, first and last among them."""

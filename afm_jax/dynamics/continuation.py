@@ -124,7 +124,7 @@ class Continuation(ResultTuple):
             return f"no tip rests on the sample, is let go and rests again after {order} periods {where}"
         what = f"orbit of {counted(self.impacts, 'impact')} in {order} drive periods"
         if self.impacts == 0:
-            return f"the tip meets the sample at every value of {self.range}; try --impacts 1"
+            return f"the tip meets the sample at every value of {self.range}; try `impacts=1`"
         if self.rejected:
             return f"in every {what} {where} the tip would have to pass through the platform; try another order"
         return f"no {what} was found {where}; try another order or range"

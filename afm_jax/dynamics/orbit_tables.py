@@ -205,5 +205,5 @@ def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> st
         else f"there is no orbit of order {order}"
     )
     if nearest != order:
-        return f"{what}; the drive is at {reduced:.4g} times twice the free frequency: try --order {nearest}"
+        return f"{what}; the drive is at {reduced:.4g} times twice the free frequency: try `order={nearest}`"
     return f"{what}; try a larger drive amplitude, another offset or a drive nearer to resonance"

@@ -555,7 +555,7 @@ def _check_missing(names: list[str], form: Form, present: set[str], *, line: int
         else:
             there = f" (there are {', '.join(quoted(name) for name in names[:6])})" if form.open and any(names) else ""
             other = " or rename the one that holds it" if form.open else ""
-            message = f"the column {columns[0].name}{_in_unit(columns[0])} is missing{there}; add it{other}"
+            message = f'the column "{columns[0].name}"{_in_unit(columns[0])} is missing{there}; add it{other}'
         faults.add(message, line=line)
 
 
