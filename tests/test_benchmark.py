@@ -16,12 +16,17 @@ from afm_jax.bench.timing import run_in_own_process
 from afm_jax.cli.bench import AIMED_BATCH, PARTS, aim_of, aim_sentence, map_aims
 from afm_jax.verify.fifty_digits import ExactMap, reference_error
 from tests.answers import answer, table
-from tests.run_here import run_here
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict:
+    """The impact map on one core, few and small measurements."""
+    return one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)
 
 
 @pytest.mark.slow
-def test_one_core_measures_what_it_says():
-    rows = one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)["rows"]
+def test_one_core_measures_what_it_says(measured: dict):
+    rows = measured["rows"]
     for row in rows:
         assert set(row) <= set(PARTS[0].table.columns)
         assert row["impacts_per_second"] == pytest.approx(1e6 / row["microseconds_per_impact"], rel=1e-12)
@@ -128,9 +133,14 @@ def test_aims_are_judged_and_not_invented():
     assert aim_sentence(judged["one forward derivative"]).endswith("not measured in this run")
 
 
+NOTHING = {"rows": []}
+
+
 @pytest.mark.slow
-def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
+def test_command_writes_tables_and_one_json_object(measured: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(
+        own_process, "run_in_own_process", lambda task, *_, **__: measured if "one" in task else NOTHING
+    )
     payload = answer(tmp_path, "bench", "--only", "map", "--quick", "--batch", 2)
     assert {"format", "format_version", "rows", "contact_rows", "scene_rows", "aims", "machine"} == set(payload)
     assert payload["contact_rows"] == []

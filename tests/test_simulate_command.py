@@ -142,13 +142,6 @@ def test_a_tip_too_slow_sticks(tmp_path: Path):
     assert nulls(answer) == answer["null_reasons"].keys()
 
 
-def test_a_preset_has_its_start():
-    result = simulate("figure2", "--periods", 30, "--json")
-    assert result.exit_code == 0, result.stderr
-    answer = strictly(result.stdout)
-    assert answer["scene"]["platform"]["offset_nm"] == -1.0
-
-
 def test_nothing_is_said_over_a_response_period_that_is_not_there():
     numbers = ("peak_amplitude_nm", "mean_height_nm", "given_by_drives_aj", "dissipated_in_air_aj")
     nothing = dict.fromkeys(("peak_deflection_nm", "phase_lag_deg", "peak_force_nn"))
