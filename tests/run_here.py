@@ -13,7 +13,7 @@ def run_here(task: str, settings: Mapping[str, Any], *, cores: int) -> Any:
 
 
 def answered_with(results: Mapping[str, Any]) -> Callable[..., Any]:
-    """Return another stand-in: it has measured already, by the functions' names, and sees that they take the settings."""
+    """Return a stand-in that has measured already, by the functions' names; it sees that these take the settings."""
 
     def run(task: str, settings: Mapping[str, Any], *, cores: int) -> Any:
         del cores

@@ -10,6 +10,7 @@ from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
 from afm_jax.plots.accuracy import accuracy_figure
 from tests.answers import answer, table
+from tests.run_here import answered_with
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +96,7 @@ def test_figure_has_a_labelled_panel_for_each_scene(study: dict):
 
 @pytest.mark.slow
 def test_command_writes_table_picture_and_one_json_object(study: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(own_process, "run_in_own_process", lambda *_, **__: study)
+    monkeypatch.setattr(own_process, "run_in_own_process", answered_with({"map_accuracy": study}))
     payload = answer(tmp_path, "accuracy", "map", "--quick")
     own = {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"}
     assert own | {"format", "format_version"} == set(payload)

@@ -18,6 +18,7 @@ from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import Start, save_scene
 from tests.answers import answer, table
 from tests.reference_driven_contact import DrivenContact, follow
+from tests.run_here import answered_with
 
 DELAYED = Scene(
     Cantilever(90.0, 40.0),
@@ -159,7 +160,7 @@ def test_command_tells_all_of_a_law_scene(
     law_file: str, of_settings: dict, of_models: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     known = {"law_accuracy": of_settings, "fidelity_ladder": of_models}
-    monkeypatch.setattr(own_process, "run_in_own_process", lambda task, *_, **__: known[task.partition(":")[2]])
+    monkeypatch.setattr(own_process, "run_in_own_process", answered_with(known))
     payload = answer(tmp_path, "accuracy", law_file, "--quick", "--contacts", 6)
     assert tuple(table(tmp_path / "accuracy.csv")[0]) == SETTINGS.columns
     assert tuple(table(tmp_path / "ladder.csv")[0]) == LADDER.columns

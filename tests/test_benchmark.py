@@ -16,6 +16,7 @@ from afm_jax.bench.timing import run_in_own_process
 from afm_jax.cli.bench import AIMED_BATCH, PARTS, aim_of, aim_sentence, map_aims
 from afm_jax.verify.fifty_digits import ExactMap, reference_error
 from tests.answers import answer, table
+from tests.run_here import answered_with
 
 
 @pytest.fixture(scope="module")
@@ -133,13 +134,10 @@ def test_aims_are_judged_and_not_invented():
     assert aim_sentence(judged["one forward derivative"]).endswith("not measured in this run")
 
 
-NOTHING = {"rows": []}
-
-
 @pytest.mark.slow
 def test_command_writes_tables_and_one_json_object(measured: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(
-        own_process, "run_in_own_process", lambda task, *_, **__: measured if "one" in task else NOTHING
+        own_process, "run_in_own_process", answered_with({"one_core": measured, "all_cores": {"rows": []}})
     )
     payload = answer(tmp_path, "bench", "--only", "map", "--quick", "--batch", 2)
     assert {"format", "format_version", "rows", "contact_rows", "scene_rows", "aims", "machine"} == set(payload)
