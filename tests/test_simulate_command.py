@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.cli.main import main
-from afm_jax.cli.simulate import text_of
+from afm_jax.motion.motion_table import lines_of
 from afm_jax.motion.trajectory import pieces_between
 from afm_jax.scenefile.scenefile import Start
 from fitting.traces.lockin import lockin
@@ -154,7 +154,7 @@ def test_nothing_is_said_over_a_response_period_that_is_not_there():
 
     def said(responses: int) -> str:
         return " ".join(
-            text_of(payload | {"window": {"from_us": 7.2, "to_us": 9.0, "periods": 1, "responses": responses}})
+            lines_of(payload | {"window": {"from_us": 7.2, "to_us": 9.0, "periods": 1, "responses": responses}})
         )
 
     assert "At the drive's frequency (180 kHz): 10 nm, 0 deg." in said(1)
