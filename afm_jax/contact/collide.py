@@ -44,7 +44,7 @@ from afm_jax.contact.junction import Junction, find_junction, require_junction
 from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.results import ResultTuple, public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.derivatives import by_tangents, implicit_root
 from afm_jax.solve.lanes import LANES, again_for_the_open, filled, for_each_lane, rows_in_blocks
 
@@ -536,6 +536,8 @@ class Collisions(NamedTuple):
     capture_speed_reason: str | None
     junction: dict[str, float]
     unresolved: list[str]
+
+    text = Result.text
 
     @property
     def reason(self) -> str | None:

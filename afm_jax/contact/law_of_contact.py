@@ -428,6 +428,8 @@ class ContactLaws(NamedTuple):
     delay: ContactDelay
     law: TabulatedLaw
 
+    text = Result.text
+
     @property
     def reason(self) -> str | None:
         """Which fits of a formula did not converge; None where all did."""

@@ -27,7 +27,7 @@ from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
-from afm_jax.results import ResultTuple, public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.solve.lanes import Report, in_blocks
 from afm_jax.units import within_turn
@@ -140,6 +140,8 @@ class Ramps(NamedTuple):
     sweeps: list[Sweep]
     impacts_each: int
     """Impacts at each value."""
+
+    text = Result.text
 
     @property
     def reason(self) -> str | None:

@@ -14,6 +14,7 @@ from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, ManyImpactOrbits, orbit_facts
 from afm_jax.dynamics.sticking_orbits import StickingOrbit
 from afm_jax.impact.orbits import SingleImpactOrbits
+from afm_jax.results import Result
 from afm_jax.words import counted
 
 _OF_AN_ORBIT = (
@@ -43,6 +44,8 @@ class OrbitTable(NamedTuple):
     scene: Scene
     order: int
     found: SingleImpactOrbits
+
+    text = Result.text
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -105,6 +108,8 @@ class ManyOrbitTable(NamedTuple):
     found: ManyImpactOrbits
     resting: StickingOrbit | str
     """The orbit with a rest, or a sentence on why there is none."""
+
+    text = Result.text
 
     @property
     def rows(self) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.effects.study import Change, Cost, EffectReport, EffectStudy, periods_read
+from afm_jax.results import Result
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.words import counted, known
@@ -19,6 +20,8 @@ class EffectTable(NamedTuple):
     """The effects of a scene, one a row."""
 
     study: EffectStudy
+
+    text = Result.text
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax effects`."""

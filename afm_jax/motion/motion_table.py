@@ -14,6 +14,7 @@ from afm_jax.motion.observe import OBSERVABLES, Observables, why_absent
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
 from afm_jax.motion.settle import Window
 from afm_jax.motion.trajectory import DensePath
+from afm_jax.results import Result
 
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
@@ -32,6 +33,8 @@ class MotionTable(NamedTuple):
     dense: DensePath
     """The tip over what is read and written of it."""
     settings: Mapping[str, Any]
+
+    text = Result.text
 
     @property
     def reason(self) -> str | None:

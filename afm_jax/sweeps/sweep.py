@@ -22,6 +22,7 @@ import numpy as np
 from afm_jax.apparatus.scene import SceneLike, as_scene
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, silence_xla
+from afm_jax.results import Result
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.sweeps.plan import MESSAGE, Columns, SweepPlan, plan_of, plan_of_worker
 from afm_jax.sweeps.scenes import EXTRAPOLATED, SCENE_BUILDER
@@ -67,6 +68,8 @@ class Swept(NamedTuple):
     """Why points have no result to be trusted, and how many each time."""
     extrapolated: str | None
     """A sentence on points whose law is asked at other speeds than it is known for; None without any."""
+
+    text = Result.text
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""

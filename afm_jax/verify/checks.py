@@ -23,6 +23,7 @@ from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.impact import jacobian as formulas
 from afm_jax.impact.law import ImpactLaw, formula_of
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.results import Result
 from afm_jax.verify.fifty_digits import exact_impact, exact_trace, mpmath_or_reason
 from afm_jax.verify.samples import (
     BLOCK,
@@ -101,6 +102,8 @@ class Verification(NamedTuple):
     states: int
     seed: int
     exact_states: int
+
+    text = Result.text
 
     @property
     def reason(self) -> str | None:
