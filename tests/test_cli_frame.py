@@ -4,7 +4,6 @@ import io
 import json
 import math
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -309,25 +308,6 @@ def test_closed_pipe_is_quiet():
     done = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, check=False)
     os.close(writer)
     assert (done.returncode, done.stderr) == (1, b"")
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
-def test_interrupt_ends_with_130():
-    code = (
-        # a test run in the background inherits that interrupts are ignored
-        "import signal, sys, time, types\nfrom afm_jax.cli import main\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "module = types.ModuleType('waiting')\n"
-        "module.wait = lambda session: (print('ready', flush=True), time.sleep(60))\nsys.modules['waiting'] = module\n"
-        "row = dict(name='wait', group='check', summary='Wait.', runs='waiting:wait', help='', computes=False)\n"
-        "main.COMMANDS['wait'] = main.Command(**row)\nmain.main(['wait'])"
-    )
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"ready\n"
-        process.send_signal(signal.SIGINT)
-        _, complaint = process.communicate(timeout=30)
-    assert (process.returncode, complaint.strip()) == (130, b"afm-jax: interrupted")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
