@@ -147,13 +147,14 @@ def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
     """Return sentences and tables to print as one text; None says nothing."""
     from rich.console import Console  # noqa: PLC0415 (help is there without it)
 
-    console = Console(file=io.StringIO(), width=_UNBROKEN)
+    text = io.StringIO()
+    console = Console(file=text, width=_UNBROKEN)
     for part in parts:
         if isinstance(part, str):
             console.print(part, markup=False, highlight=False, soft_wrap=True)
         elif part is not None:
             console.print(part)
-    return console.file.getvalue().rstrip("\n")  # pyright: ignore[reportAttributeAccessIssue]
+    return text.getvalue().rstrip("\n")
 
 
 def html_of(self: Any) -> str:

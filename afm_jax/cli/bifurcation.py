@@ -1,5 +1,7 @@
 """`afm-jax bifurcation SCENE.toml --parameter P=a:b:n`: what motions come to along a parameter, swept up and down."""
 
+from typing import Any
+
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.fitted_law import as_drawn
 from afm_jax.cli.session import Session
@@ -23,7 +25,8 @@ def bifurcation(  # noqa: PLR0913
 ) -> Output:
     """Return what motions of a scene come to along a parameter, swept up, down or both ways."""
     (swept,) = ranges_of(scene.name, scene.scene, [parameter], counted=True)
-    how, sweeps = {"start": scene.start, "impacts": impacts}, []
+    how: dict[str, Any] = {"start": scene.start, "impacts": impacts}
+    sweeps = []
     for upward in [True, False] if both else [not down]:
         direction = "up" if upward else "down"
         with session.working(f"sweeping {direction}", f"values {direction}") as report:

@@ -49,6 +49,7 @@ def sweep(
         with session.working("measuring a chunk"):
             result = estimate(plan)
         return Output(payload=result.to_dict(), text=result.printed())
+    assert session.out is not None  # asked before  # noqa: S101
     result = swept(plan, run_sweep(session, plan, workers=workers, scheduler=scheduler), session.out / STORE)
     files = {"sweep.png": partial(_draw, plan, result.store)} if plot else {}
     return Output(payload=result.to_dict(), text=result.printed(), files=files)

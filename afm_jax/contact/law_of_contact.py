@@ -543,7 +543,7 @@ def contact_laws(
         mass_ng: the tip's mass in ng.
         points: number of speeds.
     """
-    how = {"mass_ng": mass_ng, "points": points}
+    how: dict[str, Any] = {"mass_ng": mass_ng, "points": points}
     formulas = [fit_law(contact, speed_range=speed_range, model=model, residuals=residuals, **how) for model in FREE]
     delay = fit_delay(contact, speed_range=delay_range, **how)
     return ContactLaws(formulas, delay, make_law(contact, mass_ng=mass_ng))

@@ -89,7 +89,9 @@ class OrbitTable(NamedTuple):
         else:
             cells |= {"lock-in\nnm": "lockin_amplitude_nm", "lock-in\ndeg": "lockin_phase_deg"}
         cells |= {"trace": "trace", "determinant": "determinant", "stable": "stable", "admissible": "admissible"}
-        parts = [printed_table(f"Orbits with one impact in {counted(self.order, 'drive period')}", cells, rows)]
+        parts: list[str | Table] = [
+            printed_table(f"Orbits with one impact in {counted(self.order, 'drive period')}", cells, rows)
+        ]
         if any(orbit["near_double"] for orbit in rows):
             parts.append("Two of them nearly coincide (a fold): derivatives there have no meaning.")
         return parts
@@ -131,13 +133,13 @@ class ManyOrbitTable(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
-        rests = isinstance(self.resting, StickingOrbit)
+        resting = self.resting
         return {
             "order": self.order,
             "impacts": self.impacts,
             "orbits": self.rows,
-            "sticking": self.resting._asdict() if rests else None,
-            "sticking_reason": None if rests else self.resting,
+            "sticking": None if isinstance(resting, str) else resting._asdict(),
+            "sticking_reason": resting if isinstance(resting, str) else None,
         }
 
     def printed(self) -> list[str | Table]:
