@@ -89,9 +89,8 @@ class OrbitTable(NamedTuple):
         else:
             cells |= {"lock-in\nnm": "lockin_amplitude_nm", "lock-in\ndeg": "lockin_phase_deg"}
         cells |= {"trace": "trace", "determinant": "determinant", "stable": "stable", "admissible": "admissible"}
-        parts: list[str | Table] = [
-            printed_table(f"Orbits with one impact in {counted(self.order, 'drive period')}", cells, rows)
-        ]
+        title = f"Orbits with one impact in {counted(self.order, 'drive period')}"
+        parts: list[str | Table] = [printed_table(title, cells, rows)]
         if any(orbit["near_double"] for orbit in rows):
             parts.append("Two of them nearly coincide (a fold): derivatives there have no meaning.")
         return parts

@@ -89,11 +89,8 @@ class EffectTable(NamedTuple):
 def _effect(report: EffectReport, full: Cost, *, needed: bool) -> dict[str, Any]:
     """Return what is told of the effect; the cost of the full scene says what leaving it out saves."""
     effect, whole = report.effect, _cost(full)
-    cost = dict.fromkeys(_COSTS) if report.cost is None else _cost(report.cost)
-    saved = {
-        f"saved_{name}": None if spent is None or whole[name] is None else whole[name] - spent
-        for name, spent in cost.items()
-    }
+    cost = _cost(report.cost)
+    saved = {f"saved_{name}": _less(whole[name], spent) for name, spent in cost.items()}
     return {
         "name": effect.name,
         "description": effect.sentence,
@@ -109,9 +106,14 @@ def _effect(report: EffectReport, full: Cost, *, needed: bool) -> dict[str, Any]
     }
 
 
-def _cost(cost: Cost) -> dict[str, float | None]:
+def _cost(cost: Cost | None) -> dict[str, float | None]:
     """Return a cost by the keys of the JSON object."""
-    return dict(zip(_COSTS, (cost.time_us, *cost.program), strict=True))
+    numbers = (None, None, None) if cost is None else (cost.time_us, *cost.program)
+    return dict(zip(_COSTS, numbers, strict=True))
+
+
+def _less(whole: float | None, part: float | None) -> float | None:
+    return None if whole is None or part is None else whole - part
 
 
 def _of_full(told: Mapping[str, Any]) -> str:
