@@ -8,7 +8,6 @@ from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
 from afm_jax.accuracy.overview import cheapest, impacts, orbits, overview_row
 from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
-from afm_jax.plots.accuracy import accuracy_figure
 from tests.answers import answer, table
 from tests.run_here import answered_with
 
@@ -82,16 +81,6 @@ def test_cheapest_is_the_fastest_that_is_good_enough():
     assert [one["method"] for one in cheapest_settings(rows, 1e-12)] == [None, None, None]
     # an error that could not be measured is not a good one
     assert cheapest_settings([row("a", 1e-2, 1.0, None)], 1.0)[0]["method"] is None
-
-
-@pytest.mark.slow
-def test_figure_has_a_labelled_panel_for_each_scene(study: dict):
-    figure = accuracy_figure(study["rows"], 1e-9)
-    assert [axes.get_title() for axes in figure.axes] == ["scene: regular", "scene: grazing", "scene: order 5"]
-    for axes in figure.axes:
-        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-        assert "µs" in axes.get_xlabel()
-        assert len(axes.get_lines()) == 4
 
 
 @pytest.mark.slow
