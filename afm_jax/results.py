@@ -8,9 +8,10 @@ can be told too.
 import enum
 import html
 import importlib
+import io
 import math
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, dataclass_transform, get_args
 
@@ -22,11 +23,14 @@ from afm_jax.saved import fields_of, is_abstract, is_record, save
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+    from rich.table import Table
     from xarray import Dataset
 
 Kind = TypeVar("Kind", bound=type)
 MOST_LINES = 20
 _WIDTH = 110
+_UNBROKEN = 10_000
+"""Columns of a text in which no line is broken."""
 _SHOWN = 5
 UNITS = {
     "nm_per_us": "nm/us",
@@ -66,6 +70,11 @@ class Result:
 
     def _repr_html_(self) -> str:
         return html_of(self)
+
+    def text(self) -> str:
+        """Return what the command that computes this result prints; of a result without one its fields in 20 lines."""
+        printed = getattr(self, "printed", None)
+        return text_of(self) if printed is None else text_of_parts(printed())
 
     def plot(self, path: str | Path | None = None) -> "Figure":
         """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given."""
@@ -132,6 +141,20 @@ def text_of(self: Any) -> str:
     return "\n".join(
         [f"{type(self).__name__}:", *(f"  {name:<{_widest(self)}}  {text}" for name, text in _lines(self))]
     )
+
+
+def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
+    """Return sentences and tables to print as one text; None says nothing."""
+    from rich.console import Console  # noqa: PLC0415 (help is there without it)
+
+    text = io.StringIO()
+    console = Console(file=text, width=_UNBROKEN)
+    for part in parts:
+        if isinstance(part, str):
+            console.print(part, markup=False, highlight=False, soft_wrap=True)
+        elif part is not None:
+            console.print(part)
+    return text.getvalue().rstrip("\n")
 
 
 def html_of(self: Any) -> str:

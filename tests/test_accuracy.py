@@ -7,10 +7,9 @@ import pytest
 from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
 from afm_jax.accuracy.overview import cheapest, impacts, orbits, overview_row
 from afm_jax.bench import timing as own_process
-from afm_jax.cli.accuracy import COLUMNS, OVERVIEW_FULL
-from afm_jax.plots.accuracy import accuracy_figure
+from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
 from tests.answers import answer, table
-from tests.run_here import run_here
+from tests.run_here import answered_with
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +28,7 @@ def test_every_scene_and_setting_has_its_row(study: dict):
     assert {row["scene"] for row in study["rows"]} == {"regular", "grazing", "order 5"}
     assert len(study["rows"]) == 3 * (2 * 3 + 1)
     for row in study["rows"]:
-        assert set(row) <= set(COLUMNS)
+        assert set(row) <= set(MAP.columns)
     assert study["reference_error_us"] < 1e-40  # fifty digits
 
 
@@ -85,23 +84,13 @@ def test_cheapest_is_the_fastest_that_is_good_enough():
 
 
 @pytest.mark.slow
-def test_figure_has_a_labelled_panel_for_each_scene(study: dict):
-    figure = accuracy_figure(study["rows"], 1e-9)
-    assert [axes.get_title() for axes in figure.axes] == ["scene: regular", "scene: grazing", "scene: order 5"]
-    for axes in figure.axes:
-        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-        assert "µs" in axes.get_xlabel()
-        assert len(axes.get_lines()) == 4
-
-
-@pytest.mark.slow
-def test_command_writes_table_picture_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
+def test_command_writes_table_picture_and_one_json_object(study: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(own_process, "run_in_own_process", answered_with({"map_accuracy": study}))
     payload = answer(tmp_path, "accuracy", "map", "--quick")
     own = {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"}
     assert own | {"format", "format_version"} == set(payload)
     assert {path.name for path in tmp_path.iterdir()} == {"accuracy.json", "accuracy.csv", "accuracy.png"}
-    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(COLUMNS)
+    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(MAP.columns)
 
 
 @pytest.mark.slow

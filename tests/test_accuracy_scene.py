@@ -9,7 +9,7 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene
 from afm_jax.accuracy.scenes import contact_accuracy, fidelity_ladder, law_accuracy
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.bench import timing as own_process
-from afm_jax.cli.accuracy_scene import COLUMNS, LADDER_COLUMNS, fitted_law, scene_to_study
+from afm_jax.cli.accuracy_scene import LADDER, SETTINGS, fitted_law, scene_to_study
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import State
@@ -18,7 +18,7 @@ from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import Start, save_scene
 from tests.answers import answer, table
 from tests.reference_driven_contact import DrivenContact, follow
-from tests.run_here import run_here
+from tests.run_here import answered_with
 
 DELAYED = Scene(
     Cantilever(90.0, 40.0),
@@ -64,11 +64,22 @@ def test_highest_points_are_those_of_the_closed_form():
     assert still[0] == pytest.approx(2.0, rel=5e-4)
 
 
-@pytest.mark.slow
-def test_root_tolerances_bound_the_error_of_an_impact(law_file: str):
-    scene, start = scene_to_study(law_file)
+@pytest.fixture(scope="module")
+def of_settings(law_file: str) -> dict:
     settings = {"contacts": 6, "tolerances": [1e-3, 1e-8, 1e-13, 1e-14], "repetitions": 1}
-    result = law_accuracy(scene=law_file, start=numbers(start), **settings)
+    return law_accuracy(scene=law_file, start=numbers(scene_to_study(law_file)[1]), **settings)
+
+
+@pytest.fixture(scope="module")
+def of_models(law_file: str) -> dict:
+    start = numbers(scene_to_study(law_file)[1])
+    return fidelity_ladder(scene=law_file, start=start, duration_us=800.0, law=None, repetitions=1)
+
+
+@pytest.mark.slow
+def test_root_tolerances_bound_the_error_of_an_impact(law_file: str, of_settings: dict):
+    scene, _ = scene_to_study(law_file)
+    result = of_settings
     assert [row["setting"] for row in result["rows"]][1] == "root tolerance 1e-08 us"
     errors = [row.get("arrival_error_us") for row in result["rows"]]
     # the tolerance bounds the error of one impact; this orbit is stable and does not multiply it by more than ten
@@ -83,9 +94,8 @@ def test_root_tolerances_bound_the_error_of_an_impact(law_file: str):
 
 
 @pytest.mark.slow
-def test_ladder_of_a_law_ends_at_its_own_map(law_file: str):
-    _, start = scene_to_study(law_file)
-    result = fidelity_ladder(scene=law_file, start=numbers(start), duration_us=800.0, law=None, repetitions=1)
+def test_ladder_of_a_law_ends_at_its_own_map(of_models: dict):
+    result = of_models
     rows = {row["model"]: row for row in result["ladder"]}
     assert list(rows) == [
         "single-impact orbit",
@@ -146,11 +156,14 @@ def test_law_of_a_scene_is_fitted_over_its_own_speeds(contact_file: str):
 
 
 @pytest.mark.slow
-def test_command_tells_all_of_a_law_scene(law_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
-    payload = answer(tmp_path, "accuracy", law_file, "--quick", "--contacts", 5)
-    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(COLUMNS)
-    assert tuple(table(tmp_path / "ladder.csv")[0]) == tuple(LADDER_COLUMNS)
+def test_command_tells_all_of_a_law_scene(
+    law_file: str, of_settings: dict, of_models: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    known = {"law_accuracy": of_settings, "fidelity_ladder": of_models}
+    monkeypatch.setattr(own_process, "run_in_own_process", answered_with(known))
+    payload = answer(tmp_path, "accuracy", law_file, "--quick", "--contacts", 6)
+    assert tuple(table(tmp_path / "accuracy.csv")[0]) == SETTINGS.columns
+    assert tuple(table(tmp_path / "ladder.csv")[0]) == LADDER.columns
     assert (tmp_path / "accuracy.png").exists()
     assert {"rows", "ladder", "reference_error_us", "reference_error_nm", "law"} <= set(payload)
-    assert payload["contacts"] == 5
+    assert payload["contacts"] == 6

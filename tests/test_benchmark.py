@@ -16,14 +16,20 @@ from afm_jax.bench.timing import run_in_own_process
 from afm_jax.cli.bench import AIMED_BATCH, PARTS, aim_of, aim_sentence, map_aims
 from afm_jax.verify.fifty_digits import ExactMap, reference_error
 from tests.answers import answer, table
-from tests.run_here import run_here
+from tests.run_here import answered_with
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict:
+    """The impact map on one core, few and small measurements."""
+    return one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)
 
 
 @pytest.mark.slow
-def test_one_core_measures_what_it_says():
-    rows = one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)["rows"]
+def test_one_core_measures_what_it_says(measured: dict):
+    rows = measured["rows"]
     for row in rows:
-        assert set(row) <= set(PARTS[0].columns)
+        assert set(row) <= set(PARTS[0].table.columns)
         assert row["impacts_per_second"] == pytest.approx(1e6 / row["microseconds_per_impact"], rel=1e-12)
     maps = [row for row in rows if row["what"].startswith("next_impact")]
     assert [(row["scene"], row["batch"], row["block"]) for row in maps] == [
@@ -129,14 +135,16 @@ def test_aims_are_judged_and_not_invented():
 
 
 @pytest.mark.slow
-def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
+def test_command_writes_tables_and_one_json_object(measured: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(
+        own_process, "run_in_own_process", answered_with({"one_core": measured, "all_cores": {"rows": []}})
+    )
     payload = answer(tmp_path, "bench", "--only", "map", "--quick", "--batch", 2)
     assert {"format", "format_version", "rows", "contact_rows", "scene_rows", "aims", "machine"} == set(payload)
     assert payload["contact_rows"] == []
     assert not (tmp_path / "bench_contact.csv").exists()
     rows = table(tmp_path / "bench.csv")
-    assert tuple(rows[0]) == PARTS[0].columns
+    assert tuple(rows[0]) == PARTS[0].table.columns
     assert len(rows) == len(payload["rows"])
 
 

@@ -7,15 +7,21 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, save_scene
+import afm_jax
+from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, load_scene, save_scene
 from afm_jax.cli.main import main
-from afm_jax.cli.orbits import COLUMNS
+from afm_jax.columns import columns_of, csv_cells
+from afm_jax.dynamics.orbit_tables import OrbitTable
 from tests.reference_examples import SCENES, scene
 from tests.reference_flight import Parameters
 from tests.reference_orbits import single_impact_orbits
 from tests.strict_reading import strictly
 
-KEYS = {*COLUMNS}
+KEYS = {
+    *("phase_rad", "velocity_after_nm_per_us", "velocity_before_nm_per_us", "approach_speed_nm_per_us"),
+    *("rebound_speed_nm_per_us", "delay_us", "peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"),
+    *("trace", "determinant", "stable", "admissible", "near_double"),
+}
 
 
 def saved(p: Parameters, path: Path, *, offset_rate: float = 0.0) -> str:
@@ -57,6 +63,12 @@ def test_table_and_file_show_the_same_orbits(tmp_path: Path):
     assert [row["stable"] for row in rows] == ["false", "true"]
     for orbit in expected:
         assert f"{float(orbit.peak_amplitude_nm):.6g}" in result.stdout
+    # the same from Python, where no terminal breaks lines
+    loaded = load_scene(path)
+    told = OrbitTable(loaded, 1, afm_jax.single_impact_orbits(loaded, 1))
+    assert told.text().split() == result.stdout.split()
+    columns = told.tables()["orbits.csv"]
+    assert columns_of(rows) == {name: list(map(str, csv_cells(column))) for name, column in columns.items()}
 
 
 def test_no_orbit_ends_with_3_and_says_why(tmp_path: Path):

@@ -12,9 +12,9 @@ from click.testing import CliRunner
 from matplotlib.image import imread
 
 from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
-from afm_jax.cli.collide import COLUMNS
 from afm_jax.cli.main import main
 from afm_jax.cli.values import Numbers
+from afm_jax.contact.collide import _COLUMNS as COLUMNS
 from afm_jax.contact.collide import default_speeds
 from afm_jax.contact.parameters import PAPER
 from afm_jax.plots.collisions import collisions_figure

@@ -6,7 +6,7 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from afm_jax.cli.design_prior import PriorOptions, prior_of_options
+from afm_jax.cli.design_prior import prior_of_options
 from afm_jax.cli.main import main
 from fitting import fit, read_table
 from tests.fit_tables import EXAMPLE, rows
@@ -142,9 +142,7 @@ def test_too_few_points_determine_nothing():
 
 
 def test_what_is_held_is_not_forecast():
-    options = PriorOptions(
-        None, None, "full", 0.1, None, None, {"free_frequency_khz": (90.0, None), "fix": (("r", 0.9),)}
-    )
+    options = {"model": "full", "uncertainty": 0.1, "free_frequency_khz": (90.0, None), "fix": (("r", 0.9),)}
     prior = prior_of_options(options, 0.01)
     assert prior.problem.names == ("epsilon", "viscous_loss")
     assert prior.fixed == {"r": 0.9}

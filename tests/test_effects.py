@@ -1,7 +1,5 @@
 """`afm-jax effects`: on scenes where it is known what an effect changes."""
 
-import math
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.cli.values import Share
 from afm_jax.effects.scene_effects import effects_in
 from afm_jax.effects.study import Change, Programs, Reduction, study_effects
 from afm_jax.impact.orbits import single_impact_orbits
@@ -290,8 +287,3 @@ def test_the_command_writes_what_it_says(called):
         for row, effect in zip(rows, payload["effects"], strict=True)
     )
     assert {path.name for path in (folder / "out").iterdir()} >= {"effects.json", "effects.png"}
-
-
-@pytest.mark.parametrize("text", ["1%", "0.01", "1 %", " 1% "])
-def test_a_share_can_be_written_in_two_ways(text):
-    assert math.isclose(Share().read(text), 0.01, rel_tol=1e-15)

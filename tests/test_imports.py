@@ -18,6 +18,7 @@ LEVELS = {
     "strict_json": 0,
     "whole_files": 0,
     "words": 0,
+    "columns": 0,
     "outcomes": 0,
     "checks": 1,
     "least_squares": 0,

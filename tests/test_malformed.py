@@ -1,5 +1,6 @@
 """Every malformed file and wrong call of the corpus ends in its own line: file, place, what is wrong; exit code 2."""
 
+import os
 import time
 from pathlib import Path
 
@@ -21,6 +22,8 @@ def test_the_corpus_is_large_and_no_file_is_there_twice():
 def test_one_clear_line(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    # a sweep tells JAX to use all cores
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
     write_sound_files()
     for case in CASES:
         if case["of"] != name:

@@ -69,12 +69,14 @@ def orbits() -> Orbits:
     return Orbits(scenes, order, there, found, start, one)
 
 
+@pytest.mark.slow
 def test_most_scenes_have_an_orbit(orbits):
     assert orbits.there.sum() > 0.8 * SCENES
     # impacts that last longer than the straight paths, and shorter
     assert np.any(orbits.one.delay_us[orbits.there] < 0.0)
 
 
+@pytest.mark.slow
 def test_the_map_leads_back_to_where_an_orbit_begins(orbits):
     start, period = orbits.start, orbits.order * np.asarray(orbits.scenes.platform.period_us)
     impact = jax.jit(jax.vmap(next_impact))(orbits.scenes, start.time_us, start.velocity_nm_per_us)

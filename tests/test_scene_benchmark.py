@@ -192,7 +192,7 @@ def test_command_writes_its_table_and_judges(tmp_path: Path, monkeypatch: pytest
     assert result.exit_code == 0, result.stderr
     assert "13.0%" in result.stdout
     assert "at most 1 wanted, 1.5 reached, not met" in result.stdout
-    assert (tmp_path / "bench_scenes.csv").read_text("utf-8").splitlines()[0] == ",".join(PARTS[2].columns)
+    assert (tmp_path / "bench_scenes.csv").read_text("utf-8").splitlines()[0] == ",".join(PARTS[2].table.columns)
     payload = json.loads((tmp_path / "bench.json").read_text("utf-8"))
     assert payload["scene_rows"] == ROWS
     assert payload["scene_reference_error_us"] == 1e-12

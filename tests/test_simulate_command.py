@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.cli.main import main
-from afm_jax.cli.simulate import text_of
+from afm_jax.motion.motion_table import lines_of
 from afm_jax.motion.trajectory import pieces_between
 from afm_jax.scenefile.scenefile import Start
 from fitting.traces.lockin import lockin
@@ -142,13 +142,6 @@ def test_a_tip_too_slow_sticks(tmp_path: Path):
     assert nulls(answer) == answer["null_reasons"].keys()
 
 
-def test_a_preset_has_its_start():
-    result = simulate("figure2", "--periods", 30, "--json")
-    assert result.exit_code == 0, result.stderr
-    answer = strictly(result.stdout)
-    assert answer["scene"]["platform"]["offset_nm"] == -1.0
-
-
 def test_nothing_is_said_over_a_response_period_that_is_not_there():
     numbers = ("peak_amplitude_nm", "mean_height_nm", "given_by_drives_aj", "dissipated_in_air_aj")
     nothing = dict.fromkeys(("peak_deflection_nm", "phase_lag_deg", "peak_force_nn"))
@@ -161,7 +154,7 @@ def test_nothing_is_said_over_a_response_period_that_is_not_there():
 
     def said(responses: int) -> str:
         return " ".join(
-            text_of(payload | {"window": {"from_us": 7.2, "to_us": 9.0, "periods": 1, "responses": responses}})
+            lines_of(payload | {"window": {"from_us": 7.2, "to_us": 9.0, "periods": 1, "responses": responses}})
         )
 
     assert "At the drive's frequency (180 kHz): 10 nm, 0 deg." in said(1)

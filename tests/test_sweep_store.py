@@ -47,6 +47,7 @@ def test_points_without_a_result_say_why(tmp_path: Path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = xarray.open_zarr(str(tmp_path / STORE)).load()
+    assert found.sizes == {"x": 7, "y": 12, "part": 2}
     np.testing.assert_array_equal(found["message"], np.where(SUM < 2.0, "the sum is below 2 \u00e4", ""))
     before = contents(tmp_path)
     (tmp_path / STORE / "computed" / "c" / "0" / "0").unlink()
@@ -301,13 +302,6 @@ def test_axes_are_what_they_say():
 def test_impossible_axes_are_named(axes: list, message: str):
     with pytest.raises(ValueError, match=message):
         axes_of(axes)
-
-
-def test_the_store_opens_without_warnings(tmp_path: Path):
-    run_plan(plan(), tmp_path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert xarray.open_zarr(str(tmp_path / STORE)).sizes == {"x": 7, "y": 12, "part": 2}
 
 
 def test_a_worker_with_other_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

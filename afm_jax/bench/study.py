@@ -9,12 +9,39 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from rich.table import Table
+
 from afm_jax.bench.timing import Compiled, progress, time_compiled
+from afm_jax.columns import Cell, columns_of, printed_table
 
 Row = dict[str, Any]
 
 RIVALS = ("SciPy", "SUNDIALS", "Diffrax", "NumPy")
 """How methods that are not this package's begin."""
+
+
+class StudyTable(NamedTuple):
+    """How measured rows are told: in a CSV file, and as a table in the terminal.
+
+    Attributes:
+        file: name of the CSV file.
+        columns: keys of the rows that it has.
+        title: of the printed table; what stands in braces is filled in.
+        cells: headings of the printed table, and what stands below them.
+    """
+
+    file: str
+    columns: tuple[str, ...]
+    title: str
+    cells: Mapping[str, Cell]
+
+    def printed(self, rows: Sequence[Row], **told: Any) -> Table:
+        """Return the rows as a table to print, numbers with three digits; the title may say more."""
+        return printed_table(self.title.format(**told), self.cells, rows, form=".3g")
+
+    def written(self, rows: Sequence[Row]) -> dict[str, dict[str, list[Any]]]:
+        """Return the columns of the CSV file by its name."""
+        return {self.file: columns_of(rows, self.columns)}
 
 
 class Contestant(NamedTuple):

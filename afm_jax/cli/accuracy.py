@@ -9,32 +9,35 @@ from afm_jax.accuracy.collisions import cheapest_collision
 from afm_jax.accuracy.impacts import cheapest_settings
 from afm_jax.accuracy.overview import cheapest
 from afm_jax.bench import timing
+from afm_jax.bench.study import StudyTable
 from afm_jax.cli.accuracy_scene import scene_study
-from afm_jax.cli.columns import Cell, columns_of, rows_table
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES
+from afm_jax.columns import Cell, columns_of, printed_table
 
 Row = dict[str, Any]
 
-COLUMNS = (
-    "scene",
-    "method",
-    "tolerance",
-    "microseconds_per_impact",
-    "error_us",
-    "median_error_us",
-    "sequence_error_us",
-    "impacts_checked",
-    "near_grazing",
-    "near_grazing_error_us",
-    "lost_impacts",
-    "evaluations_per_impact",
-    "missed_impacts",
-    "compile_s",
-    "reason",
+MAP = StudyTable(
+    "accuracy.csv",
+    (
+        *("scene", "method", "tolerance", "microseconds_per_impact", "error_us", "median_error_us"),
+        *("sequence_error_us", "impacts_checked", "near_grazing", "near_grazing_error_us", "lost_impacts"),
+        *("evaluations_per_impact", "missed_impacts", "compile_s", "reason"),
+    ),
+    "Error of an impact time against the time it takes (one core)",
+    # SciPy's tolerance is relative and in nm; the map's is in us
+    {
+        "scene": "scene",
+        "method": "method",
+        "tolerance": "tolerance",
+        "us/impact": "microseconds_per_impact",
+        "largest error us": "error_us",
+        "median us": "median_error_us",
+        "after sequence us": "sequence_error_us",
+        "near grazing us": "near_grazing_error_us",
+    },
 )
-"""What `accuracy.csv` tells of a setting."""
 FULL = {
     "root_tolerances_us": [1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13, 1e-14],
     "scipy_tolerances": [1e-4, 1e-6, 1e-8, 1e-10, 1e-12],
@@ -52,22 +55,26 @@ QUICK = {
     "repetitions": 1,
 }
 
-COLLIDE_COLUMNS = (
-    "method",
-    "variable",
-    "setting",
-    "precision",
-    "tolerance",
-    "microseconds_per_impact",
-    "rebound_error",
-    "delay_error_us",
-    "slope_error",
-    "near_capture_error",
-    "evaluations_per_impact",
-    "compile_s",
-    "reason",
+COLLIDE = StudyTable(
+    "accuracy.csv",
+    (
+        *("method", "variable", "setting", "precision", "tolerance", "microseconds_per_impact", "rebound_error"),
+        *("delay_error_us", "slope_error", "near_capture_error", "evaluations_per_impact", "compile_s", "reason"),
+    ),
+    "Error of a collision against the time it takes, 12 to 200 nm/us (one core)",
+    {
+        "method": "method",
+        "in": "variable",
+        "setting": "setting",
+        "precision": "precision",
+        "us/impact": "microseconds_per_impact",
+        "u_out error": "rebound_error",
+        "delay error us": "delay_error_us",
+        "slopes' error": "slope_error",
+        "near capture": "near_capture_error",
+        "compile s": "compile_s",
+    },
 )
-"""What `accuracy.csv` tells of a contestant of `collide`."""
 COLLIDE_FULL = {
     "tolerances": [1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11],
     "solvers": {"gap": ["Tsit5", "Dopri5", "Dopri8", "Kvaerno5"], "time": ["Tsit5", "Dopri8"]},
@@ -125,7 +132,15 @@ OVERVIEW_QUICK = {
     "fitting.benchmark:minimum_accuracy": {"rows": 20, "settled": [1e-10], "tolerances": [1e-8], "repetitions": 1},
 }
 OVERVIEW_COLUMNS = ("problem", "method", "setting", "microseconds", "error", "reason")
-"""What `accuracy.csv` tells of a method."""
+"""What `accuracy.csv` tells of a method in the overview."""
+_CHEAPEST: dict[str, Cell] = {
+    "problem": "problem",
+    "error": "wanted_error:g",
+    "here": lambda row: row["own"] or "none",
+    "us here": "own_microseconds",
+    "others": lambda row: row["other"] or "none",
+    "us there": "other_microseconds",
+}
 WANTED = [1e-3, 1e-6, 1e-9, 1e-11]
 
 
@@ -158,14 +173,6 @@ def overview_study(session: Session, *, quick: bool) -> Output:
             found = timing.run_in_own_process(task, settings, cores=1)
             rows, references = rows + found["rows"], references | found["references"]
     choices = cheapest(rows, WANTED)
-    cells: dict[str, Cell] = {
-        "problem": "problem",
-        "error": "wanted_error:g",
-        "here": lambda row: row["own"] or "none",
-        "us here": "own_microseconds",
-        "others": lambda row: row["other"] or "none",
-        "us there": "other_microseconds",
-    }
     told = [
         f"{problem}: error of the {known['error_of']}, against {known['reference']}, itself known to "
         f"{known['reference_error']:.0e}"
@@ -173,7 +180,7 @@ def overview_study(session: Session, *, quick: bool) -> Output:
     ]
     return Output(
         payload={"rows": rows, "references": references, "cheapest": choices},
-        text=[rows_table("The fastest way to a wanted error (one core)", cells, choices), *told],
+        text=[printed_table("The fastest way to a wanted error (one core)", _CHEAPEST, choices, form=".3g"), *told],
         tables={"accuracy.csv": columns_of(rows, OVERVIEW_COLUMNS)},
         files={"accuracy.png": picture_of("accuracy:overview_figure", rows, references)},
         json_file="accuracy.json",
@@ -185,17 +192,6 @@ def map_study(session: Session, wanted_error_us: float, *, quick: bool) -> Outpu
     with session.working("measuring"):
         result = timing.run_in_own_process("afm_jax.accuracy.impacts:map_accuracy", QUICK if quick else FULL, cores=1)
     rows, choices = result["rows"], cheapest_settings(result["rows"], wanted_error_us)
-    # SciPy's tolerance is relative and in nm; the map's is in us
-    cells: dict[str, Cell] = {
-        "scene": "scene",
-        "method": "method",
-        "tolerance": "tolerance",
-        "us/impact": "microseconds_per_impact",
-        "largest error us": "error_us",
-        "median us": "median_error_us",
-        "after sequence us": "sequence_error_us",
-        "near grazing us": "near_grazing_error_us",
-    }
     reference = (
         f"Reference: 50 digits, its own error {result['reference_error_us']:.0e} us. Default of next_impact: float64, "
         f"root tolerance {result['default_root_tolerance_us']:g} us."
@@ -203,11 +199,11 @@ def map_study(session: Session, wanted_error_us: float, *, quick: bool) -> Outpu
     return Output(
         payload={**result, "wanted_error_us": wanted_error_us, "cheapest": choices},
         text=[
-            rows_table("Error of an impact time against the time it takes (one core)", cells, rows),
+            MAP.printed(rows),
             reference,
             *(cheapest_sentence(choice, wanted_error_us) for choice in choices),
         ],
-        tables={"accuracy.csv": columns_of(rows, COLUMNS)},
+        tables=MAP.written(rows),
         files={"accuracy.png": picture_of("accuracy:accuracy_figure", rows, wanted_error_us)},
         json_file="accuracy.json",
     )
@@ -219,18 +215,6 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> Output:
         task = "afm_jax.accuracy.collisions:collide_accuracy"
         result = timing.run_in_own_process(task, COLLIDE_QUICK if quick else COLLIDE_FULL, cores=1)
     rows, best = result["rows"], cheapest_collision(result["rows"], accuracy)
-    cells: dict[str, Cell] = {
-        "method": "method",
-        "in": "variable",
-        "setting": "setting",
-        "precision": "precision",
-        "us/impact": "microseconds_per_impact",
-        "u_out error": "rebound_error",
-        "delay error us": "delay_error_us",
-        "slopes' error": "slope_error",
-        "near capture": "near_capture_error",
-        "compile s": "compile_s",
-    }
     sentence = (
         f"No contestant reaches {accuracy:g}."
         if best is None
@@ -238,12 +222,11 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> Output:
         f"{best['microseconds_per_impact']:.3g} us an impact, errors {best['rebound_error']:.1e} and "
         f"{best['delay_error_us']:.1e} us."
     )
-    title = "Error of a collision against the time it takes, 12 to 200 nm/us (one core)"
     reference = f"Reference: quadrature converged to {result['reference_error']:.0e}."
     return Output(
         payload={**result, "accuracy": accuracy, "cheapest": best},
-        text=[rows_table(title, cells, rows), reference, sentence],
-        tables={"accuracy.csv": columns_of(rows, COLLIDE_COLUMNS)},
+        text=[COLLIDE.printed(rows), reference, sentence],
+        tables=COLLIDE.written(rows),
         files={"accuracy.png": picture_of("accuracy:collide_accuracy_figure", rows)},
         json_file="accuracy.json",
     )

@@ -8,7 +8,7 @@ import numpy as np
 from afm_jax.accuracy.scenes import ladder_duration
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench import timing
-from afm_jax.cli.columns import Cell, columns_of, rows_table
+from afm_jax.bench.study import StudyTable
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import scene_and_start
@@ -19,17 +19,32 @@ from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import start_of
 
-COLUMNS = (
-    "way",
-    "setting",
-    "microseconds_per_contact",
-    "arrival_error_us",
-    "peak_error_nm",
-    "compile_s",
+SETTINGS = StudyTable(
+    "accuracy.csv",
+    ("way", "setting", "microseconds_per_contact", "arrival_error_us", "peak_error_nm", "compile_s"),
+    "Error after {contacts} contacts against the time of one (one core, one tip)",
+    {
+        "way": "way",
+        "setting": "setting",
+        "us/contact": "microseconds_per_contact",
+        "arrival error us": "arrival_error_us",
+        "peak error nm": "peak_error_nm",
+        "compile s": "compile_s",
+    },
 )
-"""What `accuracy.csv` tells of a setting."""
-LADDER_COLUMNS = ("model", "peak_nm", "lowest_peak_nm", "model_error", "seconds", "contacts", "reason")
-"""What `ladder.csv` tells of a model."""
+LADDER = StudyTable(
+    "ladder.csv",
+    ("model", "peak_nm", "lowest_peak_nm", "model_error", "seconds", "contacts", "reason"),
+    "The same amplitude from simpler models: error against the {model_reference}",
+    {
+        "model": "model",
+        "peak nm": "peak_nm:.5g",
+        "lowest peak nm": "lowest_peak_nm:.5g",
+        "error": "model_error:.2%",
+        "seconds": "seconds",
+        "contacts": "contacts:d",
+    },
+)
 CONTACT = {"accuracies": [1e-6, 1e-9], "quick": [2, 8], "careful": [2.0, 4.0, 6.0, 8.0], "repetitions": 5}
 CONTACT_QUICK = {"accuracies": [1e-6], "quick": [], "careful": [3.0, 5.0], "repetitions": 1}
 LAW = {"tolerances": [1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13, 1e-14], "repetitions": 5}
@@ -54,36 +69,15 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> O
         )
         rungs = {**common, "law": law, "duration_us": duration, "repetitions": settings["repetitions"]}
         result |= timing.run_in_own_process("afm_jax.accuracy.scenes:fidelity_ladder", rungs, cores=1)
-    errors: dict[str, Cell] = {
-        "way": "way",
-        "setting": "setting",
-        "us/contact": "microseconds_per_contact",
-        "arrival error us": "arrival_error_us",
-        "peak error nm": "peak_error_nm",
-        "compile s": "compile_s",
-    }
-    ladder: dict[str, Cell] = {
-        "model": "model",
-        "peak nm": "peak_nm:.5g",
-        "lowest peak nm": "lowest_peak_nm:.5g",
-        "error": "model_error:.2%",
-        "seconds": "seconds",
-        "contacts": "contacts:d",
-    }
-    settings_title = f"Error after {result['contacts']} contacts against the time of one (one core, one tip)"
-    ladder_title = f"The same amplitude from simpler models: error against the {result['model_reference']}"
     return Output(
         payload={**result, "scene": name, "law": law},
         text=[
-            rows_table(settings_title, errors, result["rows"]),
+            SETTINGS.printed(result["rows"], **result),
             reference_sentence(result),
-            rows_table(ladder_title, ladder, result["ladder"]),
+            LADDER.printed(result["ladder"], **result),
             *(f"{row['model']}: {row['reason']}" for row in result["ladder"] if row.get("reason")),
         ],
-        tables={
-            "accuracy.csv": columns_of(result["rows"], COLUMNS),
-            "ladder.csv": columns_of(result["ladder"], LADDER_COLUMNS),
-        },
+        tables=SETTINGS.written(result["rows"]) | LADDER.written(result["ladder"]),
         files={"accuracy.png": picture_of("accuracy:scene_accuracy_figure", result)},
         json_file="accuracy.json",
     )

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.cli.columns import TableColumn, printed_table
 from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.session import Session
+from afm_jax.columns import Cell, printed_table
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome, approach_curve
 from afm_jax.scenefile.scenefile import scene_tables
 from fitting.simulated.experiment import table_of_curve
@@ -16,14 +16,14 @@ from fitting.tables.table import write_table
 NOISE, PHASE_NOISE_DEG = 0.003, 0.2
 """Errors of curve.csv, relative and in degrees, where none are asked for."""
 
-_COLUMNS = (
-    TableColumn("height\n(nm)", "height_nm"),
-    TableColumn("", "direction", "", left=True),
-    TableColumn("amplitude\n(nm)", "amplitude_nm"),
-    TableColumn("lag\n(degrees)", "phase_lag_deg", ".5g"),
-    TableColumn("lost to the\nsample (aJ)", "dissipated_in_contact_aj", ".4g"),
-    TableColumn("outcome", "outcome", "", left=True),
-)
+_CELLS: dict[str, Cell] = {
+    "height\n(nm)": "height_nm",
+    "": "direction",
+    "amplitude\n(nm)": "amplitude_nm",
+    "lag\n(degrees)": "phase_lag_deg:.5g",
+    "lost to the\nsample (aJ)": "dissipated_in_contact_aj:.4g",
+    "outcome": "outcome",
+}
 
 
 def approach(
@@ -97,4 +97,4 @@ def _points(curve: ApproachCurve) -> dict[str, list[Any]]:
 
 
 def _table(rows: list[dict[str, Any]]) -> Any:
-    return printed_table("Approach curve", _COLUMNS, rows)
+    return printed_table("Approach curve", _CELLS, rows)

@@ -1,12 +1,11 @@
 """`afm-jax bench`: impacts and contacts per second, studies, sweeps and fits, next to SciPy.
 
-What is measured is a list, `PARTS`: each part with its file, its columns, its table and the function that measures it.
+What is measured is a list, `PARTS`: each part with the function that measures it and the tables that tell of it.
 """
 
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -14,8 +13,10 @@ from typing import Any, NamedTuple
 from rich.table import Table
 
 from afm_jax.bench import collisions, dynamics, scenes, sweeps, timing
-from afm_jax.cli.columns import Cell, rows_table
-from afm_jax.cli.session import Session, write_json
+from afm_jax.bench.study import StudyTable
+from afm_jax.cli.command import Output
+from afm_jax.cli.session import Session
+from afm_jax.columns import Cell, printed_table
 from afm_jax.compilation_cache import available_cores
 
 Row = dict[str, Any]
@@ -41,46 +42,41 @@ class Measured(NamedTuple):
     told: Mapping[str, Any] = MappingProxyType({})
 
 
-@dataclass(frozen=True, kw_only=True)
-class Part:
+class Part(NamedTuple):
     """A part of the benchmark.
 
     Attributes:
         name: what --only calls it.
         key: of its rows in the JSON object.
-        file: its CSV file.
-        columns: of that file.
         measure: gives the rows.
-        tables: shows them in the terminal.
+        table: how they are told.
+        further: another printed table of them, its rows made of the part's.
     """
 
     name: str
     key: str
-    file: str
-    columns: tuple[str, ...]
     measure: Callable[[Size], Measured]
-    tables: Callable[[Sequence[Row]], list[Table]]
+    table: StudyTable
+    further: Callable[[Sequence[Row]], Table] | None = None
 
 
-def bench(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
-    """Measure all parts, or one, and write and show each."""
+def bench(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> Output:
+    """Measure all parts, or one."""
     size = Size(quick, available_cores(), batches)
     machine = machine_facts(size.cores)
     if (machine["load_before"] or 0.0) > 0.3 * size.cores:
         session.note(f"other programs are running (load {machine['load_before']:.1f}): times will be too long")
     payload: dict[str, Any] = {"rows": [], "contact_rows": [], "scene_rows": [], "aims": [], "machine": machine}
-    tables = []
+    printed, tables = [], {}
     with session.working("measuring"):
         for part in (part for part in PARTS if only in {None, part.name}):
-            measured = part.measure(size)
-            payload |= {part.key: measured.rows, **measured.told}
-            payload["aims"] += [aim_of(*aim) for aim in measured.aims]
-            tables += part.tables(measured.rows)
-            session.write_table(part.file, measured.rows, part.columns)
-    if session.out is not None:
-        write_json(session.out / "bench.json", payload)
-        session.note(f"wrote {session.out / 'bench.json'}")
-    session.emit(payload, *tables, *(aim_sentence(aim) for aim in payload["aims"]))
+            rows, aims, told = part.measure(size)
+            payload |= {part.key: rows, **told}
+            payload["aims"] += [aim_of(*aim) for aim in aims]
+            printed += [part.table.printed(rows), *([] if part.further is None else [part.further(rows)])]
+            tables |= part.table.written(rows)
+    text = [*printed, *(aim_sentence(aim) for aim in payload["aims"])]
+    return Output(payload=payload, text=text, tables=tables, json_file="bench.json")
 
 
 def aim_of(name: str, reached: float | None, bound: float) -> dict[str, Any]:
@@ -140,28 +136,6 @@ def map_aims(rows: Sequence[Row]) -> list[tuple[str, float | None, float]]:
     ]
 
 
-def _map_tables(rows: Sequence[Row]) -> list[Table]:
-    def error(row: Mapping[str, Any]) -> str:
-        if "error_us" in row:
-            return f"{row['error_us']:.1e} {row['error_kind']}"
-        slope = row.get("derivative_relative_error")
-        return "-" if slope is None else f"derivative: {slope:.1e} relative"
-
-    cells: dict[str, Cell] = {
-        "what": "what",
-        "scene": "scene",
-        "batch": "batch:,",
-        "cores": "cores:d",
-        "us/impact": "microseconds_per_impact",
-        "median": "median_microseconds_per_impact",
-        "impacts/s": "impacts_per_second:,.0f",
-        "compile s": "compile_s:.1f",
-        "ratio": "ratio_to_plain:.2f",
-        "error us": error,
-    }
-    return [rows_table("Time of an impact: best of several repetitions, compilation apart", cells, rows)]
-
-
 def measure_contact(size: Size) -> Measured:
     """Measure collisions of free tips through the contact."""
     full = {"batch": AIMED_BATCH, "repetitions": 7, "many": 1_000_000, "scipy_speeds": [12.0, 30.0, 100.0]}
@@ -169,21 +143,6 @@ def measure_contact(size: Size) -> Measured:
     task = "afm_jax.bench.collisions:contact_one_core"
     rows = timing.run_in_own_process(task, small if size.quick else full, cores=1)["rows"]
     return Measured(rows, collisions.aims(rows))
-
-
-def _contact_tables(rows: Sequence[Row]) -> list[Table]:
-    cells: dict[str, Cell] = {
-        "what": "what",
-        "batch": "batch:,",
-        "us/impact": "microseconds_per_impact",
-        "compile s": "compile_s",
-        "u_out error": "rebound_error",
-        "delay error us": "delay_error_us",
-        "ratio": "ratio_to_plain",
-        "operations": "instructions",
-        "scratch MiB": "memory_mib",
-    }
-    return [rows_table("Time of a collision through the contact, 12 to 200 nm/us, one core", cells, rows)]
 
 
 _PERIODS = {"1.01": 30, "5.277": 150}
@@ -203,45 +162,6 @@ def measure_scenes(size: Size) -> Measured:
     return Measured(found["rows"], scenes.aims(found["rows"]), told)
 
 
-def _scene_tables(rows: Sequence[Row]) -> list[Table]:
-    """Return two tables: times, and errors of one contact each."""
-    times: dict[str, Cell] = {
-        "what": "what",
-        "scene": "scene",
-        "batch": "batch:d",
-        "periods": "periods:d",
-        "contacts": "contacts:d",
-        "us/contact": "microseconds_per_contact",
-        "seconds": "seconds",
-        "compile s": "compile_s",
-        "turning": "turning_share:.1%",
-        "held": "held_share:.1%",
-        "failed": "failed:d",
-    }
-
-    def spread(name: str) -> Callable[[Mapping[str, Any]], str]:
-        def cell(row: Mapping[str, Any]) -> str:
-            values = [row.get(f"{row['part']}_{name}_{share}") for share in _SHARES]
-            return "  ".join(f"{value:.1e}" for value in values if value is not None)
-
-        return cell
-
-    errors: dict[str, Cell] = {
-        "what": "what",
-        "scene": "scene",
-        "contacts": "part",
-        "rebound (relative)": spread(_ERRORS[0]),
-        "departure time us": spread(_ERRORS[1]),
-        "ends otherwise": "different:d",
-    }
-    parts = [row | {"part": part} for row in rows for part in _STRAIGHT_OR_TURNING]
-    parts = [row for row in parts if f"{row['part']}_{_ERRORS[0]}_worst" in row]
-    return [
-        rows_table("Time of a driven contact, the flight to it included; one core", times, rows),
-        rows_table("Error of one contact, from the same arrival: median, 99 %, worst", errors, parts),
-    ]
-
-
 def measure_dynamics(size: Size) -> Measured:
     """Measure charts, diagrams, exponents and basins."""
     full = {"values": 10_000, "impacts": 2000, "side": 1000, "orders": 8, "grid": 1000, "by_scipy": 100}
@@ -251,39 +171,12 @@ def measure_dynamics(size: Size) -> Measured:
     return Measured(rows, dynamics.aims(rows, whole=not size.quick))
 
 
-def _dynamics_tables(rows: Sequence[Row]) -> list[Table]:
-    cells: dict[str, Cell] = {
-        "what": "what",
-        "work": "work",
-        "s": "seconds",
-        "processor s": "processor_seconds",
-        "first time, s": "first_s",
-        "beside, s": "beside_seconds",
-        "times as fast": "ratio",
-    }
-    return [rows_table("charts, diagrams, exponents, basins; all cores", cells, rows)]
-
-
 def measure_sweeps(size: Size) -> Measured:
     """Measure sweeps over law scenes."""
     full = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 8_000_000, "processes": [1, 2, 4]}
     small = {"sizes": [2000], "points": 0, "processes": []}
     rows = sweeps.sweep_rows(**(small if size.quick else full), cores=size.cores)
     return Measured(rows, sweeps.aims(rows))
-
-
-def _sweep_tables(rows: Sequence[Row]) -> list[Table]:
-    cells: dict[str, Cell] = {
-        "what": "what",
-        "scenes": "points:,",
-        "processes": "processes:d",
-        "devices": "devices:d",
-        "s": "seconds",
-        "us/scene": "microseconds_per_point",
-        "processor us/scene": "processor_microseconds_per_point",
-        "peak MiB": "peak_memory_mib",
-    }
-    return [rows_table("sweeps over law scenes, one order", cells, rows)]
 
 
 _FIT_BOUNDS = {
@@ -310,89 +203,179 @@ def measure_fits(size: Size) -> Measured:
     return Measured(rows, aims)
 
 
-def _fit_tables(rows: Sequence[Row]) -> list[Table]:
-    def goodness(row: Mapping[str, Any]) -> str:
-        return f"{row['chi2']:.1f}/{row['degrees_of_freedom']}"
+def _map_error(row: Mapping[str, Any]) -> str:
+    if "error_us" in row:
+        return f"{row['error_us']:.1e} {row['error_kind']}"
+    slope = row.get("derivative_relative_error")
+    return "-" if slope is None else f"derivative: {slope:.1e} relative"
+
+
+def _scene_errors(rows: Sequence[Row]) -> Table:
+    """Return the errors of contacts that go straight through and of those that turn, a line each."""
+
+    def spread(name: str) -> Callable[[Mapping[str, Any]], str]:
+        def cell(row: Mapping[str, Any]) -> str:
+            values = [row.get(f"{row['part']}_{name}_{share}") for share in _SHARES]
+            return "  ".join(f"{value:.1e}" for value in values if value is not None)
+
+        return cell
 
     cells: dict[str, Cell] = {
-        "model": "model",
-        "rows": "rows:d",
-        "first time, s": "first_s:.1f",
-        "first time, processor s": "first_processor_s:.1f",
-        "warm cache, s": "warm_s:.1f",
-        "warm cache, processor s": "warm_processor_s:.1f",
-        "chi2/dof": goodness,
+        "what": "what",
+        "scene": "scene",
+        "contacts": "part",
+        "rebound (relative)": spread(_ERRORS[0]),
+        "departure time us": spread(_ERRORS[1]),
+        "ends otherwise": "different:d",
     }
-    return [rows_table("fits from the shell", cells, rows)]
+    parts = [row | {"part": part} for row in rows for part in _STRAIGHT_OR_TURNING]
+    parts = [row for row in parts if f"{row['part']}_{_ERRORS[0]}_worst" in row]
+    return printed_table("Error of one contact, from the same arrival: median, 99 %, worst", cells, parts)
 
 
-PARTS = (
-    Part(
-        name="map",
-        key="rows",
-        file="bench.csv",
-        columns=(
+MAP = Part(
+    "map",
+    "rows",
+    measure_map,
+    StudyTable(
+        "bench.csv",
+        (
             *("what", "scene", "batch", "cores", "block", "impacts", "microseconds_per_impact"),
             *("median_microseconds_per_impact", "impacts_per_second", "compile_s", "error_us", "error_kind"),
             *("near_grazing", "ratio_to_plain", "derivative_relative_error"),
         ),
-        measure=measure_map,
-        tables=_map_tables,
+        "Time of an impact: best of several repetitions, compilation apart",
+        {
+            "what": "what",
+            "scene": "scene",
+            "batch": "batch:,",
+            "cores": "cores:d",
+            "us/impact": "microseconds_per_impact",
+            "median": "median_microseconds_per_impact",
+            "impacts/s": "impacts_per_second:,.0f",
+            "compile s": "compile_s:.1f",
+            "ratio": "ratio_to_plain:.2f",
+            "error us": _map_error,
+        },
     ),
-    Part(
-        name="contact",
-        key="contact_rows",
-        file="bench_contact.csv",
-        columns=(
+)
+CONTACT = Part(
+    "contact",
+    "contact_rows",
+    measure_contact,
+    StudyTable(
+        "bench_contact.csv",
+        (
             *("what", "batch", "microseconds_per_impact", "median_microseconds_per_impact", "compile_s"),
             *("rebound_error", "delay_error_us", "ratio_to_plain", "flops", "instructions", "memory_mib"),
             *("results_mib", "peak_process_mib", "evaluations_per_impact"),
         ),
-        measure=measure_contact,
-        tables=_contact_tables,
+        "Time of a collision through the contact, 12 to 200 nm/us, one core",
+        {
+            "what": "what",
+            "batch": "batch:,",
+            "us/impact": "microseconds_per_impact",
+            "compile s": "compile_s",
+            "u_out error": "rebound_error",
+            "delay error us": "delay_error_us",
+            "ratio": "ratio_to_plain",
+            "operations": "instructions",
+            "scratch MiB": "memory_mib",
+        },
     ),
-    Part(
-        name="scenes",
-        key="scene_rows",
-        file="bench_scenes.csv",
-        columns=(
+)
+SCENES = Part(
+    "scenes",
+    "scene_rows",
+    measure_scenes,
+    StudyTable(
+        "bench_scenes.csv",
+        (
             *("what", "scene", "batch", "periods", "contacts", "microseconds_per_contact"),
             *("median_microseconds_per_contact", "seconds", "compile_s", "turning_share", "held_share"),
             *("failed", "different"),
             *(f"{part}_{error}_{share}" for part in _STRAIGHT_OR_TURNING for error in _ERRORS for share in _SHARES),
             "evaluations_per_contact",
         ),
-        measure=measure_scenes,
-        tables=_scene_tables,
+        "Time of a driven contact, the flight to it included; one core",
+        {
+            "what": "what",
+            "scene": "scene",
+            "batch": "batch:d",
+            "periods": "periods:d",
+            "contacts": "contacts:d",
+            "us/contact": "microseconds_per_contact",
+            "seconds": "seconds",
+            "compile s": "compile_s",
+            "turning": "turning_share:.1%",
+            "held": "held_share:.1%",
+            "failed": "failed:d",
+        },
     ),
-    Part(
-        name="dynamics",
-        key="dynamics_rows",
-        file="bench_dynamics.csv",
-        columns=("what", "work", "seconds", "processor_seconds", "first_s", "beside", "beside_seconds", "ratio"),
-        measure=measure_dynamics,
-        tables=_dynamics_tables,
+    _scene_errors,
+)
+DYNAMICS = Part(
+    "dynamics",
+    "dynamics_rows",
+    measure_dynamics,
+    StudyTable(
+        "bench_dynamics.csv",
+        ("what", "work", "seconds", "processor_seconds", "first_s", "beside", "beside_seconds", "ratio"),
+        "charts, diagrams, exponents, basins; all cores",
+        {
+            "what": "what",
+            "work": "work",
+            "s": "seconds",
+            "processor s": "processor_seconds",
+            "first time, s": "first_s",
+            "beside, s": "beside_seconds",
+            "times as fast": "ratio",
+        },
     ),
-    Part(
-        name="sweep",
-        key="sweep_rows",
-        file="bench_sweep.csv",
-        columns=(
+)
+SWEEP = Part(
+    "sweep",
+    "sweep_rows",
+    measure_sweeps,
+    StudyTable(
+        "bench_sweep.csv",
+        (
             *("what", "points", "processes", "devices", "seconds", "microseconds_per_point"),
             *("processor_microseconds_per_point", "peak_memory_mib"),
         ),
-        measure=measure_sweeps,
-        tables=_sweep_tables,
+        "sweeps over law scenes, one order",
+        {
+            "what": "what",
+            "scenes": "points:,",
+            "processes": "processes:d",
+            "devices": "devices:d",
+            "s": "seconds",
+            "us/scene": "microseconds_per_point",
+            "processor us/scene": "processor_microseconds_per_point",
+            "peak MiB": "peak_memory_mib",
+        },
     ),
-    Part(
-        name="fits",
-        key="fit_rows",
-        file="bench_fits.csv",
-        columns=(
+)
+FITS = Part(
+    "fits",
+    "fit_rows",
+    measure_fits,
+    StudyTable(
+        "bench_fits.csv",
+        (
             *("model", "rows", "first_s", "first_processor_s", "warm_s", "warm_processor_s", "valid", "chi2"),
             "degrees_of_freedom",
         ),
-        measure=measure_fits,
-        tables=_fit_tables,
+        "fits from the shell",
+        {
+            "model": "model",
+            "rows": "rows:d",
+            "first time, s": "first_s:.1f",
+            "first time, processor s": "first_processor_s:.1f",
+            "warm cache, s": "warm_s:.1f",
+            "warm cache, processor s": "warm_processor_s:.1f",
+            "chi2/dof": lambda row: f"{row['chi2']:.1f}/{row['degrees_of_freedom']}",
+        },
     ),
 )
+PARTS = (MAP, CONTACT, SCENES, DYNAMICS, SWEEP, FITS)

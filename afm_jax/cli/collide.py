@@ -2,41 +2,12 @@
 
 from typing import Any
 
-from afm_jax.cli.columns import TableColumn, columns_of, printed_table
 from afm_jax.cli.command import Output, picture_of
-from afm_jax.cli.contact_law import make_law as law_of
 from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
 from afm_jax.contact.collide import collisions
-
-COLUMNS = (
-    "approach_speed_nm_per_us",
-    "rebound_speed_nm_per_us",
-    "collision_delay_us",
-    "captured",
-    "outcome",
-    "time_in_contact_us",
-    "time_in_junction_us",
-    "deepest_gap_nm",
-    "bridge_hysteresis_aj",
-    "junction_hysteresis_aj",
-    "viscous_loss_aj",
-    "end_energy_aj",
-)
-"""What is told of a tip."""
-_PRINTED = (
-    TableColumn("approach\nnm/us", "approach_speed_nm_per_us"),
-    TableColumn("rebound\nnm/us", "rebound_speed_nm_per_us"),
-    TableColumn("delay\nus", "collision_delay_us"),
-    TableColumn("in junction\nus", "time_in_junction_us"),
-    TableColumn("deepest gap\nnm", "deepest_gap_nm"),
-    TableColumn("bridge\naJ lost", "bridge_hysteresis_aj"),
-    TableColumn("junction\naJ lost", "junction_hysteresis_aj"),
-    TableColumn("viscous\naJ lost", "viscous_loss_aj"),
-    TableColumn("outcome", "outcome_name", "", left=True),
-)
-_MOST_PRINTED = 40
-"""Tips in the printed table at most."""
+from afm_jax.contact.law_of_contact import contact_laws
+from afm_jax.scenefile.law_files import save_law, save_law_csv
 
 
 def collide(
@@ -50,51 +21,52 @@ def collide(
 ) -> Output:
     """Return the collisions of free tips with a contact; with ``make_law`` the law that the contact amounts to."""
     if make_law:
-        return law_of(session, **options)
+        return contact_as_law(session, **options)
     contact, mass, description = chosen_contact(options)
     with session.working("colliding (the first run compiles for some seconds)"):
         result = collisions(contact, speeds, mass, accuracy=accuracy, method=method)
-    rows = result.rows
-    payload = {
-        **{name: [row[name] for row in rows] for name in COLUMNS},
-        "capture_speed_nm_per_us": result.capture_speed_nm_per_us,
-        "capture_speed_reason": result.capture_speed_reason,
-        "junction": result.junction,
-        "contact": description,
-        "mass_ng": mass,
-        "settings": {"accuracy": accuracy, "method": method, "default_speeds": speeds is None},
-    }
+    settings = {"accuracy": accuracy, "method": method, "default_speeds": speeds is None}
     title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
-    return Output(
-        payload=payload,
-        text=[
-            printed_table("Collisions of a free tip with the sample at rest", _PRINTED, rows[:_MOST_PRINTED]),
-            *sentences(payload),
-        ],
-        tables={"collide.csv": columns_of(rows, COLUMNS)},
-        files={"collide.png": picture_of("collisions:collisions_figure", rows, result.capture_speed_nm_per_us, title)},
+    capture = result.capture_speed_nm_per_us
+    return Output.of(
+        result,
+        payload=result.to_dict() | {"contact": description, "mass_ng": mass, "settings": settings},
+        files={"collide.png": picture_of("collisions:collisions_figure", result.rows, capture, title)},
         json_file="collide.json",
-        not_valid=f"{len(result.unresolved)} of {len(rows)} collisions: {result.unresolved[0]}"
-        if result.unresolved
-        else None,
     )
 
 
-def sentences(payload: dict[str, Any]) -> list[str]:
-    """Return what is said below the table: the capture speed, the junction, and what the outcomes mean."""
-    junction, speeds, captured = payload["junction"], payload["approach_speed_nm_per_us"], payload["captured"]
-    lines = []
-    if len(speeds) > _MOST_PRINTED:
-        lines.append(f"The first {_MOST_PRINTED} of {len(speeds)} collisions; --json and --out give all.")
-    lines += sorted(set(payload["outcome"]))
-    capture = payload["capture_speed_nm_per_us"]
-    if all(captured):
-        lines.append(f"All of these tips are captured{'; faster ones leave again' if capture else ''}.")
-    lines.append(payload["capture_speed_reason"] or f"Capture speed: {capture:.6g} nm/us.")
-    lines.append(
-        f"The junction forms at a gap of {junction['forms_gap_nm']:.4g} nm and breaks at "
-        f"{junction['breaks_gap_nm']:.4g} nm; hysteresis takes {junction['hysteresis_aj']:.4g} aJ: "
-        f"{junction['bridge_hysteresis_aj']:.4g} in the bridge, {junction['junction_hysteresis_aj']:.4g} in the "
-        "junction."
+def contact_as_law(
+    session: Session,
+    *,
+    speed_range: tuple[float, float] | None,
+    delay_range: tuple[float, float] | None,
+    residuals: str | None,
+    points: int | None,
+    **options: Any,
+) -> Output:
+    """Return the law that a contact amounts to: a table, and the formulas that are closest to it."""
+    contact, mass, description = chosen_contact(options)
+    with session.working("fitting (the first run compiles for some seconds)"):
+        result = contact_laws(
+            contact,
+            speed_range=speed_range,
+            delay_range=delay_range,
+            residuals=residuals or "relative",
+            mass_ng=mass,
+            points=points or 512,
+        )
+    text = result.printed()
+    if session.out is not None:
+        text.append(f'In a scene file: [interaction] model = "law", file = "{session.out / "law.json"}"; or --law.')
+    return Output.of(
+        result,
+        payload=result.to_dict() | {"contact": description, "mass_ng": mass},
+        text=text,
+        files={
+            "law.json": lambda path: save_law(result.law, path),
+            "law.csv": lambda path: save_law_csv(result.law, path),
+            "law.png": picture_of("collisions:contact_law_figure", result.formulas, result.delay),
+        },
+        json_file="collide.json",
     )
-    return lines

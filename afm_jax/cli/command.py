@@ -8,9 +8,13 @@ options by their names, and returns an `Output`, which the runner writes (None: 
     def basins(session: Session, scene: NamedScene, *, grid, speeds, draws, picture) -> Output:
         with session.working("following starts", "starts") as report:
             result = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
-        return Output(payload={"share": result.share}, text=["..."], tables={"basins.csv": columns_of(result)})
+        return Output.of(result, files={f"basins.{picture}": picture_of("dynamics:basins_figure", result)})
+
+A result says itself: `to_dict()` is the JSON object, `printed()` what is written in the terminal, `tables()` are the
+columns of CSV files by the files' names, `reason` is why it is not valid.
 """
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -21,11 +25,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.ending import NotValid, is_inner
+from afm_jax.cli.ending import NotValid, in_options, is_inner
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session, session_options, write_json
 from afm_jax.cli.values import scene_and_start
-from afm_jax.compilation_cache import silence_xla
+from afm_jax.compilation_cache import available_cores, silence_xla
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
@@ -79,8 +83,27 @@ class Output:
     failure: Exception | None = None
 
     @classmethod
-    def of(cls, result: Any, summary: Callable[[], str], report: Callable[..., Sequence[Path]]) -> "Output":
-        """Return what is handed out of a result that has `to_dict`, `valid` and `reasons`."""
+    def of(cls, result: Any, **more: Any) -> "Output":
+        """Return what is handed out of a result that says itself.
+
+        Args:
+            result: has `to_dict`, `printed` and `tables`, `reason` (which is a key of the JSON object, too) and, where
+                its impacts may be extrapolated, `impact_speeds_nm_per_us`.
+            **more: pictures, and what else the output has.
+        """
+        reason = None if result.reason is None else in_options(result.reason)
+        told = {
+            "payload": {**result.to_dict(), "reason": reason},
+            "text": result.printed(),
+            "tables": result.tables(),
+            "impact_speeds": getattr(result, "impact_speeds_nm_per_us", None),
+            "not_valid": reason,
+        }
+        return cls(**told | more)
+
+    @classmethod
+    def of_report(cls, result: Any, summary: Callable[[], str], report: Callable[..., Sequence[Path]]) -> "Output":
+        """Return what is handed out of a result of `fitting`, which has `to_dict`, `valid` and `reasons`."""
         not_valid = None if result.valid else result.reasons[0]
         return cls(payload=result.to_dict(), text=[summary], report=report, not_valid=not_valid)
 
@@ -141,6 +164,13 @@ class Command:
         return click.command(self.name, help=self.help)(function)
 
 
+def use_all_cores() -> None:
+    """Let JAX have a device for every core, before it starts, unless the user has said how many there are."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "host_platform_device_count" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
+
+
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
     """Run a command: check the call, start JAX, load the scene, call the function, hand out the result.
 
@@ -170,8 +200,8 @@ def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **
         output = function(session, **options)
     if output is None:
         return
-    if output.impact_speeds is not None and scene is not None:
-        output = _saying_if_extrapolated(output, scene)
+    if scene is not None:
+        output = _with_scene(output, scene, options)
     hand_out(session, output)
 
 
@@ -199,11 +229,17 @@ def hand_out(session: Session, output: Output) -> None:
         raise NotValid(output.not_valid)
 
 
-def _saying_if_extrapolated(output: Output, scene: NamedScene) -> Output:
-    """Return a result that says whether its impacts are faster or slower than the scene's law is known for."""
-    extrapolation_of = import_module("afm_jax.impact.law").extrapolation_of
-    sentence = extrapolation_of(scene.scene.interaction, output.impact_speeds)
-    return replace(output, payload={**output.payload, "extrapolated": sentence}, text=[*output.text, sentence])
+def _with_scene(output: Output, scene: NamedScene, options: Options) -> Output:
+    """Return a result that says of which scene it is, and where its law is extrapolated."""
+    scene_tables = import_module("afm_jax.scenefile.scenefile").scene_tables
+    payload, text = {**output.payload, "scene": scene_tables(scene.scene)}, list(output.text)
+    if scene.unknowns is not None and "draws" in options:
+        payload["draws"] = options["draws"]
+    if output.impact_speeds is not None:
+        extrapolation_of = import_module("afm_jax.impact.law").extrapolation_of
+        payload["extrapolated"] = extrapolation_of(scene.scene.interaction, output.impact_speeds)
+        text.append(payload["extrapolated"])
+    return replace(output, payload=payload, text=text)
 
 
 def _loaded(options: Options) -> NamedScene:

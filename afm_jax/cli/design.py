@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 from afm_jax.cli.command import Output
-from afm_jax.cli.design_prior import PriorOptions, prior_of_options
+from afm_jax.cli.design_prior import prior_of_options
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Numbers, Orders
 from fitting.experiments.candidates import drive_grid
@@ -19,7 +19,6 @@ _SAMPLE = {"orders": "1-4", "detuning": "0.97:1.05:0.01", "drive_nm": "2,4,7,10"
 def planned(  # noqa: PLR0913
     session: Session,
     *,
-    prior_options: PriorOptions,
     frequencies_khz: tuple[float, ...] | None,
     largest_nm: float | None,
     points: int,
@@ -28,12 +27,12 @@ def planned(  # noqa: PLR0913
     noise: float,
     amplitudes: str,
     phase_noise_deg: float,
-    **lists: tuple[int, ...] | tuple[float, ...] | None,
+    **options: Any,
 ) -> Output:
     """Return the drives to measure next, of all combinations of the lists, and what they will determine."""
     with session.working("forecasting (the first run compiles for some seconds)"):
-        prior = prior_of_options(prior_options, noise)
-        chosen = _with_defaults(lists, tapping=prior.problem.tapping)
+        prior = prior_of_options(options, noise)
+        chosen = _with_defaults(options, tapping=prior.problem.tapping)
         drives = drive_grid(
             orders=chosen["orders"],
             amplitudes_nm=chosen["drive_nm"],
@@ -56,14 +55,14 @@ def planned(  # noqa: PLR0913
             largest_nm=largest_nm,
             phase_noise_deg=phase_noise_deg,
         )
-    return Output.of(result, partial(design_summary, result), partial(write_design, result))
+    return Output.of_report(result, partial(design_summary, result), partial(write_design, result))
 
 
-def _with_defaults(lists: Mapping[str, tuple[int, ...] | tuple[float, ...] | None], *, tapping: bool) -> dict[str, Any]:
+def _with_defaults(options: Mapping[str, Any], *, tapping: bool) -> dict[str, Any]:
     """Return what can be driven, with the usual lists where none were given."""
     usual = dict(_TAPPING if tapping else _SAMPLE)
-    if lists["offsets_nm"] is not None:
+    if options["offsets_nm"] is not None:
         usual.pop("heights", None)
     numbers, orders = Numbers(positive=False), Orders()
     found = {name: (orders if name == "orders" else numbers).convert(text, None, None) for name, text in usual.items()}
-    return {name: given if given is not None else found.get(name) for name, given in lists.items()}
+    return {name: found.get(name) if options[name] is None else options[name] for name in (*_SAMPLE, "heights")}

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from afm_jax.cli.columns import columns_of
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.sweep import run_sweep
+from afm_jax.columns import columns_of
 from afm_jax.sweeps.plan import plan_of
 from afm_jax.sweeps.store import STORE
 from afm_jax.words import text_table, with_error

@@ -44,7 +44,12 @@ def _assigned(text: str) -> tuple[str, list[float]]:
     name, _, numbers = text.partition("=")
     if not name.strip():
         raise ValueError("names no parameter")
-    return name.strip(), parse_around_plus_minus(numbers)
+    return named_parameter(name), parse_around_plus_minus(numbers)
+
+
+def named_parameter(text: str) -> str:
+    """Return the parameter that a text names, in the words of an option or of the library."""
+    return text.strip().replace("-", "_")
 
 
 class Names(ValueKind):
@@ -124,11 +129,20 @@ def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
         settings["effects"] = effects = _effects(options["left_out"] or ())
         _check_of_use(free or (), fixed, effects)
         settings["free"] = free or _usual_parameters(fixed, effects)
+    _ = checked_model(model, settings["free"], fixed)
+    return settings
+
+
+def checked_model(model: str, free: tuple[str, ...] | None, fixed: dict[str, float]) -> tuple[str, ...]:
+    """Return the parameters of a model, of which some are fitted and some held.
+
+    Raises:
+        click.UsageError: if one is none of the model's, or cannot have its value.
+    """
     try:
-        model_parameters(model, settings["free"], fixed)
+        return model_parameters(model, free, fixed)
     except ValueError as error:
         raise click.UsageError(str(error).replace("`free`", "--free").replace("`fixed`", "--fix")) from error
-    return settings
 
 
 def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:

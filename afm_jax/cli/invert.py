@@ -27,4 +27,4 @@ def inversion(  # noqa: PLR0913
     true_law, fitted_law = (None if path is None else load_law(path) for path in (truth, law))
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured, frequency_error_khz=frequency_error_khz, truth=true_law, law=fitted_law)
-    return Output.of(result, partial(inversion_summary, result), partial(write_inversion, result))
+    return Output.of_report(result, partial(inversion_summary, result), partial(write_inversion, result))

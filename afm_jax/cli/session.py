@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.columns import columns_of, csv_cells
+from afm_jax.columns import columns_of, csv_cells
 from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import check_plain, write_whole
@@ -81,7 +81,7 @@ def write_json(path: Path, payload: Mapping[str, Any]) -> None:
     write_whole(path, strict_json(labelled(payload)) + "\n")
 
 
-_WIDTH_OF_A_PIPE = 10_000
+WIDTH_OF_A_PIPE = 10_000
 """Columns of text that nobody looks at in a terminal: no line is broken, no table turned."""
 _SECONDS_BETWEEN_NOTES = 2.0
 
@@ -289,7 +289,7 @@ def _table_text(console: Any, table: Any) -> Any:
     """Return a table of rich; as the text of one that is turned, where the terminal is too narrow for it."""
     from rich.measure import Measurement  # noqa: PLC0415
 
-    whole = console.options.update(width=_WIDTH_OF_A_PIPE, max_width=_WIDTH_OF_A_PIPE)
+    whole = console.options.update(width=WIDTH_OF_A_PIPE, max_width=WIDTH_OF_A_PIPE)
     if Measurement.get(console, whole, table).maximum <= console.width:
         return table
     head = [str(column.header).replace("\n", " ") for column in table.columns]
@@ -303,4 +303,4 @@ def _console(*, stderr: bool) -> Any:
     stream = sys.stderr if stderr else sys.stdout
     asked = os.environ.get("COLUMNS", "")
     width = int(asked) if asked.isdigit() and int(asked) else None
-    return Console(stderr=stderr, width=width or (None if stream.isatty() else _WIDTH_OF_A_PIPE))
+    return Console(stderr=stderr, width=width or (None if stream.isatty() else WIDTH_OF_A_PIPE))

@@ -40,7 +40,7 @@ def energy_of_taps(
         return _together(session, curve_files, files, model, how)
     (table,) = files[0].tables.values()
     result = _analysed(session, table, model, **how)
-    output = Output.of(result, partial(tapping_summary, result), partial(write_tapping, result))
+    output = Output.of_report(result, partial(tapping_summary, result), partial(write_tapping, result))
     return output if result.valid else replace(output, not_valid=result.in_unit(result.reasons[0]))
 
 

@@ -25,4 +25,4 @@ def map_of_an_image(
     """Return energy and virial of every pixel of an image, or of a grid of curves."""
     images = read_images(image, phase_image, columns=columns, grid=grid, ratio=ratio)
     result = tapping_map(images, **options)
-    return Output.of(result, partial(map_summary, result), lambda folder, _: write_map(result, folder, formats))
+    return Output.of_report(result, partial(map_summary, result), lambda folder, _: write_map(result, folder, formats))

@@ -167,8 +167,8 @@ class Ends(ValueKind):
 class Share(ValueKind):
     """A share between 0 and 100 %, neither of the two.
 
-    >>> Share().read("1 %"), Share().read("0.01")
-    (0.01, 0.01)
+    >>> Share().read("1%"), Share().read(" 1 % "), Share().read("0.01")
+    (0.01, 0.01, 0.01)
     """
 
     name = "share"

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from rich.table import Table
 
 from afm_jax.checks import (
     as_parameter,
@@ -26,6 +27,7 @@ from afm_jax.checks import (
     refuse_float32,
     require_float64,
 )
+from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.contact.bridge_leg import (
     Passage,
     Turn,
@@ -42,7 +44,7 @@ from afm_jax.contact.junction import Junction, find_junction, require_junction
 from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.results import ResultTuple, public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.derivatives import by_tangents, implicit_root
 from afm_jax.solve.lanes import LANES, again_for_the_open, filled, for_each_lane, rows_in_blocks
 
@@ -534,6 +536,67 @@ class Collisions(NamedTuple):
     capture_speed_reason: str | None
     junction: dict[str, float]
     unresolved: list[str]
+
+    text = Result.text
+
+    @property
+    def reason(self) -> str | None:
+        """Why not every collision has a result; None where all have."""
+        failed = self.unresolved
+        return f"{len(failed)} of {len(self.rows)} collisions: {failed[0]}" if failed else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax collide`."""
+        return {
+            **columns_of(self.rows, _COLUMNS),
+            "capture_speed_nm_per_us": self.capture_speed_nm_per_us,
+            "capture_speed_reason": self.capture_speed_reason,
+            "junction": self.junction,
+        }
+
+    def printed(self) -> list[str | Table]:
+        """Return the table of collisions, what their outcomes mean, the capture speed and the junction."""
+        cells: dict[str, Cell] = {
+            "approach\nnm/us": "approach_speed_nm_per_us",
+            "rebound\nnm/us": "rebound_speed_nm_per_us",
+            "delay\nus": "collision_delay_us",
+            "in junction\nus": "time_in_junction_us",
+            "deepest gap\nnm": "deepest_gap_nm",
+            "bridge\naJ lost": "bridge_hysteresis_aj",
+            "junction\naJ lost": "junction_hysteresis_aj",
+            "viscous\naJ lost": "viscous_loss_aj",
+            "outcome": "outcome_name",
+        }
+        title = "Collisions of a free tip with the sample at rest"
+        parts: list[str | Table] = [printed_table(title, cells, self.rows[:_MOST_PRINTED])]
+        if len(self.rows) > _MOST_PRINTED:
+            parts.append(f"The first {_MOST_PRINTED} of {len(self.rows)} collisions; --json and --out give all.")
+        parts += sorted({row["outcome"] for row in self.rows})
+        capture, junction = self.capture_speed_nm_per_us, self.junction
+        if all(row["captured"] for row in self.rows):
+            parts.append(f"All of these tips are captured{'; faster ones leave again' if capture else ''}.")
+        parts.append(self.capture_speed_reason or f"Capture speed: {capture:.6g} nm/us.")
+        parts.append(
+            f"The junction forms at a gap of {junction['forms_gap_nm']:.4g} nm and breaks at "
+            f"{junction['breaks_gap_nm']:.4g} nm; hysteresis takes {junction['hysteresis_aj']:.4g} aJ: "
+            f"{junction['bridge_hysteresis_aj']:.4g} in the bridge, {junction['junction_hysteresis_aj']:.4g} in the "
+            "junction."
+        )
+        return parts
+
+    def tables(self) -> dict[str, dict[str, list[Any]]]:
+        """Return the columns of collide.csv, a row a tip."""
+        return {"collide.csv": columns_of(self.rows, _COLUMNS)}
+
+
+_COLUMNS = (
+    *("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "captured", "outcome"),
+    *("time_in_contact_us", "time_in_junction_us", "deepest_gap_nm"),
+    *("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj", "end_energy_aj"),
+)
+"""What is told of a tip."""
+_MOST_PRINTED = 40
+"""Tips in the printed table at most."""
 
 
 def collisions(

@@ -25,8 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
+from rich.table import Table
 
 from afm_jax.checks import checked, require_float64
+from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Contact
@@ -417,6 +419,134 @@ def fit_delay(
         lead_us=lag - delay,
         fitted_us=fitted,
     )
+
+
+class ContactLaws(NamedTuple):
+    """What `afm-jax collide --make-law` tells: the formulas closest to a contact, its delay, and its table."""
+
+    formulas: list[ContactLaw]
+    delay: ContactDelay
+    law: TabulatedLaw
+
+    text = Result.text
+
+    @property
+    def reason(self) -> str | None:
+        """Which fits of a formula did not converge; None where all did."""
+        lost = [law.model for law in self.formulas if not law.converged]
+        return f"the fit of {', '.join(lost)} did not converge; try another speed range" if lost else None
+
+    def _delay_rows(self) -> list[dict[str, float]]:
+        """Return the delay at a few speeds, first and last among them."""
+        places = np.round(np.linspace(0, len(self.delay.delay_us) - 1, _SHOWN_DELAYS)).astype(int)
+        return [{name: float(getattr(self.delay, name)[place]) for name in _DELAY_COLUMNS} for place in places]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        first, delay = self.formulas[0], self.delay
+        return {
+            "residuals": first.residuals,
+            "speed_range_nm_per_us": first.speed_range,
+            "points": len(first.approach_speed_nm_per_us),
+            "models": [{name: getattr(law, name) for name in _MODEL_KEYS} for law in self.formulas],
+            "contact_capture_speed_nm_per_us": first.contact_capture_speed_nm_per_us,
+            "delay": {
+                **{name: getattr(delay.delay, name) for name in _DELAY_NUMBERS},
+                "rms_us": delay.rms_us,
+                "worst_us": delay.worst_us,
+                "speed_range_nm_per_us": delay.speed_range,
+                **columns_of(self._delay_rows()),
+            },
+            "law": self.law.to_dict(),
+        }
+
+    def printed(self) -> list[str | Table]:
+        """Return a table of the formulas and one of the delay, each with what it is."""
+        first, delay = self.formulas[0], self.delay
+        formulas: dict[str, Cell] = {
+            "law": "model",
+            "r\n": "r:.5f",
+            "epsilon\nnm^2/us^2": "epsilon:.5g",
+            "c\nnm/us": "viscous_loss:.3g",
+            "worst error\n%": lambda law: f"{100.0 * law.worst_relative_error:.3g}",
+            "rms error\n%": lambda law: f"{100.0 * law.rms_relative_error:.3g}",
+            "worst error\nnm/us": "worst_error_nm_per_us:.3g",
+            "of top speed\n%": lambda law: f"{100.0 * law.worst_share_of_top_speed:.2g}",
+            "capture speed\nnm/us": "capture_speed_nm_per_us:.5g",
+        }
+        delays: dict[str, Cell] = {
+            "approach\nnm/us": "approach_speed_nm_per_us:.5g",
+            "rebound\nnm/us": "rebound_speed_nm_per_us:.5g",
+            **{f"{name}\nus": f"{name}_us:.4f" for name in ("delay", "lag", "lead")},
+            "delay law\nus": "fitted_us:.4f",
+        }
+        (low, high), (slow, fast) = first.speed_range, delay.speed_range
+        formula = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us"
+        numbers = ", ".join(f"{name} {float(getattr(delay.delay, name)):.4g}" for name in _DELAY_NUMBERS)
+        errors = f"rms error {delay.rms_us:.2g} us, worst {delay.worst_us:.2g} us"
+        return [
+            printed_table(f"{formula}, {first.residuals} residuals", formulas, self.formulas),
+            f"Capture speed of the contact: {first.contact_capture_speed_nm_per_us:.6g} nm/us.",
+            "law: the paper's eq. 6; viscous: r = 1 and a loss c linear in speed; full: all three.",
+            "",
+            printed_table("Collision delay = lag - lead", delays, self._delay_rows()),
+            "lag: time in the solid junction; lead: what straight paths to gap 0 would take longer outside it.",
+            f"Delay law: {numbers}; {errors}, from {slow:.4g} to {fast:.4g} nm/us.",
+        ]
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of law_models.csv and of law_delay.csv, a row a speed."""
+        first = self.formulas[0]
+        models = {
+            "approach_speed_nm_per_us": first.approach_speed_nm_per_us,
+            "rebound_speed_nm_per_us": first.rebound_speed_nm_per_us,
+            **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in self.formulas},
+            **{f"{law.model}_relative_error": law.relative_error for law in self.formulas},
+        }
+        delays = {name: getattr(self.delay, name) for name in _DELAY_COLUMNS}
+        return {"law_models.csv": models, "law_delay.csv": delays}
+
+
+_MODEL_KEYS = (
+    *("model", "r", "epsilon", "viscous_loss", "worst_relative_error", "rms_relative_error"),
+    *("worst_error_nm_per_us", "rms_error_nm_per_us", "worst_share_of_top_speed"),
+    *("capture_speed_nm_per_us", "converged"),
+)
+"""What is told of a formula: attributes of `ContactLaw`."""
+_DELAY_TIMES = ("delay_us", "lag_us", "lead_us", "fitted_us")
+_DELAY_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", *_DELAY_TIMES)
+"""What is told of the delay at a speed: attributes of `ContactDelay`."""
+_DELAY_NUMBERS = ("hertz", "lead_nm", "offset_nm")
+_SHOWN_DELAYS = 9
+"""Speeds at which the delay is told in JSON and text."""
+
+
+def contact_laws(
+    contact: Contact,
+    *,
+    speed_range: tuple[float, float] | None = None,
+    delay_range: tuple[float, float] | None = None,
+    residuals: str = "relative",
+    mass_ng: float = 1.0,
+    points: int = 512,
+) -> ContactLaws:
+    """Return the law that a contact amounts to: the table of it, and the formulas that are closest to it.
+
+    Three formulas of the rebound speed, at uniform speeds: the paper's (r and epsilon), a viscous one (epsilon and a
+    loss linear in speed), and all three. Beside them the collision delay, its lag and lead, and its formula.
+
+    Args:
+        contact: the contact, of numbers.
+        speed_range: of `fit_law`.
+        delay_range: the speed range of `fit_delay`.
+        residuals: of `fit_law`.
+        mass_ng: the tip's mass in ng.
+        points: number of speeds.
+    """
+    how: dict[str, Any] = {"mass_ng": mass_ng, "points": points}
+    formulas = [fit_law(contact, speed_range=speed_range, model=model, residuals=residuals, **how) for model in FREE]
+    delay = fit_delay(contact, speed_range=delay_range, **how)
+    return ContactLaws(formulas, delay, make_law(contact, mass_ng=mass_ng))
 
 
 def closest_delay(

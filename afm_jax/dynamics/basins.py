@@ -7,7 +7,7 @@ apart like the sample. Distances are in drive phase (rad) and velocity over beta
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
 from afm_jax.dynamics.many_tips import Record, Tips, advance, follow
 from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
-from afm_jax.dynamics.verdicts import RECORDED, MotionKind, settled_below, verdicts_of
+from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, settled_below, verdicts_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import LANES, Report, in_blocks
@@ -80,6 +80,7 @@ class Basins(ResultTuple):
         share_error: its standard error, as of random starts.
         boundary_dimension: by the uncertainty exponent; NaN with one attractor.
         boundary_dimension_error: its standard error.
+        share_interval95: of each attractor the interval that holds 95 % of its shares for drawn laws; None: none drawn.
     """
 
     phase_rad: Float[np.ndarray, " columns"]
@@ -90,6 +91,7 @@ class Basins(ResultTuple):
     share_error: Float[np.ndarray, " attractors"]
     boundary_dimension: float
     boundary_dimension_error: float
+    share_interval95: Float[np.ndarray, "attractors 2"] | None = None
 
     def table(self) -> list[dict[str, object]]:
         """Return one row a start: where it is, and the number of its attractor."""
@@ -97,6 +99,91 @@ class Basins(ResultTuple):
         names = ("phase_rad", "rebound_speed_nm_per_us", "attractor")
         columns = (np.ravel(column).tolist() for column in (phase, speed, self.attractor))
         return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+
+    @property
+    def reason(self) -> str | None:
+        """Why the shares are not valid: some starts could not be followed; None where all were."""
+        unresolved = sum(
+            share
+            for attractor, share in zip(self.attractors, self.share, strict=True)
+            if attractor.kind == MotionKind.UNRESOLVED
+        )
+        if not unresolved:
+            return None
+        return f"{100.0 * unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}"
+
+    @property
+    def impact_speeds_nm_per_us(self) -> Float[np.ndarray, " impacts"]:
+        """Approach speeds of the attractors' impacts."""
+        return np.concatenate([attractor.approach_speed_nm_per_us for attractor in self.attractors])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax basins`."""
+        attractors = []
+        for number, attractor in enumerate(self.attractors):
+            told = {
+                "name": attractor.name,
+                "impacts": attractor.impacts,
+                "periods": attractor.periods,
+                "share": self.share[number],
+                "share_error": self.share_error[number],
+                "phase_rad": attractor.phase_rad,
+                "velocity_after_nm_per_us": attractor.velocity_nm_per_us,
+            }
+            if self.share_interval95 is not None:
+                told["share_interval95"] = self.share_interval95[number].tolist()
+            attractors.append(told)
+        return {
+            "starts": self.attractor.size,
+            "attractors": attractors,
+            "boundary_dimension": self.boundary_dimension,
+            "boundary_dimension_error": self.boundary_dimension_error,
+        }
+
+    def printed(self) -> list[str]:
+        """Return what `afm-jax basins` prints, a line an attractor."""
+        speeds = self.rebound_speed_nm_per_us
+        box = f"{len(self.phase_rad)} drive phases of a period x {len(speeds)} rebound speeds"
+        starts = f"Starts: {box} from {speeds[0]:.4g} to {speeds[-1]:.4g} nm/us (--speeds chooses others)"
+        lines = [
+            f"{attractor.name}: {100.0 * share:.4g} +- {100.0 * error:.2g} % of the starts"
+            for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)
+        ]
+        if self.share_interval95 is not None:
+            ends = 100.0 * self.share_interval95
+            lines = [
+                f"{line}; {low:.4g} to {high:.4g} % in 95 % of the draws"
+                for line, (low, high) in zip(lines, ends, strict=True)
+            ]
+        if np.isfinite(self.boundary_dimension):
+            dimension = f"{self.boundary_dimension:.3f} +- {self.boundary_dimension_error:.3f}"
+            lines.append(f"dimension of the boundaries: {dimension}")
+        return [starts, *lines]
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of basins.csv, a row a start, and of attractors.csv, a row an impact of an attractor."""
+        names = np.array([attractor.name for attractor in self.attractors])
+        phase, speed = np.meshgrid(self.phase_rad, self.rebound_speed_nm_per_us)
+        starts = {
+            "phase_rad": phase.ravel(),
+            "rebound_speed_nm_per_us": speed.ravel(),
+            "attractor": names[self.attractor.ravel()].tolist(),
+        }
+        # an attractor without an impact has a row, too
+        nothing = np.array([np.nan])
+        impacts = [max(attractor.phase_rad.size, 1) for attractor in self.attractors]
+        points = {
+            "attractor": np.repeat(names, impacts),
+            "share": np.repeat(self.share, impacts),
+            "share_error": np.repeat(self.share_error, impacts),
+            "phase_rad": np.concatenate(
+                [each.phase_rad if each.phase_rad.size else nothing for each in self.attractors]
+            ),
+            "velocity_after_nm_per_us": np.concatenate(
+                [each.velocity_nm_per_us if each.phase_rad.size else nothing for each in self.attractors]
+            ),
+        }
+        return {"basins.csv": starts, "attractors.csv": points}
 
 
 @checked

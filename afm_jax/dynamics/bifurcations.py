@@ -9,6 +9,8 @@ carries drive phase and rebound speed from value to value. A tip that the platfo
 anew at the next value, where it is told to or where there is motion (`bouncing_tips`).
 """
 
+from collections import Counter
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +27,7 @@ from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
-from afm_jax.results import ResultTuple, public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.solve.lanes import Report, in_blocks
 from afm_jax.units import within_turn
@@ -40,6 +42,11 @@ _PASSES = 40
 """Times at most that stretches are swept again."""
 _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
+_LISTED = 6
+"""Kinds of motion that a line names."""
+_NONE_WENT_ON = (
+    "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"
+)
 
 
 @public_result(picture="afm_jax.plots.dynamics:bifurcation_figure")
@@ -59,6 +66,7 @@ class Sweep(ResultTuple):
         strobe_height_nm: the tip's height whenever the drive's phase is 0 (the platform, if it moves, is highest),
             (values, drive periods), of the last ones.
         complete: False where stretches were still being swept again when there were enough.
+        verdict_probability: at each value the fraction of drawn laws with this verdict; None: no laws were drawn.
     """
 
     values: Float[np.ndarray, " values"]
@@ -71,6 +79,101 @@ class Sweep(ResultTuple):
     height_nm: Float[np.ndarray, "values impacts"]
     strobe_height_nm: Float[np.ndarray, "values periods"]
     complete: bool
+    verdict_probability: Float[np.ndarray, " values"] | None = None
+
+    @property
+    def direction(self) -> str:
+        """Whether the parameter rises or falls, in a word."""
+        return "up" if self.upward else "down"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `afm-jax bifurcation --json` tells of one direction."""
+        told = {
+            "direction": self.direction,
+            "complete": self.complete,
+            "values": self.values,
+            "verdicts": self.verdicts.names(),
+            "impacts": self.verdicts.impacts,
+            "periods": self.verdicts.periods,
+            "restarted": self.restarted,
+            "phase_rad": [row[np.isfinite(row)] for row in self.phase_rad],
+            "platform_height_nm": [row[np.isfinite(row)] for row in self.height_nm],
+        }
+        return told if self.verdict_probability is None else told | {"verdict_probability": self.verdict_probability}
+
+    def printed(self) -> list[str]:
+        """Return a line with the commonest kinds of motion, and at how many values each is."""
+        counts = Counter(self.verdicts.names()).most_common()
+        words = ", ".join(f"{name} at {count}" for name, count in counts[:_LISTED])
+        others = sum(count for _, count in counts[_LISTED:])
+        return [f"swept {self.direction}: {words}" + (f", others at {others}" if others else "")]
+
+    def columns(self, parameter: str) -> Iterator[dict[str, np.ndarray]]:
+        """Give the columns of three tables: a row a value, an impact, and a height when the drive's phase is 0."""
+        values = {
+            "direction": np.full(len(self.values), self.direction),
+            parameter: self.values,
+            "verdict": np.array(self.verdicts.names()),
+            "restarted": self.restarted,
+        }
+        probability = self.verdict_probability
+        yield values if probability is None else values | {"verdict_probability": probability}
+        impacts = {
+            "phase_rad": self.phase_rad,
+            "approach_speed_nm_per_us": self.approach_nm_per_us,
+            "velocity_after_nm_per_us": self.velocity_after_nm_per_us,
+            "platform_height_nm": self.height_nm,
+        }
+        for arrays in (impacts, {"height_nm": self.strobe_height_nm}):
+            there = np.isfinite(next(iter(arrays.values())))
+            yield {
+                "direction": np.full(there.sum(), self.direction),
+                parameter: np.repeat(self.values, there.sum(axis=1)),
+                **{name: array[there] for name, array in arrays.items()},
+            }
+
+
+class Ramps(NamedTuple):
+    """What `afm-jax bifurcation` tells: a parameter, by its path, that is swept up, down or both ways."""
+
+    parameter: str
+    sweeps: list[Sweep]
+    impacts_each: int
+    """Impacts at each value."""
+
+    text = Result.text
+
+    @property
+    def reason(self) -> str | None:
+        """Why the diagram is empty; None where a motion goes on somewhere."""
+        went_on = any(np.isfinite(sweep.phase_rad).any() for sweep in self.sweeps)
+        return None if went_on else _NONE_WENT_ON
+
+    @property
+    def impact_speeds_nm_per_us(self) -> Float[np.ndarray, " impacts"]:
+        """Approach speeds of all impacts that were recorded."""
+        return np.concatenate([sweep.approach_nm_per_us.ravel() for sweep in self.sweeps])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        return {
+            "parameter": self.parameter,
+            "impacts_each": self.impacts_each,
+            "sweeps": [sweep.to_dict() for sweep in self.sweeps],
+        }
+
+    def printed(self) -> list[str]:
+        """Return a line a direction."""
+        return [line for sweep in self.sweeps for line in sweep.printed()]
+
+    def tables(self) -> dict[str, dict[str, np.ndarray]]:
+        """Return the columns of three files, the directions one below the other."""
+        files = ("bifurcation.csv", "impacts.csv", "strobe.csv")
+        parts = zip(*(sweep.columns(self.parameter) for sweep in self.sweeps), strict=True)
+        return {
+            file: {name: np.concatenate([part[name] for part in both]) for name in both[0]}
+            for file, both in zip(files, parts, strict=True)
+        }
 
 
 @checked

@@ -7,7 +7,7 @@ judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,7 +27,7 @@ from afm_jax.impact.closure import OrbitPlace, OrbitProblem, find_roots
 from afm_jax.impact.law import TabulatedLaw, impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
 from afm_jax.results import Result, public_result
-from afm_jax.scenefile.parameter_paths import scene_family
+from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 from afm_jax.solve.lanes import Report, again_for, in_blocks
 
 _LANES = 1024
@@ -186,12 +186,18 @@ class StabilityChart(Result):
         x_values: of the columns, ascending; in the paper's figures n = omega/2 Omega.
         y_values: of the rows, ascending; in the paper's figures beta in nm.
         verdicts: orders 1, 2, ... by points; the points are the rows one after the other.
+        x: the first parameter by its path, if it is a scene file's.
+        y: the second.
+        probability: fraction of drawn laws with a stable orbit, of each order and point; None: no laws were drawn.
     """
 
     scene_of: Callable[..., Scene]
     x_values: Float[np.ndarray, " columns"]
     y_values: Float[np.ndarray, " rows"]
     verdicts: OrbitVerdicts
+    x: ParameterRange | None = None
+    y: ParameterRange | None = None
+    probability: Float[np.ndarray, "orders points"] | None = None
 
     @property
     def orders(self) -> int:
@@ -238,6 +244,73 @@ class StabilityChart(Result):
         columns = (*self.points(), order > 0, order, self.verdicts.any_admissible(), peak)
         rows = zip(*(column.tolist() for column in columns), strict=True)
         return [dict(zip(TABLE_COLUMNS, row, strict=True)) for row in rows]
+
+    @property
+    def reason(self) -> str | None:
+        """Why the chart is empty; None where an orbit is admissible."""
+        if self.verdicts.admissible.any():
+            return None
+        return (
+            f"no single-impact orbit of an order up to {self.orders} is admissible over {self.x} and {self.y}: "
+            "try larger drive amplitudes, or more orders"
+        )
+
+    @property
+    def impact_speeds_nm_per_us(self) -> Any:
+        """Approach speeds of the orbits that are told; none of a contact's."""
+        speeds = self.verdicts.approach_speed_nm_per_us
+        return () if speeds is None else speeds
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax chart`."""
+        verdicts = self.verdicts
+        several = verdicts.stable.sum(axis=0) > 1
+        told: dict[str, Any] = {
+            **{
+                axis: {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
+                for axis, given in (("x", self.x), ("y", self.y))
+                if given is not None
+            },
+            "orders": list(range(1, self.orders + 1)),
+            "points": int(several.size),
+            "admissible_share": verdicts.admissible.mean(axis=1),
+            "stable_share": verdicts.stable.mean(axis=1),
+            "any_stable_share": float(verdicts.any_stable().mean()),
+            "several_stable_share": float(several.mean()),
+        }
+        if verdicts.unresolved is not None:
+            told["unresolved_share"] = verdicts.unresolved.mean(axis=1)
+        if self.probability is not None:
+            told["uncertain_share"] = ((self.probability > 0.0) & (self.probability < 1.0)).mean(axis=1)
+        return told
+
+    def printed(self) -> list[str]:
+        """Return what `afm-jax chart` prints, a line an order."""
+        told = self.to_dict()
+        shares = zip(told["orders"], told["stable_share"], told["admissible_share"], strict=True)
+        return [
+            *(
+                f"order {order}: stable at {100.0 * stable:.4g} % of the points, "
+                f"admissible at {100.0 * admissible:.4g} %"
+                for order, stable, admissible in shares
+            ),
+            f"several orders are stable at {100.0 * told['several_stable_share']:.4g} % of the points",
+        ]
+
+    def arrays(self) -> dict[str, Shaped[np.ndarray, "orders points"]]:
+        """Return what a file holds of every order and point."""
+        names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
+        arrays = {name: getattr(self.verdicts, name) for name in names} | {"stable_probability": self.probability}
+        return {name: array for name, array in arrays.items() if array is not None}
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of chart.csv, a row a point."""
+        x, y = ("x" if self.x is None else self.x.path, "y" if self.y is None else self.y.path)
+        columns: dict[str, Any] = dict(zip((x, y), self.points(), strict=True))
+        columns["lowest_stable_order"] = self.lowest_stable_order.ravel()
+        for order in range(self.orders):
+            columns |= {f"{name}_{order + 1}": array[order] for name, array in self.arrays().items()}
+        return {"chart.csv": columns}
 
     def _plane(self, rows: np.ndarray) -> np.ndarray:
         return rows.reshape(len(rows), len(self.y_values), len(self.x_values))

@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from rich.table import Table
 
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
 from afm_jax.checks import checked, require_float64
+from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
 from afm_jax.dynamics.curves import (
@@ -27,7 +29,13 @@ from afm_jax.dynamics.curves import (
     tested_by,
 )
 from afm_jax.dynamics.impact_loop import LoopFamily, driven_part, samples_for
-from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
+from afm_jax.dynamics.impact_orbits import (
+    IMPACT_COLUMNS,
+    MOST_IMPACTS,
+    impact_rows,
+    many_impact_orbits,
+    orbit_facts,
+)
 from afm_jax.dynamics.special_points import (
     OrbitBranch,
     SpecialCurve,
@@ -38,13 +46,39 @@ from afm_jax.dynamics.special_points import (
 )
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.results import ResultTuple, columns_of, public_result
+from afm_jax.results import ResultTuple, public_result
+from afm_jax.results import columns_of as columns_of_record
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parameter_values, scene_family
+from afm_jax.units import TWO_SIDED_95
+from afm_jax.words import counted
 
 _VALUES_TRIED = 9
 _FEWER_TRIED = 3
 _BEFORE_CAPTURE = 1e-6
 """Of the last step's way to capture: there the orbit still exists."""
+
+_POINT_COLUMNS = (
+    *("branch", "parameter", "phase_rad", "velocity_after_nm_per_us", "peak_amplitude_nm", "peak_amplitude_error_nm"),
+    *("trace", "determinant", "stable", "admissible"),
+)
+_SPECIAL_COLUMNS = (
+    *("kind", "parameter", "parameter_error", "interval95_low", "interval95_high", "branch"),
+    *("peak_amplitude_nm", "admissible"),
+)
+_ENDS = {
+    "range": "the end of the range",
+    "capture": "capture: an impact comes too slowly to leave again",
+    "no_speed": "where an impact's speed vanishes: the tip grazes the sample, or rests on it",
+    "delay": "close to capture, where the law's delay is longer than half a drive period",
+    "shorter": "where it becomes an orbit of fewer impacts",
+    "closed": "where it began: it is closed",
+    "held": "where the sample no longer lets the tip go",
+    "rest_lost": "where the sample no longer holds the tip for a while",
+    "grazing": "where a flight grazes the sample, and another motion follows",
+    "lost": "a point that it could not be followed beyond",
+    "too long": "the most points that are followed",
+}
+"""In words why a branch ends."""
 
 
 @public_result(picture="afm_jax.plots.branches:continuation_figure", rows="points")
@@ -63,16 +97,143 @@ class Continuation(ResultTuple):
     family: LoopFamily
     sticking: bool = False
     """The orbits rest on the surface (`follow_sticking`)."""
+    law_parameters: tuple[str, ...] | None = None
+    """What is uncertain of the law, and gives the errors below; None: nothing."""
+    amplitude_errors: tuple[Float[np.ndarray, " points"], ...] | None = None
+    """Standard errors of the peak amplitude, in nm, of each branch."""
+    special_errors: Float[np.ndarray, " special"] | None = None
+    """Standard errors of the parameter at the special points."""
 
     def points(self) -> list[dict[str, Any]]:
         """Return a mapping for each point of the branches: the branch, the parameter, what is read of the orbit."""
         rows = []
         for number, branch in enumerate(self.branches):
-            columns = {name: array for name, (array, _) in columns_of(branch.reading).items() if array.ndim == 1}
+            columns = {name: array for name, (array, _) in columns_of_record(branch.reading).items() if array.ndim == 1}
             for i, value in enumerate(branch.parameter.tolist()):
                 orbit = {name: array[i].item() for name, array in columns.items()}
                 rows.append({"branch": number, "parameter": value, **orbit})
         return rows
+
+    @property
+    def reason(self) -> str | None:
+        """Why no point of the branches is an orbit that the tip flies; None where one is."""
+        if any(branch.reading.admissible.any() for branch in self.branches):
+            return None
+        order, where = self.order, f"with {self.range}"
+        if self.sticking:
+            return f"no tip rests on the sample, is let go and rests again after {order} periods {where}"
+        what = f"orbit of {counted(self.impacts, 'impact')} in {order} drive periods"
+        if self.impacts == 0:
+            return f"the tip meets the sample at every value of {self.range}; try `impacts=1`"
+        if self.rejected:
+            return f"in every {what} {where} the tip would have to pass through the platform; try another order"
+        return f"no {what} was found {where}; try another order or range"
+
+    @property
+    def impact_speeds_nm_per_us(self) -> list[float]:
+        """Approach speeds of all impacts of all points."""
+        return [speed for branch in self.branches for speed in branch.reading.approach_speed_nm_per_us.ravel().tolist()]
+
+    def _point_rows(self) -> list[dict[str, Any]]:
+        """Return the points of the branches as plain numbers, the first impact's and all impacts of each."""
+        rows = []
+        for number, branch in enumerate(self.branches):
+            for index, value in enumerate(branch.parameter.tolist()):
+                row = {"branch": number, "parameter": value, **orbit_facts(branch.reading, index)}
+                if self.amplitude_errors is not None:
+                    error = float(self.amplitude_errors[number][index])
+                    row["peak_amplitude_error_nm"] = error if np.isfinite(error) else None
+                rows.append(row)
+        return rows
+
+    def _special_rows(self) -> list[dict[str, Any]]:
+        """Return the special points as plain numbers, with an interval where the law has errors."""
+        rows = []
+        for index, point in enumerate(self.special):
+            row = {
+                "kind": point.kind,
+                "parameter": point.parameter,
+                "branch": point.branch,
+                "peak_amplitude_nm": float(point.reading.peak_amplitude_nm),
+                "admissible": point.admissible,
+                "impacts": impact_rows(point.reading),
+            }
+            if self.special_errors is not None:
+                error = float(self.special_errors[index])
+                low, high = point.parameter - TWO_SIDED_95 * error, point.parameter + TWO_SIDED_95 * error
+                row |= {"parameter_error": error, "interval95": [low, high]}
+            rows.append(row)
+        return rows
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax continue`."""
+        return {
+            "order": self.order,
+            "impacts": self.impacts,
+            "parameter": self.range.path,
+            "range": [self.range.low, self.range.high],
+            "second": None if self.second is None else self.second.path,
+            "points": self._point_rows(),
+            "special": self._special_rows(),
+            "curves": [
+                curve._asdict() | {"meetings": [meeting._asdict() for meeting in curve.meetings]}
+                for curve in self.curves
+            ],
+            "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in self.branches],
+            "sticking": self.sticking,
+            "law_parameters": None if self.law_parameters is None else list(self.law_parameters),
+        }
+
+    def printed(self) -> list[str | Table]:
+        """Return what `afm-jax continue` prints: a line a branch, a table of special points, lines for each curve."""
+        kind = f"({self.impacts}, {self.order}) orbits"
+        if self.sticking:
+            kind = f"Orbits with a rest, N = {self.order},"
+        parts: list[str | Table] = [f"{'' if self.branches else 'No '}{kind} with {self.range}"]
+        for number, branch in enumerate(self.branches):
+            low, high = branch.parameter.min(), branch.parameter.max()
+            ends = " and ".join(dict.fromkeys(_ENDS[end] for end in branch.ends))
+            count = len(branch.parameter)
+            parts.append(f"  branch {number}: {count} points from {low:.6g} to {high:.6g}; ends at {ends}")
+        if self.special:
+            cells: dict[str, Cell] = {
+                "kind": lambda row: row["kind"].replace("_", " "),
+                self.range.path: "parameter:.9g",
+                "95 % interval": lambda row: (
+                    "{:.5g} to {:.5g}".format(*row["interval95"]) if "interval95" in row else ""
+                ),
+                "peak\nnm": "peak_amplitude_nm:.5g",
+                "branch": "branch:d",
+                "admissible": "admissible",
+            }
+            parts.append(printed_table("Special points", cells, self._special_rows()))
+        for curve in self.curves:
+            ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
+            parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")
+            parts += [
+                f"    {meeting.kind.replace('_', ' ')} at ({meeting.parameter:.6g}, {meeting.second:.6g})"
+                for meeting in curve.meetings
+            ]
+        return parts
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of files: points, their impacts if there are several, special points, and curves."""
+        points, special = self._point_rows(), self._special_rows()
+        tables = {"branches.csv": columns_of(points, _POINT_COLUMNS)}
+        if self.impacts > 1:
+            impacts = [{"point": k, **impact} for k, point in enumerate(points) for impact in point["impacts"]]
+            tables["impacts.csv"] = columns_of(impacts, ("point", *IMPACT_COLUMNS))
+        for row in special:
+            row["interval95_low"], row["interval95_high"] = row.get("interval95", (None, None))
+        tables["special.csv"] = columns_of(special, _SPECIAL_COLUMNS)
+        if self.second is not None:
+            curves = [
+                {"curve": k, "kind": curve.kind, "parameter": p, "second": q, "admissible": flown}
+                for k, curve in enumerate(self.curves)
+                for p, q, flown in zip(curve.parameter, curve.second, curve.admissible, strict=True)
+            ]
+            tables["curves.csv"] = columns_of(curves, ("curve", "kind", "parameter", "second", "admissible"))
+        return tables
 
 
 @checked

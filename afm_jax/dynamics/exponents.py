@@ -37,7 +37,9 @@ from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.scenefile.parameter_paths import ParameterRange
 from afm_jax.solve.lanes import Report, in_blocks
+from afm_jax.words import counted, with_error
 
 _PARTS = 20
 """Parts of a motion whose means tell the errors."""
@@ -63,6 +65,8 @@ class Lyapunov(ResultTuple):
         rested: how many of them ended in a rest.
         verdicts: what the motions have come to.
         approach_speed_nm_per_us: of the last impacts of each motion.
+        along: the parameter whose values the motions belong to, if they belong to one.
+        larger_interval95: what holds 95 % of the larger exponents per impact for drawn laws; None: none drawn.
     """
 
     exponents_per_impact: Float[np.ndarray, "lanes 2"]
@@ -75,8 +79,94 @@ class Lyapunov(ResultTuple):
     rested: Int[np.ndarray, " lanes"]
     verdicts: Verdicts
     approach_speed_nm_per_us: Float[np.ndarray, "lanes last"]
+    along: ParameterRange | None = None
+    larger_interval95: Float[np.ndarray, "lanes 2"] | None = None
+
+    @property
+    def reason(self) -> str | None:
+        """Why there are no exponents at all; None where there are some."""
+        motions = self._motions()
+        if not np.isnan(motions.exponents_per_impact[:, 0]).all():
+            return None
+        verdicts = exponent_verdicts(motions)
+        most = "at most " if len(verdicts) > 1 else ""
+        words = "; ".join(dict.fromkeys(verdicts))
+        return f"{words}; there were {most}{int(motions.impacts.max())} impacts to average over"
+
+    @property
+    def impact_speeds_nm_per_us(self) -> Float[np.ndarray, "lanes last"]:
+        """Approach speeds of the last impacts."""
+        return self.approach_speed_nm_per_us
+
+    def _motions(self) -> "Lyapunov":
+        """Return the exponents of many motions; those of one as a batch of one."""
+        return self if np.ndim(self.impacts) else jax.tree.map(lambda array: np.asarray(array)[None], self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax lyapunov`: numbers of one motion, lists of many."""
+        many, verdicts = np.ndim(self.impacts) > 0, exponent_verdicts(self._motions())
+        told = {
+            **{name: getattr(self, name) for name in _TOLD},
+            "orbit": {"impacts": self.verdicts.impacts, "periods": self.verdicts.periods},
+            "verdict": verdicts if many else verdicts[0],
+        }
+        if self.larger_interval95 is not None:
+            told["exponent_per_impact_interval95"] = self.larger_interval95
+        return told if self.along is None else told | {"parameter": self.along.path, "values": self.along.values}
+
+    def printed(self) -> list[str]:
+        """Return the exponents of one motion with their errors; of many how many are positive."""
+        larger, error = self.exponents_per_impact[..., 0], self.exponents_per_impact_error[..., 0]
+        if np.ndim(self.impacts):
+            positive = int(np.sum(np.isfinite(larger) & (larger > CHAOTIC_ERRORS * error)))
+            unknown = int(np.sum(np.isnan(larger)))
+            what, others = self.along or counted(larger.size, "motion"), larger.size - unknown - positive
+            verdict = f"negative or undecided at {others}, unknown at {unknown}"
+            return [f"{what}: the larger exponent is positive at {positive} values, {verdict}"]
+
+        def pair(values: np.ndarray, errors: np.ndarray) -> str:
+            pairs = zip(values, errors, strict=True)
+            return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in pairs)
+
+        lines = [
+            f"Lyapunov exponents per impact: {pair(self.exponents_per_impact, self.exponents_per_impact_error)}",
+            f"                       per us: {pair(self.exponents_per_us, self.exponents_per_us_error)}",
+            f"{int(self.impacts)} impacts; {exponent_verdicts(self._motions())[0]}",
+        ]
+        if self.near_grazing:
+            many = int(self.near_grazing)
+            lines.append(f"{many} impacts are near grazing, where the map's slopes grow without bound")
+        if self.larger_interval95 is not None:
+            low, high = self.larger_interval95
+            lines.append(f"the larger per impact: {low:.6g} to {high:.6g} in 95 % of the draws")
+        return lines
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of lyapunov.csv, a row a motion."""
+        motions = self._motions()
+        columns: dict[str, Any] = {} if self.along is None else {self.along.path: self.along.values}
+        columns |= {
+            "exponent_per_impact": motions.exponents_per_impact[:, 0],
+            "second_exponent_per_impact": motions.exponents_per_impact[:, 1],
+            "exponent_per_impact_error": motions.exponents_per_impact_error[:, 0],
+            "exponent_per_us": motions.exponents_per_us[:, 0],
+            "second_exponent_per_us": motions.exponents_per_us[:, 1],
+            "impacts": motions.impacts,
+            "near_grazing": motions.near_grazing,
+            "rested": motions.rested,
+            "verdict": exponent_verdicts(motions),
+        }
+        if motions.larger_interval95 is not None:
+            low, high = motions.larger_interval95.T
+            columns |= {"exponent_per_impact_low": low, "exponent_per_impact_high": high}
+        return {"lyapunov.csv": columns}
 
 
+_TOLD = (
+    *("exponents_per_us", "exponents_per_impact", "exponents_per_us_error", "exponents_per_impact_error"),
+    *("mean_log_determinant", "impacts", "near_grazing", "rested"),
+)
+"""Attributes of `Lyapunov` that are keys of its JSON object."""
 CHAOTIC_ERRORS = 3.0
 """Standard errors by which the larger exponent must be above 0 to be called positive."""
 

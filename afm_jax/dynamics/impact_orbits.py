@@ -5,6 +5,7 @@ Newton's method closes the whole loop (`impact_loop`). What is left are loops th
 """
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -51,6 +52,11 @@ _SAME = 1e-7
 _FASTEST = 100.0
 """Of the speeds that starts have, over the drive's."""
 _STEPS = 2000
+IMPACT_COLUMNS = (
+    *("phase_rad", "velocity_after_nm_per_us", "velocity_before_nm_per_us"),
+    *("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us"),
+)
+"""What is told of an impact: attributes of `LoopReading`."""
 
 
 @public_result(picture="afm_jax.plots.dynamics:many_orbits_figure")
@@ -84,6 +90,32 @@ def multipliers_of(
     # the smaller one from the product: as a difference it cancels
     small = np.where(np.imag(root) != 0.0, np.conj(large), determinant / np.where(large == 0.0, 1.0, large))
     return np.stack([large, small], axis=-1)
+
+
+def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
+    """Return what is told of one orbit of several impacts: the first one's numbers, and all in `impacts`."""
+    trace, determinant = float(reading.trace[index]), float(reading.determinant[index])
+    multipliers = multipliers_of(np.asarray(trace), np.asarray(determinant))
+    impacts = impact_rows(reading, index)
+    first = impacts[0] if impacts else dict.fromkeys(IMPACT_COLUMNS)
+    return {
+        "phase_rad": first["phase_rad"],
+        "velocity_after_nm_per_us": first["velocity_after_nm_per_us"],
+        "peak_amplitude_nm": float(reading.peak_amplitude_nm[index]),
+        "trace": trace,
+        "determinant": determinant,
+        "multipliers": [[float(each.real), float(each.imag)] for each in multipliers],
+        "stable": bool(is_stable(multipliers)),
+        "admissible": bool(reading.admissible[index]),
+        "impacts": impacts,
+    }
+
+
+def impact_rows(reading: LoopReading, index: int | None = None) -> list[dict[str, float]]:
+    """Return what is told of each impact of an orbit; of one of many, or of the only one."""
+    columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
+    lists = {name: (values if index is None else values[index]).tolist() for name, values in columns.items()}
+    return [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
 
 
 def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray, "*orbits"]:

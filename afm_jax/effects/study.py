@@ -6,6 +6,7 @@ full scene is. What the two readings differ by is what the effect changes; what 
 it costs.
 """
 
+import statistics
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -71,6 +72,8 @@ class Cost(NamedTuple):
     time_us: float | None
     """Processor time of a drive period; None without a steady motion to time."""
     program: Operations
+    scatter_us: float = 0.0
+    """Standard deviation of that time from one repetition to the next."""
 
 
 class View(NamedTuple):
@@ -337,8 +340,9 @@ def _cost(programs: "Programs", observed: Observed, view: View, like: tuple[Scen
         return Cost(None, operations)
     start = view.start if observed.orbit is None else observed.orbit.start
     duration = min(_TIMED_PERIODS * view.drive.period_us, view.duration_us)
-    spent = programs.time_us(observed.scene, start, duration)
-    return Cost(spent / (duration / view.drive.period_us), operations)
+    spent, scatter = programs.time_us(observed.scene, start, duration)
+    periods = duration / view.drive.period_us
+    return Cost(spent / periods, operations, scatter / periods)
 
 
 class Programs:
@@ -358,11 +362,12 @@ class Programs:
         counts = self._program(scene, start, 1.0)[0].cost_analysis() or {}
         return Operations(float(counts.get("flops", 0.0)), float(counts.get("transcendentals", 0.0)))
 
-    def time_us(self, scene: Scene, start: State, duration_us: float) -> float:
-        """Return what following a scene takes of the process's own time, in us: the best of several runs."""
+    def time_us(self, scene: Scene, start: State, duration_us: float) -> tuple[float, float]:
+        """Return what following a scene takes of the process's own time, in us: the best of several, their scatter."""
         program, arguments = self._program(scene, start, duration_us)
         calls = 1 + int(_SHORTEST_REPETITION_S / max(_seconds(program, arguments, 1), 1e-6))
-        return 1e6 * min(_seconds(program, arguments, calls) for _ in range(_REPETITIONS))
+        times = [1e6 * _seconds(program, arguments, calls) for _ in range(_REPETITIONS)]
+        return min(times), statistics.stdev(times)
 
     def _program(self, scene: Scene, start: State, duration_us: float) -> tuple[Compiled, tuple[Any, ...]]:
         arguments = (scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float))

@@ -9,9 +9,11 @@ import os
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,10 +22,12 @@ import numpy as np
 from afm_jax.apparatus.scene import SceneLike, as_scene
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, silence_xla
+from afm_jax.results import Result
 from afm_jax.scenefile.scenefile import Start, scene_tables
-from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of, plan_of_worker
-from afm_jax.sweeps.scenes import SCENE_BUILDER
+from afm_jax.sweeps.plan import MESSAGE, Columns, SweepPlan, plan_of, plan_of_worker
+from afm_jax.sweeps.scenes import EXTRAPOLATED, SCENE_BUILDER
 from afm_jax.sweeps.store import STORE, Kept, SweepStore, locked, open_store
+from afm_jax.words import counted
 
 if TYPE_CHECKING:
     import xarray
@@ -52,6 +56,101 @@ class SweepRun(NamedTuple):
     computed: int
     """Chunks that were computed now."""
     seconds: float
+
+
+class Swept(NamedTuple):
+    """What `afm-jax sweep` tells of a sweep that is done."""
+
+    plan: SweepPlan
+    run: SweepRun
+    store: Path
+    messages: Counter[str]
+    """Why points have no result to be trusted, and how many each time."""
+    extrapolated: str | None
+    """A sentence on points whose law is asked at other speeds than it is known for; None without any."""
+
+    text = Result.text
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        return {
+            "store": self.store,
+            "points": self.plan.points,
+            "shape": self.plan.shape,
+            "chunks": self.run.chunks,
+            "chunks_kept": len(self.run.kept.done),
+            "chunks_damaged": len(self.run.kept.damaged),
+            "chunks_computed": self.run.computed,
+            "seconds": self.run.seconds,
+            "without_result": sum(self.messages.values()),
+            "messages": dict(self.messages.most_common(_MOST_MESSAGES)),
+            "extrapolated": self.extrapolated,
+            "variables": {variable.name: variable.attributes() for variable in self.plan.recorder.variables},
+        }
+
+    def printed(self) -> list[str | None]:
+        """Return what was computed and kept, why points have no result, and how the results open."""
+        run, points = self.run, "point" if self.plan.points == 1 else "points"
+        grid = " x ".join(map(str, self.plan.shape))
+        took = f"Computed in {_duration(run.seconds)}: {run.computed}."
+        lines: list[str | None] = [f"{grid} {points} in {counted(run.chunks, 'chunk')}. {took}"]
+        if run.kept.done:
+            lines.append(f"Done before and kept: {len(run.kept.done)}.")
+        if run.kept.damaged:
+            lines.append(f"With other bytes than they were written with, computed again: {len(run.kept.damaged)}.")
+        if self.messages:
+            many = sum(self.messages.values())
+            lines.append(f"{many} points have no result to be trusted (`message` says why), most of them:")
+            lines += [f"  {count}: {text}" for text, count in self.messages.most_common(_MOST_MESSAGES)]
+        return [*lines, f"Open them with xarray.open_zarr({str(self.store)!r}).", self.extrapolated]
+
+
+_MOST_MESSAGES = 3
+
+
+def swept(plan: SweepPlan, run: SweepRun, store: Path) -> Swept:
+    """Return what is told of a sweep whose results are in a store."""
+    import xarray  # noqa: PLC0415 (an extra package)
+
+    told = {variable.name: variable.meaning for variable in plan.recorder.variables}
+    messages, beyond = Counter[str](), None
+    with xarray.open_zarr(str(store)) as found:
+        if MESSAGE.name in told:
+            messages.update(text for text in found[MESSAGE.name].values.ravel().tolist() if text)
+        if EXTRAPOLATED in told:
+            outside = int(found[EXTRAPOLATED].values.reshape(plan.points, -1).any(axis=1).sum())
+            if outside:
+                beyond = f"Extrapolated: at {outside} of {plan.points} points {told[EXTRAPOLATED]}."
+    return Swept(plan, run, store, messages, beyond)
+
+
+def processes_for(plan: SweepPlan) -> int:
+    """Return how many processes use this machine best: one for batches, which take every device themselves."""
+    if not plan.recorder.alone or find_spec("distributed") is None:
+        return 1
+    return min(available_cores(), plan.chunks)
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration in words.
+
+    >>> _duration(75.0), _duration(1e5)
+    ('1.2 min', '27.8 h')
+    """
+    if seconds < 60.0:
+        return f"{seconds:.1f} s"
+    if seconds < 3600.0:
+        return f"{seconds / 60.0:.1f} min"
+    return f"{seconds / 3600.0:.1f} h" if seconds < 200.0 * 3600.0 else f"{seconds / 86400.0:.0f} days"
+
+
+def _size(size_bytes: float) -> str:
+    """Return a size in words.
+
+    >>> _size(3e6), _size(45e9)
+    ('2.9 MiB', '41.9 GiB')
+    """
+    return f"{size_bytes / 2**20:.1f} MiB" if size_bytes < 2**30 else f"{size_bytes / 2**30:,.1f} GiB"
 
 
 @checked
@@ -364,6 +463,25 @@ class Estimate(NamedTuple):
     disk_bytes: float
     memory_bytes: int
     """Most that this process has had so far: it does not grow with the points."""
+    processes: int
+    """That the sweep would use here."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax sweep --dry-run`."""
+        return self._asdict()
+
+    def printed(self) -> list[str]:
+        """Return points, time, disk and memory, a line each."""
+        here = f"{self.processes} process{'es' if self.processes > 1 else ''}"
+        return [
+            f"{self.points:,} points in {self.chunks:,} chunks of {self.chunk_points:,}.",
+            (
+                f"Time: {_duration(self.seconds / self.processes)} with {here} here, "
+                f"{1e6 * self.seconds_a_point:.3g} us a point as measured on {self.sampled_points:,}."
+            ),
+            f"Disk: {_size(self.disk_bytes)}, compressed as the sample was.",
+            f"Memory: {self.memory_bytes / 2**20:,.0f} MiB a process, whatever the number of points.",
+        ]
 
 
 def estimate(plan: SweepPlan) -> Estimate:
@@ -391,6 +509,7 @@ def estimate(plan: SweepPlan) -> Estimate:
         seconds=seconds * plan.points,
         disk_bytes=size * plan.points / sampled + empty + sum(8 * axis.size * len(axis.columns) for axis in plan.axes),
         memory_bytes=peak_memory(),
+        processes=processes_for(plan),
     )
 
 

@@ -6,21 +6,24 @@ single-impact orbits of random scenes.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from rich.table import Table
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import require_float64
+from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.impact import jacobian as formulas
 from afm_jax.impact.law import ImpactLaw, formula_of
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.results import Result
 from afm_jax.verify.fifty_digits import exact_impact, exact_trace, mpmath_or_reason
 from afm_jax.verify.samples import (
     BLOCK,
@@ -44,6 +47,7 @@ from afm_jax.verify.samples import (
     sum_of_terms,
     written_formulas,
 )
+from afm_jax.words import known
 
 EQUATIONS = ("eq. 5", "eq. 6", "eq. 7", "eqs. 5+7")
 TOLERANCE = 1e-10
@@ -89,6 +93,58 @@ class Check:
     judged: float | None
     passed: bool | None
     reason: str | None = None
+
+
+class Verification(NamedTuple):
+    """All comparisons, and of how many states."""
+
+    checks: list[Check]
+    states: int
+    seed: int
+    exact_states: int
+
+    text = Result.text
+
+    @property
+    def reason(self) -> str | None:
+        """Which comparison differs too much; None where none does."""
+        failed = [check for check in self.checks if check.passed is False]
+        if not failed:
+            return None
+        first = failed[0]
+        return (
+            f"{len(failed)} of {len(self.checks)} comparisons differ too much, first {first.equation} "
+            f"({first.against}, {first.where}): {first.judged:.2g}, allowed {first.tolerance:g}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax verify`."""
+        settings = {name: getattr(self, name) for name in ("seed", "states", "exact_states")}
+        return {"checks": [asdict(check) for check in self.checks], "passed": self.reason is None, **settings}
+
+    def printed(self) -> list[str | Table]:
+        """Return the comparisons as a table, what the columns were held against, and the reasons, each once."""
+        cells: dict[str, Cell] = {
+            "equation": "equation",
+            "against": "against",
+            "where": "where",
+            "points": "points:d",
+            "worst rel. difference": "max_relative_difference:.1e",
+            "in rounding": lambda check: "" if check.against == "autodiff" else known(check.judged, ".2g"),
+            "passed": lambda check: {True: "yes", False: "NO", None: "not compared"}[check.passed],
+        }
+        limits = {check.against: check.tolerance for check in reversed(self.checks)}
+        reasons = (f"{check.where}, {check.against}: {check.reason}." for check in self.checks if check.reason)
+        allowed = (
+            f"Allowed: {limits['autodiff']:g} against automatic differentiation (worse of forward and reverse); "
+            f"{limits['50 digits']:g} times what rounding can do against 50 digits "
+            f"(eq. 8: {max(check.tolerance for check in self.checks):g})."
+        )
+        return [printed_table("", cells, self.checks), allowed, *dict.fromkeys(reasons)]
+
+    def tables(self) -> dict[str, dict[str, list[Any]]]:
+        """Return the columns of verify.csv, a row a comparison."""
+        return {"verify.csv": columns_of([asdict(check) for check in self.checks])}
 
 
 def verify(*, states: int = 10_000, seed: int = 0, exact_states: int = 200) -> list[Check]:

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.design_prior import with_prior_options
+from afm_jax.cli.design_prior import PRIOR_OPTIONS, check_prior
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
 from afm_jax.cli.session import FIT_PROGRAMS, Session
@@ -89,7 +89,8 @@ CALIBRATE = Command(
 
 
 def _check_lists(_: Session, options: Options) -> None:
-    """Check that frequencies and places are said once."""
+    """Check that frequencies and places are said once, and the table that is added to."""
+    check_prior(options)
     if options["frequencies_khz"] is not None and options["detuning"] is not None:
         raise click.UsageError("--frequencies-khz and --detuning both say what the drive frequency can be; give one")
     if options["offsets_nm"] is not None and options["heights"] is not None:
@@ -174,7 +175,7 @@ DESIGN = Command(
             metavar="SHARE",
             help="How far the law may be off where no fit says.",
         ),
-        with_prior_options,
+        *PRIOR_OPTIONS,
     ),
     check=_check_lists,
 )

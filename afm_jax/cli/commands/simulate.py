@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from afm_jax.cli.command import Command, Options
+from afm_jax.cli.command import Command, Options, use_all_cores
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Ends, Finite, Grid, Share, ValueKind
@@ -383,6 +383,19 @@ SIMULATE = Command(
 )
 
 
+def _check_sweep(session: Session, options: Options) -> None:
+    """Check where results go and that they can be written; let JAX have every core, unless the user says how many."""
+    if options["workers"] is not None and options["scheduler"] is not None:
+        raise click.UsageError("--scheduler has workers of its own: leave --workers out")
+    if session.out is None and not options["dry_run"]:
+        raise click.UsageError("--out is missing: name a folder for the results, or ask for a --dry-run")
+    if options["dry_run"] and options["plot"]:
+        raise click.UsageError("--dry-run computes nothing to --plot: leave one of them out")
+    import_module("xarray")
+    import_module("zarr")
+    use_all_cores()
+
+
 SWEEP = Command(
     name="sweep",
     group="simulate",
@@ -420,7 +433,7 @@ SWEEP = Command(
         flag("--plot", "Draw a sweep of one or two axes, sweep.png."),
         LAW,
     ),
-    computes=False,
+    check=_check_sweep,
 )
 
 COMMANDS = (BASINS, BIFURCATION, CHART, CONTINUE, EFFECTS, LYAPUNOV, ORBITS, SIMULATE, SWEEP)

@@ -1,0 +1,215 @@
+"""What `afm-jax orbits` tells of the orbits of one scene: rows of plain numbers, tables, and why there is none.
+
+An orbit of one impact is a row of `SingleImpactOrbits`; an orbit of several impacts is told with all of them, the first
+one's numbers besides (`orbit_facts`).
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rich.table import Table
+
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, ManyImpactOrbits, orbit_facts
+from afm_jax.dynamics.sticking_orbits import StickingOrbit
+from afm_jax.impact.orbits import SingleImpactOrbits
+from afm_jax.results import Result
+from afm_jax.words import counted
+
+_OF_AN_ORBIT = (
+    *("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"),
+    *("trace", "determinant", "stable", "admissible", "near_double"),
+)
+_OF_A_DRIVEN_TIP = (
+    *("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg", "peak_deflection_nm"),
+    *("deflection_lockin_amplitude_nm", "deflection_lockin_phase_deg"),
+    *("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg"),
+)
+"""What is told besides of a tip that base or force drives; the deflection's over a moving base only."""
+_MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
+"""What is told in a row of an orbit of several impacts, of its impacts the first."""
+_IMPACT_CELLS: dict[str, Cell] = {
+    "phase\nrad": "phase_rad",
+    "velocity after\nnm/us": "velocity_after_nm_per_us",
+    "approach\nnm/us": "approach_speed_nm_per_us",
+    "rebound\nnm/us": "rebound_speed_nm_per_us",
+    "delay\nus": "delay_us",
+}
+
+
+class OrbitTable(NamedTuple):
+    """The single-impact orbits of one scene, of order N."""
+
+    scene: Scene
+    order: int
+    found: SingleImpactOrbits
+
+    text = Result.text
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """What is told of an orbit: attributes that orbits of such a scene have."""
+        there = (name for name in (*_OF_A_DRIVEN_TIP, "extrapolated") if getattr(self.found, name) is not None)
+        return (*IMPACT_COLUMNS, *_OF_AN_ORBIT, *there)
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The orbits that exist as plain numbers, by rising approach speed."""
+        columns = {name: getattr(self.found, name).tolist() for name in self.columns}
+        slots = [slot for slot, exists in enumerate(self.found.exists.tolist()) if exists]
+        return [{name: values[slot] for name, values in columns.items()} for slot in slots]
+
+    @property
+    def reason(self) -> str | None:
+        """Why no orbit is admissible; None where one is."""
+        rows = self.rows
+        if any(orbit["admissible"] for orbit in rows):
+            return None
+        return why_none(self.scene, self.order, rejected=len(rows))
+
+    @property
+    def impact_speeds_nm_per_us(self) -> list[float]:
+        """Approach speed of each orbit."""
+        return [orbit["approach_speed_nm_per_us"] for orbit in self.rows]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        return {"order": self.order, "orbits": self.rows, "complete": self.found.complete}
+
+    def printed(self) -> list[str | Table]:
+        """Return the orbits as a table; where base or force drive with what is read at the drive's frequency."""
+        rows = self.rows
+        cells: dict[str, Cell] = {**_IMPACT_CELLS, "peak\nnm": "peak_amplitude_nm"}
+        if rows and "drive_lockin_amplitude_nm" in rows[0]:
+            cells |= {"at drive\nnm": "drive_lockin_amplitude_nm", "at drive\ndeg": "drive_lockin_phase_deg"}
+            if "peak_deflection_nm" in rows[0]:
+                cells["deflection\nat drive nm"] = "deflection_drive_lockin_amplitude_nm"
+            cells["lag\ndeg"] = "phase_lag_deg"
+        else:
+            cells |= {"lock-in\nnm": "lockin_amplitude_nm", "lock-in\ndeg": "lockin_phase_deg"}
+        cells |= {"trace": "trace", "determinant": "determinant", "stable": "stable", "admissible": "admissible"}
+        title = f"Orbits with one impact in {counted(self.order, 'drive period')}"
+        parts: list[str | Table] = [printed_table(title, cells, rows)]
+        if any(orbit["near_double"] for orbit in rows):
+            parts.append("Two of them nearly coincide (a fold): derivatives there have no meaning.")
+        return parts
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of orbits.csv, a row an orbit."""
+        return {"orbits.csv": columns_of(self.rows, self.columns)}
+
+
+class ManyOrbitTable(NamedTuple):
+    """The orbits of one scene with several impacts, or of its contact, and the one that rests on the sample."""
+
+    scene: Scene
+    order: int
+    impacts: int
+    found: ManyImpactOrbits
+    resting: StickingOrbit | str
+    """The orbit with a rest, or a sentence on why there is none."""
+
+    text = Result.text
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The orbits as plain numbers, each with all its impacts."""
+        return [orbit_facts(self.found.reading, index) for index in range(len(self.found.stable))]
+
+    @property
+    def reason(self) -> str | None:
+        """Why there is no orbit of this order, with a rest or without; None where there is one."""
+        rests = isinstance(self.resting, StickingOrbit) and self.resting.order == self.order
+        if len(self.found.stable) or rests:
+            return None
+        return why_none(self.scene, self.order, rejected=0, impacts=self.impacts)
+
+    @property
+    def impact_speeds_nm_per_us(self) -> list[float]:
+        """Approach speed of each impact of each orbit."""
+        return [impact["approach_speed_nm_per_us"] for orbit in self.rows for impact in orbit["impacts"]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        resting = self.resting
+        return {
+            "order": self.order,
+            "impacts": self.impacts,
+            "orbits": self.rows,
+            "sticking": None if isinstance(resting, str) else resting._asdict(),
+            "sticking_reason": resting if isinstance(resting, str) else None,
+        }
+
+    def printed(self) -> list[str | Table]:
+        """Return the orbits as a table, a line an impact, an orbit's numbers in its first; and the one that rests."""
+
+        def of_orbit(cell: Callable[[dict[str, Any]], str]) -> Cell:
+            return lambda row: cell(row["orbit"]) if row["first"] else ""
+
+        rows = [
+            {**impact, "orbit": orbit | {"number": number}, "first": place == 0}
+            for number, orbit in enumerate(self.rows)
+            for place, impact in enumerate(orbit["impacts"])
+        ]
+        cells: dict[str, Cell] = {
+            "orbit": of_orbit(lambda orbit: str(orbit["number"])),
+            **_IMPACT_CELLS,
+            "peak\nnm": of_orbit(lambda orbit: f"{orbit['peak_amplitude_nm']:.6g}"),
+            "multipliers": of_orbit(lambda orbit: ", ".join(map(_multiplier, orbit["multipliers"]))),
+            "stable": of_orbit(lambda orbit: "yes" if orbit["stable"] else "no"),
+        }
+        title = f"Orbits with {counted(self.impacts, 'impact')} in {counted(self.order, 'drive period')}"
+        return [printed_table(title, cells, rows), self._resting_words()]
+
+    def _resting_words(self) -> str:
+        rests = self.resting
+        if isinstance(rests, str):
+            return f"No orbit with a rest: {rests}."
+        return (
+            f"Orbit with a rest on the sample: it repeats after {rests.order} drive periods, peak "
+            f"{rests.peak_amplitude_nm:.6g} nm; the sample lets go at a drive phase of {rests.release_phase_rad:.6g} "
+            f"rad, {rests.impacts} impacts were followed one by one, the rest of them and the rest take "
+            f"{rests.rest_us:.4g} us. Its multipliers are 0."
+        )
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of orbits.csv, a row an orbit, and of impacts.csv, a row an impact."""
+        orbits = self.rows
+        impacts = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
+        return {
+            "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], _MANY_COLUMNS),
+            "impacts.csv": columns_of(impacts, ("orbit", *IMPACT_COLUMNS)),
+        }
+
+
+def _multiplier(parts: list[float]) -> str:
+    return f"{complex(*parts):.4g}" if parts[1] else f"{parts[0]:.4g}"
+
+
+def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> str:
+    """Return a sentence on why a scene has no admissible orbit of an order, and what to try.
+
+    Args:
+        scene: a scene with an impact law.
+        order: N, drive periods between impacts.
+        rejected: how many orbits would close if the tip could pass through the platform.
+        impacts: m, impacts in an orbit.
+    """
+    if float(getattr(scene.interaction, "r", 1.0)) == 0.0:
+        return "with r = 0 every impact is a capture: no orbit leaves the sample; `afm-jax simulate` follows the tip"
+    if impacts > 1:
+        return (
+            f"the search found no orbit of {impacts} impacts in {order} drive periods; `afm-jax orbits --order` and "
+            "`afm-jax continue` say where orbits of one impact double their period"
+        )
+    reduced = float(drive_of(scene).angular_frequency) / (2.0 * float(scene.cantilever.angular_frequency))
+    nearest = max(1, round(reduced))
+    what = (
+        f"in every orbit of order {order} the tip would have to pass through the platform"
+        if rejected
+        else f"there is no orbit of order {order}"
+    )
+    if nearest != order:
+        return f"{what}; the drive is at {reduced:.4g} times twice the free frequency: try `order={nearest}`"
+    return f"{what}; try a larger drive amplitude, another offset or a drive nearer to resonance"
