@@ -105,8 +105,12 @@ def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any]):
     assert paper["capture_speed_reason"] is None
 
 
+def rows_of(paper: dict[str, Any]) -> list[dict[str, Any]]:
+    return [dict(zip(COLUMNS, row, strict=True)) for row in zip(*(paper[name] for name in COLUMNS), strict=True)]
+
+
 def test_energy_ledger_closes(paper: dict[str, Any]):
-    rows = [dict(zip(COLUMNS, row, strict=True)) for row in zip(*(paper[name] for name in COLUMNS), strict=True)]
+    rows = rows_of(paper)
     for row in rows[1:]:
         kept = 0.5 * row["rebound_speed_nm_per_us"] ** 2
         lost = row["bridge_hysteresis_aj"] + row["junction_hysteresis_aj"] + row["viscous_loss_aj"]
@@ -127,7 +131,7 @@ def test_files_hold_what_is_printed(paper: dict[str, Any], out: Path):
 
 def test_picture_shows_curve_capture_delay_and_losses(out: Path, paper: dict[str, Any]):
     assert imread(out / "collide.png").shape[1] >= 1400
-    rows = [dict(zip(COLUMNS, row, strict=True)) for row in zip(*(paper[name] for name in COLUMNS), strict=True)]
+    rows = rows_of(paper)
     panels = collisions_figure(rows, paper["capture_speed_nm_per_us"]).axes
     drawn = [{line.get_label(): np.asarray(line.get_ydata())[1:] for line in axes.lines} for axes in panels]
     np.testing.assert_array_equal(drawn[0]["contact"], paper["rebound_speed_nm_per_us"][1:])
