@@ -97,7 +97,7 @@ def cache_folder() -> Path | None:
 def user_cache_folder() -> Path | None:
     """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax.
 
-    None where that hangs on a home folder and there is none: a user without an entry in the system's list, as
+    None where that depends on a home folder and there is none: a user without an entry in the system's list, as
     containers have, and without HOME; or one whose HOME is no absolute path.
     """
     base = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")

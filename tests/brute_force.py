@@ -43,7 +43,7 @@ class FirstImpacts(NamedTuple):
 
     `closest_gap_nm`: smallest minimum of the gap before the impact, where it is below 1e-9 nm (inf otherwise).
     `dip_depth_nm`: how deep the tip would pass into the platform, u^2/(2 g''), inf where it would not turn.
-    `near_grazing`: one of the two is below 1e-9 nm: whether there is an impact then hangs on rounding.
+    `near_grazing`: one of the two is below 1e-9 nm: whether there is an impact then depends on rounding.
     """
 
     found: NDArray[np.bool_]

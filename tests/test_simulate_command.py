@@ -191,7 +191,7 @@ def test_the_drives_frequency_is_read_and_named_whatever_harmonics_are_asked_for
     keys = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
     assert [answer["order"] for answer in answers] == [3] * 3
     for answer in answers:
-        # neither is one of those asked for, nor hangs on them
+        # neither is one of those asked for, nor depends on them
         assert [answer[key] for key in keys] == [answers[0][key] for key in keys]
         assert answer["drive_frequency_khz"] == pytest.approx(545.4, rel=1e-12)
         assert answer["response_frequency_khz"] == pytest.approx(181.8, rel=1e-12)

@@ -162,7 +162,7 @@ def test_a_contact_comes_out_of_a_noisy_curve():
     )
     assert np.mean((low <= truth.rebound(speeds)) & (truth.rebound(speeds) <= high)) >= 0.9
     assert any(one.startswith("Held, with errors that are assumed: ") for one in held.warnings)
-    assert any(one.startswith("modulus_gpa hangs on what is held: tip_radius_nm") for one in held.warnings)
+    assert any(one.startswith("modulus_gpa depends on what is held: tip_radius_nm") for one in held.warnings)
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """Orbits with sticking phases: complete chatter, rest, release. Where the scene lets a tip go, and what comes of it.
 
-Where the surface lets a resting tip go hangs on the scene alone, so that nothing has to be solved: the orbit is what
+Where the surface lets a resting tip go depends on the scene alone, so that nothing has to be solved: the orbit is what
 becomes of the released tip, if it comes to rest again. Followed through a parameter it ends where the rest does, or
 where a flight grazes and what follows is another motion.
 """

@@ -201,7 +201,7 @@ def _comparison_lines(result: Calibration) -> list[str]:
     lines = []
     if result.peak_frequency_khz is not None:
         lower_hz = 1e3 * (result.frequency_khz.value - result.peak_frequency_khz)
-        lines.append(f"  The response without background is largest {lower_hz:.3g} Hz below frequency_khz.")
+        lines.append(f"  Without the background the response peaks {lower_hz:.3g} Hz below frequency_khz.")
     found = result.sweep.instrument
     if "frequency_khz" in found:
         difference_hz = 1e3 * (result.frequency_khz.value - found["frequency_khz"])

@@ -279,7 +279,7 @@ def disagreement(found: Sequence[Stiffness], stated_n_per_m: float | None = None
         return None
     return (
         f"Equipartition gives {thermal.value:.3g} N/m, {other} {wanted:.3g}: if {condition}, the deflection's nm are "
-        f"{np.exp(-0.5 * apart):.3g} times the true ones (its sensitivity was not calibrated){advice}."
+        f"{np.exp(-0.5 * apart):.3g} times the true ones (the sensitivity is wrong by this factor){advice}."
     )
 
 

@@ -312,7 +312,7 @@ def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"], *, tappin
             share = float(np.mean(column[chosen] == end))
             if len(np.unique(column[usable])) > 1 and share > 0.5 and len(chosen) > 1:
                 warnings.append(
-                    f"{share:.0%} of the points are at the {word} {what}, {end:g} nm: a wider range may be better."
+                    f"{share:.0%} of the points are at the {word} {what}, {end:g} nm: values beyond it may be better."
                 )
     return warnings
 

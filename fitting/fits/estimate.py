@@ -1,8 +1,8 @@
 """From a minimum to an estimate: one linear step to the law with the model discrepancy, its errors and predictions.
 
-At the minimum of chi2 the model is taken at its word. Where impacts last, `estimate_of` adds what the model leaves out
-(`discrepancy`), as unknowns with priors beside the parameters: as much of the linear step as lowers chi2, computed and
-not linearised, leads to the law. Of several tables it also says how far each one's law is from that of the others.
+At the minimum of chi2 the model is assumed to be exact. Where impacts last, `estimate_of` adds what the model leaves
+out (`discrepancy`), as unknowns with priors beside the parameters: as much of the linear step as lowers chi2, computed
+and not linearised, leads to the law. Of several tables it also says how far each one's law is from that of the others.
 """
 
 from dataclasses import dataclass, replace
@@ -60,7 +60,7 @@ class Found:
 
 
 class AtMinimum(NamedTuple):
-    """What the model says at a minimum, taken at its word.
+    """What the model says at a minimum, assumed to be exact.
 
     Attributes:
         table: the table that is fitted, or all of several.

@@ -56,7 +56,7 @@ class ModelLaw(NamedTuple):
         measurement: gives the contact's fixed parameters.
         values: fitted values.
         covariance: of the values, or of those after the step; infinite entries give an open band (NaN).
-        after: the step from these values, and the discrepancy; None: the model is taken at its word.
+        after: the step from these values, and the discrepancy; None: the model is assumed to be exact.
     """
 
     problem: Problem

@@ -37,7 +37,7 @@ _RUN, _LONGEST_RUN = 3.0, 3.5
 beside a wider model discrepancy from which the model does not explain the table."""
 LARGEST_SCALE = 3.0
 """Scale of the errors that is believed: a spread given for that of a mean, a 3 sigma limit for 1 sigma. Errors that
-would have to be larger are no matter of scale, and have to be stated nearer to the truth."""
+would have to be larger are wrong by more than a scale, and have to be stated nearer to the truth."""
 _CORRELATED = 4.0
 """Correlation of neighbouring residuals, in standard deviations of those of independent ones, from which they are
 taken to be correlated: by chance in one fit of ten thousand."""
@@ -347,7 +347,7 @@ def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> st
         given, error = assumed
         return (
             f"quality_factor = {given:g} is given without an error: {100.0 * ASSUMED_ERROR_OF_Q:g} % was assumed "
-            f"({given:g} +- {error:.3g}). The loss hangs on it: state it, like `# quality_factor = {given:g} +- 1`."
+            f"({given:g} +- {error:.3g}). The loss depends on it: state it, like `# quality_factor = {given:g} +- 1`."
         )
     if table.quality_factor is None or table.quality_factor_error is not None:
         return ""
@@ -455,7 +455,7 @@ def _hanging(evidence: Evidence) -> list[str]:
     """Return each fitted parameter whose error is mostly that of what is held, in words."""
     values = {held.name: _held_in_words(held) for held in evidence.held}
     return [
-        f"{name} hangs on what is held: {', '.join(values[other] for other in others)}"
+        f"{name} depends on what is held: {', '.join(values[other] for other in others)}"
         for name, others in evidence.hanging.items()
     ]
 
@@ -618,7 +618,7 @@ WARNINGS: Rules[Evidence] = (
     Rule(_damping_warnings, "{case}"),
     Rule(
         lambda e: e.table.mass_ng is None and e.contact,
-        f"1 ng assumed: {NO_MASS}. Each of the contact's parameters hangs on it.",
+        f"1 ng assumed: {NO_MASS}. Each of the contact's parameters depends on it.",
     ),
     Rule(
         lambda e: [f for f in [max(table.free_frequency_khz for table in e.table.tables)] if f > _FASTEST_KHZ],
@@ -633,7 +633,7 @@ WARNINGS: Rules[Evidence] = (
     Rule(_may_be_anything, "Not determined by these taps: {case}."),
     Rule(
         lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if _PULLED < abs(by) <= _TORN],
-        "{case}: check it, the loss hangs on it.",
+        "{case}: check it, the loss depends on it.",
     ),
     Rule(_limits, "{case}."),
     Rule(
@@ -655,7 +655,7 @@ WARNINGS: Rules[Evidence] = (
     ),
     Rule(_assumed, "Held, with errors that are assumed: {case}."),
     Rule(_hanging, "{case}."),
-    Rule(_excluded, "Set aside, because these impacts are {case}."),
+    Rule(_excluded, "Excluded, because these impacts are {case}."),
     Rule(_model_error, "A model error of up to {case}."),
     Rule(
         lambda e: _named(e, _unseen(e)),
@@ -689,8 +689,8 @@ WARNINGS: Rules[Evidence] = (
     ),
     Rule(
         _untold_drifts,
-        "Hardly told by the rows, which stand in order of time, only assumed: {case}. Rows of the free tip before and "
-        "after the others tell drifts; `--constrain` takes what is known of them.",
+        "The rows, which stand in order of time, hardly determine what is assumed here: {case}. Rows of the free tip "
+        "before and after the others determine drifts; `--constrain` takes what is known of them.",
     ),
 )
 """What a reader should know besides."""

@@ -653,7 +653,7 @@ def _scale_notes(curve: MeasuredCurve) -> list[str]:
     if abs(slope - 1.0) > max(0.1, 3.0 * error):
         why = "the scale of the amplitude is off by that" + (", or the sample is soft" if slope < 1.0 else "")
         return [
-            f"Gain: in contact the amplitude falls by {shown} nm per nm, not by 1: {why}; --nm-per-volt slope mends it."
+            f"Gain: in contact the amplitude falls by {shown} nm per nm, not by 1: {why}; --nm-per-volt slope sets it."
         ]
     return []
 

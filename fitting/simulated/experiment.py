@@ -1,4 +1,4 @@
-"""Simulated experiments: an amplitude table as an instrument would read it off the full scene.
+"""Synthetic measurements: the amplitude table that an instrument would give of a full scene.
 
 Every row of the table to be is a motion simulated in time until it repeats, then observed.
 """

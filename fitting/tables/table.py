@@ -629,15 +629,15 @@ def _check_header(table: AmplitudeTable, faults: Faults) -> None:
 
 
 def check_quality_factor(table: AmplitudeTable) -> None:
-    """Check that a table says its quality factor, or that there is no air damping: the impacts' loss hangs on it.
+    """Check that a table says its quality factor, or that there is no air damping: the impacts' loss depends on it.
 
     Raises:
         TableError: if it does not.
     """
     if table.quality_factor is not None and np.isnan(table.quality_factor):
         raise TableError(
-            f"{printable(table.source)}: the quality factor is missing, and the loss of the impacts hangs on it; add a "
-            "line such as '# quality_factor = 40 +- 2' above the column names or give --quality-factor '40 +- 2' "
+            f"{printable(table.source)}: the quality factor is missing, and the loss of the impacts depends on it; add "
+            "a line such as '# quality_factor = 40 +- 2' above the column names or give --quality-factor '40 +- 2' "
             "(`afm-jax calibrate` measures it); '# quality_factor = none' says that there is no air damping"
         )
 

@@ -1,7 +1,7 @@
 """The energy of a tap as a smooth function along each branch, or as a constant, jointly with the instrument.
 
-Near resonance the energy of a single row hangs on f0 and Q far beyond their errors (10 Hz of 90 kHz at Q = 200 turn the
-phase by 2.5 degrees), but a wrong f0 bends the energy along the whole curve. Each branch has a function, a constant
+Near resonance the energy of a single row depends on f0 and Q far beyond their errors (10 Hz of 90 kHz at Q = 200 turn
+the phase by 2.5 degrees), but a wrong f0 bends the energy along the whole curve. Each branch has a function, a constant
 plus a Gaussian process (Matern 5/2) over the logarithm of the amplitude lost, for energies change fastest at first
 contact, and readings are energies(instrument) = function + noise of the row. Linear in small changes of the instrument,
 that is generalised least squares: function and instrument are determined together, and the band of the function holds

@@ -137,7 +137,7 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     ]
     lines += [
         f"  retract less approach, {result.branches[i].side}: {with_error(one.energy_aj, one.standard_error)} aJ "
-        f"at A/A0 = {one.amplitude_ratio:.2f}, where it is most in its errors"
+        f"at A/A0 = {one.amplitude_ratio:.2f}, where the difference is largest in units of its error"
         for (i, _), one in result.way_differences.items()
     ]
     caption = "Energy of a tap, a smooth function of the height, by the amplitude over the free one; standard errors"
@@ -217,8 +217,8 @@ def _thresholds(result: Tapping) -> list[ReportSection]:
         ]
         for one in result.hysteresis
     ]
-    head = ["threshold (height in nm)", "approach", "retract", "later by", "between"]
-    table = Table("Heights of the sample over the tip's rest position", head, cells, words=("between",))
+    head = ["threshold (height in nm)", "approach", "retract", "approach - retract", "energy between"]
+    table = Table("Heights of the sample over the tip's rest position", head, cells, words=("energy between",))
     return [ReportSection("Thresholds", [table], "Thresholds")]
 
 
@@ -229,7 +229,12 @@ def _height(found: Height | None) -> str:
 def _between(found: Hysteresis) -> str:
     if found.energy_between_aj is None:
         return "-"
-    return f"{with_error(*found.energy_between_aj)} aJ {found.energy_of}"
+    energy = with_error(*found.energy_between_aj)
+    return (
+        f"{energy} aJ {found.energy_of}"
+        if found.energy_of == "a tap"
+        else f"{energy} aJ for one approach and retract of the held tip"
+    )
 
 
 def _speeds(result: Tapping) -> list[ReportSection]:
@@ -240,7 +245,7 @@ def _speeds(result: Tapping) -> list[ReportSection]:
     u = found.approach_speed_nm_per_us
     here = np.isfinite(u)
     if not here.any():
-        return [ReportSection("Speeds of the impacts", [Text("Impact speeds: in no row known to a quarter.")])]
+        return [ReportSection("Speeds of the impacts", [Text("Impact speeds: known to 25 % or better in no row.")])]
     many = found.in_capture_speeds[here]
     known = percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))
     speeds = f"{u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows"

@@ -446,8 +446,8 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
     advice = f"drive 3 to 10 % above resonance ({1.03 * f0:.4g} to {1.1 * f0:.4g} kHz)"
     if not known.any():
         what = (
-            "the speed of its impacts cannot be read off this curve: it hangs on the origin of the heights and on the "
-            "calibration far beyond their errors"
+            "the speed of its impacts cannot be determined from this curve: it depends on the origin of heights and "
+            "on the calibration more finely than these are known"
         )
     elif np.nanmax(in_capture) < _SLOWEST:
         what = f"its impacts are slow, {np.nanmax(in_capture):.2g} times the capture speed at most"

@@ -31,9 +31,9 @@ def _check_lever(_: Session, options: Options) -> None:
 CALIBRATE = Command(
     name="calibrate",
     group="measure",
-    summary="Fit a resonance sweep or a thermal spectrum: frequency, Q, stiffness.",
+    summary="Fit a resonance scan or a thermal spectrum: frequency, Q, stiffness.",
     runs="afm_jax.cli.calibrate:calibration",
-    help="""Fit frequency and quality factor to a free resonance sweep or a thermal spectrum.
+    help="""Fit frequency and quality factor to a frequency scan of the free resonance, or to a thermal spectrum.
 
     SWEEP is Nanonis text, or CSV with the columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any
     unit) and, where known, phase_deg, amplitude_error_nm (or amplitude_error), phase_error_deg. Without errors and
@@ -52,7 +52,7 @@ CALIBRATE = Command(
             help="What is added to the response: with phase none, constant or linear; without none, floor or "
             "constant. Without this option constant, or what Akaike's criterion prefers clearly.",
         ),
-        flag("--amplitude-only", "Leave the phase of the sweep aside."),
+        flag("--amplitude-only", "Ignore the phase of the scan."),
         click.option(
             "--noise",
             type=Share("a relative error"),
@@ -193,7 +193,7 @@ FIT = Command(
     with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
     counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
     offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
-    ones, and the report says how far each is from the others (its pull). With --out the report: fit.html, fit.txt,
+    ones, and the report says how far each is from the others (its deviation). With --out the report: fit.html, fit.txt,
     fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not converged, not explained by
     the model, or a parameter not identified.
     """,
@@ -244,7 +244,7 @@ FIT = Command(
             type=click.Path(path_type=Path, dir_okay=False),
             help="Write the posterior for ArviZ (with --posterior; extras `arviz` and `nuts`).",
         ),
-        click.option("--seed", type=click.IntRange(min=0), default=0, help="Of everything random."),
+        click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the random numbers."),
         click.option(
             "--share",
             type=Names(),
@@ -255,9 +255,7 @@ FIT = Command(
         flag("--hierarchical", "Let the laws of several tables scatter around their mean, and say how much."),
         flag("--example", "Fit the bundled table instead of a file."),
         flag("--each", "Fit each of several tables by itself; with --out what is done is kept."),
-        click.option(
-            "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes that --each takes, by Dask."
-        ),
+        click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes for --each, by Dask."),
     ),
     check=check_fit,
     programs=lambda options: () if options["each"] else FIT_PROGRAMS,
@@ -391,7 +389,7 @@ READING = (
     click.option(
         "--drive",
         type=click.Choice(["base", "force"]),
-        help="What shakes the tip: a piezo at its base (assumed without this option), or a force (photothermal, "
+        help="What drives the tip: a piezo at its base (assumed without this option), or a force (photothermal, "
         "magnetic).",
     ),
     click.option(
@@ -545,7 +543,7 @@ TAPPING_MAP = Command(
             show_default=False,
             help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase:-1.",
         ),
-        click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What shakes."),
+        click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What is driven."),
         *_IMAGE_SETTINGS,
         click.option(
             "--free-phase-deg",

@@ -17,14 +17,14 @@ BASINS = Command(
     group="simulate",
     summary="Find which start of a scene ends where.",
     runs="afm_jax.cli.basins:basins",
-    help="""Find what the starts of a scene come to, and which comes to what.
+    help="""Find on which motion each start of a scene ends.
 
     A start is a drive phase and a speed at which the tip leaves the platform, at most four times the platform's top
     speed unless --speeds says otherwise. Attractors are named (m,N), m impacts in N drive periods, chaotic (the larger
-    Lyapunov exponent is positive), irregular, stuck or free. Told are their shares, with the errors of as many random
-    starts, and the dimension of the boundaries between them.
-    With --law shares have a band from drawn laws. With --out basins.csv (a row a start), attractors.csv and a picture.
-    Exit code 3 if starts could not be followed.
+    Lyapunov exponent is positive), irregular, stuck or free. The output gives the fraction of the starts that end on
+    each, with the errors of as many random starts, and the dimension of the boundaries between them. With --law
+    fractions have a band from drawn laws. With --out basins.csv (a row a start), attractors.csv and a picture. Exit
+    code 3 if starts could not be followed.
     """,
     options=(
         SCENE,
@@ -39,25 +39,25 @@ BASINS = Command(
 BIFURCATION = Command(
     name="bifurcation",
     group="simulate",
-    summary="Sweep a parameter and record what the tip comes to.",
+    summary="Ramp a parameter and record on which motion the tip settles.",
     runs="afm_jax.cli.bifurcation:bifurcation",
-    help="""Sweep a parameter and record what the tip comes to at each of its values.
+    help="""Ramp a parameter and record on which motion the tip settles at each of its values.
 
-    The tip is carried from value to value with its drive phase and rebound speed. It begins, and begins anew where the
+    The tip is carried from value to value with its drive phase and rebound speed. It starts, and starts again where the
     platform held it or it flew away, at the file's [start]; without one on the stable single-impact orbit of the order
-    nearest to resonance, else leaving the platform upward. Of each value the verdict is told, (m,N): m impacts in N
-    drive periods, irregular, stuck or free; and the last impacts are. With --out bifurcation.csv (a row a value),
+    nearest to resonance, else leaving the platform upward. The output gives the motion at each value, (m,N): m impacts
+    in N drive periods, irregular, stuck or free; and its last impacts. With --out bifurcation.csv (a row a value),
     impacts.csv (a row an impact; of an orbit each once), strobe.csv (heights whenever the platform is highest) and a
-    picture. With --law the share of the fit's draws with the same verdict is told too. Exit code 3 if no motion went on
-    anywhere.
+    picture. With --law it also gives the fraction of the fit's draws with the same motion. Exit code 3 if no motion
+    went on anywhere.
     """,
     options=(
         SCENE,
         click.option(
             "--parameter", metavar="P=a:b:n", required=True, help="A parameter of the scene file and its values."
         ),
-        flag("--both", "Sweep up and then down, so that hysteresis shows."),
-        flag("--down", "Sweep down instead of up."),
+        flag("--both", "Ramp up and then down, so that hysteresis shows."),
+        flag("--down", "Ramp down instead of up."),
         click.option("--impacts", type=click.IntRange(200), default=2000, help="At every value."),
         LAW,
         DRAWS,
@@ -82,8 +82,8 @@ CHART = Command(
     Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
     if there are several) the peak amplitude and the size of the larger multiplier. A contact's orbits are closed by
     simulation from those of the law closest to it: chart a thousand points, not a million; where none closes the point
-    is unresolved. With --law the share of the fit's draws in which an orbit is stable is told too. With --out a table
-    (chart.csv or chart.zarr) and a picture. Exit code 3 if there is no admissible orbit at all.
+    is unresolved. With --law the fraction of the fit's draws in which an orbit is stable is given, too. With --out a
+    table (chart.csv or chart.zarr) and a picture. Exit code 3 if there is no admissible orbit at all.
     """,
     options=(
         SCENE,
@@ -251,12 +251,11 @@ ORBITS = Command(
     help="""Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
 
     Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
-    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase
-    and lag at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and
-    orbits.png. Exit code 3 if none is admissible.
-    With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
-    A contact's are told so too: its impacts begin where the bridge forms and end, with phase and velocity, where it
-    breaks.
+    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase and lag
+    at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and orbits.png. Exit
+    code 3 if none is admissible. With --impacts every impact is listed, the hardest first, and the orbit with a rest on
+    the sample if there is one. A contact's orbits are listed like this, too: its impacts begin where the bridge forms
+    and end, with phase and velocity, where it breaks.
     """,
     options=(
         SCENE,
