@@ -28,7 +28,7 @@ def main() -> None:
     for number in range(1, LAST + 1):
         top = n[order[-1] == number]
         ax.text(top.mean(), 2.6, f"(1,{number})", ha="center", va="center", color="white", weight="bold", fontsize=11)
-    ax.text(1.445, 2.6, "no stable\norbit", ha="center", va="center", fontsize=7, color="0.3")
+    ax.text(1.445, 2.6, "no stable\nsingle-impact\norbit", ha="center", va="center", fontsize=7, color="0.3")
     ax.set(xlabel="drive frequency / twice the free frequency,  n = ω/2Ω", ylabel="drive amplitude (nm)")
     ax.set_xlim(n[0], n[-1])
     figure.savefig(PICTURE, dpi=160)

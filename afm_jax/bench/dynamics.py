@@ -71,7 +71,7 @@ def dynamics_rows(*, values: int, impacts: int, side: int, orders: int, grid: in
         ),
         _row(
             "bifurcation diagram",
-            f"{values} values, {impacts} impacts each, swept up",
+            f"{values} values, {impacts} impacts each, ramped up",
             lambda: bifurcation_diagram(scene, FREQUENCY, line, impacts=impacts),
             scipy,
             values * impacts * each,

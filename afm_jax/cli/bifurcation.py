@@ -1,4 +1,4 @@
-"""`afm-jax bifurcation SCENE.toml --parameter P=a:b:n`: what motions come to along a parameter, swept up and down."""
+"""`afm-jax bifurcation SCENE.toml --parameter P=a:b:n`: what motions come to along a parameter, ramped up and down."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ def bifurcation(  # noqa: PLR0913
     draws: int,
     picture: str,
 ) -> Output:
-    """Return what motions of a scene come to along a parameter, swept up, down or both ways."""
+    """Return what motions of a scene come to along a parameter, ramped up, down or both ways."""
     (swept,) = ranges_of(scene.name, scene.scene, [parameter], counted=True)
     how: dict[str, Any] = {"start": scene.start, "impacts": impacts}
     sweeps = []

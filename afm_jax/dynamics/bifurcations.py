@@ -1,10 +1,10 @@
-"""Bifurcation diagrams: what motions come to while a parameter is swept up, and down.
+"""Bifurcation diagrams: what motions come to while a parameter is ramped up, and down.
 
 A sweep carries the tip from value to value, which is what makes hysteresis show, and is a long sequence. It is done in
 many lanes at once, each a stretch of neighbouring values, like this: a first tip hurries along the first values of all
-stretches; from where it was, all stretches are swept side by side; then the first value of every stretch is done again
-from the end of the stretch before it, and the stretches in which that makes a difference are swept again from there,
-until none is left. What remains is what one tip that is swept along all values does, where its motion is regular; it
+stretches; from where it was, all stretches are ramped side by side; then the first value of every stretch is done again
+from the end of the stretch before it, and the stretches in which that makes a difference are ramped again from there,
+until none is left. What remains is what one tip that is ramped along all values does, where its motion is regular; it
 carries drive phase and rebound speed from value to value. A tip that the platform holds, or that flies away, begins
 anew at the next value, where it is told to or where there is motion (`bouncing_tips`).
 """
@@ -33,13 +33,13 @@ from afm_jax.solve.lanes import Report, in_blocks
 from afm_jax.units import within_turn
 
 _STRETCHES, _MORE_STRETCHES = 512, 1024
-"""Stretches at most that are swept side by side: one block of tips; two, for two cores, where that leaves long ones."""
+"""Stretches at most that are ramped side by side: one block of tips; two, for two cores, where that leaves long ones."""
 _LONG_STRETCH = 8
-"""Values: the shorter stretches are, the more often they are swept again."""
+"""Values: the shorter stretches are, the more often they are ramped again."""
 _HURRIED = 100
 """Impacts at each value of the first, hurried sweep."""
 _PASSES = 40
-"""Times at most that stretches are swept again."""
+"""Times at most that stretches are ramped again."""
 _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 _LISTED = 6
@@ -65,7 +65,7 @@ class Sweep(ResultTuple):
         height_nm: the platform's height when the tip arrives.
         strobe_height_nm: the tip's height whenever the drive's phase is 0 (the platform, if it moves, is highest),
             (values, drive periods), of the last ones.
-        complete: False where stretches were still being swept again when there were enough.
+        complete: False where stretches were still being ramped again when there were enough.
         verdict_probability: at each value the fraction of drawn laws with this verdict; None: no laws were drawn.
     """
 
@@ -106,7 +106,7 @@ class Sweep(ResultTuple):
         counts = Counter(self.verdicts.names()).most_common()
         words = ", ".join(f"{name} at {count}" for name, count in counts[:_LISTED])
         others = sum(count for _, count in counts[_LISTED:])
-        return [f"swept {self.direction}: {words}" + (f", others at {others}" if others else "")]
+        return [f"ramped {self.direction}: {words}" + (f", others at {others}" if others else "")]
 
     def columns(self, parameter: str) -> Iterator[dict[str, np.ndarray]]:
         """Give the columns of three tables: a row a value, an impact, and a height when the drive's phase is 0."""
@@ -134,7 +134,7 @@ class Sweep(ResultTuple):
 
 
 class Ramps(NamedTuple):
-    """What `afm-jax bifurcation` tells: a parameter, by its path, that is swept up, down or both ways."""
+    """What `afm-jax bifurcation` tells: a parameter, by its path, that is ramped up, down or both ways."""
 
     parameter: str
     sweeps: list[Sweep]
@@ -188,7 +188,7 @@ def bifurcation_diagram(  # noqa: PLR0913
     accuracy: float = 1e-6,
     report: Report | None = None,
 ) -> Sweep:
-    """Return what a tip comes to at each value of a parameter, swept up or down.
+    """Return what a tip comes to at each value of a parameter, ramped up or down.
 
     Args:
         scene: a scene with a law or a contact, driven with one frequency.
@@ -234,7 +234,7 @@ class _SweptRows(NamedTuple):
 
 
 class _Sweeper:
-    """Sweeps of the same scenes in stretches; the scenes are in the order in which they are swept."""
+    """Sweeps of the same scenes in stretches; the scenes are in the order in which they are ramped."""
 
     def __init__(self, scenes: Scene, fresh: Tips, impacts: int, accuracy: float):
         self.scenes, self.fresh, self.impacts, self.accuracy = scenes, fresh, impacts, accuracy
@@ -244,7 +244,7 @@ class _Sweeper:
         self.lanes = -(-self.count // self.stretch)
 
     def run(self, report: Report | None) -> tuple[_SweptRows, bool]:
-        """Return the sweep of all values, and whether nothing was left to be swept again."""
+        """Return the sweep of all values, and whether nothing was left to be ramped again."""
         every = np.arange(self.lanes)
         starts = self._hurried()
         parts = self._sweep(every, starts, report)

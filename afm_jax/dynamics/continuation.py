@@ -67,11 +67,11 @@ _SPECIAL_COLUMNS = (
 )
 _ENDS = {
     "range": "the end of the range",
-    "capture": "capture: an impact comes too slowly to leave again",
-    "no_speed": "where an impact's speed vanishes: the tip grazes the sample, or rests on it",
+    "capture": "capture (an impact comes too slowly to leave again)",
+    "no_speed": "where an impact's speed vanishes (the tip grazes the sample, or rests on it)",
     "delay": "close to capture, where the law's delay is longer than half a drive period",
     "shorter": "where it becomes an orbit of fewer impacts",
-    "closed": "where it began: it is closed",
+    "closed": "where it began (it is closed)",
     "held": "where the sample no longer lets the tip go",
     "rest_lost": "where the sample no longer holds the tip for a while",
     "grazing": "where a flight grazes the sample, and another motion follows",
@@ -194,19 +194,21 @@ class Continuation(ResultTuple):
             low, high = branch.parameter.min(), branch.parameter.max()
             ends = " and ".join(dict.fromkeys(_ENDS[end] for end in branch.ends))
             count = len(branch.parameter)
-            parts.append(f"  branch {number}: {count} points from {low:.6g} to {high:.6g}; ends at {ends}")
+            parts.append(f"  branch {number}: {count} points between {low:.6g} and {high:.6g}; ends at {ends}")
         if self.special:
             cells: dict[str, Cell] = {
                 "kind": lambda row: row["kind"].replace("_", " "),
                 self.range.path: "parameter:.9g",
-                "95 % interval": lambda row: (
-                    "{:.5g} to {:.5g}".format(*row["interval95"]) if "interval95" in row else ""
-                ),
                 "peak\nnm": "peak_amplitude_nm:.5g",
                 "branch": "branch:d",
                 "admissible": "admissible",
             }
-            parts.append(printed_table("Special points", cells, self._special_rows()))
+            rows = self._special_rows()
+            if any("interval95" in row for row in rows):
+                cells["95 % interval"] = lambda row: (
+                    "{:.5g} to {:.5g}".format(*row["interval95"]) if "interval95" in row else ""
+                )
+            parts.append(printed_table("Special points", cells, rows))
         for curve in self.curves:
             ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
             parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")

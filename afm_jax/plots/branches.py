@@ -147,7 +147,7 @@ def curves_figure(found: Continuation) -> Figure:
                 axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=_once(name, labels))
         for one in curve.meetings:
             marker = "*" if one.kind == "cusp" else "X"
-            name = "cusp" if one.kind == "cusp" else "meeting"
+            name = "cusp" if one.kind == "cusp" else "codimension two"
             axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=_once(name, labels))
     label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")

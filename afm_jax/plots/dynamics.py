@@ -257,7 +257,7 @@ def chart_figure(
     y: str = "second parameter",
     probability: Float[np.ndarray, "orders points"] | None = None,
 ) -> Figure:
-    """Return a picture of a chart: the lowest stable order, and how stable its orbit is; white where none is stable.
+    """Return a picture of a chart: the lowest stable order, and how fast its orbit attracts; white where none is stable.
 
     Args:
         chart: the chart.
@@ -293,8 +293,8 @@ def chart_figure(
     least = float(np.nanmin(lowest_size)) if np.isfinite(lowest_size).any() else 0.0
     # a wide tongue is damped alike throughout: the colours show how it loses its stability at the edges
     mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=min(least, 0.99), vmax=1.0, rasterized=True)
-    figure.colorbar(mesh, ax=right, label="size of its larger multiplier; 1: stability is lost")
-    right.set_title("how stable its orbit is", fontsize=12)
+    figure.colorbar(mesh, ax=right, label="modulus of its larger multiplier; 1: stability is lost")
+    right.set_title("how fast its orbit attracts", fontsize=12)
     label_axes(left, x=label_of(x), y=label_of(y))
     label_axes(right, x=label_of(x), y="")
     figure.legend(handles=known, loc="outside lower center", ncols=2, fontsize=11, frameon=False)
