@@ -9,7 +9,7 @@ import numpy as np
 
 import afm_jax as afm
 
-PICTURE = Path(__file__).parent / "pages" / "pictures" / "figure3.png"
+PICTURE = Path(__file__).parent / "pages" / "pictures" / "figure3"
 # Okabe and Ito's colours, told apart by colour-blind readers too
 COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 LAST = len(COLOURS)
@@ -24,14 +24,18 @@ def main() -> None:
     chart = afm.stability_chart(family, x_values=n, y_values=drive_nm, last_order=14)
     order = np.where(chart.any_stable & (chart.lowest_stable_order <= LAST), chart.lowest_stable_order, np.nan)
     figure, ax = plt.subplots(figsize=(8.0, 3.4), layout="constrained")
-    ax.pcolormesh(n, drive_nm, order, cmap=mpl.colors.ListedColormap(COLOURS), vmin=0.5, vmax=LAST + 0.5)
+    ax.pcolormesh(
+        n, drive_nm, order, cmap=mpl.colors.ListedColormap(COLOURS), vmin=0.5, vmax=LAST + 0.5, rasterized=True
+    )
     for number in range(1, LAST + 1):
         top = n[order[-1] == number]
         ax.text(top.mean(), 2.6, f"(1,{number})", ha="center", va="center", color="white", weight="bold", fontsize=11)
-    ax.text(1.445, 2.6, "no stable\nsingle-impact\norbit", ha="center", va="center", fontsize=7, color="0.3")
+    ax.text(1.43, 2.05, "no stable orbit of one impact", rotation=90, ha="center", va="center", fontsize=8, color="0.3")
     ax.set(xlabel="drive frequency / twice the free frequency,  n = ω/2Ω", ylabel="drive amplitude (nm)")
     ax.set_xlim(n[0], n[-1])
-    figure.savefig(PICTURE, dpi=160)
+    figure.savefig(PICTURE.with_suffix(".png"), dpi=160)
+    with mpl.rc_context({"svg.hashsalt": "afm-jax"}):
+        figure.savefig(PICTURE.with_suffix(".svg"), dpi=300, metadata={"Date": None})
 
 
 if __name__ == "__main__":

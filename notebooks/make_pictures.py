@@ -1,12 +1,24 @@
-"""Make the pictures of README and of the pages anew, by the commands that stand beside them: `make pictures`."""
+"""Make the pictures of README and of the pages anew, by the commands that stand beside them: `make pictures`.
 
+Commands write PNG; the pages show the same figures as SVG. The picture of a fit is several figures and stays a PNG.
+"""
+
+import contextlib
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
+from unittest import mock
+
+from matplotlib.figure import Figure
+
+from afm_jax.cli.main import main as run_command
+from afm_jax.plots import picture_style
 
 ROOT = Path(__file__).parent.parent
 PAGES = ROOT / "notebooks" / "pages"
@@ -42,9 +54,39 @@ def main() -> None:
                 continue
             arguments = shlex.split(PICTURES[picture])
             print("afm-jax", *arguments)
-            subprocess.run([sys.executable, "-m", "afm_jax", *arguments], cwd=folder, check=True)
+            with contextlib.chdir(folder), kept_figures() as figures:
+                run_command(arguments, standalone_mode=False)
             made = folder / arguments[arguments.index("--out") + 1] / f"{picture}.png"
-            shutil.copy(made, PAGES / "pictures" / made.name)
+            figure = figures.get(made.read_bytes())
+            if figure is None:
+                shutil.copy(made, PAGES / "pictures" / made.name)
+            else:
+                (PAGES / "pictures" / f"{picture}.svg").write_bytes(picture_style.svg_of(figure))
+
+
+@contextlib.contextmanager
+def kept_figures() -> Iterator[dict[bytes, Figure]]:
+    """Collect the figures that are drawn meanwhile, each under the bytes of the PNG file that shows it alone."""
+    figures: dict[bytes, Figure] = {}
+    pixels_of, png_of_pixels = picture_style.pixels_of, picture_style.png_of_pixels
+    drawn: list[Figure] = []
+
+    def pixels(figure: Figure, dpi: float) -> Any:
+        drawn.append(figure)
+        return pixels_of(figure, dpi)
+
+    def png(image: Any, dpi: float) -> bytes:
+        written = png_of_pixels(image, dpi)
+        if len(drawn) == 1:
+            figures[written] = drawn[0]
+        drawn.clear()
+        return written
+
+    with (
+        mock.patch.object(picture_style, "pixels_of", pixels),
+        mock.patch.object(picture_style, "png_of_pixels", png),
+    ):
+        yield figures
 
 
 if __name__ == "__main__":

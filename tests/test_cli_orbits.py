@@ -52,7 +52,8 @@ def test_json_is_the_references_list(name: str, tmp_path: Path):
             np.testing.assert_allclose(orbit[key], float(getattr(exact, key)), rtol=1e-8, atol=1e-8, err_msg=key)
 
 
-def test_table_and_file_show_the_same_orbits(tmp_path: Path):
+def test_table_and_file_show_the_same_orbits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "400")
     path = saved(SCENES["damped"], tmp_path / "scene.toml")
     result = orbits(path, "--order", "1", "--out", str(tmp_path / "out"))
     assert result.exit_code == 0

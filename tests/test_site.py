@@ -61,9 +61,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_pictures_stand_beside_their_commands():
     pages = ROOT / "notebooks" / "pages"
     text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages.glob("*.md")).split())
-    assert {path.stem for path in (pages / "pictures").glob("*.png")} == {*PICTURES, "figure3"}
+    files = {path.stem: path.name for path in sorted((pages / "pictures").iterdir())}
+    assert files.keys() == {*PICTURES, "figure3"}
     for picture, command in PICTURES.items():
-        assert f"(pictures/{picture}.png)" in text
+        assert f"(pictures/{files[picture]})" in text
         assert f"`afm-jax {command}`" in text
 
 
@@ -91,7 +92,7 @@ def test_links_lead_somewhere_and_nothing_is_fetched_from_other_machines(site: P
             assert (page.parent / link).exists(), (page.name, link)
     gallery = (site / "gallery" / "index.html").read_text(encoding="utf-8")
     assert all(f'href="{path.stem}.html"' in gallery for path in NOTEBOOKS)
-    assert "(pictures/figure3.png)" in (ROOT / "notebooks" / "pages" / "index.md").read_text(encoding="utf-8")
+    assert "(pictures/figure3.svg)" in (ROOT / "notebooks" / "pages" / "index.md").read_text(encoding="utf-8")
     assert "capture_speed" in (site / "api.html").read_text(encoding="utf-8")
     assert "--scale-errors" in (site / "commands.html").read_text(encoding="utf-8")
 

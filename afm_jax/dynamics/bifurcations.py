@@ -33,7 +33,7 @@ from afm_jax.solve.lanes import Report, in_blocks
 from afm_jax.units import within_turn
 
 _STRETCHES, _MORE_STRETCHES = 512, 1024
-"""Stretches at most that are ramped side by side: one block of tips; two, for two cores, where that leaves long ones."""
+"""Stretches at most that are ramped side by side: one block of tips; two where that leaves long ones."""
 _LONG_STRETCH = 8
 """Values: the shorter stretches are, the more often they are ramped again."""
 _HURRIED = 100

@@ -257,7 +257,7 @@ def chart_figure(
     y: str = "second parameter",
     probability: Float[np.ndarray, "orders points"] | None = None,
 ) -> Figure:
-    """Return a picture of a chart: the lowest stable order, and how fast its orbit attracts; white where none is stable.
+    """Return the picture of a chart: the lowest stable order, and how fast its orbit attracts; white: none is stable.
 
     Args:
         chart: the chart.

@@ -79,11 +79,14 @@ def png_of_pixels(pixels: Shaped[np.ndarray, "height width 4"], dpi: float) -> b
 def svg_of(figure: Figure) -> bytes:
     """Return a figure as an SVG file, in the layout in which it was drawn before: a layout costs as much as drawing.
 
-    Lines and marks of many points are pixels in it, of the resolution in which it was drawn.
+    Lines, marks and meshes of many points are pixels in it, of the resolution in which it was drawn.
     """
     figure.set_layout_engine("none")
-    for line in (line for axes in figure.axes for line in axes.lines if np.size(line.get_xdata()) > _MANY_POINTS):
-        line.set_rasterized(True)
+    for axes in figure.axes:
+        lines = [line for line in axes.lines if np.size(line.get_xdata()) > _MANY_POINTS]
+        meshes = [mesh for mesh in axes.collections if np.size(mesh.get_array()) > _MANY_POINTS]
+        for artist in (*lines, *meshes):
+            artist.set_rasterized(True)
     buffer = io.BytesIO()
     with rc_context({"svg.hashsalt": "afm-jax"}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})

@@ -72,6 +72,7 @@ REFUSED: dict[str, Callable[[], object]] = {
         last_order=1,
     ),
     "sweep": lambda: afm.sweep(_scene(), [{"parameter": "platform.amplitude_nm", "linear": [1, 2, 2]}], "orbits"),
+    "approach_curve": lambda: afm.approach_curve(_scene(), [10.0]),
     "tapping": lambda: fitting.tapping(fitting.read_table(EXAMPLES / "tapping_contact.csv")),
 }
 """What says that it needs 64 bits."""
@@ -98,7 +99,7 @@ NO_NUMBERS = {
         "tapping_map",
         "tapping_together",
     ),
-    *("write_inference_data", "write_table"),
+    *("table_of_curve", "write_inference_data", "write_table"),
 }
 
 
