@@ -31,6 +31,8 @@ from afm_jax.results import ResultTuple, public_result
 
 TOLERANCE = 1e-6
 """What may remain to the steady motion, relative: a hundredth of the phase errors of good instruments."""
+_STRICTER = 1e-9
+"""The same for a motion of several drive periods: one of a single period that turns as it dies away passes for such."""
 _FEWEST_PERIODS = 2000
 _RINGING = 20.0
 """Drive periods, in units of Q, that a height is given at most: a transient of a free tip has e^-63 left of it."""
@@ -264,7 +266,10 @@ def _at_height(
         # a way that broke off is left out: the tip begins at the height at once
 
     def over(motion: Simulation) -> bool:
-        return is_stuck(here, motion) or settled(here, motion, tolerance=TOLERANCE).settled
+        if is_stuck(here, motion):
+            return True
+        verdict = settled(here, motion, tolerance=TOLERANCE)
+        return verdict.settled and (verdict.periods == 1 or settled(here, motion, tolerance=_STRICTER).settled)
 
     run = follow_long(here, start, longest_periods * period_us, enough=over, **settings)
     reading = _why_over(run)
