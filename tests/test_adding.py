@@ -57,8 +57,8 @@ DELAY = {
         ('"delay_offset_nm": 0.726', '{}, "delay_late_nm2_per_us": 0.0'),
         ("- delay_offset_nm/u_in", "{} + delay_late_nm2_per_us/u_in^2"),
     ],
-    "fitting/report/words.py": [
-        ("(1.0 / w - 1.0 / u) - offset / u", '{} + values.get("delay_late_nm2_per_us", 0.0) / u**2'),
+    "fitting/fits/law_after.py": [
+        ('    "delay_offset_nm": lambda', '    "delay_late_nm2_per_us": lambda u, w: 1.0 / u**2,\n{}'),
     ],
 }
 SCENE = """
