@@ -45,6 +45,7 @@ class _Instrument(NamedTuple):
     tip_calibration: float = 1.0
     drive_calibration: float = 1.0
     offset_origin_nm: float = 0.0
+    phase_zero_deg: float = 0.0
 
 
 class _Shared(NamedTuple):
@@ -211,6 +212,7 @@ def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> I
     """Return some rows inverted with an instrument."""
     value, error = _numbers(table)
     per_nm = np.array([instrument.tip_calibration, instrument.tip_calibration, 1.0])
+    zero = np.array([0.0, 0.0, instrument.phase_zero_deg])
     fill = filled(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
     # every field an array of the rows' shape, for `vmap`
     amplitude, frequency, offset = (
@@ -223,7 +225,7 @@ def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> I
     rows = MeasuredRow(
         platform,
         jnp.asarray(table.order[fill], float),
-        jnp.asarray((value / per_nm)[fill]),
+        jnp.asarray(((value - zero) / per_nm)[fill]),
         jnp.asarray((error / per_nm)[fill]),
     )
     cantilever = Cantilever(instrument.free_frequency_khz, instrument.quality_factor, table.mass_ng)
