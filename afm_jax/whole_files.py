@@ -145,7 +145,6 @@ def write_whole(
     path: str | os.PathLike[str],
     content: str | bytes,
     *,
-    synced: bool = True,
     within: str | os.PathLike[str] | None = None,
     named_by_user: bool = False,
 ) -> None:
@@ -154,7 +153,6 @@ def write_whole(
     Args:
         path: of the file.
         content: bytes, or a text to be encoded as UTF-8; what no encoding has, as in names of files, is escaped.
-        synced: whether it must outlast a power cut, too, which takes the disk's time.
         within: folder below which no part of the path may be a link; None: the file itself must be none.
         named_by_user: whether the user gave this very path: a link there is followed, a device or a pipe written to.
 
@@ -175,9 +173,9 @@ def write_whole(
         try:
             with fresh.open("xb") as file:
                 file.write(data)
-                if synced:
-                    file.flush()
-                    os.fsync(file.fileno())
+                # it must outlast a power cut, too
+                file.flush()
+                os.fsync(file.fileno())
             fresh.replace(target)
         except BaseException:
             fresh.unlink(missing_ok=True)

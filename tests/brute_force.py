@@ -41,17 +41,14 @@ class Flights(NamedTuple):
 class FirstImpacts(NamedTuple):
     """What ended the flights, arrays of shape (flights,); NaN where no impact was `found`.
 
-    `closest_gap_nm`: smallest minimum of the gap before the impact, where it is below 1e-9 nm (inf otherwise).
-    `dip_depth_nm`: how deep the tip would pass into the platform, u^2/(2 g''), inf where it would not turn.
-    `near_grazing`: one of the two is below 1e-9 nm: whether there is an impact then depends on rounding.
+    `near_grazing`: the gap's smallest minimum before the impact, or how deep the tip would pass into the platform,
+    u^2/(2 g''), is below 1e-9 nm: whether there is an impact then depends on rounding.
     """
 
     found: NDArray[np.bool_]
     arrival_time_us: Floats
     flight_time_us: Floats
     velocity_before_nm_per_us: Floats
-    closest_gap_nm: Floats
-    dip_depth_nm: Floats
     near_grazing: NDArray[np.bool_]
 
 
@@ -223,11 +220,11 @@ def first_impact(flights: Flights, *, duration_us: float, position_nm: Floats | 
         blocks.append(np.concatenate(_impacts(moving, duration_us), axis=1))
     flight, before, closest, depth = np.concatenate(blocks).T
     near = np.minimum(closest, np.where(np.isnan(depth), np.inf, depth)) < GRAZING_NM
-    return FirstImpacts(~np.isnan(flight), flights.time_us + flight, flight, before, closest, depth, near)
+    return FirstImpacts(~np.isnan(flight), flights.time_us + flight, flight, before, near)
 
 
 def _impacts(moving: Motion, duration_us: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return flight time, velocity before, closest gap and dip depth, shapes (flights, 1)."""
+    """Return flight time, velocity before, closest gap and dip depth (inf: it does not turn), shapes (flights, 1)."""
     # A damped tip stops reaching the platform once its envelope lies above the platform's top.
     top = moving.height - moving.start_gap + moving.amplitude * (1 - np.cos(moving.phase))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -52,16 +52,12 @@ class RankCalibration:
     uniform if a posterior ignores the data.
 
     Attributes:
-        ranks: in the exact posteriors.
-        gaussian_ranks: in the Gaussian ones that a fit states.
-        p_value: probability of ranks farther from uniform, of the least uniform quantity, times their number
-            (Bonferroni).
-        gaussian_p_value: likewise of the Gaussian ones.
+        p_value: probability of ranks in the exact posteriors that are farther from uniform, of the least uniform
+            quantity, times their number (Bonferroni).
+        gaussian_p_value: likewise of ranks in the Gaussian posteriors that a fit states.
         failed: sets that could not be fitted, or whose posterior is too far from Gaussian to be weighted; left out.
     """
 
-    ranks: Float[np.ndarray, "sets q"]
-    gaussian_ranks: Float[np.ndarray, "sets q"]
     p_value: float
     gaussian_p_value: float
     failed: int
@@ -129,7 +125,7 @@ def calibrate_ranks(
     for ranks in (exact, gaussian):
         farther = np.mean(uniform >= _deviation(np.array(ranks))[:, None], axis=1)
         p_values.append(float(min(farther.size * farther.min(), 1.0)))
-    return RankCalibration(np.array(exact), np.array(gaussian), *p_values, failed=sets - len(exact))
+    return RankCalibration(*p_values, failed=sets - len(exact))
 
 
 def _both_tables(refit: Refit, second: Float[np.ndarray, "sets rows k"]) -> tuple[Refit, DataSets]:

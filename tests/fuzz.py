@@ -45,7 +45,6 @@ from tests.test_first_impact import compare_with_brute_force
 LONGEST_S = 60
 """Of the processor, for a batch; a file, or the slowest of its tips, takes a tenth of a second."""
 LANES = 256
-ROOT = Path(__file__).parent.parent
 Random = np.random.Generator
 
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 from tests.reference_contact_bridge import cross_bridge, junction_time, turning_s
 from tests.reference_contact_forces import (
     DIGITS,
-    EFFECTS,
     GUARD_DIGITS,
     Constants,
     ContactParameters,
@@ -25,24 +24,6 @@ from tests.reference_contact_forces import (
     static_potential,
 )
 from tests.reference_contact_junction import Junction, junction
-
-__all__ = [
-    "DIGITS",
-    "EFFECTS",
-    "PUBLISHED",
-    "Collision",
-    "ContactParameters",
-    "Differences",
-    "Junction",
-    "capture_difference",
-    "capture_speed",
-    "collision",
-    "constants",
-    "differences",
-    "junction",
-    "mp",
-]
-
 
 PUBLISHED = {
     12: (4.8899, -0.5148),

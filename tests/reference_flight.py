@@ -142,9 +142,9 @@ def outgoing(k: Constants, u: Number, lib: Any = mp) -> Number:
     return lib.sqrt(k.r**2 * u**2 - k.viscous * u - k.epsilon)
 
 
-def outgoing_slope(k: Constants, u: Number, lib: Any = mp) -> Number:
+def outgoing_slope(k: Constants, u: Number) -> Number:
     """Return d u_out/d u_in = (2 r^2 u - c)/(2 u_out)."""
-    return (2 * k.r**2 * u - k.viscous) / (2 * outgoing(k, u, lib))
+    return (2 * k.r**2 * u - k.viscous) / (2 * outgoing(k, u))
 
 
 def capture_limit(k: Constants, lib: Any = mp) -> Number:

@@ -57,20 +57,18 @@ class Orbit:
 
 
 @high_precision
-def single_impact_orbits(p: Parameters, order: int, *, largest_delay_us: float | None = None) -> list[Orbit]:
+def single_impact_orbits(p: Parameters, order: int) -> list[Orbit]:
     """Return all (1, order) orbits, admissible or not, by rising approach speed.
+
+    A |delay| of half a drive period and more is not looked at: the delay law diverges at the capture speed and has
+    meaningless orbits without number there.
 
     Args:
         p: tip, platform and law.
         order: drive periods of a response period.
-        largest_delay_us: longest |delay| looked at; half a drive period if left out. The delay law diverges at the
-            capture speed and has meaningless orbits without number there.
     """
     k = constants(p)
-    if p.delay is None:
-        pairs = orbits_by_phase(p, order)
-    else:
-        pairs = orbits_by_speed(p, order, largest_delay_us=largest_delay_us)
+    pairs = orbits_by_phase(p, order) if p.delay is None else orbits_by_speed(p, order)
     orbits = [_orbit(p, k, order, phase, approach) for phase, approach in pairs]
     return sorted(orbits, key=lambda orbit: orbit.approach_speed_nm_per_us)
 
@@ -128,10 +126,9 @@ def _closing_by_phase(k: Constants, order: int, sign: int, phase: Number, lib: A
 
 
 @high_precision
-def orbits_by_speed(p: Parameters, order: int, *, largest_delay_us: float | None = None) -> list[tuple[Number, Number]]:
+def orbits_by_speed(p: Parameters, order: int) -> list[tuple[Number, Number]]:
     """Return (phase, approach speed) of all orbits, with or without delay, by scanning the approach speed."""
     k, rough = constants(p), constants(p, np)
-    largest = 0.5 * rough.drive_period if largest_delay_us is None else largest_delay_us
     limit, fastest = capture_limit(rough, np), rough.amplitude * rough.drive + np.sqrt(rough.epsilon) + rough.viscous
     speeds = limit + fastest * np.geomspace(1e-7, 1e6, SPEEDS)
 
@@ -140,7 +137,9 @@ def orbits_by_speed(p: Parameters, order: int, *, largest_delay_us: float | None
             delay = collision_delay(rough, approach, np)
             cosine, sine, scale = _closing_by_speed(rough, order, approach, np)
             value = (cosine**2 + sine**2 - scale**2) / (cosine**2 + sine**2 + scale**2)
-        return np.where((np.abs(delay) < largest) & (delay < order * rough.drive_period), value, np.nan)
+        return np.where(
+            (np.abs(delay) < 0.5 * rough.drive_period) & (delay < order * rough.drive_period), value, np.nan
+        )
 
     def exact(approach: Number) -> Number:
         cosine, sine, scale = _closing_by_speed(k, order, approach, mp)

@@ -24,7 +24,6 @@ from tests.strict_reading import strictly
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
 AMPLITUDES, FORCES = (REAL / f"tapping_{what}_wsxm.f.curves" for what in ("amplitude", "normal_force"))
 NEASNOM, THERMAL = REAL / "tapping_approach_neasnom.txt", REAL / "thermal_nanosurf.nid"
-HEAD = "offset_nm,lockin_amplitude_nm,phase_lag_deg\n"
 
 
 def saved(folder: Path, data: bytes | str, name: str = "curve.dat") -> Path:

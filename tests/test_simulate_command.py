@@ -32,9 +32,9 @@ def law_file(tmp_path: Path) -> Path:
     return path
 
 
-def nulls(value: object, name: str = "") -> set[str]:
+def nulls(answer: dict[str, object]) -> set[str]:
     """Return the keys at the top of an answer that are null."""
-    return {key for key, item in value.items() if item is None} if isinstance(value, dict) else {name}
+    return {key for key, item in answer.items() if item is None}
 
 
 def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -266,7 +266,6 @@ def test_a_disk_that_is_full_in_fact(tmp_path: Path):
     assert found["chunks_kept"] > 0
 
 
-ORBITS = '[record]\nwhat = "orbits"\n'
 AXIS = '[[axes]]\nparameter = "platform.amplitude_nm"\nlinear = [1, 2, 3]\n'
 
 

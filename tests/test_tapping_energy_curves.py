@@ -53,13 +53,13 @@ assert [one.curve.rows for one in result.curves] == [1000] * 30
 """
 
 
-def deviations(result: Tapping, truth: Truth, free_nm: float, name: str = "energy") -> np.ndarray:
-    """Return by how many of its errors a function is off, at all points of all branches."""
+def deviations(result: Tapping, truth: Truth, free_nm: float) -> np.ndarray:
+    """Return by how many of its errors the energy is off, at all points of all branches."""
     found = []
     for branch in result.branches:
         curve = branch.curve
-        true = truth.at(f"{name}_aj", curve.amplitude_ratio, free_nm)
-        found.append((getattr(curve, f"{name}_aj") - true) / getattr(curve, f"{name}_error_aj"))
+        true = truth.at("energy_aj", curve.amplitude_ratio, free_nm)
+        found.append((curve.energy_aj - true) / curve.energy_error_aj)
     return np.concatenate(found)
 
 

@@ -275,7 +275,7 @@ class StabilityChart(Result):
             "points": int(several.size),
             "admissible_share": verdicts.admissible.mean(axis=1),
             "stable_share": verdicts.stable.mean(axis=1),
-            "any_stable_share": float(verdicts.any_stable().mean()),
+            "any_stable_share": self.stable_share,
             "several_stable_share": float(several.mean()),
         }
         if verdicts.unresolved is not None:

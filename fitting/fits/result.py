@@ -447,12 +447,12 @@ EV_PER_AJ = 1.0 / 0.1602176634
 """Electron volts in an attojoule (exact in SI)."""
 
 
-def interval_of(value: float, error: float, lowest: float = -np.inf, highest: float = np.inf) -> WithInterval:
-    """Return a value with its 95 % interval, cut off where nothing can be."""
+def interval_of(value: float, error: float, lowest: float = -np.inf) -> WithInterval:
+    """Return a value with its 95 % interval, cut off below where nothing can be."""
     if not np.isfinite(error):
         return WithInterval(value, (None, None))
     reach = TWO_SIDED_95 * error
-    return WithInterval(value, (float(max(value - reach, lowest)), float(min(value + reach, highest))))
+    return WithInterval(value, (float(max(value - reach, lowest)), float(value + reach)))
 
 
 def scaled(known: WithInterval, factor: float) -> WithInterval:

@@ -838,9 +838,9 @@ def _agreement(told: list[np.ndarray], weighted: list[np.ndarray]) -> float:
     return chi2_tail(max(sum(part for part, _ in each) - whole[0], 0.0), freedom) if freedom > 0 else 1.0
 
 
-def _smoothed(values: np.ndarray, width: int = 5) -> np.ndarray:
-    """Return running means of residuals along the curve."""
-    width = min(width, len(values))
+def _smoothed(values: np.ndarray) -> np.ndarray:
+    """Return running means of five values along the curve."""
+    width = min(5, len(values))
     return np.convolve(values, np.full(width, 1.0 / width), "valid")
 
 

@@ -34,8 +34,6 @@ class ImpactCount(NamedTuple):
     """What was counted; `impacts` is None where the samples do not tell, and `reason` says why."""
 
     impacts: int | None
-    phases: tuple[float, ...]
-    """Response phase of each, in turns."""
     reason: str | None
 
 
@@ -68,9 +66,8 @@ def count_impacts(
             why = "the noise hides jumps of the velocity; record more response periods"
             continue
         least = np.maximum(_SURE * spread, _LEAST_JUMP * omega * peak_nm)
-        places = _tops(np.where(jump > least, jump, 0.0), across)
-        return ImpactCount(len(places), tuple(float(place / bins) for place in places), None)
-    return ImpactCount(None, (), why)
+        return ImpactCount(_tops(np.where(jump > least, jump, 0.0), across), None)
+    return ImpactCount(None, why)
 
 
 def _binned(folded: Fold, bins: int) -> tuple[Float[np.ndarray, " bins"], ...]:
@@ -130,14 +127,14 @@ def _velocity(
     return velocity, np.mean(error, axis=1) * np.sqrt(cc / determinant)
 
 
-def _tops(jump: Float[np.ndarray, " bins"], across: int) -> list[int]:
-    """Return the largest jumps that lie more than a stretch apart on the circle, in order."""
-    left, places = jump.copy(), []
+def _tops(jump: Float[np.ndarray, " bins"], across: int) -> int:
+    """Return how many jumps, from the largest on, lie more than a stretch apart on the circle."""
+    left, count = jump.copy(), 0
     while left.max() > 0.0:
         place = int(np.argmax(left))
-        places.append(place)
+        count += 1
         left[np.arange(place - across - _BESIDE, place + across + _BESIDE + 1) % len(left)] = 0.0
-    return sorted(places)
+    return count
 
 
 _GRID = 2048

@@ -14,12 +14,12 @@ from tests import reference_contact as exact
 from tests.collisions_of_eight import collide_in_eights
 
 
-def crossed_in_time(contact, speed, inner_nm, mass=1.0):
+def crossed_in_time(contact, speed, inner_nm):
     """Return speed and time at which SciPy leaves the bridge again, in time and with events; None if it does not."""
     static = jax.jit(lambda gap, rate: contact.forces(gap, rate))  # noqa: PLW0108 (modules with arrays do not hash)
 
     def rates(_, state):
-        return [state[1], float(static(state[0], state[1])) / mass]
+        return [state[1], float(static(state[0], state[1]))]
 
     def crossing(gap_nm, direction):
         def event(_, state):
