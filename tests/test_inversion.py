@@ -191,12 +191,13 @@ def test_calibration_of_the_instrument_is_taken_back(exact):
     read |= {f"{name[:-3]}_error_nm": 1.02 * np.asarray(getattr(table, f"{name[:-3]}_error_nm")) for name in read}
     known = {"tip_calibration": (1.02, 0.01), "drive_calibration": (0.5, 0.005), "offset_origin_nm": (0.3, 0.1)}
     known["phase_zero_deg"] = (4.0, 0.2)
+    assert table.phase_deg is not None
     other = dataclasses.replace(
         table,
         **read,
         drive_amplitude_nm=2.0 * np.asarray(table.drive_amplitude_nm, float),
         offset_nm=table.offset_nm - 0.3,
-        phase_deg=np.asarray(table.phase_deg) + 4.0,
+        phase_deg=table.phase_deg + 4.0,
         calibration=known,
     )
     found = invert(other)
