@@ -99,7 +99,7 @@ def test_viscous_law_and_delay_read_the_contact_off_the_shared_table(viscous):
 def test_rows_set_aside_are_named(viscous, shared):
     aside = np.flatnonzero(viscous.rows.set_aside)
     assert aside.size >= 1
-    (said,) = [warning for warning in viscous.warnings if warning.startswith("Set aside")]
+    (said,) = [warning for warning in viscous.warnings if warning.startswith("Excluded")]
     for row in aside:
         assert str(int(shared.lines[row])) in said
     assert not np.any(viscous.rows.used & viscous.rows.set_aside)

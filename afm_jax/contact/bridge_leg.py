@@ -35,6 +35,8 @@ from afm_jax.solve.quadrature import gauss_nodes, nodes_along
 
 _NEAREST = 1e-14
 """Lower bound of b: at 0 speed and square root would vanish together."""
+_STEEP = 1e-10
+"""Values of b below which it has no derivative."""
 GRADING = 1.6
 """Steps towards the inner end shrink on the way in, where the core repulsion rises as the 8th power."""
 _SLOWEST = 0.01
@@ -210,16 +212,17 @@ def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
 def margin_of(energy: Float[Array, "..."], pull: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return b, without unit, between 0 and 1: the kinetic energy at the outer end over that end's pull.
 
-    No derivative: b chooses the variable of the integration and not its result. At capture that of sqrt(b) is 1e7, and
-    with it the last digits of the integration would enter every gradient.
+    Close to capture b has no derivative: it chooses the variable of the integration and not its result, and the
+    derivative of sqrt(b), up to 1e7, would bring the last digits of the integration into every gradient. Farther off
+    the derivative keeps the variable where the speed is smooth in it.
 
     Args:
         energy: kinetic energy at the outer end, in aJ.
         pull: -F(D) D there, the bridge's attraction times the gap, in aJ.
     """
-    energy, pull = lax.stop_gradient((energy, pull))
     near = energy < pull
-    return jnp.where(near, jnp.maximum(energy, _NEAREST * pull) / jnp.where(near, pull, 1.0), 1.0)
+    margin = jnp.where(near, jnp.maximum(energy, _NEAREST * pull) / jnp.where(near, pull, 1.0), 1.0)
+    return jnp.where(margin < _STEEP, lax.stop_gradient(margin), margin)
 
 
 class Collocation(NamedTuple):
@@ -392,7 +395,7 @@ def driven_way(driven: Driven, gaps: tuple[Array, Array], state: ContactState, *
         if driven.drive is not None:
             at_outer = at_outer + driven.mass_ng * driven.drive.push(state.time_us) * (outer - inner)
     pull = -driven.bridge.force(outer) * outer
-    margin = margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30))
+    margin = lax.stop_gradient(margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30)))
     return way_through(driven, gaps, start, margin, inward=inward, begin_us=state.time_us)
 
 

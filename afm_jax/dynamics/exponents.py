@@ -94,7 +94,7 @@ class Lyapunov(ResultTuple):
         return f"{words}; there were {most}{int(motions.impacts.max())} impacts to average over"
 
     @property
-    def impact_speeds_nm_per_us(self) -> Float[np.ndarray, "lanes last"]:
+    def impact_speeds_nm_per_us(self) -> Float[np.ndarray, "*lanes last"]:
         """Approach speeds of the last impacts."""
         return self.approach_speed_nm_per_us
 
