@@ -35,9 +35,9 @@ class StudyTable(NamedTuple):
     title: str
     cells: Mapping[str, Cell]
 
-    def printed(self, rows: Sequence[Row], **told: Any) -> Table:
-        """Return the rows as a table to print, numbers with three digits; the title may say more."""
-        return printed_table(self.title.format(**told), self.cells, rows, form=".3g")
+    def printed(self, rows: Sequence[Row], told: Mapping[str, Any] | None = None) -> Table:
+        """Return the rows as a table to print, numbers with three digits; its title takes what it names from `told`."""
+        return printed_table(self.title.format_map(told or {}), self.cells, rows, form=".3g")
 
     def written(self, rows: Sequence[Row]) -> dict[str, dict[str, list[Any]]]:
         """Return the columns of the CSV file by its name."""

@@ -72,9 +72,9 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> O
     return Output(
         payload={**result, "scene": name, "law": law},
         text=[
-            SETTINGS.printed(result["rows"], **result),
+            SETTINGS.printed(result["rows"], result),
             reference_sentence(result),
-            LADDER.printed(result["ladder"], **result),
+            LADDER.printed(result["ladder"], result),
             *(f"{row['model']}: {row['reason']}" for row in result["ladder"] if row.get("reason")),
         ],
         tables=SETTINGS.written(result["rows"]) | LADDER.written(result["ladder"]),
