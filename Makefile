@@ -39,7 +39,7 @@ $(SETUP): pyproject.toml
 fit: $(SETUP) ## fit the bundled table (or TABLE=..., MODEL=...), print the impact law, write OUT=report/
 	$(BIN)/afm-jax fit $(if $(TABLE),'$(TABLE)',--example) --model $(MODEL) --out $(OUT)
 
-test: $(SETUP) ## the tests (under 7 minutes on two cores)
+test: $(SETUP) ## the tests (five minutes on two cores)
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_AT_ONCE)" $(BIN)/python $(PYTEST) -n auto --dist worksteal $(SHARP:%=--ignore %)
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -n auto $(SHARP)
 

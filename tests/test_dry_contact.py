@@ -137,11 +137,12 @@ def test_law_of_a_dry_contact_gives_back_the_speed():
 SCENE = Scene(Cantilever(90.0, 40.0, 1.0), Platform(4.0, 180.0, 0.0), Contact(VanDerWaals() + Viscous(), Dmt()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "contact",
     [
         pytest.param(SCENE.interaction, id="dmt"),
-        pytest.param(Contact((), Hertz()), id="hertz", marks=pytest.mark.slow),
+        pytest.param(Contact((), Hertz()), id="hertz"),
     ],
 )
 def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them(contact):
