@@ -84,7 +84,8 @@ def svg_of(figure: Figure) -> bytes:
     figure.set_layout_engine("none")
     for axes in figure.axes:
         lines = [line for line in axes.lines if np.size(line.get_xdata()) > _MANY_POINTS]
-        meshes = [mesh for mesh in axes.collections if np.size(mesh.get_array()) > _MANY_POINTS]
+        coloured = [(mesh, mesh.get_array()) for mesh in axes.collections]
+        meshes = [mesh for mesh, values in coloured if values is not None and values.size > _MANY_POINTS]
         for artist in (*lines, *meshes):
             artist.set_rasterized(True)
     buffer = io.BytesIO()
