@@ -6,7 +6,6 @@ until it is within such a radius, is held, or flies away, and drops out; what is
 apart like the sample. Distances are in drive phase (rad) and velocity over beta omega.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -429,9 +428,14 @@ class _Finder:
         return jnp.asarray(points), jnp.asarray(radius), owner
 
 
-@partial(jax.jit, static_argnames=("impacts",))
+@jax.jit
 def _towards(
-    scene: Scene, tips: Tips, points: Float[Array, "points 2"], radius: Float[Array, " points"], *, impacts: int
+    scene: Scene,
+    tips: Tips,
+    points: Float[Array, "points 2"],
+    radius: Float[Array, " points"],
+    *,
+    impacts: int | Int[Array, ""],
 ) -> tuple[Tips, Int[Array, " lanes"]]:
     """Return tips some impacts later, and the number of the point that each has come close enough to; -1: none."""
     omega, top = scene.platform.angular_frequency, scene.platform.top_speed_nm_per_us

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
@@ -239,6 +239,7 @@ class _Sweeper:
     def __init__(self, scenes: Scene, fresh: Tips, impacts: int, accuracy: float):
         self.scenes, self.fresh, self.impacts, self.accuracy = scenes, fresh, impacts, accuracy
         self.count = len(scenes.platform.frequency_khz)
+        self.period_us = np.asarray(scenes.platform.period_us)
         shortest, longest = (-(-self.count // most) for most in (_MORE_STRETCHES, _STRETCHES))
         self.stretch = max(shortest, min(longest, _LONG_STRETCH))
         self.lanes = -(-self.count // self.stretch)
@@ -307,7 +308,7 @@ class _Sweeper:
 
         scenes, _ = self._at(numbers)
         end, record = in_blocks(work, (scenes, tips))
-        period = np.asarray(scenes.platform.period_us)
+        period = self.period_us[numbers]
         return _SweptRows(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
 
     def _hurried(self) -> Tips:
@@ -402,7 +403,7 @@ def _sweep_of(
         phase_rad=known(within_turn(turn * record.departure_us + ahead, 2.0 * np.pi)),
         approach_nm_per_us=known(record.approach_nm_per_us),
         velocity_after_nm_per_us=known(
-            record.velocity_after_nm_per_us + np.asarray(seen.response(record.departure_us)[1])
+            record.velocity_after_nm_per_us + np.asarray(_response(seen, record.departure_us)[1])
         ),
         height_nm=known(offset + amplitude * np.cos(turn * record.arrival_us + ahead)),
         strobe_height_nm=_strobes(seen, record, shown, period),
@@ -423,12 +424,30 @@ def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.n
     end = record.arrival_periods + record.arrival_us / period[:, None] + ahead
     begin, end, used = begin[:, :-1], end[:, some][:, 1:], shown[:, some][:, 1:]
     gap = np.asarray(scenes.interaction.bridge_breaks_nm) if isinstance(scenes.interaction, Contact) else 0.0 * period
-    column = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None, None], scenes)
     strobe = np.ceil(begin)[..., None] + np.arange(_STROBES)
     flown = (strobe - begin[..., None]) * period[:, None, None]
-    start = np.asarray(column.platform.position(record.departure_us[:, some][:, :-1, None])) + gap[:, None, None]
-    velocity = record.velocity_after_nm_per_us[:, some][:, :-1, None]
-    height = np.asarray(column.cantilever.propagator(np.where(np.isfinite(flown), flown, 0.0))(start, velocity)[0])
-    height = height + np.asarray(seen.response(-(ahead * period[:, None])[..., None])[0])
+    departure, velocity = (
+        part[:, some][:, :-1, None] for part in (record.departure_us, record.velocity_after_nm_per_us)
+    )
+    height = np.asarray(
+        _flight_height(scenes, gap, departure, velocity, np.where(np.isfinite(flown), flown, 0.0))
+    ) + np.asarray(_response(seen, -(ahead * period[:, None])[..., None])[0])
     inside = used[..., None] & (strobe < end[..., None])
     return np.where(inside, height, np.nan).reshape(len(period), -1)
+
+
+_response = jax.jit(SampleDriven.response)
+
+
+@jax.jit
+def _flight_height(
+    scenes: Scene,
+    gap_nm: Float[Array, " values"],
+    departure_us: Float[Array, "values impacts 1"],
+    velocity_nm_per_us: Float[Array, "values impacts 1"],
+    flown_us: Float[Array, "values impacts times"],
+) -> Float[Array, "values impacts times"]:
+    """Return the height in nm of tips that departed at a gap over the platform, some time of their flights later."""
+    column, gap = jax.tree.map(lambda leaf: leaf[:, None, None], (scenes, gap_nm))
+    start = column.platform.position(departure_us) + gap
+    return column.cantilever.propagator(flown_us)(start, velocity_nm_per_us)[0]

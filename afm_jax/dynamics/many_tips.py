@@ -105,7 +105,7 @@ def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float
     """
     if isinstance(scenes.interaction, Contact):
         return tips_after_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
-    tips, rows = recorded(scenes, skipped(scenes, tips, impacts=skip), impacts=record)
+    tips, rows = recorded(scenes, tips, skip, impacts=record)
     return tips, Record(*(np.asarray(column).T for column in rows))
 
 
@@ -127,12 +127,13 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
         scenes: a batch of scenes with a law, every number of one lane a tip.
         tips: at the beginning of a flight each.
     """
+    longer = jax.vmap(partial(_one_impact, max_steps=MAX_STEPS))
+    if len(tips.time_us) <= _FEW:
+        return after_impacts(scenes, tips, longer(scenes, tips))
     going = tips.outcome == Outcome.IMPACT
     impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
     slow = going & (impact.outcome == Outcome.STEP_LIMIT)
-    longer = jax.vmap(partial(_one_impact, max_steps=MAX_STEPS))
-    impact = again_for(longer, slow, (scenes, tips), impact, block=_FEW)
-    return after_impacts(scenes, tips, impact)
+    return after_impacts(scenes, tips, again_for(longer, slow, (scenes, tips), impact, block=_FEW))
 
 
 def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
@@ -193,21 +194,33 @@ def _rest(scene: Scene, impact: NextImpact) -> tuple[Departure, Bool[Array, ""],
     return departure, rested & ~held, held
 
 
-@partial(jax.jit, static_argnames=("impacts",))
-def skipped(scenes: Scene, tips: Tips, *, impacts: int) -> Tips:
+@jax.jit
+def skipped(scenes: Scene, tips: Tips, *, impacts: int | Int[Array, ""]) -> Tips:
     """Return a block of tips some impacts later."""
     return lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now).end, tips)
 
 
 @partial(jax.jit, static_argnames=("impacts",))
-def recorded(scenes: Scene, tips: Tips, *, impacts: int) -> tuple[Tips, Record]:
-    """Return a block of tips some impacts later, and the impacts, with axes (impacts, lanes)."""
+def recorded(scenes: Scene, tips: Tips, skip: int | Int[Array, ""] = 0, *, impacts: int) -> tuple[Tips, Record]:
+    """Return a block of tips `skip` and then so many more impacts later, and these, with axes (impacts, lanes).
 
-    def one(now: Tips, _: None) -> tuple[Tips, Record]:
-        step = advance(scenes, now)
-        return step.end, record_of(scenes, step)
+    The map stands in the program once: compiling it takes longer than most runs of it.
+    """
 
-    return lax.scan(one, tips, length=impacts)
+    def next_row(step: MapStep, count: Array) -> tuple[MapStep, Record]:
+        step = lax.fori_loop(0, count, lambda _, before: advance(scenes, before.end), step)
+        return step, record_of(scenes, step)
+
+    counts = jnp.ones(impacts, int).at[0].add(skip)
+    step, rows = lax.scan(next_row, _before_any(tips), counts)
+    return step.end, rows
+
+
+def _before_any(tips: Tips) -> MapStep:
+    """Return a step that ends where tips are, for a loop to begin with."""
+    no_number, no = jnp.zeros_like(tips.time_us), jnp.zeros_like(tips.time_us, bool)
+    impact = NextImpact(no_number, no_number, no_number, no_number, tips.outcome, no)
+    return MapStep(tips, impact, no, tips)
 
 
 def record_of(scenes: Scene, step: MapStep) -> Record:

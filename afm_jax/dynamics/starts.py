@@ -132,6 +132,7 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
     return after_impacts(scenes, tips, jax.vmap(first_impact_of)(scenes, starts)).end
 
 
+@jax.jit
 def leaving_tips(scenes: Scene) -> Tips:
     """Return tips that leave the platform upward at its highest speed, at that speed again or twice the capture speed.
 
@@ -157,7 +158,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
     Args:
         scenes: a batch of scenes, driven by the sample alone.
     """
-    usual, gap = leaving_tips(scenes), jnp.zeros_like(scenes.platform.frequency_khz)
+    usual, gap = leaving_tips(scenes), np.zeros(scenes.platform.frequency_khz.shape)
     laws = laws_of(scenes)
     if laws is None:
         return usual
@@ -169,7 +170,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
         return _on_orbits(*lanes)
 
     there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), block=_ORBITS_AT_ONCE)
-    return jax.tree.map(lambda on_orbit, elsewhere: jnp.where(there & has_law, on_orbit, elsewhere), tips, usual)
+    return jax.tree.map(lambda on_orbit, elsewhere: np.where(there & has_law, on_orbit, elsewhere), tips, usual)
 
 
 @jax.jit
