@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
@@ -23,7 +24,7 @@ from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, 
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, settled_below, verdicts_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.lanes import LANES, Report, in_blocks
+from afm_jax.solve.lanes import LANES, Report, compiling, in_blocks
 from afm_jax.units import within_turn
 
 _SAMPLE = 2048
@@ -215,7 +216,7 @@ def basins_of_attraction(
     if speeds_nm_per_us is None:
         one = jax.tree.map(lambda leaf: leaf[None], scene)
         usual = leaving_tips(one)
-        speeds_nm_per_us = (0.0, 4.0 * float((usual.velocity_nm_per_us - one.platform.velocity(usual.time_us))[0]))
+        speeds_nm_per_us = (0.0, 4.0 * float((usual.velocity_nm_per_us - _velocity(one.platform, usual.time_us))[0]))
     low, high = speeds_nm_per_us
     if not 0.0 <= low < high:
         raise ValueError(f"`speeds_nm_per_us` must rise from 0 or more, but is {speeds_nm_per_us}")
@@ -227,7 +228,9 @@ def basins_of_attraction(
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
     else:
-        finder.look_around(high, low)
+        targets = finder.targets()
+        with compiling(lambda: finder.towards(targets, starts, impacts=0)):
+            finder.look_around(high, low)
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
     order = [number for number in np.argsort(-count, kind="stable") if count[number]]
@@ -254,6 +257,21 @@ def basins_of_attraction(
     )
 
 
+_velocity = jax.jit(Platform.velocity)
+"""Compiled: all of a formula in one program."""
+
+
+class _Targets(NamedTuple):
+    """Points of orbits, filled up to one number of them."""
+
+    points: Float[np.ndarray, "points 2"]
+    """Phase in rad, and velocity over beta omega."""
+    radius: Float[np.ndarray, " points"]
+    """From within which all tips come back; negative where there is no point."""
+    owner: Int[np.ndarray, " points"]
+    """The number of the attractor."""
+
+
 class _Finder:
     """The attractors of one scene that are known so far, and how starts are matched with them.
 
@@ -271,9 +289,8 @@ class _Finder:
 
     def tips(self, phase: np.ndarray, speed: np.ndarray) -> Tips:
         """Return tips that leave at drive phases with rebound speeds."""
-        scenes = self.scenes(len(phase))
-        time = jnp.asarray(phase / self.omega)
-        tips = tips_at(scenes, time, scenes.platform.velocity(time) + speed)
+        scenes, time = self.scenes(len(phase)), phase / self.omega
+        tips = tips_at(scenes, time, np.asarray(_velocity(self.scene.platform, time)) + speed)
         if isinstance(self.scene.interaction, Contact):
             tips = tips._replace(gap_nm=scenes.interaction.bridge_breaks_nm)
         return jax.tree.map(np.asarray, tips)
@@ -363,11 +380,10 @@ class _Finder:
                     owner += [number] * len(ring)
                     sizes += [size] * len(ring)
         points, owner, sizes = np.concatenate(rows), np.asarray(owner), np.asarray(sizes)
-        scenes = self.scenes(len(points))
-        time = jnp.asarray(points[:, 0] % (2.0 * np.pi) / self.omega)
-        tips = jax.tree.map(np.asarray, tips_at(scenes, time, jnp.asarray(points[:, 1])))
+        time = points[:, 0] % (2.0 * np.pi) / self.omega
+        tips = jax.tree.map(np.asarray, tips_at(self.scenes(len(points)), time, points[:, 1]))
         # no start: beside the orbit of a tip that leaves with the platform's own speed
-        into = points[:, 1] <= np.asarray(scenes.platform.velocity(time))
+        into = points[:, 1] <= np.asarray(_velocity(self.scene.platform, time))
         end, record = self._later(tips, _BACK)
         # on the orbit: the last point is one of its own
         phase, velocity = self.omega * record.departure_us[:, -1], record.velocity_after_nm_per_us[:, -1]
@@ -384,14 +400,9 @@ class _Finder:
         count = len(tips.time_us)
         label, remaining = np.full(count, -1), np.arange(count)
         for impacts in _ROUNDS:
-            points, radius, owner = self._targets()
-
-            def work(some: Tips, impacts=impacts, points=points, radius=radius) -> tuple[Tips, Array]:
-                return _towards(self.scene, some, points, radius, impacts=impacts)
-
-            tips, nearest = in_blocks(work, tips, block=_PART)
-            near = nearest >= 0
-            arrival = np.where(near, owner[np.maximum(nearest, 0)], -1)
+            targets = self.targets()
+            tips, nearest = self.towards(targets, tips, impacts=impacts)
+            arrival = np.where(nearest >= 0, targets.owner[np.maximum(nearest, 0)], -1)
             for outcome, kind in (
                 (Outcome.CAPTURED, MotionKind.STUCK),
                 (Outcome.NO_FURTHER_IMPACT, MotionKind.FREE),
@@ -415,8 +426,16 @@ class _Finder:
             label[remaining] = self._number_of((int(MotionKind.IRREGULAR), 0, 0))
         return label
 
-    def _targets(self) -> tuple[Array, Array, np.ndarray]:
-        """Return points of orbits (phase, velocity over beta omega), their radii and whose they are, filled up."""
+    def towards(self, targets: "_Targets", tips: Tips, *, impacts: int) -> tuple[Tips, Int[np.ndarray, " lanes"]]:
+        """Return tips some impacts later, and the number of the point that each has come close enough to; -1: none."""
+
+        def work(some: Tips) -> tuple[Tips, Array]:
+            return _towards(self.scene, some, targets.points, targets.radius, impacts=impacts)
+
+        return in_blocks(work, tips, block=_PART)
+
+    def targets(self) -> "_Targets":
+        """Return the points of the orbits that are known."""
         points, radius, owner = np.zeros((_POINTS, 2)), np.full(_POINTS, -1.0), np.zeros(_POINTS, int)
         used = 0
         for number, orbit in enumerate(self.attractors):
@@ -425,15 +444,15 @@ class _Finder:
                 points[some] = np.stack([orbit.phase_rad, orbit.velocity_nm_per_us / self.top], axis=1)
                 radius[some], owner[some] = self.radius[number], number
                 used += orbit.impacts
-        return jnp.asarray(points), jnp.asarray(radius), owner
+        return _Targets(points, radius, owner)
 
 
 @jax.jit
 def _towards(
     scene: Scene,
     tips: Tips,
-    points: Float[Array, "points 2"],
-    radius: Float[Array, " points"],
+    points: Float[ArrayLike, "points 2"],
+    radius: Float[ArrayLike, " points"],
     *,
     impacts: int | Int[Array, ""],
 ) -> tuple[Tips, Int[Array, " lanes"]]:

@@ -11,6 +11,7 @@ anew at the next value, where it is told to or where there is motion (`bouncing_
 
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -23,13 +24,13 @@ from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Record, Tips, follow, skipped, tips_after_contacts
-from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
+from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, leaving_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
-from afm_jax.solve.lanes import Report, in_blocks
+from afm_jax.solve.lanes import LANES, Report, compiling, in_blocks
 from afm_jax.units import within_turn
 
 _STRETCHES, _MORE_STRETCHES = 512, 1024
@@ -40,6 +41,8 @@ _HURRIED = 100
 """Impacts at each value of the first, hurried sweep."""
 _PASSES = 40
 """Times at most that stretches are ramped again."""
+_FEW = 128
+"""Lanes of a block of laws unless there are more than fill a whole one: fewer take as long."""
 _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 _LISTED = 6
@@ -214,7 +217,8 @@ def bifurcation_diagram(  # noqa: PLR0913
     if impacts < RECORDED:
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
     begin = None if start is None else seen.start(start_of(scenes, start))
-    _, fresh = batch_and_tips(seen.scenes, begin)
+    with _compiling_for(seen.scenes, accuracy):
+        _, fresh = batch_and_tips(seen.scenes, begin)
     seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
     sweeper = _Sweeper(seen.scenes, fresh, impacts, accuracy)
     swept, complete = sweeper.run(report)
@@ -223,6 +227,14 @@ def bifurcation_diagram(  # noqa: PLR0913
     seen, platform, swept, restarted = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept, restarted))
     seen, platform = jax.tree.map(jnp.asarray, (seen, platform))
     return _sweep_of(seen, platform, swept, restarted, ordered, upward=upward, complete=complete)
+
+
+def _compiling_for(scenes: Scene, accuracy: float) -> AbstractContextManager[None]:
+    """Compile on another core what will follow the tips of scenes with laws."""
+    if isinstance(scenes.interaction, Contact):
+        return nullcontext()
+    anywhere = jax.tree.map(np.asarray, (scenes, leaving_tips(scenes)))
+    return compiling(_Sweeper(*anywhere, RECORDED, accuracy).follow_the_firsts)
 
 
 class _SweptRows(NamedTuple):
@@ -307,9 +319,18 @@ class _Sweeper:
             return follow(*lanes, skip=self.impacts - RECORDED, record=RECORDED, accuracy=self.accuracy)
 
         scenes, _ = self._at(numbers)
-        end, record = in_blocks(work, (scenes, tips))
+        if isinstance(scenes.interaction, Contact):
+            end, record = in_blocks(work, (scenes, tips))
+        else:
+            width = LANES if len(numbers) > LANES else _FEW
+            end, record = in_blocks(work, (scenes, tips), block=width, widths=(width,))
         period = self.period_us[numbers]
         return _SweptRows(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
+
+    def follow_the_firsts(self) -> _SweptRows:
+        """Return what the tips that begin there come to at the first values of all stretches."""
+        firsts = self._numbers(np.arange(self.lanes))[:, 0]
+        return self._follow(firsts, self._at(firsts)[1])
 
     def _hurried(self) -> Tips:
         """Return the tips that one gets at the first values of all stretches in a sweep of those alone."""
@@ -403,7 +424,7 @@ def _sweep_of(
         phase_rad=known(within_turn(turn * record.departure_us + ahead, 2.0 * np.pi)),
         approach_nm_per_us=known(record.approach_nm_per_us),
         velocity_after_nm_per_us=known(
-            record.velocity_after_nm_per_us + np.asarray(_response(seen, record.departure_us)[1])
+            record.velocity_after_nm_per_us + np.asarray(seen.response(record.departure_us)[1])
         ),
         height_nm=known(offset + amplitude * np.cos(turn * record.arrival_us + ahead)),
         strobe_height_nm=_strobes(seen, record, shown, period),
@@ -431,12 +452,9 @@ def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.n
     )
     height = np.asarray(
         _flight_height(scenes, gap, departure, velocity, np.where(np.isfinite(flown), flown, 0.0))
-    ) + np.asarray(_response(seen, -(ahead * period[:, None])[..., None])[0])
+    ) + np.asarray(seen.response(-(ahead * period[:, None])[..., None])[0])
     inside = used[..., None] & (strobe < end[..., None])
     return np.where(inside, height, np.nan).reshape(len(period), -1)
-
-
-_response = jax.jit(SampleDriven.response)
 
 
 @jax.jit

@@ -51,6 +51,7 @@ class SampleDriven(NamedTuple):
         height, velocity = self.response(time)
         return State(time, start.position_nm - height, start.velocity_nm_per_us - velocity)
 
+    @jax.jit
     def response(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return height and velocity of what the frame leaves out, at a time of its clock: the free tip's response."""
         time, wave = jnp.asarray(time_us), self.frame.response
@@ -215,6 +216,7 @@ def laws_of(scenes: Scene) -> tuple[Law, Bool[np.ndarray, " lanes"]] | None:
     return jax.tree.map(lambda leaf: leaf[owner.ravel()], laws), has_law
 
 
+@jax.jit
 def tips_at(scenes: Scene, time_us: Array, velocity_nm_per_us: Array) -> Tips:
     """Return tips that leave the platform at a time in us with a velocity in nm/us in the lab; arrays of one shape."""
     zero = jnp.zeros_like(scenes.platform.frequency_khz)

@@ -7,8 +7,9 @@ A batch costs what its hardest lane costs where all lanes take the same steps. S
 need more are gathered into small blocks of their own, where no others wait for them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -80,6 +81,23 @@ def in_blocks(
                 if report is not None:
                     report(min(len(done) * width, count), count)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
+
+
+@contextmanager
+def compiling(work: Callable[[], object]) -> Iterator[None]:
+    """Do work on another core until the block ends and drop its result: the programs that it compiles stay.
+
+    Compiling takes a core for seconds. Where a computation needs two programs one after the other, the second one is
+    compiled while the first one is.
+    """
+
+    def in_usual_precision() -> None:
+        with jax.enable_x64(True):  # noqa: FBT003
+            work()
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(in_usual_precision)
+        yield
 
 
 def map_in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int, recompute: bool = False) -> Any:
