@@ -28,10 +28,12 @@ def copy_of_the_packages(folder: Path, cache: Path) -> Path:
     return folder
 
 
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run Python in a copy, whose packages come before the installed ones."""
+def run_tests(folder: Path, tests: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run tests in a copy, whose packages come before the installed ones."""
+    # -x ends at the first red test, a fixed seed keeps hypothesis from looking elsewhere in each run
+    options = ("-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-m", "slow or not slow")
     return subprocess.run(
-        [sys.executable, *arguments],
+        [sys.executable, "-m", "pytest", *options, *tests],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"},
         capture_output=True,
@@ -39,12 +41,6 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         timeout=TIME_LIMIT_S,
         check=False,
     )
-
-
-def run_tests(folder: Path, tests: list[str]) -> subprocess.CompletedProcess[str]:
-    # -x ends at the first red test, a fixed seed keeps hypothesis from looking elsewhere in each run
-    options = ("-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-m", "slow or not slow")
-    return run(folder, "-m", "pytest", *options, *tests)
 
 
 def mutate(folder: Path, name: str, mutation: Mutation) -> None:
@@ -74,12 +70,10 @@ def outcome(
     """Run the unchanged copy first, then the mutations that were selected, two at a time."""
     base = tmp_path_factory.mktemp("mutations")
     (base / "cache").mkdir()
-    unchanged = run_tests(
-        copy_of_the_packages(base / UNCHANGED, base / "cache"), sorted({m.test for m in MUTATIONS.values()})
-    )
-    selected = {
-        vars(item)["callspec"].params.get("name") for item in request.session.items if hasattr(item, "callspec")
-    }
+    folder = copy_of_the_packages(base / UNCHANGED, base / "cache")
+    unchanged = run_tests(folder, sorted({mutation.test for mutation in MUTATIONS.values()}))
+    items = [item for item in request.session.items if hasattr(item, "callspec")]
+    selected = {vars(item)["callspec"].params.get("name") for item in items}
 
     def job(number: int, name: str) -> subprocess.CompletedProcess[str]:
         folder = copy_of_the_packages(base / f"copy{number}", base / "cache")
@@ -91,17 +85,6 @@ def outcome(
             name: pool.submit(job, number, name) for number, name in enumerate(MUTATIONS) if name in selected
         }
         yield lambda name: unchanged if name == UNCHANGED else jobs[name].result()
-
-
-@pytest.mark.slow
-def test_the_copy_is_what_runs(tmp_path: Path):
-    (tmp_path / "cache").mkdir()
-    folder = copy_of_the_packages(tmp_path / "copy", tmp_path / "cache")
-    done = run(
-        folder, "-c", "import afm_jax, fitting, tests; print(afm_jax.__file__, fitting.__file__, tests.__file__)"
-    )
-    for path, name in zip(done.stdout.split(), ("afm_jax", "fitting", "tests"), strict=True):
-        assert Path(path) == folder / name / "__init__.py"
 
 
 @pytest.mark.slow
