@@ -3,7 +3,7 @@
 import re
 from typing import NamedTuple
 
-_CHANGE = re.compile(r"\{(.*?) => (.*?)\}")
+_CHANGE = re.compile(r"\{(.*?) => (.*?)\}", re.DOTALL)
 
 APPARATUS = "tests/test_apparatus.py::"
 FIRST = "tests/test_first_impact.py::"
@@ -35,26 +35,17 @@ SOLVE = "tests/test_solve.py::"
 COLLOCATION = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[collocation]"
 
 
-class Mutation(NamedTuple):
-    """An edit of the packages, and the test that must fail after it.
+def before_and_after(edit: str) -> tuple[str, str]:
+    """Return what an edit finds and what it makes of it; a change is marked {what stands there => what it becomes}."""
+    before, after = (_CHANGE.sub(side, edit) for side in (r"\1", r"\2"))
+    return before, after
 
-    Attributes:
-        edit: text that stands once in the packages, the change marked in it: {what stands there => what it becomes}.
-        test: its id.
-    """
+
+class Mutation(NamedTuple):
+    """An edit of text that stands once in the packages, and the test that must fail after it."""
 
     edit: str
     test: str
-
-    @property
-    def before(self) -> str:
-        """What stands in the packages."""
-        return _CHANGE.sub(r"\1", self.edit)
-
-    @property
-    def after(self) -> str:
-        """What it becomes."""
-        return _CHANGE.sub(r"\2", self.edit)
 
 
 MUTATIONS = {

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutations import MUTATIONS, Mutation
+from tests.mutations import MUTATIONS, before_and_after
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("afm_jax", "fitting")
@@ -43,24 +43,25 @@ def run_tests(folder: Path, tests: list[str]) -> subprocess.CompletedProcess[str
     )
 
 
-def mutate(folder: Path, name: str, mutation: Mutation) -> None:
-    """Apply an edit."""
-    path = place_of(folder, name, mutation)
-    path.write_text(path.read_text().replace(mutation.before, mutation.after))
+def mutate(folder: Path, name: str) -> None:
+    """Apply a mutation."""
+    path, (before, after) = place_of(folder, name), before_and_after(MUTATIONS[name].edit)
+    path.write_text(path.read_text().replace(before, after))
 
 
-def place_of(folder: Path, name: str, mutation: Mutation) -> Path:
-    """Return the file of the packages in which an edit's text stands, exactly once."""
+def place_of(folder: Path, name: str) -> Path:
+    """Return the file of the packages in which a mutation's text stands, exactly once."""
+    before, _ = before_and_after(MUTATIONS[name].edit)
     files = [path for package in PACKAGES for path in (folder / package).rglob("*.py")]
-    places = {path: count for path in files if (count := path.read_text().count(mutation.before))}
+    places = {path: count for path in files if (count := path.read_text().count(before))}
     found = {str(path.relative_to(folder)): count for path, count in places.items()}
-    assert sum(places.values()) == 1, f"mutation {name!r}: {mutation.before!r} stands in {found}, not once"
+    assert sum(places.values()) == 1, f"mutation {name!r}: {before!r} stands in {found}, not once"
     return next(iter(places))
 
 
 def test_every_wrong_formula_has_its_place():
-    for name, mutation in MUTATIONS.items():
-        place_of(ROOT, name, mutation)
+    for name in MUTATIONS:
+        place_of(ROOT, name)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +78,7 @@ def outcome(
 
     def job(number: int, name: str) -> subprocess.CompletedProcess[str]:
         folder = copy_of_the_packages(base / f"copy{number}", base / "cache")
-        mutate(folder, name, MUTATIONS[name])
+        mutate(folder, name)
         return run_tests(folder, [MUTATIONS[name].test])
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
