@@ -31,10 +31,7 @@ from tests.kills import ROOT, chunks_done, survive
 from tests.sweep_numbers import contents, plan
 
 FREQUENCY, AMPLITUDE = "platform.reduced_frequency", "platform.amplitude_nm"
-PLANE = [
-    {"parameter": AMPLITUDE, "linear": [1.0, 8.0, 9]},
-    {"parameter": FREQUENCY, "linear": [0.8, 2.2, 15]},
-]
+PLANE = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 9]}, {"parameter": FREQUENCY, "linear": [0.8, 2.2, 15]}]
 NUMBERS = [sys.executable, "-m", "tests.sweep_numbers"]
 
 

@@ -220,10 +220,7 @@ def test_other_files_by_another_name_and_pipes_are_refused(swept: Path, tmp_path
 
 
 def test_the_plan_of_a_billion_points_is_quick():
-    axes = [
-        {"random": {"x": [0.0, 1.0]}, "count": 10**6, "seed": 1},
-        {"parameter": "y", "log": [1.0, 10.0, 1000]},
-    ]
+    axes = [{"random": {"x": [0.0, 1.0]}, "count": 10**6, "seed": 1}, {"parameter": "y", "log": [1.0, 10.0, 1000]}]
     given = dict(plan().given, axes=axes, chunk=20_000)
     found = estimate(type(plan())(given, axes_of(axes), plan().recorder))
     assert (found.points, found.chunks) == (10**9, 50_000)
