@@ -141,46 +141,39 @@ def test_the_tests_of_the_imports_see_what_they_must():
 PROGRAM = """
 import importlib, inspect, pkgutil, sys
 import afm_jax, fitting
-print("jax" in sys.modules)
+# names are taken when they are used; statistics alone take as long as JAX, and posteriors import them
+assert "jax" not in sys.modules
 import jax
 before = dict(jax.config.values)
 import fitting.fits.fit, fitting.report.report
-print("scipy" in sys.modules)
+assert "scipy" not in sys.modules
 import afm_jax.plots.motion
-print("matplotlib.pyplot" in sys.modules)
+assert "matplotlib.pyplot" not in sys.modules
 for package in (afm_jax, fitting):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
-print({name for name, value in before.items() if jax.config.values[name] != value})
-for package in (afm_jax, fitting):
-    for name in dir(package):
-        public = getattr(package, name)
-        if callable(public) and not isinstance(public, type):
-            print(name, inspect.signature(public))
-        elif not callable(public):
-            print(name, type(public).__name__)
+assert {name for name, value in before.items() if jax.config.values[name] != value} == set()
+public = {name: getattr(package, name) for package in (afm_jax, fitting) for name in dir(package)}
+# `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
+# the function of that name would be gone
+assert [name for name, each in public.items() if inspect.ismodule(each)] == ["fitting"]
+called = {name: each for name, each in public.items() if callable(each) and not inspect.isclass(each)}
+functions = {name: str(inspect.signature(each)) for name, each in called.items()}
+assert {"fit", "calibrate", "lockin", "invert", "design", "simulate", "collide"} <= set(functions)
+long = [name for name, text in functions.items() if "Union[" in text or "afm_jax." in text or "collections" in text]
+assert long == []
 print(inspect.signature(afm_jax.Cantilever))
 print(inspect.signature(afm_jax.Cantilever.propagator))
 """
 
 
 def test_importing_brings_no_more_than_is_used_changes_no_setting_and_takes_no_functions_place():
-    lines = python(PROGRAM).splitlines()
-    # names are taken when they are used; statistics alone take as long as JAX, and posteriors import them
-    jax_is_there, scipy_is_there, pyplot_is_there, changed_settings = lines[:4]
-    assert (jax_is_there, scipy_is_there, pyplot_is_there) == ("False", "False", "False")
-    assert changed_settings == "set()"
-    # `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
-    # the function of that name would be gone
-    assert [line for line in lines if line.endswith(" module")] == ["fitting module"]
-    functions = {line.partition(" (")[0] for line in lines[4:-2] if " (" in line}
-    assert {"fit", "calibrate", "lockin", "invert", "design", "simulate", "collide"} <= functions
+    constructor, method = python(PROGRAM).splitlines()
     # signatures are short words
-    assert not [line for line in lines if "Union[" in line or "afm_jax." in line or "collections" in line]
-    constructor = "(frequency_khz: ArrayLike, quality_factor: ArrayLike | None = None, mass_ng: ArrayLike | None = None"
-    assert lines[-2].startswith(constructor)
-    assert lines[-1] == "(self, duration_us: ArrayLike) -> Propagator"
+    short = "(frequency_khz: ArrayLike, quality_factor: ArrayLike | None = None, mass_ng: ArrayLike | None = None"
+    assert constructor.startswith(short)
+    assert method == "(self, duration_us: ArrayLike) -> Propagator"
 
 
 SETTING = re.compile(r"^ *(jax\.config(\.update\(|\.\w+ \|?=)|os\.environ(\[.+\] \|?=|\.setdefault\())", re.MULTILINE)
