@@ -50,10 +50,7 @@ def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noq
 
 def plan(*, chunk: int | None = None, last: float = 11.0, **record: Any) -> SweepPlan:
     """Return a plan of sums."""
-    axes = [
-        {"parameter": "x", "linear": [0.0, 6.0, SIZES[0]]},
-        {"parameter": "y", "linear": [0.0, last, SIZES[1]]},
-    ]
+    axes = [{"parameter": "x", "linear": [0.0, 6.0, SIZES[0]]}, {"parameter": "y", "linear": [0.0, last, SIZES[1]]}]
     return plan_of({"builder": "tests.sweep_numbers:recorder", "axes": axes, "record": record, "chunk": chunk})
 
 

@@ -6,59 +6,45 @@ from pathlib import Path
 import pytest
 
 from tests.fresh_python import python
+from tests.mutations import before_and_after
 
 ROOT = Path(__file__).parent.parent
-# By file: what stands there (the first time), and what it becomes.
+# by file: text that stands there, and in braces what becomes what, the first time
 FORCE = {
     "afm_jax/contact/parameters.py": [
-        ('"viscous", "jkr")', '"viscous", "attraction", "jkr")'),
-        (
-            '    ContactParameter(name="tip_radius_nm"',
-            (
-                '    ContactParameter(name="attraction_constant_aj", unit="aJ", default=0.01, allowed="not negative",\n'
-                '        meaning="H of the attraction", fitted=(1e-4, 10.0), serves=("attraction",)),\n'
-                '    ContactParameter(name="tip_radius_nm"'
-            ),
-        ),
+        '"viscous", { => "attraction", }"jkr")',
+        """{ =>     ContactParameter(name="attraction_constant_aj", unit="aJ", default=0.01, allowed="not negative",
+        meaning="H of the attraction", fitted=(1e-4, 10.0), serves=("attraction",)),
+}    ContactParameter(name="tip_radius_nm\"""",
     ],
     "afm_jax/contact/contact.py": [
-        ("import CoreRepulsion", "import Attraction, CoreRepulsion"),
-        ('    "viscous": Viscous,\n', '{}    "attraction": Attraction,\n'),
-        (
-            "        tip_radius_nm: ArrayLike",
-            '        attraction_constant_aj: ArrayLike = PAPER["attraction_constant_aj"],\n{}',
-        ),
-        (
-            '            "viscous": lambda',
-            '            "attraction": lambda: Attraction(attraction_constant_aj, tip_radius_nm),\n{}',
-        ),
+        "import { => Attraction, }CoreRepulsion",
+        '    "viscous": Viscous,\n{ =>     "attraction": Attraction,\n}',
+        '{ => attraction_constant_aj: ArrayLike = PAPER["attraction_constant_aj"],\n        }tip_radius_nm: ArrayLike',
+        '{ => "attraction": lambda: Attraction(attraction_constant_aj, tip_radius_nm),\n            }"viscous": lambda',
     ],
-    "afm_jax/contact/forces/solid.py": [("class VanDerWaals(", "class Attraction(StaticForce):{body}\n\n\n{}")],
+    # like a force that is there
+    "afm_jax/contact/forces/solid.py": ["{ => class Attraction(StaticForce):VAN DER WAALS\n\n\n}class VanDerWaals("],
 }
 DELAY = {
     "afm_jax/impact/law.py": [
-        (
-            "    corrections: bool = eqx.field(static=True, default=True)\n",
-            '{}    late_nm2_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)\n',
-        ),
-        ("(1.0 / w - 1.0 / u) - self.offset_nm / u", "{} + self.late_nm2_per_us / u**2"),
-        ("+ self.offset_nm / u**2", "{} - 2.0 * self.late_nm2_per_us / u**3"),
+        'True)\n{ =>     late_nm2_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)\n}',
+        "(1.0 / w - 1.0 / u) - self.offset_nm / u{ =>  + self.late_nm2_per_us / u**2}",
+        "+ self.offset_nm / u**2{ =>  - 2.0 * self.late_nm2_per_us / u**3}",
     ],
-    "afm_jax/scenefile/tables.py": [('"offset_nm", "corrections")', '"offset_nm", "late_nm2_per_us", "corrections")')],
-    "afm_jax/scenefile/scenefile.py": [("offset_nm = 0.726\n", "{}late_nm2_per_us = 0\n")],
+    "afm_jax/scenefile/tables.py": ['"offset_nm", { => "late_nm2_per_us", }"corrections")'],
+    "afm_jax/scenefile/scenefile.py": ["offset_nm = 0.726\n{ => late_nm2_per_us = 0\n}"],
     "fitting/parameters.py": [
-        (
-            '        symbol="d",\n    ),\n',
-            (
-                '{}    Parameter(name="delay_late_nm2_per_us", unit="nm^2/us", meaning="late",\n'
-                '        lowest=-1.0, highest=1.0, width=1.0, starts=(-0.5, 0.5), symbol="f"),\n'
-            ),
-        ),
-        ('"delay_offset_nm": 0.726', '{}, "delay_late_nm2_per_us": 0.0'),
-        ("- delay_offset_nm/u_in", "{} + delay_late_nm2_per_us/u_in^2"),
+        """        symbol="d",
+    ),
+{ =>     Parameter(name="delay_late_nm2_per_us", unit="nm^2/us", meaning="late",
+        lowest=-1.0, highest=1.0, width=1.0, starts=(-0.5, 0.5), symbol="f"),
+}""",
+        '"delay_offset_nm": 0.726{ => , "delay_late_nm2_per_us": 0.0}',
+        "- delay_offset_nm/u_in{ =>  + delay_late_nm2_per_us/u_in^2}",
     ],
     "fitting/fits/law_after.py": [
-        ('    "delay_offset_nm": lambda', '    "delay_late_nm2_per_us": lambda u, w: 1.0 / u**2,\n{}'),
+        '{ =>     "delay_late_nm2_per_us": lambda u, w: 1.0 / u**2,\n}    "delay_offset_nm": lambda'
     ],
 }
 SCENE = """
@@ -77,17 +63,17 @@ offset_nm = 0.726
 """
 
 
-def changed(folder: Path, edits: dict[str, list[tuple[str, str]]]) -> None:
+def changed(folder: Path, edits: dict[str, list[str]]) -> None:
     """Make the edits in a copy of the two packages."""
     for package in ("afm_jax", "fitting"):
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-    for name, pairs in edits.items():
+    for name, marked in edits.items():
         text = (folder / name).read_text()
-        # the class of an existing force stands for one that is written anew
         body = text.partition("class VanDerWaals(StaticForce):")[2]
-        for old, new in pairs:
+        for edit in marked:
+            old, new = before_and_after(edit)
             assert old in text, f"{name} has no {old!r}"
-            text = text.replace(old, new.replace("{}", old).replace("{body}", body), 1)
+            text = text.replace(old, new.replace("VAN DER WAALS", body), 1)
         (folder / name).write_text(text)
 
 

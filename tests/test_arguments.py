@@ -1,7 +1,5 @@
 """Arguments of another kind than a public function takes: one line of ours each; paths where scenes and tables go."""
 
-import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +9,7 @@ import pytest
 
 import afm_jax as afm
 import fitting
-from afm_jax.contact.forces import (
-    Capillary,
-    CoreRepulsion,
-    Dmt,
-    Hertz,
-    Jkr,
-    Liquid,
-    Structural,
-    VanDerWaals,
-    Viscous,
-)
+from afm_jax.contact.forces import Capillary, CoreRepulsion, Dmt, Hertz, Liquid, VanDerWaals
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from afm_jax.scenefile.presets import preset
 from tests.fresh_python import python
@@ -29,78 +17,46 @@ from tests.writing_commands import EXAMPLES
 
 # in a program of its own: here annotations are checked by the tests' own means first
 PROGRAM = """
-import json, warnings
+import inspect, re, warnings
 import jax; jax.config.update("jax_enable_x64", True)
 import numpy as np, afm_jax as afm, fitting
 from afm_jax.scenefile.presets import preset
 from fitting.examples import __path__ as examples
 warnings.simplefilter("error")
-scene, contact, law = preset("figure3"), afm.Contact.paper(), afm.ImpactLaw(0.9, 1.0)
-wet = afm.Scene(scene.cantilever, scene.platform, contact)
-table = fitting.read_table(examples[0] + "/amplitudes_law.csv")
-start = afm.State(0.0, 5.0, 80.0)
-values = np.array([3.0, 4.0])
-calls = {
-    afm.Cantilever: dict(frequency_khz=90.0, mass_ng=1.0),
-    afm.Platform: dict(amplitude_nm=4.0, frequency_khz=180.0, offset_nm=0.0, second=None),
-    afm.ForceDrive: dict(amplitude_nn=4.0, frequency_khz=180.0, second=None),
-    afm.ImpactLaw: dict(r=0.9, epsilon=1.0, delay=None),
-    afm.CollisionDelay: dict(hertz=1.0, lead_nm=1.0, offset_nm=1.0),
-    afm.Contact: dict(forces=contact.forces, junction=contact.junction),
-    afm.Scene: dict(cantilever=scene.cantilever, platform=scene.platform, interaction=law, base=None, force=None),
-    afm.single_impact_orbits: dict(scene=scene, order=1),
-    afm.many_impact_orbits: dict(scene=scene, order=1, impacts=2, starts=8),
-    afm.contact_orbits: dict(scene=wet, order=1, impacts=1, accuracy=1e-9),
-    afm.next_impact: dict(scene=scene, time_us=0.0, velocity_nm_per_us=30.0, max_steps=2000),
-    afm.iterate_map: dict(scene=scene, time_us=0.0, velocity_nm_per_us=30.0, impacts=3),
-    afm.iterate_batch: dict(scene=scene, time_us=values, velocity_nm_per_us=values, impacts=3, block=3),
-    afm.map_jacobian: dict(scene=scene, time_us=0.0, velocity_nm_per_us=30.0),
-    afm.simulate: dict(scene=scene, start=start, duration_us=50.0, max_contacts=16, accuracy=1e-9),
-    afm.basins_of_attraction: dict(scene=scene, columns=4, rows=4, speeds_nm_per_us=(10.0, 20.0)),
-    afm.bifurcation_diagram: dict(scene=scene, parameter="platform.amplitude_nm", values=values, impacts=200),
-    afm.continue_orbits: dict(scene=scene, order=1, given=None, impacts=1),
-    afm.lyapunov_spectrum: dict(scene=scene, start=start, impacts=20, transient=0, accuracy=1e-9),
-    afm.stability_chart: dict(scene_of=None, x_values=values, y_values=values, last_order=1),
-    afm.sweep: dict(scene=scene, axes=[{}], record="orbits", workers=1),
-    afm.collide: dict(contact=contact, approach_speed_nm_per_us=30.0, mass_ng=1.0, accuracy=1e-9, method="diffrax"),
-    afm.capture_speed: dict(contact=contact, mass_ng=1.0),
-    afm.time_course: dict(contact=contact, approach_speed_nm_per_us=30.0),
-    afm.find_junction: dict(contact=contact),
-    fitting.fit: dict(table=table, model="law", scale_errors=False, fixed={}, free=["r"]),
-    fitting.compare: dict(table=table, models=("restitution", "law")),
-    fitting.invert: dict(table=table),
-    fitting.tapping: dict(table=table, law=False, model="law"),
-    fitting.calibrate: dict(sweep=None, scale_errors=False),
-    fitting.lockin: dict(trace=None),
-    fitting.bootstrap: dict(result=None, samples=4),
-    fitting.posterior: dict(result=None, samples=4),
-    fitting.design: dict(prior=None, drives=None),
-    fitting.amplitude_gradients: dict(table=table, model="law", values={}),
-    fitting.fit_law: dict(contact=contact, points=8),
-    fitting.prior_of_values: dict(model="law", free_frequency_khz=90.0, mass_ng=1.0),
-    fitting.read_table: dict(path="none"),
-    fitting.read_trace: dict(path="none"),
-    fitting.read_sweep: dict(path="none"),
-    fitting.read_curve: dict(path="none"),
-}
-bad = (True, 1j, object(), contact.junction)
-said = []
-for function, good in calls.items():
-    for name in good:
-        for value in bad:
-            if value is True and isinstance(good[name], bool):
+scene, contact, values = preset("figure3"), afm.Contact.paper(), np.array([3.0, 4.0])
+good = dict(scene=scene, cantilever=scene.cantilever, platform=scene.platform, interaction=scene.interaction)
+good |= dict(contact=contact, table=fitting.read_table(examples[0] + "/amplitudes_law.csv"), model="law", path="none")
+good |= dict(order=1, impacts=2, time_us=0.0, velocity_nm_per_us=30.0, start=afm.State(0.0, 5.0, 80.0), last_order=1)
+good |= dict(amplitude_nm=4.0, amplitude_nn=1.0, frequency_khz=180.0, free_frequency_khz=90.0, r=0.9, hertz=1.0)
+good |= dict(lead_nm=1.0, offset_nm=1.0, approach_speed_nm_per_us=30.0, parameter="platform.amplitude_nm")
+good |= dict(duration_us=50.0, values=values, x_values=values, y_values=values, heights_nm=values)
+good |= dict(axes=[{}], record="orbits")
+kinds = [afm.Cantilever, afm.Platform, afm.ForceDrive, afm.ImpactLaw, afm.CollisionDelay, afm.Contact, afm.Scene]
+public = [getattr(package, name) for package in (afm, fitting) for name in dir(package)]
+count = 0
+for function in [*kinds, *filter(inspect.isfunction, public)]:
+    parameters = inspect.signature(function).parameters.values()
+    parameters = [each for each in parameters if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)]
+    needed = {each.name: good.get(each.name) for each in parameters if each.default is each.empty}
+    if function is fitting.amplitude_gradients:
+        needed |= {"values": {}}
+    # tapping_map does not look at the kinds of its arguments, a contact looks at range_nm together with its forces
+    parameters = [] if function is fitting.tapping_map else [each for each in parameters if each.name != "range_nm"]
+    for parameter in parameters:
+        for bad in (True, 1j, object(), contact.junction):
+            switch = bad is True and isinstance(parameter.default, bool)
+            if switch or (bad is contact.junction and parameter.name in ("junction", "interaction", "corrections")):
                 continue
-            if value is contact.junction and name in ("interaction", "junction"):
-                continue
+            count += 1
             try:
-                function(**{**good, name: value})
+                function(**{**needed, parameter.name: bad})
                 told = "accepted"
-            except TypeError as error:
-                told = str(error)
             except BaseException as error:
                 told = f"{type(error).__name__} {error}"
-            said.append([f"{function.__name__}({name}={value!r})", name, told])
-print(json.dumps(said))
+            names = "|".join([parameter.name, *(name for name in needed if name not in good)])
+            if not re.fullmatch(rf"TypeError (the scene's )?`({names})` must be .*, but is .*", told):
+                print(f"{function.__name__}({parameter.name}={bad!r}): {told}")
+print(count)
 """
 
 
@@ -109,6 +65,19 @@ START = afm.State(jnp.asarray(0.0), jnp.asarray(5.0), jnp.asarray(80.0))
 TWO = np.array([1.0, 2.0])
 PAPER, NO_JUNCTION = afm.Contact.paper(), afm.Contact.paper(adhesion_energy_j_per_m2=0.05)
 WET = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 181.8), PAPER)
+RAMP = afm.Platform(2.0, 180.0, offset_rate_nm_per_us=1e-3)
+RANGE = ParameterRange("platform.amplitude_nm", 1.0, 2.0)
+
+
+def with_platform(platform: afm.Platform) -> afm.Scene:
+    return afm.Scene(SCENE.cantilever, platform, SCENE.interaction)
+
+
+def grid(**changes: Any) -> Any:
+    return fitting.drive_grid(**{"orders": [1], "amplitudes_nm": [4.0], "frequencies_khz": [180.0]} | changes)
+
+
+# what scene files can hold, too, is refused by tests/malformed.jsonl
 IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.Cantilever(TWO[:0]), "`frequency_khz` must be a number or an array .*, but holds none"),
     (lambda: afm.simulate(SCENE, START, 9.0, method="x"), "`method` must be one of collocation, diffrax"),
@@ -117,10 +86,7 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.simulate(SCENE, START, 9.0, max_rounds=0), "`max_rounds` must be 1 or more, but is 0"),
     (lambda: afm.simulate(SCENE, START, TWO), r"`duration_us` must be one number, but has the shape \(2,"),
     (lambda: afm.next_impact(SCENE, TWO, 30.0), r"`time_us` must be one number.*: `iterate_batch` and"),
-    (
-        lambda: afm.iterate_map(SCENE, TWO[:0], 30.0, 3),
-        r"`time_us` must be one number, but has the shape \(0,",
-    ),
+    (lambda: afm.iterate_map(SCENE, TWO[:0], 30.0, 3), r"`time_us` must be one number, but has the shape \(0,"),
     (lambda: afm.next_impact(SCENE, 0.0, 30.0, max_steps=0), "`max_steps` must be 1 or more, but is 0"),
     (lambda: afm.next_impact(SCENE, 0.0, 30.0, root_tolerance_us=-1.0), "`root_tolerance_us` must be pos"),
     (lambda: afm.map_jacobian(SCENE, np.nan, 30.0), "`time_us` must be a finite number, but is nan"),
@@ -132,30 +98,16 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.time_course(afm.Contact.paper(), TWO), "`approach_speed_nm_per_us` must be one number"),
     (lambda: afm.capture_speed(afm.Contact.paper(), TWO), "`mass_ng` must be one number"),
     (lambda: afm.scene_family(SCENE, *["interaction.r"] * 2), "named twice: interaction.r, interaction.r"),
-    (
-        lambda: fitting.prior_of_values("law", free_frequency_khz=-9.0),
-        "`free_frequency_khz` must be positive",
-    ),
+    (lambda: fitting.prior_of_values("law", free_frequency_khz=-9.0), "`free_frequency_khz` must be positive"),
     (lambda: grid(drive="x"), "`drive` must be one of sample, force, base, but is 'x'"),
     (lambda: grid(free_frequency_khz=-1.0), "`free_frequency_khz` must be positive, but is -1"),
     (lambda: afm.load_scene(""), "an empty path|no such file"),
     # a cantilever, platforms and drives
-    (lambda: afm.Cantilever(-90.0), "`frequency_khz` must be positive, but is -90"),
-    (lambda: afm.Cantilever(90.0, 0.5), "`quality_factor` must be above 0.5, but is 0.5"),
     (lambda: afm.Cantilever(90.0, np.nan), "`quality_factor` must be above 0.5, but is nan"),
-    (lambda: afm.Cantilever(90.0, mass_ng=-1.0), "`mass_ng` must be positive, but is -1"),
     (lambda: afm.Platform(np.array([1.0, -2.0, 3.0]), 180.0), "`amplitude_nm` must not be negative, but is -2"),
-    (lambda: afm.Platform(1.0, np.inf), "`frequency_khz` must be positive, but is inf"),
-    (lambda: afm.Platform(1.0, 180.0, np.nan), "`offset_nm` must be a finite number, but is nan"),
     (lambda: afm.Platform(1.0, 180.0, 0.0, np.inf), "`offset_rate_nm_per_us` must be a finite number, but is inf"),
     (lambda: afm.Tone(-1.0, 180.0), "`amplitude` must not be negative, but is -1"),
-    (lambda: afm.Tone(1.0, 0.0), "`frequency_khz` must be positive, but is 0"),
-    (lambda: afm.BaseDrive(1.0, 180.0, np.nan), "`phase_deg` must be a finite number, but is nan"),
-    (lambda: afm.ForceDrive(np.inf, 180.0), "`amplitude_nn` must not be negative, but is inf"),
     # laws and their maps
-    (lambda: afm.ImpactLaw(1.1), r"`r` must be in \[0, 1\], but is 1.1"),
-    (lambda: afm.ImpactLaw(0.9, -1.0), "`epsilon` must not be negative"),
-    (lambda: afm.ImpactLaw(0.9, viscous_loss=-0.1), "`viscous_loss` must not be negative"),
     (lambda: afm.CollisionDelay(0.2, np.inf, 0.7), "`lead_nm` must be a finite number"),
     (lambda: afm.iterate_map(SCENE, 4.0, 60.0, 0), "`impacts` must be a positive integer, but is 0"),
     (lambda: afm.iterate_batch(SCENE, np.zeros((2, 1)), TWO, 1), "must have one shape"),
@@ -163,31 +115,19 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.iterate_batch(SCENE, TWO, TWO, 1, block=0), "`block` must be a positive integer, but is 0"),
     (lambda: afm.iterate_batch(SCENE, TWO[:0], TWO[:0], 1), "at least one row"),
     # forces and contacts
-    (lambda: Liquid(relative_humidity=1.0), "`relative_humidity` must be between 0 and 1, but is 1"),
     (lambda: Liquid(temperature_k=-3.0), "`temperature_k` must be positive"),
-    (lambda: Capillary(tip_radius_nm=0.0), "`tip_radius_nm` must be positive"),
-    (lambda: Structural(liquid=Liquid(relative_humidity=0.995)), "Kelvin radius of 107.7 nm, more than the tip radius"),
     (lambda: CoreRepulsion(constant_aj_nm6=np.nan), "`constant_aj_nm6` must be positive"),
-    (lambda: Viscous(viscosity_pa_s=-1e-3), "`viscosity_pa_s` must not be negative"),
-    (lambda: Jkr(modulus_gpa=0.0), "`modulus_gpa` must be positive"),
     (lambda: Dmt(contact_distance_nm=0.0), "`contact_distance_nm` must be positive"),
     (lambda: afm.Contact((VanDerWaals(),), Hertz()), r"Hertz\(\) is a contact without other forces; VanDerWaals\(\)"),
     (lambda: afm.Contact((Capillary(),), Dmt()), r"Capillary\(\) is a force of the liquid bridge"),
     (lambda: afm.Contact((), Hertz(), range_nm=3.0), "`range_nm` is that of a contact with Dmt"),
     (lambda: afm.Contact((VanDerWaals(),), Dmt(), range_nm=0.1), "must be larger than `contact_distance_nm` of 0.165"),
-    (
-        lambda: afm.Contact.of(["van_der_waals", "hertz"]),
-        "'van_der_waals' with 'hertz': Hertz's contact has no other",
-    ),
+    (lambda: afm.Contact.of(["van_der_waals", "hertz"]), "'van_der_waals' with 'hertz': Hertz's contact has no other"),
     (lambda: afm.Contact.of(["capillary", "dmt"]), "'capillary' with 'dmt': there is no liquid bridge"),
     (lambda: afm.Contact.of(["van_der_waals", "core", "jkr"]), "'van_der_waals' must hold 'dmt'"),
     (lambda: afm.Contact.of(["dmt", "jkr"]), "'jkr' with 'dmt'"),
     (lambda: afm.collide(PAPER, 20.0, 0.0), "`mass_ng` must be positive"),
-    (lambda: afm.collide(PAPER, 20.0, accuracy=1e-14), "`accuracy` must be at least 1e-11 with diffrax"),
-    (
-        lambda: afm.collide(PAPER, 20.0, method="rk4"),
-        "`method` must be one of diffrax, collocation, but is 'rk4'",
-    ),
+    (lambda: afm.collide(PAPER, 20.0, method="rk4"), "`method` must be one of diffrax, collocation, but is 'rk4'"),
     (
         lambda: afm.collide(afm.Contact.paper(viscosity_pa_s=np.full(3, 1e-3)), TWO),
         r"speeds' shape \(2,\), but one has \(3,\)",
@@ -199,28 +139,14 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.simulate(WET, afm.State(0.0, 3.95, 60.0), 20.0), "inside the sample"),
     (lambda: afm.simulate(WET, START, 0.0), "duration_us"),
     (lambda: afm.simulate(WET, START, 20.0, accuracy=1e-15), "accuracy"),
-    (
-        lambda: afm.simulate(afm.Scene(WET.cantilever, WET.platform, NO_JUNCTION), START, 20.0),
-        "no junction",
-    ),
+    (lambda: afm.simulate(afm.Scene(WET.cantilever, WET.platform, NO_JUNCTION), START, 20.0), "no junction"),
     # motions that do not repeat
     (
-        lambda: afm.lyapunov_spectrum(afm.Scene(SCENE.cantilever, afm.Platform(0.0, 180.0), SCENE.interaction)),
+        lambda: afm.lyapunov_spectrum(with_platform(afm.Platform(0.0, 180.0))),
         "`amplitude_nm` of the platform must be positive",
     ),
-    (
-        lambda: afm.continue_orbits(
-            afm.Scene(SCENE.cantilever, afm.Platform(2.0, 180.0, offset_rate_nm_per_us=1e-3), SCENE.interaction),
-            1,
-            ParameterRange("platform.amplitude_nm", 1.0, 2.0),
-        ),
-        "ramps",
-    ),
+    (lambda: afm.continue_orbits(with_platform(RAMP), 1, RANGE), "ramps"),
 ]
-
-
-def grid(**changes: Any) -> Any:
-    return fitting.drive_grid(**{"orders": [1], "amplitudes_nm": [4.0], "frequencies_khz": [180.0]} | changes)
 
 
 @pytest.mark.parametrize(("call", "message"), IMPOSSIBLE, ids=[message for _, message in IMPOSSIBLE])
@@ -242,27 +168,9 @@ def test_a_family_without_scenes_and_a_sweep_into_a_file_are_named(tmp_path: Pat
 
 @pytest.mark.slow
 def test_arguments_of_another_kind_are_named():
-    said = json.loads(python(PROGRAM).splitlines()[-1])
-    assert len(said) > 350
-    ours = re.compile(r"(the scene's )?`\w+` must be .*, but is .*")
-    assert [one for one in said if not ours.fullmatch(one[2])] == []
-
-
-def test_swapped_arguments_of_a_scene_are_named():
-    scene = preset("figure3")
-    said = """
-import afm_jax as afm
-for parts in ((afm.Platform(4.0, 180.0), afm.Cantilever(90.0)), (afm.Cantilever(90.0), afm.ImpactLaw(0.9))):
-    try:
-        afm.Scene(*parts)
-    except TypeError as error:
-        print(error)
-"""
-    assert python(said).splitlines() == [
-        "the scene's `cantilever` must be a Cantilever, but is a Platform",
-        "the scene's `platform` must be a Platform, but is an ImpactLaw",
-    ]
-    assert scene.base is None
+    *otherwise, count = python(PROGRAM).splitlines()
+    assert otherwise == []
+    assert int(count) > 1000
 
 
 def test_paths_and_presets_work_where_scenes_and_tables_do(tmp_path: Path):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutations import MUTATIONS, Mutation
+from tests.mutations import MUTATIONS, before_and_after
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("afm_jax", "fitting")
@@ -28,10 +28,12 @@ def copy_of_the_packages(folder: Path, cache: Path) -> Path:
     return folder
 
 
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run Python in a copy, whose packages come before the installed ones."""
+def run_tests(folder: Path, tests: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run tests in a copy, whose packages come before the installed ones."""
+    # -x ends at the first red test, a fixed seed keeps hypothesis from looking elsewhere in each run
+    options = ("-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-m", "slow or not slow")
     return subprocess.run(
-        [sys.executable, *arguments],
+        [sys.executable, "-m", "pytest", *options, *tests],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"},
         capture_output=True,
@@ -41,30 +43,25 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def run_tests(folder: Path, tests: list[str]) -> subprocess.CompletedProcess[str]:
-    # -x ends at the first red test, a fixed seed keeps hypothesis from looking elsewhere in each run
-    options = ("-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-m", "slow or not slow")
-    return run(folder, "-m", "pytest", *options, *tests)
+def mutate(folder: Path, name: str) -> None:
+    """Apply a mutation."""
+    path, (before, after) = place_of(folder, name), before_and_after(MUTATIONS[name].edit)
+    path.write_text(path.read_text().replace(before, after))
 
 
-def mutate(folder: Path, name: str, mutation: Mutation) -> None:
-    """Apply an edit."""
-    path = place_of(folder, name, mutation)
-    path.write_text(path.read_text().replace(mutation.before, mutation.after))
-
-
-def place_of(folder: Path, name: str, mutation: Mutation) -> Path:
-    """Return the file of the packages in which an edit's text stands, exactly once."""
+def place_of(folder: Path, name: str) -> Path:
+    """Return the file of the packages in which a mutation's text stands, exactly once."""
+    before, _ = before_and_after(MUTATIONS[name].edit)
     files = [path for package in PACKAGES for path in (folder / package).rglob("*.py")]
-    places = {path: count for path in files if (count := path.read_text().count(mutation.before))}
+    places = {path: count for path in files if (count := path.read_text().count(before))}
     found = {str(path.relative_to(folder)): count for path, count in places.items()}
-    assert sum(places.values()) == 1, f"mutation {name!r}: {mutation.before!r} stands in {found}, not once"
+    assert sum(places.values()) == 1, f"mutation {name!r}: {before!r} stands in {found}, not once"
     return next(iter(places))
 
 
 def test_every_wrong_formula_has_its_place():
-    for name, mutation in MUTATIONS.items():
-        place_of(ROOT, name, mutation)
+    for name in MUTATIONS:
+        place_of(ROOT, name)
 
 
 @pytest.fixture(scope="module")
@@ -74,16 +71,14 @@ def outcome(
     """Run the unchanged copy first, then the mutations that were selected, two at a time."""
     base = tmp_path_factory.mktemp("mutations")
     (base / "cache").mkdir()
-    unchanged = run_tests(
-        copy_of_the_packages(base / UNCHANGED, base / "cache"), sorted({m.test for m in MUTATIONS.values()})
-    )
-    selected = {
-        vars(item)["callspec"].params.get("name") for item in request.session.items if hasattr(item, "callspec")
-    }
+    folder = copy_of_the_packages(base / UNCHANGED, base / "cache")
+    unchanged = run_tests(folder, sorted({mutation.test for mutation in MUTATIONS.values()}))
+    items = [item for item in request.session.items if hasattr(item, "callspec")]
+    selected = {vars(item)["callspec"].params.get("name") for item in items}
 
     def job(number: int, name: str) -> subprocess.CompletedProcess[str]:
         folder = copy_of_the_packages(base / f"copy{number}", base / "cache")
-        mutate(folder, name, MUTATIONS[name])
+        mutate(folder, name)
         return run_tests(folder, [MUTATIONS[name].test])
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
@@ -91,17 +86,6 @@ def outcome(
             name: pool.submit(job, number, name) for number, name in enumerate(MUTATIONS) if name in selected
         }
         yield lambda name: unchanged if name == UNCHANGED else jobs[name].result()
-
-
-@pytest.mark.slow
-def test_the_copy_is_what_runs(tmp_path: Path):
-    (tmp_path / "cache").mkdir()
-    folder = copy_of_the_packages(tmp_path / "copy", tmp_path / "cache")
-    done = run(
-        folder, "-c", "import afm_jax, fitting, tests; print(afm_jax.__file__, fitting.__file__, tests.__file__)"
-    )
-    for path, name in zip(done.stdout.split(), ("afm_jax", "fitting", "tests"), strict=True):
-        assert Path(path) == folder / name / "__init__.py"
 
 
 @pytest.mark.slow

@@ -24,8 +24,8 @@ def commands(text: str) -> list[list[str]]:
     return [shlex.split(found.group(1) or found.group(2)) for found in COMMAND.finditer(text)]
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def same(shown: str, printed: str) -> bool:
@@ -43,8 +43,7 @@ def _same_word(word: str, other: str) -> bool:
 
 def test_readme_is_short_and_keeps_its_promises():
     assert len(README.splitlines()) <= 150
-    for target in ("fit", "test", "check", "thorough", "docs"):
-        assert f"make {target}" in README
+    assert all(f"make {target}" in README for target in ("fit", "test", "check", "thorough", "docs"))
     assert f"({len(MUTATIONS)} wrong formulas" in README
     for link in re.findall(r"\]\(([^)]+)\)", README):
         assert (ROOT / link).exists(), link
@@ -61,21 +60,27 @@ def test_commands_named_exist_with_their_options(page: Path):
         assert {word for word in arguments if word.startswith("--")} <= {*known, "--help"}, [name, *arguments]
 
 
+def printed_by(line: str, arguments: list[str], code: int = 0) -> list[str]:
+    """Return the lines that a command of a page prints."""
+    result = CliRunner().invoke(main.main, arguments)
+    assert result.exit_code == code, (line, result.output, result.exception)
+    return result.output.splitlines()
+
+
+def assert_shown(texts: list[str], printed: list[str]) -> None:
+    for shown in "".join(texts).splitlines():
+        assert not shown.strip() or any(same(shown, other) for other in printed), shown
+
+
 @pytest.mark.slow
 def test_readme_shows_what_its_commands_print(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
-    (table,) = blocks("csv")
+    (table,) = blocks(README, "csv")
     (tmp_path / "my_amplitudes.csv").write_text(table)
     (tmp_path / "fitting").symlink_to(ROOT / "fitting")
-    typed = re.findall(r"^ {4}(afm-jax .*)$", README, re.MULTILINE)
-    printed: list[str] = []
-    for line in typed:
-        result = CliRunner().invoke(main.main, shlex.split(line)[1:])
-        assert result.exit_code == 0, (line, result.output, result.exception)
-        printed += result.output.splitlines()
-    for line in (line for block in blocks("text") for line in block.splitlines() if line.strip()):
-        assert any(same(line, other) for other in printed), line
+    typed = re.findall(r"^ {4}afm-jax (.*)$", README, re.MULTILINE)
+    assert_shown(blocks(README, "text"), [told for line in typed for told in printed_by(line, shlex.split(line))])
 
 
 EXAMPLES = ROOT / "fitting" / "examples"
@@ -93,23 +98,23 @@ FEWER = (
     (r"^viscous\+delay$", "law"),
 )
 """What pages name, as what is there; grids of a few points, and models that compile quickly."""
+PAGES_WITH_COMMANDS = ("first_steps", "simulate", "drives", "contact", "fit", "orbits")
+PAGES_WITH_COMMANDS += ("dynamics", "instrument", "design", "tapping", "sweeps")
 LEFT_OUT = {
     "simulate figure8": "tests/test_presets.py simulates it",
     "calibrate fitting/examples/real": "tests/test_thermal.py fits such spectra",
     "fit monday.csv": "three tables are fitted by tests/test_several_tables.py",
     "fit my_amplitudes.csv --model law --posterior": "samples for a minute: tests/test_posterior.py",
-    **dict.fromkeys(
-        ("basins", "bifurcation", "lyapunov"),
-        "compile for twenty seconds: tests/test_dynamics.py, tests/test_lyapunov.py",
-    ),
+    "basins": "compiles for twenty seconds: tests/test_dynamics.py",
+    "bifurcation": "compiles for twenty seconds: tests/test_dynamics.py",
+    "lyapunov": "compiles for twenty seconds: tests/test_lyapunov.py",
     "design --drive force": "a law with a delay compiles for half a minute: tests/test_experiment_drives.py",
     "tapping fitting/examples/real": "its sensitivity is found for ten seconds: tests/test_instruments.py",
 }
 
 
-def of_page(page: str, language: str) -> list[str]:
-    text = (ROOT / "notebooks" / "pages" / f"{page}.md").read_text(encoding="utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+def text_of(page: str) -> str:
+    return (ROOT / "notebooks" / "pages" / f"{page}.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -121,9 +126,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = zip(sweep.frequency_khz.tolist(), sweep.amplitude.tolist(), strict=True)
     lines = [f"{khz!r},{amplitude!r}\n" for khz, amplitude in points]
     (folder / "resonance.csv").write_text("".join(["frequency_khz,amplitude_nm\n", *lines]))
-    (folder / "scene.toml").write_text(of_page("first_steps", "toml")[0])
-    (folder / "sweep.toml").write_text(of_page("sweeps", "toml")[0].replace("201", "3"))
-    for name, scene in zip(("base", "force", "two_tones"), of_page("drives", "toml"), strict=True):
+    (folder / "scene.toml").write_text(blocks(text_of("first_steps"), "toml")[0])
+    (folder / "sweep.toml").write_text(blocks(text_of("sweeps"), "toml")[0].replace("201", "3"))
+    for name, scene in zip(("base", "force", "two_tones"), blocks(text_of("drives"), "toml"), strict=True):
         (folder / f"{name}.toml").write_text(scene)
     return folder
 
@@ -143,30 +148,13 @@ def cheap(arguments: list[str]) -> list[str]:
 def test_commands_of_the_pages_run(desk: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(desk)
     monkeypatch.setenv("COLUMNS", "200")
-    for page in (
-        "first_steps",
-        "simulate",
-        "drives",
-        "contact",
-        "fit",
-        "orbits",
-        "dynamics",
-        "instrument",
-        "design",
-        "tapping",
-        "sweeps",
-    ):
-        text = (ROOT / "notebooks" / "pages" / f"{page}.md").read_text(encoding="utf-8")
-        printed: list[str] = []
+    for page in PAGES_WITH_COMMANDS:
+        text, printed = text_of(page), []
         for line, comment in re.findall(r"^ {4}afm-jax ([^#\n]*)(.*)$", text, re.MULTILINE):
-            if any(line.startswith(one) for one in LEFT_OUT):
-                continue
-            result = CliRunner().invoke(main.main, cheap(shlex.split(line)))
-            expected = 3 if "exit code 3" in comment else 0
-            assert result.exit_code == expected, (page, line, result.output, result.exception)
-            printed += result.output.splitlines()
-        for shown in "".join(of_page(page, "text")).splitlines() if page == "drives" else ():
-            assert any(same(shown, other) for other in printed), (page, shown)
+            if not line.startswith(tuple(LEFT_OUT)):
+                printed += printed_by(f"{page}: {line}", cheap(shlex.split(line)), 3 if "exit code 3" in comment else 0)
+        if page == "drives":
+            assert_shown(blocks(text, "text"), printed)
 
 
 @pytest.mark.slow
@@ -174,14 +162,14 @@ def test_python_of_the_pages_runs(desk: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(desk)
     # slopes through contacts compile for half a minute: tests/test_collide_derivatives.py has them
     for page in ("first_steps", "contact", "fit", "orbits", "results", "simulate"):
-        (code,) = of_page(page, "python")
+        (code,) = blocks(text_of(page), "python")
         exec(re.sub(r"^slope = jax.*$", "", code, flags=re.MULTILINE), {})  # noqa: S102
 
 
 @pytest.mark.slow
 def test_python_of_readme_runs(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)
-    (code,) = blocks("python")
+    (code,) = blocks(README, "python")
     names: dict = {}
     exec(code, names)  # noqa: S102
     assert names["result"].valid

@@ -8,8 +8,11 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -37,17 +40,9 @@ cli()
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    command = [
-        "build",
-        "--strict",
-        "--quiet",
-        "--config-file",
-        "notebooks/mkdocs.yml",
-        "--site-dir",
-        str(folder / "site"),
-    ]
+    options = ["--strict", "--quiet", "--config-file", "notebooks/mkdocs.yml", "--site-dir", str(folder / "site")]
     done = subprocess.run(
-        [sys.executable, "-c", UNTESTED_NOTEBOOKS, str(folder), *command],
+        [sys.executable, "-c", UNTESTED_NOTEBOOKS, str(folder), "build", *options],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
@@ -56,6 +51,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     assert done.returncode == 0, done.stderr
     return folder / "site"
+
+
+@pytest.fixture
+def page() -> Iterator[Any]:
+    """A page of a browser."""
+    with pytest.importorskip("playwright.sync_api").sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser.new_page(viewport={"width": 1400, "height": 1000})
+        browser.close()
 
 
 def test_pictures_stand_beside_their_commands():
@@ -99,74 +103,49 @@ def test_links_lead_somewhere_and_nothing_is_fetched_from_other_machines(site: P
 
 @pytest.mark.slow
 @needs_browser
-def test_search_works_from_disk(site: Path):
-    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page()
-        asked: list[str] = []
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto((site / "index.html").as_uri())
-        page.locator("input.md-search__input").press_sequentially("capture speed")
-        page.locator(".md-search-result__item").first.wait_for(timeout=60_000)
-        browser.close()
+def test_search_works_from_disk(site: Path, page: Any):
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto((site / "index.html").as_uri())
+    page.locator("input.md-search__input").press_sequentially("capture speed")
+    page.locator(".md-search-result__item").first.wait_for(timeout=60_000)
     assert {url.partition(":")[0] for url in asked} <= {"file", "data", "blob", "about"}
 
 
 def _wait_for(port: int, seconds: float = 120.0) -> None:
     """Wait until a server answers."""
     end = time.monotonic() + seconds
-    while True:
-        try:
-            socket.create_connection(("127.0.0.1", port), timeout=10).close()
-        except OSError:
-            assert time.monotonic() < end
-            time.sleep(0.5)
-        else:
+    while time.monotonic() < end:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=10):
             return
+        time.sleep(0.5)
+    raise TimeoutError(port)
 
 
 @pytest.mark.slow
 @needs_browser
 @pytest.mark.skipif(not find_spec("jupyterlab"), reason="no JupyterLab; tests/test_notebooks.py runs the page without")
-def test_sliders_move_the_picture_in_jupyterlab(tmp_path: Path):
-    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
-
+def test_sliders_move_the_picture_in_jupyterlab(tmp_path: Path, page: Any):
     shutil.copy(ROOT / "notebooks" / "sliders.ipynb", tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    address = f"http://127.0.0.1:{port}/"
     options = ["--no-browser", "--allow-root", "--IdentityProvider.token=", "--ServerApp.ip=127.0.0.1"]
+    options += [f"--ServerApp.port={port}", f"--ServerApp.root_dir={tmp_path}"]
+    there = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     with (tmp_path / "messages.txt").open("w") as messages:
-        server = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "jupyterlab",
-                *options,
-                f"--ServerApp.port={port}",
-                f"--ServerApp.root_dir={tmp_path}",
-            ],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
-            stderr=messages,
-        )
+        server = subprocess.Popen([sys.executable, "-m", "jupyterlab", *options], env=there, stderr=messages)
     try:
         _wait_for(port)
-        with sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-            page = browser.new_page(viewport={"width": 1400, "height": 1000})
-            page.goto(f"{address}lab/tree/sliders.ipynb?reset")
-            page.get_by_text("Python 3 (ipykernel) | Idle").wait_for(timeout=120_000)
-            page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
-            page.locator(".lm-Menu-itemLabel", has_text="Run All Cells").first.click()
-            picture = page.locator("img.widget-image, .widget-image img").first
-            picture.wait_for(timeout=120_000)
-            before = picture.get_attribute("src")
-            page.locator(".noUi-handle").nth(1).focus()
-            page.keyboard.press("ArrowRight")
-            page.wait_for_function("([image, old]) => image.src !== old", arg=[picture.element_handle(), before])
-            browser.close()
+        page.goto(f"http://127.0.0.1:{port}/lab/tree/sliders.ipynb?reset")
+        page.get_by_text("Python 3 (ipykernel) | Idle").wait_for(timeout=120_000)
+        page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
+        page.locator(".lm-Menu-itemLabel", has_text="Run All Cells").first.click()
+        picture = page.locator("img.widget-image, .widget-image img").first
+        picture.wait_for(timeout=120_000)
+        before = picture.get_attribute("src")
+        page.locator(".noUi-handle").nth(1).focus()
+        page.keyboard.press("ArrowRight")
+        page.wait_for_function("([image, old]) => image.src !== old", arg=[picture.element_handle(), before])
     finally:
         server.send_signal(signal.SIGTERM)
         server.wait(timeout=60)

@@ -2,12 +2,8 @@
 
 import json
 import re
-import subprocess
-import sys
 import tomllib
-from collections.abc import Callable
 from importlib import metadata
-from time import perf_counter
 from typing import Any
 
 import jax
@@ -40,21 +36,19 @@ def test_every_dependency_has_one_lower_bound(tmp_path):
     assert {"jax", "numpy", "pytest", "dask", "mkdocs-material"} <= set(bounds)
     assert bounds["numpy"] == "2.2"
     project = tmp_path / "pyproject.toml"
-    for wrong in ('"b>=1"', '"a"', '"a<2"'):
-        project.write_text(
-            f'[project]\nname = "x"\ndependencies = ["a>=1.5", {wrong}]\n[project.optional-dependencies]\n'
-        )
-        if wrong == '"b>=1"':
-            assert lower_bounds(project) == {"a": "1.5", "b": "1"}
-            continue
+
+    def bounds_of(*dependencies: str, extras: str = "") -> dict[str, str]:
+        listed = ", ".join(f'"{line}"' for line in dependencies)
+        head = f'[project]\nname = "x"\ndependencies = [{listed}]\n'
+        project.write_text(f"{head}[project.optional-dependencies]\n{extras}")
+        return lower_bounds(project)
+
+    assert bounds_of("a>=1.5", "b>=1,!=1.6", extras='all = ["x[more]"]\n') == {"a": "1.5", "b": "1"}
+    for wrong in ("a", "a<2", "a>=2"):
         with pytest.raises(ValueError, match="one lower bound"):
-            lower_bounds(project)
-    project.write_text(
-        '[project]\nname = "x"\ndependencies = ["a>=1.5,!=1.6"]\n[project.optional-dependencies]\n'
-        'more = ["a[c,d]>=2"]\nall = ["x[more]"]\n'
-    )
+            bounds_of("a>=1.5", wrong)
     with pytest.raises(ValueError, match=r"'a\[c,d\]>=2'"):
-        lower_bounds(project)
+        bounds_of("a>=1.5,!=1.6", extras='more = ["a[c,d]>=2"]\n')
 
 
 def test_what_pip_installs_without_extras_is_what_was_agreed():
@@ -108,30 +102,18 @@ def test_the_doctor_names_an_excluded_version_that_is_installed(
     assert f"{package} 0.11.1 copies a whole array" in result.stderr
 
 
-SECONDS = "import time; begin = time.perf_counter(); import {}; print(time.perf_counter() - begin)"
-
-
-def best_below(limit_s: float, seconds: Callable[[], float]) -> float:
-    """Return the best of up to ten times, the first one below a limit: other work on the machine only adds."""
-    best = seconds()
-    for _ in range(9):
-        if best < limit_s:
-            break
-        best = min(best, seconds())
-    return best
+SECONDS = "import time\nbegin = time.perf_counter()\n{}\nprint(time.perf_counter() - begin)"
 
 
 # what is not imported then: tests/test_cli_frame.py
-@pytest.mark.parametrize("package", ["afm_jax", "fitting"])
-def test_imports_take_less_than_a_tenth_of_a_second(package: str):
-    assert best_below(0.1, lambda: float(python(SECONDS.format(package)))) < 0.1
-
-
-def test_help_takes_less_than_three_tenths_of_a_second():
-    def seconds() -> float:
-        begin = perf_counter()
-        done = subprocess.run([sys.executable, "-m", "afm_jax", "--help"], capture_output=True, check=True)
-        assert b"doctor" in done.stdout
-        return perf_counter() - begin
-
-    assert best_below(0.3, seconds) < 0.3
+@pytest.mark.parametrize(
+    ("code", "limit_s"),
+    [
+        ("import afm_jax", 0.1),
+        ("import fitting", 0.1),
+        ("from afm_jax.cli.main import main; main(['--help'], standalone_mode=False)", 0.25),
+    ],
+)
+def test_a_start_takes_a_moment(code: str, limit_s: float):
+    # the best of ten: other work on the machine only adds
+    assert any(float(python(SECONDS.format(code)).splitlines()[-1]) < limit_s for _ in range(10))
