@@ -40,8 +40,8 @@ for function in [*kinds, *filter(inspect.isfunction, public)]:
     needed = {each.name: good.get(each.name) for each in parameters if each.default is each.empty}
     if function is fitting.amplitude_gradients:
         needed |= {"values": {}}
-    # tapping_map does not look at the kinds of its arguments, a contact looks at range_nm together with its forces
-    parameters = [] if function is fitting.tapping_map else [each for each in parameters if each.name != "range_nm"]
+    # a contact looks at range_nm together with its forces
+    parameters = [each for each in parameters if each.name != "range_nm"]
     for parameter in parameters:
         for bad in (True, 1j, object(), contact.junction):
             switch = bad is True and isinstance(parameter.default, bool)

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
@@ -150,6 +151,7 @@ class _Forms(NamedTuple):
     virial: Float[np.ndarray, " four"]
 
 
+@checked
 def tapping_map(
     images: AmplitudeAndPhase | str | Path | tuple[np.ndarray, np.ndarray],
     *,
@@ -172,6 +174,7 @@ def tapping_map(
 
     Raises:
         TableError: if the images do not fit, or something is missing that no energy can do without.
+        TypeError: if an argument is of another kind.
     """
     if isinstance(images, tuple):
         arrays = [np.asarray(array, dtype=float) for array in images]
