@@ -136,11 +136,6 @@ def test_a_choice_for_one_parameter_is_better_for_it(drives, of_law):
     assert of_law.interest == ("r", "epsilon")
 
 
-def test_more_points_never_know_less(of_law):
-    finite = np.where(np.isfinite(of_law.errors), of_law.errors, 1e300)
-    assert np.all(np.diff(finite, axis=0) <= 1e-12 * finite[:-1])
-
-
 def test_information_follows_the_noise_and_adds_up(drives, of_law):
     both = of_law.candidates.information
     # the instantaneous law has no error of its own: variances are those of the noise
