@@ -103,14 +103,14 @@ def measured(truth: ContactTruth, table: AmplitudeTable, model: str) -> Measured
     right = truth.rebound_and_delay(speeds)[0]
     inside = np.isfinite(right)
     speeds, right = speeds[inside], right[inside]
-    fitted, half = _law(result.law, speeds)
+    fitted, half = law_at(result.law, speeds)
     z = np.abs(fitted - right) / half
     return Measured(
         contact=truth.number,
         valid=True,
         coverage=float(np.mean(z <= 1.0)),
         worst_z=float(z.max()),
-        growth=float(np.median(half / _law(word, speeds)[1])),
+        growth=float(np.median(half / law_at(word, speeds)[1])),
         error=float(np.median(np.abs(fitted / right - 1.0))),
         per_degree=result.chi2 / result.degrees_of_freedom,
     )
@@ -147,7 +147,7 @@ def held(truth: ContactTruth, table: AmplitudeTable, model: str) -> Held:
     speeds = result.rows.approach_speed_nm_per_us[result.rows.used]
     right = truth.rebound_and_delay(speeds)[0]
     inside = np.isfinite(right)
-    _, half = _law(result.law, speeds)
+    _, half = law_at(result.law, speeds)
     values = projection(speeds[inside], right[inside], 1.0 / half[inside])
     inner = []
     for name, value in zip(("r", "epsilon"), values, strict=True):
@@ -157,25 +157,21 @@ def held(truth: ContactTruth, table: AmplitudeTable, model: str) -> Held:
     return Held(truth.number, *inner)
 
 
-def intervals_missed(fits: list[Held]) -> tuple[str, int]:
-    """Return a line about the intervals, and how many of the two shares are not as wanted."""
+def intervals_missed(fits: list[Held]) -> tuple[str, list[str]]:
+    """Return a line about the intervals, and which of the two shares are not as wanted."""
     valid = [fit for fit in fits if np.isfinite(fit.r)]
     if not valid:
-        return "intervals: no valid fit", 2
-    shares = [float(np.mean([getattr(fit, name) for fit in valid])) for name in ("r", "epsilon")]
-    short = [not INTERVALS[0] <= share <= INTERVALS[1] for share in shares]
+        return "intervals: no valid fit", ["a valid fit"]
+    shares = {name: float(np.mean([getattr(fit, name) for fit in valid])) for name in ("r", "epsilon")}
     line = (
         f"intervals: {len(valid)} of {len(fits)} fits of {len({fit.contact for fit in valid})} contacts valid; "
-        f"coverage of r {shares[0]:.3f}, of epsilon {shares[1]:.3f}"
+        f"coverage of r {shares['r']:.3f}, of epsilon {shares['epsilon']:.3f}"
     )
-    return line + "".join(
-        f"\n    MISSED: {INTERVALS[0]:g} to {INTERVALS[1]:g} of {name}"
-        for name, missed in zip(("r", "epsilon"), short, strict=True)
-        if missed
-    ), sum(short)
+    least, most = INTERVALS
+    return line, [f"{least:g} to {most:g} of {name}" for name, share in shares.items() if not least <= share <= most]
 
 
-def _law(law: FittedLaw, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def law_at(law: FittedLaw, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rebound speeds and half-widths of the band at approach speeds."""
     columns = (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us)
     fitted, half = (np.interp(speeds, law.approach_speed_nm_per_us, column) for column in columns)
@@ -237,15 +233,12 @@ def main() -> int:
             fits[noise].append(found)
             sys.stderr.write(f"contact {number}, {100 * noise:g} %, table {seed}: {found}\n")
     if options.intervals:
-        line, missed = intervals_missed([one for some in fits.values() for one in some])
-        sys.stdout.write(f"{line}\n")
-        return 1 if missed else 0
-    missed = 0
-    for noise, some in fits.items():
-        line, short = shortfalls(noise, some, model)
-        missed += len(short)
-        sys.stdout.write(f"{line}\n" + "".join(f"    MISSED: {name}\n" for name in short))
-    return 1 if missed else 0
+        told = [intervals_missed([one for some in fits.values() for one in some])]
+    else:
+        told = [shortfalls(noise, some, model) for noise, some in fits.items()]
+    for line, missed in told:
+        sys.stdout.write(f"{line}\n" + "".join(f"    MISSED: {name}\n" for name in missed))
+    return 1 if any(missed for _, missed in told) else 0
 
 
 if __name__ == "__main__":

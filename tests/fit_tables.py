@@ -1,6 +1,7 @@
 """Amplitude tables for the tests of the fit: the bundled one, parts of it, and tables of another law."""
 
 import dataclasses
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting import fit
 from fitting.fits.objective import Objective
-from fitting.fits.result import FitResult
+from fitting.fits.result import FitResult, FittedParameter, WithInterval
 from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable, read_table
 
@@ -79,22 +80,55 @@ def amplitudes_and_errors(table: AmplitudeTable) -> tuple[np.ndarray, np.ndarray
     return amplitude, error
 
 
+def table_of(drives: Iterable[Any], amplitude: np.ndarray, error: np.ndarray, **changes: Any) -> AmplitudeTable:
+    """Return the table of a cantilever of 90 kHz and Q = 40.
+
+    Args:
+        drives: order, frequency in kHz, amplitude and offset in nm: four columns.
+        amplitude: peak and lock-in amplitude in nm, shape (rows, 2).
+        error: of these.
+        changes: columns and settings besides, or in place of those.
+    """
+    order, *others = (np.asarray(column, dtype=float) for column in drives)
+    columns: dict[str, Any] = dict(zip(("drive_frequency_khz", "drive_amplitude_nm", "offset_nm"), others, strict=True))
+    columns |= {"peak_amplitude_nm": amplitude[:, 0], "peak_amplitude_error_nm": error[:, 0]}
+    columns |= {"lockin_amplitude_nm": amplitude[:, 1], "lockin_amplitude_error_nm": error[:, 1]}
+    known = {"order": order.astype(np.int64), "free_frequency_khz": 90.0, "quality_factor": 40.0}
+    return AmplitudeTable(**(columns | known | changes))
+
+
+READINGS = (
+    "peak_amplitude_nm",
+    "lockin_amplitude_nm",
+    "lockin_phase_deg",
+    "approach_speed_nm_per_us",
+    "rebound_speed_nm_per_us",
+)
+
+
+def steady_readings(drives: Iterable[Any], law: ImpactLaw, quality_factor: float | None = 40.0) -> np.ndarray:
+    """Return `READINGS` of the one steady orbit of each drive, as in `table_of`, shape (rows, 5); NaN without any."""
+    cantilever = Cantilever(90.0, quality_factor)
+    columns = [jnp.asarray(column, dtype=float) for column in drives]
+    steady, readings = (np.asarray(a) for a in _orbits(cantilever, law, *columns))
+    assert np.all(steady.sum(axis=1) <= 1)
+    first = readings[np.arange(len(readings)), np.argmax(steady, axis=1)]
+    return np.where(np.any(steady, axis=1, keepdims=True), first, np.nan)
+
+
 def steady_amplitudes(table: AmplitudeTable, law: ImpactLaw, quality_factor: float = 40.0) -> np.ndarray:
     """Return peak and lock-in amplitude (rows, 2) of each row's one steady orbit; NaN where there is none."""
-    drives = (table.order.astype(float), table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
-    cantilever = Cantilever(table.free_frequency_khz, quality_factor)
-    steady, amplitude = (np.asarray(a) for a in _orbits(cantilever, law, *map(jnp.asarray, drives)))
-    assert np.all(steady.sum(axis=1) <= 1)
-    first = amplitude[np.arange(table.rows), np.argmax(steady, axis=1)]
-    return np.where(np.any(steady, axis=1, keepdims=True), first, np.nan)
+    assert table.free_frequency_khz == 90.0
+    drives = (table.order, table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
+    return steady_readings(drives, law, quality_factor)[:, :2]
 
 
 @jax.jit
 def _orbits(cantilever: Cantilever, law: ImpactLaw, *drives: jax.Array):
     def one(order, frequency_khz, drive_nm, offset_nm):
         orbits = single_impact_orbits(Scene(cantilever, Platform(drive_nm, frequency_khz, offset_nm), law), order)
-        amplitude = jnp.stack([orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm], axis=-1)
-        return orbits.stable & orbits.admissible, amplitude
+        readings = jnp.stack([getattr(orbits, name) for name in READINGS], axis=-1)
+        return orbits.stable & orbits.admissible, readings
 
     return jax.vmap(one)(*drives)
 
@@ -119,3 +153,9 @@ def values_of(result: FitResult) -> np.ndarray:
 def standard_errors_of(result: FitResult) -> np.ndarray:
     """Return the standard errors in the order of the parameters; NaN where there is none."""
     return np.array([parameter.standard_error or np.nan for parameter in result.parameters.values()])
+
+
+def holds(parameter: FittedParameter | WithInterval, value: float) -> bool:
+    """Whether an interval with two ends holds a value."""
+    low, high = parameter.interval95
+    return low is not None and high is not None and low < value < high

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
-from fitting.parameters import PARAMETERS
+from fitting.parameters import DELAY_NAMES, PARAMETERS
 from fitting.tables.table import AmplitudeTable
 
 VALUES = {
@@ -84,20 +85,16 @@ def made_parameter(name: str, value: float, **changes: Any) -> FittedParameter:
 def made_law(values: dict[str, float], *, width: float, lasting: bool) -> FittedLaw:
     """Return the law of the parameters from 0.8 times the slowest to 1.2 times the fastest row."""
     u = np.geomspace(0.8 * SPEEDS[0], 1.2 * SPEEDS[-1], 121)
-    w = np.sqrt((values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * u - values.get("epsilon", 0.0))
-    delay = np.zeros_like(u)
-    if lasting:
-        a, b, d = (values.get(name, 0.1) for name in ("delay_hertz", "delay_lead_nm", "delay_offset_nm"))
-        delay = a * u**-0.2 - b * (1.0 / w - 1.0 / u) - d / u
-    u_c = values.get("viscous_loss", 0.0) + np.sqrt(
-        values.get("viscous_loss", 0.0) ** 2 + 4.0 * values.get("r", 1.0) ** 2 * values.get("epsilon", 0.0)
-    )
-    errors = width / TWO_SIDED_95 * np.stack([w, np.abs(delay)], axis=1)[:, :, None]
+    law = ImpactLaw(values.get("r", 1.0), values.get("epsilon", 0.0), values.get("viscous_loss", 0.0))
+    hertz, lead, offset = (values.get(name, 0.1) for name in DELAY_NAMES)
+    w = np.asarray(law.rebound_speed(u))
+    late = np.asarray(CollisionDelay(hertz, lead, offset)(u, w)) if lasting else np.zeros_like(u)
+    errors = width / TWO_SIDED_95 * np.stack([w, np.abs(late)], axis=1)[:, :, None]
     return FittedLaw(
         u,
         w,
-        delay,
-        capture_speed_nm_per_us=u_c / (2.0 * values.get("r", 1.0) ** 2),
+        late,
+        capture_speed_nm_per_us=float(law.capture_speed_nm_per_us),
         delay=None,
         lasting=lasting,
         errors=(errors, np.zeros(1)),

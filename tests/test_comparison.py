@@ -81,7 +81,6 @@ def test_a_model_that_is_fitted_already_is_not_fitted_again(table, compared, fit
     [
         (np.linalg.LinAlgError("Eigenvalues did not converge"), "Eigenvalues did not converge"),
         (FloatingPointError(), "FloatingPointError"),
-        (RuntimeError("XLA ran out of memory."), "XLA ran out of memory."),
     ],
 )
 def test_a_rival_that_fails_is_reported_beside_those_that_stand(table, compared, fitted, failing, error, said):
@@ -118,14 +117,6 @@ def test_a_wrong_call_is_no_failed_rival(table):
 
 
 @pytest.mark.slow
-def test_the_command_says_which_rival_failed(failing):
-    failing("viscous", np.linalg.LinAlgError("Eigenvalues did not converge"))
-    done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare"])
-    assert done.exit_code == 0
-    assert "viscous            failed: Eigenvalues did not converge" in done.stdout
-
-
-@pytest.mark.slow
 def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     def fail(*_, **__):
         raise OverflowError("math range error")
@@ -148,14 +139,12 @@ def test_a_law_without_adhesion_is_a_rival_like_any_other(contact_table_path: Pa
     assert answer["model"] == "restitution+delay"
     assert answer["comparison"]["failed"] == {}
     found = {row["model"]: row for row in answer["comparison"]["rows"]}
-    assert {model for model, row in found.items() if row["valid"]} == {"law+delay", "viscous+delay"}
     assert set(found) == {"restitution+delay", "law+delay", "viscous+delay"}
+    assert {model for model, row in found.items() if row["valid"]} == {"law+delay", "viscous+delay"}
     # the resolved contact, whose loss grows with speed and which holds slow tips: restitution alone is far off
     assert found["restitution+delay"]["aic"] > 10.0 * found["viscous+delay"]["aic"]
     # a model has one chi2, and its verdict is of that one
-    own = found["restitution+delay"]
-    assert {key: own[key] for key in ("chi2", "degrees_of_freedom", "valid")} == {
-        key: answer[key] for key in ("chi2", "degrees_of_freedom", "valid")
-    }
+    for key in ("chi2", "degrees_of_freedom", "valid"):
+        assert found["restitution+delay"][key] == answer[key]
     for row in found.values():
         assert not row["valid"] or chi2.sf(row["chi2"], row["degrees_of_freedom"]) > 1e-3

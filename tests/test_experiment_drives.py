@@ -9,22 +9,14 @@ from fitting import prior_of_values
 from fitting.experiments.candidates import drive_grid, same_drives
 
 
-def test_detunings_are_about_each_orders_resonance():
+def test_detunings_are_about_each_orders_resonance_and_every_combination_is_there_once():
     drives = drive_grid(
-        orders=(1, 3), amplitudes_nm=(2, 4), offsets_nm=(-1, 1), detunings=(0.97, 1.0), free_frequency_khz=90.0
+        orders=(1, 3, 1), amplitudes_nm=(2, 4, 2.0), offsets_nm=(-1, 1), detunings=(0.97, 1.0), free_frequency_khz=90.0
     )
-    assert len(drives.order) == 2 * 2 * 2 * 2
-    found = {(int(n), f) for n, f in zip(drives.order, drives.frequency_khz.tolist(), strict=True)}
+    found = sorted(zip(*(column.tolist() for column in drives), strict=True))
     # 2 N f0 times the detuning
-    assert found == {(1, 174.6), (1, 180.0), (3, 523.8), (3, 540.0)}
-
-
-def test_every_combination_is_there_once():
-    drives = drive_grid(orders=(1, 1), amplitudes_nm=(2, 2.0), frequencies_khz=(170, 180, 170))
-    assert sorted(zip(*(column.tolist() for column in drives), strict=True)) == [
-        (1, 170.0, 2.0, 0.0),
-        (1, 180.0, 2.0, 0.0),
-    ]
+    places = [(1, 174.6), (1, 180.0), (3, 523.8), (3, 540.0)]
+    assert found == [(*place, drive, offset) for place in places for drive in (2.0, 4.0) for offset in (-1.0, 1.0)]
 
 
 @pytest.mark.parametrize(
@@ -53,47 +45,35 @@ def test_measured_drives_are_recognised_up_to_rounding():
 
 
 @pytest.mark.parametrize(
-    ("text", "numbers"),
-    [("-1,0,1", (-1.0, 0.0, 1.0)), ("0.97:1:0.01", (0.97, 0.98, 0.99, 1.0)), ("170:190:8", (170.0, 178.0, 186.0))],
+    ("kind", "text", "value"),
+    [
+        (Numbers(positive=False), "-1,0,1", (-1.0, 0.0, 1.0)),
+        (Numbers(positive=False), "0.97:1:0.01", (0.97, 0.98, 0.99, 1.0)),
+        (Numbers(positive=False), "170:190:8", (170.0, 178.0, 186.0)),
+        (Orders(), "1-3, 2,7", (1, 2, 3, 7)),
+        (ValueAndError(), "40 +- 2", (40.0, 2.0)),
+        (ValueAndError(), "40+/-2", (40.0, 2.0)),
+        (ValueAndError(), "40 ± 2", (40.0, 2.0)),
+        (ValueAndError(), "40", (40.0, None)),
+    ],
 )
-def test_numbers_are_read(text, numbers):
-    assert Numbers(positive=False).read(text) == numbers
+def test_lists_and_errors_are_read(kind, text, value):
+    assert kind.convert(text, None, None) == value
 
 
-def test_orders_are_read():
-    assert Orders().read("1-3, 2,7") == (1, 2, 3, 7)
-
-
-@pytest.mark.parametrize("text", ["", "a", "1:2", "2:1:1", "1:2:0", "0:1:1e-9", "nan", "1,,2"])
-def test_wrong_numbers_are_refused(text):
-    with pytest.raises(click.BadParameter):
-        Numbers(positive=False).convert(text, None, None)
-
-
-@pytest.mark.parametrize("text", ["", "0", "-1", "1-", "3-1", "1.5", "1-2-3", "1000"])
-def test_wrong_orders_are_refused(text):
-    with pytest.raises(click.BadParameter):
-        Orders().convert(text, None, None)
-
-
-def test_positive_numbers_are_asked_for():
-    with pytest.raises(click.BadParameter, match="positive"):
-        Numbers().convert("1,0", None, None)
-
-
-@pytest.mark.parametrize("text", ["40 +- 2", "40+/-2", "40 ± 2"])
-def test_a_value_has_an_error(text):
-    assert ValueAndError().convert(text, None, None) == (40.0, 2.0)
-
-
-def test_a_value_can_be_exact():
-    assert ValueAndError().convert("40", None, None) == (40.0, None)
-
-
-@pytest.mark.parametrize("text", ["", "40 +- 0", "40 +- -1", "1 +- 2 +- 3", "x"])
-def test_wrong_values_are_refused(text):
-    with pytest.raises(click.BadParameter):
-        ValueAndError().convert(text, None, None)
+@pytest.mark.parametrize(
+    ("kind", "texts"),
+    [
+        (Numbers(positive=False), ["", "a", "1:2", "2:1:1", "1:2:0", "0:1:1e-9", "nan", "1,,2"]),
+        (Numbers(), ["1,0"]),
+        (Orders(), ["", "0", "-1", "1-", "3-1", "1.5", "1-2-3", "1000"]),
+        (ValueAndError(), ["", "40 +- 0", "40 +- -1", "1 +- 2 +- 3", "x"]),
+    ],
+)
+def test_wrong_ones_are_refused(kind, texts):
+    for text in texts:
+        with pytest.raises(click.BadParameter):
+            kind.convert(text, None, None)
 
 
 def test_a_frequency_is_believed_to_its_error_and_no_share_of_it():

@@ -37,16 +37,6 @@ def test_no_choice_of_four_of_eleven_is_better(kind, matters, seed):
     np.testing.assert_allclose(plain_score(prior + each[chosen].sum(axis=0), mask, kind), best, rtol=1e-6, atol=1e-6)
 
 
-def test_a_straight_line_is_measured_at_its_ends():
-    # the textbook's D-optimal design of a line: half of the points at either end
-    x = np.linspace(-1.0, 1.0, 21)
-    places = np.concatenate([x, x + 1e-9])
-    each = informations(np.stack([np.ones_like(places), places], axis=1))
-    criterion = criterion_of("D", np.array([True, True]), np.ones(2), each.sum(axis=0))
-    chosen = choose_points(np.zeros((2, 2)), each, 4, criterion)
-    np.testing.assert_allclose(np.sort(places[chosen]), [-1.0, -1.0, 1.0, 1.0], atol=1e-8)
-
-
 def test_a_parabola_is_measured_at_its_ends_and_in_the_middle():
     x = np.linspace(-1.0, 1.0, 41)
     each = informations(np.stack([np.ones_like(x), x, x**2], axis=1))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,15 +10,17 @@ import pytest
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
 from fitting.fits.verdict import Evidence, correlation_excess, judge_fit
-from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import example_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
 
 
-def evidence(model: str, table: AmplitudeTable, **changes) -> Evidence:
-    fit = made_fit(model, table=table)
+def evidence(model: str = "law", rows: int = 4, *, residual: np.ndarray | None = None, **changes: Any) -> Evidence:
+    """Return what a verdict on a made fit looks at, with other residuals and fields."""
+    fit = made_fit(model, table=made_table(rows, **changes.pop("table", {})))
+    if residual is not None:
+        fit = dataclasses.replace(fit, rows=dataclasses.replace(fit.rows, residual=residual))
     known = Evidence(
-        table=table,
+        table=fit.table,
         parameters=fit.parameters,
         convergence=fit.convergence,
         rows=fit.rows,
@@ -34,72 +37,86 @@ def evidence(model: str, table: AmplitudeTable, **changes) -> Evidence:
     return dataclasses.replace(known, **changes)
 
 
-def test_a_contact_whose_table_is_not_reached_is_refused():
-    given = evidence("law+delay", made_table())
-    assert not any("table" in reason for reason in judge_fit(given)[0])
-    reasons, _ = judge_fit(dataclasses.replace(given, untabulated=(0, 2)))
-    lines = f"lines {given.table.lines[0]}, {given.table.lines[2]}"
-    assert any(
-        reason.startswith(f"The table of the fitted contact's impacts misses its accuracy for {lines}:")
-        for reason in reasons
-    )
+def reasons_of(model: str = "law", rows: int = 4, **changes: Any) -> list[str]:
+    return judge_fit(evidence(model, rows, **changes))[0]
 
 
-def test_a_discrepancy_that_lowers_chi2_to_first_order_alone_is_no_result():
-    given = evidence("law+delay", made_table())
-    assert not any("Not converged" in reason for reason in judge_fit(given)[0])
-    reasons, _ = judge_fit(dataclasses.replace(given, stuck=(150.2, 120.1)))
-    assert any("would lower chi2 from 150.2 to 120.1, but computed" in reason for reason in reasons)
+def assert_said(given: Evidence, words: str, where: str) -> None:
+    """Demand words among the reasons, among the warnings, or nowhere."""
+    reasons, warnings = judge_fit(given)
+    assert any(words in text for text in reasons) is (where == "reasons")
+    assert any(words in text for text in warnings) is (where == "warnings")
 
 
-def test_correlations_are_those_of_what_rows_do_not_have_in_common():
-    given = evidence("law+delay", made_table(40))
-    rows = len(given.rows.used)
-    common = np.ones((rows, 2)) * 3.0
-    given = dataclasses.replace(given, rows=dataclasses.replace(given.rows, residual=common))
-    noise = np.random.default_rng(2).normal(size=(rows, 2))
-    assert correlation_excess(common) > 4.0 > abs(correlation_excess(noise))
-    for independent, correlated in ((None, True), (noise, False)):
-        reasons, _ = judge_fit(dataclasses.replace(given, independent_residual=independent))
-        assert any("neighbouring residuals" in reason for reason in reasons) is correlated
+STUCK = "would lower chi2 from 150.2 to 120.1, but computed"
+OTHER = "Another minimum explains the data about as well (chi2 7.2, here 5.0): r = 0.9, epsilon = 12; the band"
+RUN = "residuals run together over the approach speed (5.0"
 
 
-def test_a_row_without_an_orbit_where_the_model_has_one_is_named():
-    table = made_table()
-    unseen = np.zeros(table.rows)
-    unseen[2] = 1.0
-    blank = {
-        name: np.where(unseen > 0, np.nan, getattr(table, name))
-        for name in ("peak_amplitude_nm", "peak_amplitude_error_nm", "lockin_amplitude_nm", "lockin_amplitude_error_nm")
-        if getattr(table, name) is not None
-    }
-    table = dataclasses.replace(table, no_orbit=unseen, **blank)
-    given = evidence("law", table)
-    for orbits, named in ((1, True), (0, False)):
-        rows = dataclasses.replace(given.rows, orbits=np.full(table.rows, orbits))
-        _, warnings = judge_fit(dataclasses.replace(given, rows=rows))
-        said = f"No orbit was seen, though the fitted model has a steady one, for line {table.lines[2]}:"
-        assert any(warning.startswith(said) for warning in warnings) is named
+@pytest.mark.parametrize(
+    ("model", "changes", "words", "where"),
+    [
+        ("law+delay", {}, "misses its accuracy", "nowhere"),
+        ("law+delay", {"untabulated": (0, 2)}, "impacts misses its accuracy for lines 1, 3:", "reasons"),
+        ("law+delay", {}, "Not converged", "nowhere"),
+        ("law+delay", {"stuck": (150.2, 120.1)}, STUCK, "reasons"),
+        # a bound is only worth a word where the model explains the data
+        ("viscous", {"p_value": 0.5}, "at its bound", "warnings"),
+        ("viscous", {"p_value": 1e-9}, "at its bound", "nowhere"),
+        ("law+delay", {"p_value": 1e-9, "contact_share": 0.1}, "errors may be too small", "reasons"),
+        ("law+delay", {"p_value": 1e-9, "contact_share": 0.4}, "Impacts last up to 40 % of a drive", "reasons"),
+        ("law", {"other_minimum": ({"r": 0.9, "epsilon": 12.0}, 7.25)}, OTHER, "warnings"),
+        ("law+delay", {"run": (5.0, 2.0), "short": 0.7}, "a model discrepancy of 70 % of the loss", "warnings"),
+        ("law+delay", {"run": (5.0, 2.0), "short": 0.7}, RUN, "nowhere"),
+        ("law+delay", {"run": (5.0, 4.0), "short": 0.7}, RUN, "reasons"),
+        ("law", {"table": {"free_frequency_khz": 9e4}}, "written in Hz for kHz", "warnings"),
+        ("law", {"table": {"lockin_amplitude_nm": np.full(4, 0.02)}}, "micrometres for nanometres", "warnings"),
+    ],
+)
+def test_a_finding_is_a_reason_or_a_warning_or_not_worth_a_word(model, changes, words, where):
+    assert_said(evidence(model, **changes), words, where)
 
 
-@pytest.mark.parametrize(("p_value", "said"), [(0.5, True), (1e-9, False)])
-def test_a_bound_is_only_worth_a_word_where_the_model_explains_the_data(p_value, said):
-    given = evidence("viscous", made_table(), p_value=p_value)
-    assert given.parameters["epsilon"].at_bound
-    _, warnings = judge_fit(given)
-    assert any("at its bound" in warning for warning in warnings) is said
+@pytest.mark.parametrize(
+    ("value", "given", "words", "where"),
+    [
+        (None, None, "is taken as exact", "warnings"),
+        (40.2, None, "is taken as exact", "nowhere"),
+        (40.2, (40.0, 2.0), "given without an error: 5 % was assumed (40 +- 2)", "warnings"),
+        (40.7, (40.0, 0.4), "standard errors from the given", "nowhere"),
+        (41.0, (40.0, 0.4), "quality_factor = 41 is 2.5 standard errors from the given 40 +- 0.4", "warnings"),
+        (41.3, (40.0, 0.4), "quality_factor = 41.3 is 3.2 standard errors from the given 40 +- 0.4", "reasons"),
+    ],
+)
+def test_what_is_said_of_a_quality_factor_that_is_fitted_along(value, given, words, where):
+    table = {"quality_factor_error": 0.4 if given == (40.0, 0.4) else None}
+    along = {} if value is None else {"quality_factor": made_parameter("quality_factor", value, constraint=given)}
+    parameters = made_fit("law").parameters | along
+    given = evidence(table=table, parameters=parameters, correlations=np.eye(len(parameters)))
+    assert_said(given, words, where)
 
 
 @pytest.mark.parametrize(("tapped", "open_ones", "refused"), [(True, 1, False), (True, 2, True), (False, 1, True)])
 def test_what_taps_do_not_determine_is_named_and_no_reason_to_refuse(tapped: bool, open_ones: int, refused: bool):  # noqa: FBT001
-    given = evidence("law", made_table())
     names = ("modulus_gpa", "relative_humidity")
     known = {name: made_parameter(name, 1.0) for name in names}
     for name in names[:open_ones]:
         known[name] = dataclasses.replace(known[name], interval95=(None, None), undetermined=True)
-    reasons, warnings = judge_fit(dataclasses.replace(given, parameters=known, correlations=np.eye(2), tapped=tapped))
+    reasons, warnings = judge_fit(evidence(parameters=known, correlations=np.eye(2), tapped=tapped))
     assert any("modulus_gpa" in reason for reason in reasons) is refused
     assert any(said.startswith("Not determined by these taps: modulus_gpa,") for said in warnings) is not refused
+
+
+def test_a_row_without_an_orbit_where_the_model_has_one_is_named():
+    unseen = np.array([0.0, 0.0, 1.0, 0.0])
+    amplitude = np.where(unseen > 0.0, np.nan, 50.0)
+    columns = [f"{kind}_amplitude{error}_nm" for kind in ("peak", "lockin") for error in ("", "_error")]
+    given = evidence(table={"no_orbit": unseen} | dict.fromkeys(columns, amplitude))
+    for orbits, named in ((1, True), (0, False)):
+        rows = dataclasses.replace(given.rows, orbits=np.full(4, orbits))
+        _, warnings = judge_fit(dataclasses.replace(given, rows=rows))
+        said = "No orbit was seen, though the fitted model has a steady one, for line 3:"
+        assert any(warning.startswith(said) for warning in warnings) is named
 
 
 @pytest.mark.parametrize(
@@ -110,59 +127,27 @@ def test_what_taps_do_not_determine_is_named_and_no_reason_to_refuse(tapped: boo
     ],
 )
 def test_what_does_not_explain_the_data_says_what_to_try_and_which_rows_are_far(model, said):
-    given = evidence(model, made_table(), p_value=0.0, chi2=9e4)
-    residual = np.full_like(given.rows.residual, 0.5)
+    residual = np.full((4, 2), 0.5)
     residual[1, 0] = -40.0
-    (reason,) = [
-        text
-        for text in judge_fit(dataclasses.replace(given, rows=dataclasses.replace(given.rows, residual=residual)))[0]
-        if "does not explain" in text
-    ]
+    (reason,) = reasons_of(model, residual=residual, p_value=0.0, chi2=9e4)
     assert said in reason
-    assert f"farthest off: line {given.table.lines[1]} (if only a few are wrong: --robust)." in reason
+    assert "farthest off: line 2 (if only a few are wrong: --robust)." in reason
 
 
-def test_a_quality_factor_that_is_fitted_along_is_not_called_exact():
-    table = dataclasses.replace(made_table(), quality_factor=40.0, quality_factor_error=None)
-    exact = evidence("law", table)
-    along = exact.parameters | {"quality_factor": made_parameter("quality_factor", 40.2)}
-    for parameters, said in ((exact.parameters, True), (along, False)):
-        given = dataclasses.replace(exact, parameters=parameters, correlations=np.eye(len(parameters)))
-        assert any("is taken as exact" in warning for warning in judge_fit(given)[1]) is said
+@pytest.mark.parametrize(("share", "advised"), [(0.2, True), (0.8, False)])
+def test_robust_loss_is_advised_only_where_the_rest_is_explained(share, advised):
+    generator = np.random.default_rng(1)
+    residual = np.where(generator.random((40, 1)) < share, 30.0, 0.5) * generator.choice([-1.0, 1.0], size=(40, 2))
+    (reason,) = reasons_of(rows=40, residual=residual, p_value=0.0, chi2=9e4)
+    assert ("if only a few are wrong: --robust" in reason) is advised
 
 
-@pytest.mark.parametrize(
-    ("value", "named", "refused"), [(40.7, False, False), (41.0, True, False), (41.3, False, True)]
-)
-def test_a_quality_factor_that_is_pulled_is_named_and_then_not_believed(value, named, refused):
-    given = evidence("law", made_table())
-    along = given.parameters | {"quality_factor": made_parameter("quality_factor", value, constraint=(40.0, 0.4))}
-    reasons, warnings = judge_fit(dataclasses.replace(given, parameters=along, correlations=np.eye(len(along))))
-    said = f"quality_factor = {value:g} is {(value - 40.0) / 0.4:.1f} standard errors from the given 40 +- 0.4"
-    assert any(warning.startswith(said) for warning in warnings) is named
-    assert any(said in reason for reason in reasons) is refused
-
-
-@pytest.mark.parametrize(
-    ("share", "said"), [(0.1, "errors may be too small"), (0.4, "Impacts last up to 40 % of a drive")]
-)
-def test_an_impact_that_lasts_long_is_not_laid_to_the_errors(share, said):
-    given = dataclasses.replace(evidence("law+delay", made_table()), p_value=1e-9, contact_share=share)
-    (reason,) = [text for text in judge_fit(given)[0] if "does not explain" in text]
-    assert said in reason
-
-
-def test_an_error_of_the_quality_factor_that_was_assumed_is_said():
-    table = dataclasses.replace(made_table(), quality_factor=40.0, quality_factor_error=None)
-    given = evidence("law+delay", table)
-    along = given.parameters | {"quality_factor": made_parameter("quality_factor", 40.2, constraint=(40.0, 2.0))}
-    _, warnings = judge_fit(dataclasses.replace(given, parameters=along, correlations=np.eye(len(along))))
-    assert any("given without an error: 5 % was assumed (40 +- 2)" in warning for warning in warnings)
-
-
-def with_residuals(given: Evidence, residual: np.ndarray, **changes) -> Evidence:
-    rows = dataclasses.replace(given.rows, residual=residual)
-    return dataclasses.replace(given, rows=rows, **changes)
+def test_a_robust_fit_whose_other_rows_are_not_explained_is_not_valid():
+    residual = 2.0 * np.random.default_rng(6).choice([-1.0, 1.0], size=(40, 2))
+    residual[3] = 40.0
+    (reason,) = reasons_of(rows=40, residual=residual, robust=True)
+    # 78 readings of two errors each
+    assert "without outliers chi2/dof = 4.11 (probability" in reason
 
 
 @pytest.mark.slow
@@ -199,26 +184,23 @@ def test_a_law_that_the_amplitudes_are_not_made_by_stays_invalid_with_every_opti
     assert said in result.reasons[0]
 
 
-def test_a_robust_fit_whose_other_rows_are_not_explained_is_not_valid():
-    given = evidence("law", made_table(40), robust=True)
-    residual = 2.0 * np.random.default_rng(6).choice([-1.0, 1.0], size=(40, 2))
-    residual[3] = 40.0
-    (reason,) = judge_fit(with_residuals(given, residual))[0]
-    # 78 readings of two errors each
-    assert "without outliers chi2/dof = 4.11 (probability" in reason
-
-
 def test_correlated_residuals_invalidate_though_chi2_is_as_it_should_be():
-    table = made_table(80)
-    given = evidence("law", table)
-    wave = np.sqrt(2.0) * np.sin(np.linspace(0.0, 12.0, table.rows))
-    waved = with_residuals(given, np.stack([wave, wave], axis=1))
-    (reason,) = judge_fit(waved)[0]
+    wave = np.sqrt(2.0) * np.sin(np.linspace(0.0, 12.0, 80))
+    residual = np.stack([wave, wave], axis=1)
+    (reason,) = reasons_of(rows=80, residual=residual)
     assert "--robust" not in reason
     # the same far within the errors is of no consequence
-    assert not judge_fit(with_residuals(given, 0.1 * np.stack([wave, wave], axis=1)))[0]
-    scattered = np.random.default_rng(3).permutation(waved.rows.residual)
-    assert not judge_fit(with_residuals(given, scattered))[0]
+    assert not reasons_of(rows=80, residual=0.1 * residual)
+    assert not reasons_of(rows=80, residual=np.random.default_rng(3).permutation(residual))
+
+
+def test_correlations_are_those_of_what_rows_do_not_have_in_common():
+    common = np.full((40, 2), 3.0)
+    noise = np.random.default_rng(2).normal(size=(40, 2))
+    assert correlation_excess(common) > 4.0 > abs(correlation_excess(noise))
+    for independent, correlated in ((None, True), (noise, False)):
+        reasons = reasons_of("law+delay", 40, residual=common, independent_residual=independent)
+        assert any("neighbouring residuals" in reason for reason in reasons) is correlated
 
 
 def test_independent_residuals_are_seldom_called_correlated():
@@ -236,54 +218,27 @@ def test_independent_residuals_are_seldom_called_correlated():
     assert np.var(excess) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 2000))
 
 
-@pytest.mark.parametrize(("share", "advised"), [(0.2, True), (0.8, False)])
-def test_robust_loss_is_advised_only_where_the_rest_is_explained(share, advised):
-    table = made_table(40)
-    given = evidence("law", table, p_value=0.0, chi2=9e4)
-    generator = np.random.default_rng(1)
-    residual = np.where(generator.random((40, 1)) < share, 30.0, 0.5) * generator.choice([-1.0, 1.0], size=(40, 2))
-    (reason,) = judge_fit(with_residuals(given, residual))[0]
-    assert ("if only a few are wrong: --robust" in reason) is advised
-
-
-def test_another_minimum_is_named_with_its_chi2():
-    given = evidence("law", made_table(), other_minimum=({"r": 0.9, "epsilon": 12.0}, 7.25))
-    said = "Another minimum explains the data about as well (chi2 7.2, here 5.0): r = 0.9, epsilon = 12; the band"
-    assert any(warning.startswith(said) for warning in judge_fit(given)[1])
-
-
 def test_rows_that_are_off_to_one_side_invalidate_though_chi2_is_as_it_should_be():
-    table = made_table(60)
-    given = evidence("law", table)
     random = np.random.default_rng(4)
     # what a model's own error in the weights leaves of independent noise
     calm = 0.87 * random.normal(size=(60, 2))
     off = calm.copy()
     off[::10] -= 3.0
-    assert not judge_fit(with_residuals(given, calm))[0]
-    (reason,) = judge_fit(with_residuals(given, off))[0]
+    assert not reasons_of(rows=60, residual=calm)
+    (reason,) = reasons_of(rows=60, residual=off)
     assert "off to one side" in reason
-    assert f"predicted below what was read for lines {table.lines[0]}, {table.lines[10]}" in reason
+    assert "predicted below what was read for lines 1, 11" in reason
     # a robust fit is for that
-    assert not any("to one side" in text for text in judge_fit(with_residuals(given, off, robust=True))[0])
-    honest = [judge_fit(with_residuals(given, random.normal(size=(60, 2))))[0] for _ in range(200)]
+    assert not any("to one side" in text for text in reasons_of(rows=60, residual=off, robust=True))
+    honest = [reasons_of(rows=60, residual=random.normal(size=(60, 2))) for _ in range(200)]
     # one in three thousand
     assert sum("to one side" in text for reasons in honest for text in reasons) <= 1
 
 
-@pytest.mark.parametrize(("left", "refused"), [(2.0, False), (4.0, True)])
-def test_residuals_that_run_together_over_the_speed_are_said_and_count(left, refused):
-    given = dataclasses.replace(evidence("law+delay", made_table()), run=(5.0, left), short=0.7)
-    reasons, warnings = judge_fit(given)
-    assert any("residuals run together over the approach speed (5.0" in text for text in reasons) is refused
-    assert any("a model discrepancy of 70 % of the loss" in text for text in warnings)
-
-
 def test_a_search_that_ends_at_no_minimum_is_not_said_to_be_infinitely_far_from_one():
-    given = evidence("law", made_table())
-    adrift = dataclasses.replace(given.convergence, converged=False, estimated_distance=float("inf"))
-    (reason,) = judge_fit(dataclasses.replace(given, convergence=adrift))[0]
-    assert reason == "Not converged: chi2 bends downwards where the search ended, which is no minimum."
+    adrift = dataclasses.replace(evidence().convergence, converged=False, estimated_distance=float("inf"))
+    said = "Not converged: chi2 bends downwards where the search ended, which is no minimum."
+    assert reasons_of(convergence=adrift) == [said]
 
 
 def test_an_interval_holds_that_of_another_minimum():

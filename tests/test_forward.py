@@ -6,6 +6,7 @@ import pytest
 from fitting.forward import Linearised, _filling, linearise
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
 from fitting.tables.table import AmplitudeTable
+from tests.fit_tables import table_of
 from tests.reference_examples import scene
 from tests.reference_flight import Parameters
 from tests.reference_orbits import single_impact_orbits
@@ -31,20 +32,9 @@ ERRORS = np.array([[2.0, 0.5], [1.0, 1.0], [np.nan, 4.0], [0.5, 0.25]])
 
 
 def table() -> AmplitudeTable:
-    order, reduced, amplitude, offset = (np.array(column) for column in zip(*ROWS, strict=True))
-    return AmplitudeTable(
-        order=order,
-        drive_frequency_khz=180.0 * reduced,
-        drive_amplitude_nm=amplitude,
-        offset_nm=offset,
-        free_frequency_khz=90.0,
-        peak_amplitude_nm=MEASURED[:, 0],
-        peak_amplitude_error_nm=ERRORS[:, 0],
-        lockin_amplitude_nm=MEASURED[:, 1],
-        lockin_amplitude_error_nm=ERRORS[:, 1],
-        quality_factor=40.0,
-        quality_factor_error=4.0,
-    )
+    order, reduced, amplitude, offset = zip(*ROWS, strict=True)
+    drives = (order, 180.0 * np.array(reduced), amplitude, offset)
+    return table_of(drives, MEASURED, ERRORS, quality_factor_error=4.0)
 
 
 @pytest.fixture(scope="module")

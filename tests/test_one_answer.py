@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, simulate, single_impact_orbits
-from afm_jax.impact.jacobian import map_jacobian
-from afm_jax.impact.map import iterate_map, next_impact
+from afm_jax.impact.map import next_impact
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, State
 from fitting.forward import BATCH, linearise
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES
-from fitting.tables.table import AmplitudeTable
+from tests.fit_tables import table_of
 
 LAWS, DRIVES = BATCH, 25
 SCENES = LAWS * DRIVES
-IMPACTS = 500
 PERIODS = 100
 NAMES = ("r", "epsilon", *DELAY_NAMES)
 
@@ -63,17 +61,13 @@ def orbits() -> Orbits:
     slot = np.argmax(np.where(stable, np.asarray(found.approach_speed_nm_per_us), -np.inf), axis=1)
     one = jax.tree.map(lambda part: np.asarray(part)[np.arange(SCENES), slot] if part.ndim > 1 else part, found)
     there = np.any(stable, axis=1)
+    assert there.sum() > 0.8 * SCENES
+    # impacts that last longer than the straight paths, and shorter
+    assert np.any(one.delay_us[there] < 0.0)
     time = np.where(there, one.phase_rad / np.asarray(scenes.platform.angular_frequency), 0.0)
     velocity = np.where(there, one.velocity_after_nm_per_us, 100.0)
     start = State(*(jnp.asarray(part) for part in (time, scenes.platform.position(time), velocity)))
     return Orbits(scenes, order, there, found, start, one)
-
-
-@pytest.mark.slow
-def test_most_scenes_have_an_orbit(orbits):
-    assert orbits.there.sum() > 0.8 * SCENES
-    # impacts that last longer than the straight paths, and shorter
-    assert np.any(orbits.one.delay_us[orbits.there] < 0.0)
 
 
 @pytest.mark.slow
@@ -88,39 +82,6 @@ def test_the_map_leads_back_to_where_an_orbit_begins(orbits):
     np.testing.assert_allclose(after[here], np.asarray(start.velocity_nm_per_us)[here], rtol=1e-11)
     approach = orbits.scenes.platform.velocity(impact.arrival_time_us) - impact.velocity_before_nm_per_us
     np.testing.assert_allclose(np.asarray(approach)[here], orbits.one.approach_speed_nm_per_us[here], rtol=1e-11)
-
-
-@pytest.mark.slow
-def test_trace_and_determinant_are_those_of_the_maps_derivative(orbits):
-    def ends(scene, time, velocity):
-        impact = next_impact(scene, time, velocity)
-        return jnp.stack([impact.time_us, impact.velocity_after_nm_per_us])
-
-    at = (orbits.scenes, orbits.start.time_us, orbits.start.velocity_nm_per_us)
-    written = np.asarray(jax.jit(jax.vmap(map_jacobian))(*at))[orbits.there]
-    automatic = np.stack(jax.jit(jax.vmap(jax.jacfwd(ends, argnums=(1, 2))))(*at), axis=-1)[orbits.there]
-    np.testing.assert_allclose(written, automatic, rtol=1e-9, atol=1e-9)
-    trace, determinant = written[:, 0, 0] + written[:, 1, 1], np.linalg.det(written)
-    np.testing.assert_allclose(orbits.one.trace[orbits.there], trace, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(orbits.one.determinant[orbits.there], determinant, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_long_iterations_settle_on_the_orbit(orbits):
-    start, one = orbits.start, orbits.one
-    iterate = jax.jit(jax.vmap(lambda scene, time, velocity: iterate_map(scene, time, velocity, IMPACTS)))
-    # from a little beside the orbit
-    rows = iterate(orbits.scenes, start.time_us, 1.0005 * start.velocity_nm_per_us)
-    half = 0.5 * np.asarray(one.trace) + np.emath.sqrt(0.25 * one.trace**2 - one.determinant)
-    radius = np.maximum(np.abs(half), np.abs(one.trace - half))
-    settles = orbits.there & (radius < 1e-10 ** (1.0 / IMPACTS))
-    assert settles.sum() > 0.5 * SCENES, settles.sum()
-    speeds = np.asarray(rows.velocity_after_nm_per_us)[:, -1]
-    expected = np.asarray(start.velocity_nm_per_us)
-    stays = settles & (np.abs(speeds / expected - 1.0) < 1e-2)
-    # a narrow basin lets few of them go elsewhere
-    assert stays.sum() > 0.9 * settles.sum()
-    np.testing.assert_allclose(speeds[stays], expected[stays], rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -154,18 +115,7 @@ def test_the_fit_predicts_the_orbits_amplitudes(orbits):
     laws, drives = made(DRIVES)
     known = np.stack([orbits.one.peak_amplitude_nm, orbits.one.lockin_amplitude_nm], axis=-1)[:DRIVES]
     measured = np.where(np.isfinite(known), known, 1.0)
-    table = AmplitudeTable(
-        order=drives[:, 0].astype(np.int64),
-        drive_frequency_khz=drives[:, 1],
-        drive_amplitude_nm=drives[:, 2],
-        offset_nm=drives[:, 3],
-        free_frequency_khz=90.0,
-        quality_factor=40.0,
-        peak_amplitude_nm=measured[:, 0],
-        peak_amplitude_error_nm=0.01 * measured[:, 0],
-        lockin_amplitude_nm=measured[:, 1],
-        lockin_amplitude_error_nm=0.01 * measured[:, 1],
-    )
+    table = table_of(drives.T, measured, 0.01 * measured)
     problem = Problem("law+delay", NAMES)
     prediction = linearise(laws, measurement_of(table, problem), problem).prediction
     predicted = np.asarray(prediction.amplitude_nm)[:, :DRIVES].reshape(SCENES, 2)

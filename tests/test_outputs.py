@@ -1,6 +1,5 @@
 """What the commands' JSON has in common: it says what it is, and phases follow one convention."""
 
-import json
 import math
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import pytest
 
 from afm_jax.cli import main
 from afm_jax.units import within_turn
-from tests.strict_reading import strictly
 
 
 def test_a_whole_turn_is_none():
@@ -18,18 +16,6 @@ def test_a_whole_turn_is_none():
         found = within_turn(np.array([-1e-17, -turn, 2.5 * turn, -0.25 * turn, turn]), turn)
         np.testing.assert_allclose(found, [0.0, 0.0, 0.5 * turn, 0.75 * turn, 0.0], rtol=1e-15)
         assert np.all(found < turn)
-
-
-@pytest.mark.parametrize("name", ["phase_rad", "phase_deg", "lag_deg"])
-def test_answers_of_motions_are_read_with_phases_within_one_turn(name: str):
-    """As tests of the commands read them."""
-    turn = 2.0 * math.pi if name.endswith("rad") else 360.0
-    answer = {"format": "afm-jax orbits", "format_version": 1, "orbits": [{f"first_{name}": [0.0, 0.9 * turn]}]}
-    assert strictly(json.dumps(answer)) == answer
-    for wrong in (-1e-3, turn):
-        answer["orbits"] = [{f"first_{name}": [0.0, wrong]}]
-        with pytest.raises(AssertionError, match=name):
-            strictly(json.dumps(answer))
 
 
 @pytest.mark.parametrize("name", main.COMMANDS)

@@ -38,9 +38,24 @@ class LinearObjective(Objective):
         )
 
 
+class Changed(LinearObjective):
+    """Residuals and Jacobian that a function of the values changes in part."""
+
+    def __init__(self, design: np.ndarray, centre: np.ndarray, change):
+        """Keep the function as well: of the values, residuals and Jacobian, which it may change in place."""
+        super().__init__(design, centre)
+        self.change = change
+
+    def at_values(self, values):
+        """Return the changed ones."""
+        found = super().at_values(values)
+        residual, jacobian = np.array(found.residual), np.array(found.jacobian)
+        self.change(values, residual, jacobian)
+        return found._replace(residual=residual, jacobian=jacobian)
+
+
 def intervals_of(errors: tuple[float, float], correlation: float, centre: np.ndarray):
-    first, second = errors
-    covariance = np.array([[first**2, correlation * first * second], [correlation * first * second, second**2]])
+    covariance = np.array([[1.0, correlation], [correlation, 1.0]]) * np.outer(errors, errors)
     design = np.linalg.cholesky(np.linalg.inv(covariance)).T
     return profile_intervals(LinearObjective(design, centre), centre, covariance, 1.5**2)
 
@@ -104,20 +119,18 @@ def test_a_loss_that_vanishes_at_the_minimum_grows_again_where_it_has_to(correla
     assert loss.high is not None
 
 
+CENTRE = np.array([0.8, 120.0])
+
+
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_side_where_chi2_is_not_finite_is_open_and_the_others_are_not(number):
-    class Torn(LinearObjective):
-        def at_values(self, values):
-            found = super().at_values(values)
-            beyond = values[:, 0] > self.centre[0]
-            return found._replace(
-                residual=np.where(beyond[:, None], number, found.residual),
-                jacobian=np.where(beyond[:, None, None], number, found.jacobian),
-            )
+    def torn(values, residual, jacobian):
+        beyond = values[:, 0] > CENTRE[0]
+        residual[beyond], jacobian[beyond] = number, number
 
-    centre = np.array([0.8, 120.0])
+    objective = Changed(np.diag([100.0, 0.3]), CENTRE, torn)
     with np.errstate(invalid="ignore"):
-        first, second = profile_intervals(Torn(np.diag([100.0, 0.3]), centre), centre, np.diag([1e-4, 9.0]), 1.5**2)
+        first, second = profile_intervals(objective, CENTRE, np.diag([1e-4, 9.0]), 1.5**2)
     assert first.high is None
     assert first.reason == "upper end: chi2 is not finite on this side"
     assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
@@ -129,37 +142,26 @@ def test_an_interval_goes_on_along_a_bent_valley_where_a_straight_step_loses_an_
     # r is known to 0.01; epsilon follows 120 + bend (r - 0.8)^2, and 3 of its errors beside that an orbit is lost
     bend, error, stated = 4.0 * 3.0 / 0.01372**2, 3.0, 0.007
 
-    class Lost(LinearObjective):
-        def at_values(self, values):
-            found = super().at_values(values)
-            apart = values[:, 0] - 0.8
-            beside = (values[:, 1] - 120.0 - bend * apart**2) / error
-            residual, jacobian = np.array(found.residual), np.array(found.jacobian)
-            residual[:, 1], jacobian[:, 1, 0] = beside, -2.0 * bend * apart / error
-            lost = np.abs(beside) > 3.0
-            residual[lost, 1], jacobian[lost, 1] = 300.0, 0.0
-            return found._replace(residual=residual, jacobian=jacobian)
+    def lost_beside(values, residual, jacobian):
+        apart = values[:, 0] - 0.8
+        beside = (values[:, 1] - 120.0 - bend * apart**2) / error
+        residual[:, 1], jacobian[:, 1, 0] = beside, -2.0 * bend * apart / error
+        lost = np.abs(beside) > 3.0
+        residual[lost, 1], jacobian[lost, 1] = 300.0, 0.0
 
-    centre = np.array([0.8, 120.0])
-    first, _ = profile_intervals(
-        Lost(np.diag([100.0, 1.0 / error]), centre), centre, np.diag([stated**2, error**2]), 1.5**2
-    )
+    objective = Changed(np.diag([100.0, 1.0 / error]), CENTRE, lost_beside)
+    first, _ = profile_intervals(objective, CENTRE, np.diag([stated**2, error**2]), 1.5**2)
     assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
     assert first.high == pytest.approx(0.8 + QUANTILE * 0.01, abs=1e-5)
 
 
 def test_an_interval_ends_where_an_orbit_is_lost():
-    class Torn(LinearObjective):
-        def at_values(self, values):
-            found = super().at_values(values)
-            lost = (values[:, 0] > 0.81)[:, None]
-            return found._replace(
-                residual=np.where(lost, 300.0, found.residual),
-                jacobian=np.where(lost[..., None], 0.0, found.jacobian),
-            )
+    def lost_beyond(values, residual, jacobian):
+        lost = values[:, 0] > 0.81
+        residual[lost], jacobian[lost] = 300.0, 0.0
 
-    centre = np.array([0.8, 120.0])
-    first, _ = profile_intervals(Torn(np.diag([100.0, 0.3]), centre), centre, np.diag([1e-4, 9.0]), 1.5**2)
+    objective = Changed(np.diag([100.0, 0.3]), CENTRE, lost_beyond)
+    first, _ = profile_intervals(objective, CENTRE, np.diag([1e-4, 9.0]), 1.5**2)
     # within a hundredth of the standard error
     assert first.high == pytest.approx(0.81, abs=1e-4)
     assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)

@@ -25,7 +25,7 @@ from fitting.report.html import fit_page
 from fitting.report.report import row_records, summary
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, read_table
-from tests.fit_tables import example_amplitudes, rows, simulated
+from tests.fit_tables import example_amplitudes, holds, rows, simulated, standard_errors_of, values_of
 from tests.made_fits import made_fit, made_parameter, made_rows, made_table
 
 TABLES, READINGS = 5, 24
@@ -138,12 +138,6 @@ def cut(table: AmplitudeTable, count: int) -> list[AmplitudeTable]:
     return [rows(table, np.arange(table.rows)[i::count], source=f"part{i}.csv") for i in range(count)]
 
 
-def joined(tables: list[AmplitudeTable], whole: AmplitudeTable) -> AmplitudeTable:
-    """Return the rows of a table in the order of its parts."""
-    order = np.concatenate([np.arange(whole.rows)[i :: len(tables)] for i in range(len(tables))])
-    return rows(whole, order)
-
-
 def test_names_tell_tables_apart():
     def named(*sources: str) -> tuple[str, ...]:
         return SeveralTables(tuple(made_table(source=source) for source in sources)).labels
@@ -176,15 +170,12 @@ def test_what_tables_cannot_share_is_said(changes: dict, options: dict, message:
         fit([made_table(source="a.csv"), made_table(source="b.csv", **changes)], **options)
 
 
-def test_taps_of_several_tables_are_of_one_lever():
+def test_taps_of_several_tables_are_of_one_lever_and_several_are_needed():
     tapping = read_table("fitting/examples/tapping_contact.csv")
     with pytest.raises(ValueError, match="or of a driven sample, not both at a time"):
         fit([tapping, made_table(mass_ng=tapping.mass_ng)], "contact")
     with pytest.raises(ValueError, match="of one free frequency at a time, but there are 90 and 95 kHz"):
         fit([tapping, dataclasses.replace(tapping, free_frequency_khz=95.0)], "contact")
-
-
-def test_options_of_several_tables_need_several():
     with pytest.raises(ValueError, match="`share` is about several tables"):
         fit(made_table(), share=["all"])
     with pytest.raises(ValueError, match="`hierarchical` is about several tables"):
@@ -233,7 +224,7 @@ def test_reports_say_each_tables_pull(tmp_path: Path):
 def test_ten_tables_are_the_table_that_they_are_parts_of():
     whole = example_amplitudes()
     parts = cut(whole, 10)
-    together = joined(parts, whole)
+    together = rows(whole, np.concatenate([np.arange(whole.rows)[i::10] for i in range(10)]))
 
     def timed(table, **options) -> tuple[FitResult, float]:
         begin = time.process_time()
@@ -245,9 +236,7 @@ def test_ten_tables_are_the_table_that_they_are_parts_of():
     assert times[1] < 1.5 * times[0]
     for name, parameter in one.parameters.items():
         assert many.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)
-        np.testing.assert_allclose(
-            np.array(many.parameters[name].interval95, float), np.array(parameter.interval95, float), rtol=1e-6
-        )
+        assert many.parameters[name].interval95 == pytest.approx(parameter.interval95, rel=1e-6)
     assert many.chi2 == pytest.approx(one.chi2, rel=1e-6)
     assert many.law.rebound_high_nm_per_us == pytest.approx(one.law.rebound_high_nm_per_us, rel=1e-6)
 
@@ -260,15 +249,14 @@ def test_tables_with_their_own_nuisances_are_their_fits_put_together():
     information, pushed = np.zeros((2, 2)), np.zeros(2)
     for part in parts:
         alone = fit(part)
-        error = np.array([alone.parameters[name].standard_error for name in ("r", "epsilon")], float)
+        error = standard_errors_of(alone)[:2]
         inverse = np.linalg.inv(alone.correlations[:2, :2] * np.outer(error, error))
         information += inverse
-        pushed += inverse @ [alone.parameters[name].value for name in ("r", "epsilon")]
-    found = np.array([result.parameters[name].value for name in ("r", "epsilon")])
+        pushed += inverse @ values_of(alone)[:2]
     error = np.sqrt(np.diag(np.linalg.inv(information)))
-    np.testing.assert_allclose(found, np.linalg.solve(information, pushed), atol=0.1 * error.min(), rtol=2e-3)
-    shown = np.array([result.parameters[name].standard_error for name in ("r", "epsilon")], float)
-    np.testing.assert_allclose(shown, error, rtol=0.05)
+    best = np.linalg.solve(information, pushed)
+    np.testing.assert_allclose(values_of(result), best, atol=0.1 * error.min(), rtol=2e-3)
+    np.testing.assert_allclose(standard_errors_of(result), error, rtol=0.05)
     assert sum(table.chi2 for table in result.tables) == pytest.approx(result.chi2, rel=1e-6)
     assert list(result.parameters) == ["r", "epsilon"]
 
@@ -291,10 +279,7 @@ def test_laws_that_differ_are_named_and_their_scatter_is_found(tmp_path: Path):
     assert high is not None
     # their own standard deviation is 0.0025
     assert low < np.std(truth, ddof=1) < high
-    low, high = differing.parameters["r"].interval95
-    assert low is not None
-    assert high is not None
-    assert low < np.mean(truth) < high
+    assert holds(differing.parameters["r"], float(np.mean(truth)))
     found = [table.departures["r"] for table in differing.tables]
     np.testing.assert_allclose(found, np.array(truth) - np.mean(truth), atol=0.001)
     paths = [tmp_path / table.source for table in tables]

@@ -7,15 +7,13 @@ import numpy as np
 import pytest
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.impact.orbits import single_impact_orbits
 from fitting.examples.make_contact_amplitudes import EXAMPLE
-from fitting.simulated.experiment import drives_of, simulate_experiment, with_noise
+from fitting.simulated.experiment import Drives, drives_of, simulate_experiment, with_noise
 from fitting.tables.table import read_table
 from tests.contact_experiment import paper_experiment
+from tests.fit_tables import steady_readings
 from tests.tapping_truths import MASS_NG, tapping_truth
 
 pytestmark = pytest.mark.slow
@@ -32,7 +30,6 @@ def of_a_law():
     return simulate_experiment(LAW, Cantilever(90.0, 40.0), drives_of(ROWS), phase_noise_deg=0.1)
 
 
-@pytest.mark.slow
 def test_bundled_table_is_what_its_script_makes():
     bundled, made = read_table(EXAMPLE), paper_experiment().table
     assert bundled.rows == made.rows == 57
@@ -42,30 +39,18 @@ def test_bundled_table_is_what_its_script_makes():
         np.testing.assert_allclose(getattr(bundled, name), getattr(made, name), rtol=2e-5)
 
 
-@pytest.mark.slow
 def test_drives_without_an_orbit_are_named():
     left_out = paper_experiment().left_out
     assert len(left_out) == 3
     assert any(sentence.startswith("order 2, 349.2 kHz, 2 nm, offset 1 nm: ") for sentence in left_out)
 
 
-@pytest.mark.slow
 def test_contact_amplitudes_agree_with_an_independent_program(contact_table_path):
     other = read_table(contact_table_path)
     # as many rows as are simulated side by side, of every order
     chosen = np.arange(2, other.rows, 6)[:16]
-    drives = drives_of(
-        [
-            (int(order), float(frequency), float(amplitude), float(offset))
-            for order, frequency, amplitude, offset in zip(
-                other.order[chosen],
-                other.drive_frequency_khz[chosen],
-                np.asarray(other.drive_amplitude_nm)[chosen],
-                other.offset_nm[chosen],
-                strict=True,
-            )
-        ]
-    )
+    columns = (other.order, other.drive_frequency_khz, np.asarray(other.drive_amplitude_nm), other.offset_nm)
+    drives = Drives(*(column[chosen] for column in columns))
     found = simulate_experiment(Contact.paper(), Cantilever(90.0, 40.0), drives)
     assert found.left_out == ()
     for name in ("peak_amplitude", "lockin_amplitude"):
@@ -80,15 +65,10 @@ def test_contact_amplitudes_agree_with_an_independent_program(contact_table_path
 def test_amplitudes_of_a_law_are_those_of_its_orbits_in_closed_form(of_a_law):
     exact = of_a_law.exact
     assert of_a_law.left_out == ()
-    for i, (order, frequency, amplitude, offset) in enumerate(ROWS):
-        orbits = single_impact_orbits(
-            Scene(Cantilever(90.0, 40.0), Platform(amplitude, frequency, offset), LAW), float(order)
-        )
-        slot = int(np.argmax(np.asarray(orbits.stable & orbits.admissible)))
-        expected = (orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm, orbits.lockin_phase_deg)
-        for name, value in zip(MEASURED, expected, strict=True):
-            # motions are followed to 1e-9 and settle to 1e-6
-            np.testing.assert_allclose(getattr(exact, name)[i], float(value[slot]), rtol=1e-6)
+    expected = steady_readings(zip(*ROWS, strict=True), LAW)
+    for name, column in zip(MEASURED, expected.T, strict=False):
+        # motions are followed to 1e-9 and settle to 1e-6
+        np.testing.assert_allclose(getattr(exact, name), column, rtol=1e-6)
 
 
 def test_noise_has_the_size_that_the_table_states(of_a_law):
@@ -104,11 +84,10 @@ def test_noise_has_the_size_that_the_table_states(of_a_law):
 
 
 def test_another_seed_gives_other_noise_on_the_same_amplitudes(of_a_law):
-    other = simulate_experiment(LAW, Cantilever(90.0, 40.0), drives_of(ROWS[:2]), phase_noise_deg=0.1, seed=1)
+    other = simulate_experiment(LAW, Cantilever(90.0, 40.0), drives_of(ROWS), phase_noise_deg=0.1, seed=1)
     for name in MEASURED:
-        # the same program on the same rows, beside others
-        np.testing.assert_allclose(getattr(other.exact, name), getattr(of_a_law.exact, name)[:2], rtol=1e-9)
-        assert not np.any(getattr(other.table, name) == getattr(of_a_law.table, name)[:2])
+        np.testing.assert_array_equal(getattr(other.exact, name), getattr(of_a_law.exact, name))
+        assert not np.any(getattr(other.table, name) == getattr(of_a_law.table, name))
 
 
 def test_an_experiment_without_any_orbit_is_an_error_that_says_so():
