@@ -71,16 +71,14 @@ def collision(p: ContactParameters, approach_speed: Number, *, digits: int = DIG
 
     Args:
         p: the parameters.
-        approach_speed: u_in in nm/us.
+        approach_speed: u_in in nm/us, positive.
         digits: how many digits are to be right.
 
     Raises:
-        ValueError: if the speed is not positive or the tip turns round before the junction, for which there is no rule.
+        ValueError: if the tip turns round before the junction, for which there is no rule.
     """
     with mp.workdps(digits + GUARD_DIGITS):
         k, solid, speed = constants(p), junction(p, digits=digits + GUARD_DIGITS), mp.mpf(approach_speed)
-        if speed <= 0:
-            raise ValueError(f"approach_speed must be positive, but is {approach_speed}")
         way_in = cross_bridge(k, k.forms, -speed, solid.snap_on_gap_nm)
         if not way_in.reached:
             raise ValueError(f"at {approach_speed} nm/us the tip turns round before the junction; take a higher speed")
