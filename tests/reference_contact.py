@@ -5,6 +5,7 @@ DRY -> BRIDGE at 3.5 nm inwards, BRIDGE -> JUNCTION at D_on, JUNCTION -> BRIDGE 
 junction that reaches beyond 4.7 nm breaks straight into DRY. The cantilever's spring is left out.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -178,25 +179,24 @@ def differences(
         step: relative to the parameter.
         digits: of the collisions.
     """
+
+    def ends(value: Number) -> Number:
+        changed, speed = (p, value) if name == "approach_speed" else (replace(p, **{name: value}), approach_speed)
+        found = collision(changed, speed, digits=digits)
+        return mp.matrix([found.rebound_speed_nm_per_us, found.delay_us])
+
     with mp.workdps(digits + GUARD_DIGITS):
-        centre = mp.mpf(approach_speed if name == "approach_speed" else getattr(p, name))
-        width = mp.mpf(step) * centre
-        above, below = (
-            collision(p, x, digits=digits)
-            if name == "approach_speed"
-            else collision(replace(p, **{name: x}), approach_speed, digits=digits)
-            for x in (centre + width, centre - width)
-        )
-        return Differences(
-            (above.rebound_speed_nm_per_us - below.rebound_speed_nm_per_us) / (2 * width),
-            (above.delay_us - below.delay_us) / (2 * width),
-        )
+        return Differences(*slope(ends, approach_speed if name == "approach_speed" else getattr(p, name), step))
 
 
 def capture_difference(p: ContactParameters, name: str, *, step: Number = "1e-8", digits: int = DIGITS) -> Number:
     """Return the derivative of the capture speed with respect to a parameter by central differences."""
     with mp.workdps(digits + GUARD_DIGITS):
-        centre = mp.mpf(getattr(p, name))
-        width = mp.mpf(step) * centre
-        above, below = (capture_speed(replace(p, **{name: x}), digits=digits) for x in (centre + width, centre - width))
-        return (above - below) / (2 * width)
+        return slope(lambda x: capture_speed(replace(p, **{name: x}), digits=digits), getattr(p, name), step)
+
+
+def slope(function: Callable[[Number], Number], value: Number, step: Number) -> Number:
+    """Return a central difference; the step is relative."""
+    centre = mp.mpf(value)
+    width = mp.mpf(step) * centre
+    return (function(centre + width) - function(centre - width)) / (2 * width)
