@@ -62,12 +62,20 @@ def test_effects_are_chosen_in_any_order(path: Path):
     assert eqx.tree_equal(contact, Contact.paper(effects=("core", "viscous", "jkr")))
 
 
-@pytest.mark.parametrize("effects", [("core", "jkr"), ("capillary", "core", "jkr"), ("viscous", "core", "jkr")])
+WET = [("core", "jkr"), ("capillary", "core", "jkr"), ("core", "viscous", "jkr")]
+DRY = [("van_der_waals", "dmt"), ("van_der_waals", "viscous", "dmt"), ("hertz",)]
+
+
+@pytest.mark.parametrize("effects", WET + DRY)
 def test_loop_is_exact_for_every_choice_of_effects(path: Path, effects: tuple[str, ...]):
-    contact = Contact.paper(effects=effects, **CHANGED)
+    if effects in WET:
+        contact = Contact.paper(effects=effects, **CHANGED)
+    else:
+        contact = Contact.of(effects, range_nm=12.0, contact_distance_nm=0.2, hamaker_constant_aj=0.3)
     scene = Scene(Cantilever(90.0, 40.0, 1.5), Platform(4.0, 181.8, -1.0, 1e-3), contact)
     save_scene(scene, path)
     assert eqx.tree_equal(load_scene(path), scene)
+    assert load_scene(path).interaction.effects == effects
 
 
 @given(values=st.fixed_dictionaries({name: st.floats(0.98 * value, 1.02 * value) for name, value in CHANGED.items()}))
