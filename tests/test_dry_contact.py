@@ -1,6 +1,5 @@
-"""Dry contacts (Hertz, DMT): closed form, an independent integration, ledger, derivatives, scenes, refusals."""
+"""Dry contacts (Hertz, DMT): closed form, an independent integration, ledger, derivatives, scenes."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +12,6 @@ from afm_jax.contact.forces import Dmt, Hertz, VanDerWaals, Viscous
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.scenefile.scenefile import load_scene, save_scene
 from fitting import fit_law
 
 DRY = {"hamaker_constant_aj": 0.1, "contact_distance_nm": 0.165, "range_nm": 20.0, "modulus_gpa": 100.0}
@@ -157,13 +155,3 @@ def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them(conta
     moved = cumulative_trapezoid(path.gap_rate_nm_per_us, times, initial=0.0)
     # the trapezoidal rule's error, from the acceleration's jump where the solids meet
     np.testing.assert_allclose(path.gap_nm, path.gap_nm[0] + moved, atol=2e-3)
-
-
-@pytest.mark.parametrize("effects", [["van_der_waals", "dmt"], ["van_der_waals", "viscous", "dmt"], ["hertz"]])
-def test_scene_file_round_trip(tmp_path, effects):
-    contact = Contact.of(effects, range_nm=12.0, contact_distance_nm=0.2, hamaker_constant_aj=0.3, modulus_gpa=7.0)
-    scene = Scene(SCENE.cantilever, SCENE.platform, contact)
-    save_scene(scene, tmp_path / "scene.toml")
-    again = load_scene(tmp_path / "scene.toml")
-    assert again.interaction.effects == tuple(effects)
-    assert eqx.tree_equal(again, scene)
