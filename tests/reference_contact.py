@@ -5,6 +5,7 @@ DRY -> BRIDGE at 3.5 nm inwards, BRIDGE -> JUNCTION at D_on, JUNCTION -> BRIDGE 
 junction that reaches beyond 4.7 nm breaks straight into DRY. The cantilever's spring is left out.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -71,16 +72,14 @@ def collision(p: ContactParameters, approach_speed: Number, *, digits: int = DIG
 
     Args:
         p: the parameters.
-        approach_speed: u_in in nm/us.
+        approach_speed: u_in in nm/us, positive.
         digits: how many digits are to be right.
 
     Raises:
-        ValueError: if the speed is not positive or the tip turns round before the junction, for which there is no rule.
+        ValueError: if the tip turns round before the junction, for which there is no rule.
     """
     with mp.workdps(digits + GUARD_DIGITS):
         k, solid, speed = constants(p), junction(p, digits=digits + GUARD_DIGITS), mp.mpf(approach_speed)
-        if speed <= 0:
-            raise ValueError(f"approach_speed must be positive, but is {approach_speed}")
         way_in = cross_bridge(k, k.forms, -speed, solid.snap_on_gap_nm)
         if not way_in.reached:
             raise ValueError(f"at {approach_speed} nm/us the tip turns round before the junction; take a higher speed")
@@ -180,25 +179,24 @@ def differences(
         step: relative to the parameter.
         digits: of the collisions.
     """
+
+    def ends(value: Number) -> Number:
+        changed, speed = (p, value) if name == "approach_speed" else (replace(p, **{name: value}), approach_speed)
+        found = collision(changed, speed, digits=digits)
+        return mp.matrix([found.rebound_speed_nm_per_us, found.delay_us])
+
     with mp.workdps(digits + GUARD_DIGITS):
-        centre = mp.mpf(approach_speed if name == "approach_speed" else getattr(p, name))
-        width = mp.mpf(step) * centre
-        above, below = (
-            collision(p, x, digits=digits)
-            if name == "approach_speed"
-            else collision(replace(p, **{name: x}), approach_speed, digits=digits)
-            for x in (centre + width, centre - width)
-        )
-        return Differences(
-            (above.rebound_speed_nm_per_us - below.rebound_speed_nm_per_us) / (2 * width),
-            (above.delay_us - below.delay_us) / (2 * width),
-        )
+        return Differences(*slope(ends, approach_speed if name == "approach_speed" else getattr(p, name), step))
 
 
 def capture_difference(p: ContactParameters, name: str, *, step: Number = "1e-8", digits: int = DIGITS) -> Number:
     """Return the derivative of the capture speed with respect to a parameter by central differences."""
     with mp.workdps(digits + GUARD_DIGITS):
-        centre = mp.mpf(getattr(p, name))
-        width = mp.mpf(step) * centre
-        above, below = (capture_speed(replace(p, **{name: x}), digits=digits) for x in (centre + width, centre - width))
-        return (above - below) / (2 * width)
+        return slope(lambda x: capture_speed(replace(p, **{name: x}), digits=digits), getattr(p, name), step)
+
+
+def slope(function: Callable[[Number], Number], value: Number, step: Number) -> Number:
+    """Return a central difference; the step is relative."""
+    centre = mp.mpf(value)
+    width = mp.mpf(step) * centre
+    return (function(centre + width) - function(centre - width)) / (2 * width)

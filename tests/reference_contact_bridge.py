@@ -72,25 +72,14 @@ def safe_step(d: list[Number]) -> Number:
 
 
 def crossing_time(series: list[Number], target: Number, end: Number) -> Number:
-    """Return when a series first monotone between times 0 and `end` passes a target: Newton's method, bracketed."""
-    rates = derivative(series)
-    low, high = mp.mpf(0), end
-    sign = mp.sign(polynomial(series, end) - target)
-    time = end
-    for _ in range(4 * mp.prec):
-        miss = polynomial(series, time) - target
-        if miss * sign > 0:
-            high = time
-        else:
-            low = time
-        slope = polynomial(rates, time)
-        new = time - miss / slope if slope else low
-        if not min(low, high) <= new <= max(low, high):
-            new = (low + high) / 2
-        if abs(new - time) <= 4 * mp.eps * abs(end):
-            return new
-        time = new
-    return time
+    """Return when a series that is monotone between times 0 and `end` passes a target there."""
+
+    def miss(time: Number) -> Number:
+        return polynomial(series, time) - target
+
+    near = mp.findroot(miss, (0, end), solver="anderson", verify=False)
+    slope = polynomial(derivative(series), near)
+    return near - miss(near) / slope if slope else near
 
 
 def cross_bridge(k: Constants, gap: Number, velocity: Number, target: Number, *, backwards: bool = False) -> Crossing:
@@ -137,12 +126,8 @@ def turning_s(k: Constants, energy: Number) -> Number:
     while jkr_potential(k, s) <= energy:
         s *= 2
     slope = derivative(jkr_potential_coefficients(k))
-    for _ in range(4 * mp.prec):
-        new = s - (jkr_potential(k, s) - energy) / polynomial(slope, s)
-        if abs(new - s) <= 4 * mp.eps * s:
-            return new
-        s = new
-    return s
+    lack, rate = (lambda at: jkr_potential(k, at) - energy), (lambda at: polynomial(slope, at))
+    return mp.findroot(lack, s, df=rate, solver="newton", maxsteps=4 * mp.prec, verify=False)
 
 
 def junction_time(k: Constants, s: Number, turn: Number) -> Number:

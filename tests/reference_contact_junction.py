@@ -85,11 +85,8 @@ def junction(p: ContactParameters, *, digits: int = DIGITS) -> Junction:
     first.
 
     Raises:
-        ValueError: if an effect is left out that the junction needs, or if no tangency exists.
+        ValueError: if no tangency exists, as without the core repulsion.
     """
-    missing = [name for name in ("core", "jkr") if name not in p.effects]
-    if missing:
-        raise ValueError(f"no solid junction without {' and '.join(missing)}: add it to effects")
     with mp.workdps(digits + GUARD_DIGITS):
         k = constants(p)
         found = tangencies(k)

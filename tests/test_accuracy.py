@@ -8,8 +8,7 @@ from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
 from afm_jax.accuracy.overview import cheapest, impacts, orbits, overview_row
 from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
-from tests.answers import answer, table
-from tests.run_here import answered_with
+from tests.answers import answer
 
 
 @pytest.fixture(scope="module")
@@ -19,78 +18,41 @@ def study() -> dict:
     )
 
 
-def rows_of(study: dict, method: str) -> list[dict]:
-    return [row for row in study["rows"] if row["method"] == method]
-
-
 @pytest.mark.slow
-def test_every_scene_and_setting_has_its_row(study: dict):
+def test_achieved_errors_are_what_tolerances_and_rounding_allow(study: dict):
     assert {row["scene"] for row in study["rows"]} == {"regular", "grazing", "order 5"}
     assert len(study["rows"]) == 3 * (2 * 3 + 1)
+    assert study["reference_error_us"] < 1e-40  # fifty digits
     for row in study["rows"]:
         assert set(row) <= set(MAP.columns)
-    assert study["reference_error_us"] < 1e-40  # fifty digits
-
-
-@pytest.mark.slow
-def test_float64_keeps_its_tolerance_and_reaches_rounding(study: dict):
-    for row in rows_of(study, "next_impact float64"):
-        # the tolerance bounds the error; rounding of times up to 30 us and of the gap adds 1e-14 or so
-        assert row["error_us"] <= row["tolerance"] + 1e-13, row
-        assert row["impacts_checked"] + row["near_grazing"] == 10
-    coarse, _, fine = rows_of(study, "next_impact float64")[:3]
-    assert fine["error_us"] < 1e-13
-    assert coarse["error_us"] > 1e-4
-
-
-@pytest.mark.slow
-def test_float32_ends_at_its_rounding(study: dict):
-    for row in rows_of(study, "next_impact float32"):
-        if row["tolerance"] == 1e-13:
-            # times of 1 to 30 us have a rounding of 1e-7 to 4e-6; slow impacts multiply it
-            assert 1e-8 < row["error_us"] < 1e-3, row
-
-
-@pytest.mark.slow
-def test_scipy_misses_no_impact_and_keeps_near_its_tolerance(study: dict):
-    for row in rows_of(study, "SciPy DOP853"):
-        assert row["missed_impacts"] == 0
-        # 1e-9 relative of 10 nm/us, divided by slow approaches
-        assert row["error_us"] < 1e-6
+        error, tolerance = row["error_us"], row["tolerance"]
+        if row["method"] == "next_impact float64":
+            # the tolerance bounds the error; rounding of times up to 30 us and of the gap adds 1e-14 or so
+            assert error <= tolerance + 1e-13, row
+            assert row["impacts_checked"] + row["near_grazing"] == 10
+            # a coarse tolerance is made use of, in the first scene at least
+            assert error > 1e-4 or tolerance < 1e-2 or row["scene"] != "regular", row
+        elif row["method"] == "SciPy DOP853":
+            assert row["missed_impacts"] == 0
+            # 1e-9 relative of 10 nm/us, divided by slow approaches
+            assert error < 1e-6
+        elif tolerance == 1e-13:
+            # float32: times of 1 to 30 us have a rounding of 1e-7 to 4e-6; slow impacts multiply it
+            assert 1e-8 < error < 1e-3, row
 
 
 def test_cheapest_is_the_fastest_that_is_good_enough():
-    def row(scene: str, tolerance: float, time: float, error: float | None) -> dict:
-        return {
-            "scene": scene,
-            "method": "next_impact float64",
-            "tolerance": tolerance,
-            "microseconds_per_impact": time,
-            "error_us": error,
-        }
+    def row(scene: str, tolerance: float, time: float, error: float | None, method="next_impact float64") -> dict:
+        own = {"scene": scene, "method": method, "tolerance": tolerance}
+        return own | {"microseconds_per_impact": time, "error_us": error}
 
-    rows = [row("a", 1e-2, 1.0, 1e-3), row("a", 1e-8, 2.0, 1e-9)]
-    rows += [row("b", 1e-2, 1.0, 1e-9), row("b", 1e-8, 3.0, 1e-10)]
-    scipy = {**row("a", 1e-2, 0.1, 1e-12), "method": "SciPy DOP853"}
-    chosen = cheapest_settings([*rows, scipy], 1e-8)
-    assert [(one["scene"], one["tolerance"], one["microseconds_per_impact"]) for one in chosen] == [
-        ("a", 1e-8, 2.0),
-        ("b", 1e-2, 1.0),
-        ("all", 1e-8, 3.0),
-    ]
+    rows = [row("a", 1e-2, 1.0, 1e-3), row("a", 1e-8, 2.0, 1e-9), row("b", 1e-2, 1.0, 1e-9), row("b", 1e-8, 3.0, 1e-10)]
+    chosen = cheapest_settings([*rows, row("a", 1e-2, 0.1, 1e-12, "SciPy DOP853")], 1e-8)
+    found = [(one["scene"], one["tolerance"], one["microseconds_per_impact"]) for one in chosen]
+    assert found == [("a", 1e-8, 2.0), ("b", 1e-2, 1.0), ("all", 1e-8, 3.0)]
     assert [one["method"] for one in cheapest_settings(rows, 1e-12)] == [None, None, None]
     # an error that could not be measured is not a good one
     assert cheapest_settings([row("a", 1e-2, 1.0, None)], 1.0)[0]["method"] is None
-
-
-@pytest.mark.slow
-def test_command_writes_table_picture_and_one_json_object(study: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(own_process, "run_in_own_process", answered_with({"map_accuracy": study}))
-    payload = answer(tmp_path, "accuracy", "map", "--quick")
-    own = {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"}
-    assert own | {"format", "format_version"} == set(payload)
-    assert {path.name for path in tmp_path.iterdir()} == {"accuracy.json", "accuracy.csv", "accuracy.png"}
-    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(MAP.columns)
 
 
 @pytest.mark.slow
@@ -104,10 +66,7 @@ def test_every_integrator_comes_to_the_same_impacts_and_orbit():
         limit = 1e-13 if row["method"] == "next_impact float64" else 1e-3 if "float32" in row["method"] else 1e-6
         assert row["error"] < limit, row
     closed = orbits(**few)
-    assert {row["method"] for row in closed["rows"]} == {
-        "single_impact_orbits",
-        *(f"{one}, shooting" for one in rivals),
-    }
+    assert {row["method"] for row in closed["rows"] if not row["own"]} == {f"{one}, shooting" for one in rivals}
     for row in closed["rows"]:
         assert row["error"] < (1e-13 if row["own"] else 1e-6), row
 
@@ -119,10 +78,9 @@ def test_the_cheapest_way_to_an_error_here_and_elsewhere():
         overview_row("orbits", "SciPy DOP853, shooting", "tight", 9.0, 1e-10),
         overview_row("orbits", "SciPy Radau, shooting", "gave up", 0.1, float("nan")),
     ]
-    assert [
-        (row["wanted_error"], row["own"], row["other"], row["other_microseconds"])
-        for row in cheapest(rows, [1e-3, 1e-9])
-    ] == [
+    keys = ("wanted_error", "own", "other", "other_microseconds")
+    found = [tuple(row[key] for key in keys) for row in cheapest(rows, [1e-3, 1e-9])]
+    assert found == [
         (1e-3, "single_impact_orbits, one", "SciPy DOP853, shooting, loose", 1.0),
         (1e-9, "single_impact_orbits, one", "SciPy DOP853, shooting, tight", 9.0),
     ]

@@ -22,21 +22,11 @@ from tests.tapping_truths import MASS_NG, tapping_truth
 
 LEVER = Cantilever(90.0, 200.0, 16.81)
 OMEGA = 2e-3 * np.pi * 90.0
-MIXED: dict[str, Any] = {
-    "tip_radius_nm": 50.0,
-    "relative_humidity": 0.42,
-    "adhesion_energy_j_per_m2": 0.22,
-    "modulus_gpa": 70.0,
-}
+MIXED: dict[str, Any] = {"tip_radius_nm": 50.0, "relative_humidity": 0.42, "modulus_gpa": 70.0}
+MIXED |= {"adhesion_energy_j_per_m2": 0.22}
+pytestmark = pytest.mark.slow
 
 
-def system(numbers: dict[str, Any], **more: Any) -> DrivenContact:
-    return DrivenContact(
-        **{"drive_frequency_khz": 90.0, "mass_ng": 16.81, "contact": ContactParameters(**numbers)} | more
-    )
-
-
-@pytest.mark.slow
 def test_taps_are_collisions_of_the_undriven_lever():
     impact = tapped(Contact.paper(**MIXED), LEVER, jnp.array([2.0, 26.0]))
     seen = set()
@@ -44,7 +34,14 @@ def test_taps_are_collisions_of_the_undriven_lever():
         tap = jax.jit(type(impact).tap)(impact, jnp.array(approach), jnp.array(pull))
         # at the plane the lever is bent by pull/Omega^2
         plane = -pull / OMEGA**2
-        lever = system(MIXED, amplitude_nm=0.0, offset_nm=plane - 4.7, quality_factor=None)
+        lever = DrivenContact(
+            amplitude_nm=0.0,
+            drive_frequency_khz=90.0,
+            offset_nm=plane - 4.7,
+            quality_factor=None,
+            mass_ng=16.81,
+            contact=ContactParameters(**MIXED),
+        )
         contact = follow(lever, 0.0, plane, -approach, contacts=1).contacts[0]
         seen.add(contact.junctions)
         assert float(tap.speeds.rebound) == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-7)
@@ -52,7 +49,6 @@ def test_taps_are_collisions_of_the_undriven_lever():
     assert seen == {0, 1}
 
 
-@pytest.mark.slow
 def test_light_taps_have_the_slopes_of_their_table():
     """What the adhesion of a junction that never forms changes is the places of the series alone."""
 
@@ -80,37 +76,33 @@ def read_of(impact, cantilever, free_nm, frequency_khz, offset_nm):
     return jnp.stack(read), orbits.steady[slot]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["tapping_712_0_1_8.csv", "tapping_712_0_1.03_12.csv"])
+NEAREST = {11: (4e-4, 0.01), 21: (4e-4, 0.01), 22: (4e-4, 0.03), 23: (3e-3, 0.5)}
+"""How near amplitudes and phases (degrees) come to those of a table's rows."""
+READ = {
+    # on resonance and 3 % above it; nearer the sample taps are slow and last a quarter of the period
+    "tapping_712_0_1_8.csv": (0, [1.0, 30.0], None),
+    "tapping_712_0_1.03_12.csv": (0, [1.0, 30.0], None),
+    # the nearest heights, where drive and lever cancel; the last tap takes a third of a period
+    "tapping_712_0_1.03_12.csv, near": (0, [-1.1, 28.0], NEAREST),
+    "tapping_712_1_1.03_12.csv": (1, [-1.1, 28.0], NEAREST),
+}
+
+
+@pytest.mark.parametrize("name", READ)
 def test_taps_are_read_as_full_simulations_are(name: str):
-    """On resonance and 3 % above it; the full scene in time, followed until it repeats."""
-    truth, table = tapping_truth(0), read_table(Path(__file__).parent / "tapping_tables" / name)
-    cantilever = Cantilever(90.0, truth.quality_factor, MASS_NG)
-    impact = tapped(Contact.paper(**truth.parameters), cantilever, jnp.array([1.0, 30.0]))
-    assert table.lockin_amplitude_nm is not None
-    assert table.phase_lag_deg is not None
-    # nearer the sample taps are slow and last a quarter of the period
-    near = -table.offset_nm > 0.35 * table.excitation_nm
-    assert np.count_nonzero(near) >= 12
-    for row in np.flatnonzero(near):
-        drive = (table.excitation_nm[row], table.drive_frequency_khz[row], table.offset_nm[row])
-        (amplitude, lag), steady = read_of(impact, cantilever, *map(jnp.asarray, drive))
-        assert steady
-        assert amplitude == pytest.approx(table.lockin_amplitude_nm[row], rel=1e-4)
-        assert (lag - table.phase_lag_deg[row] + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.006)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [0, 1])
-def test_taps_hardly_pulled_or_pushed_are_read_as_full_simulations_are(number: int):
-    """The nearest heights 3 % above resonance, where drive and lever cancel; the last tap takes a third of a period."""
+    """The full scene in time, followed until it repeats."""
+    number, pulls, rows = READ[name]
     truth = tapping_truth(number)
-    table = read_table(Path(__file__).parent / "tapping_tables" / f"tapping_712_{number}_1.03_12.csv")
-    cantilever = Cantilever(90.0, truth.quality_factor, MASS_NG)
-    impact = tapped(Contact.paper(**truth.parameters), cantilever, jnp.array([-1.1, 28.0]))
+    table = read_table(Path(__file__).parent / "tapping_tables" / name.partition(",")[0])
     assert table.lockin_amplitude_nm is not None
     assert table.phase_lag_deg is not None
-    for row, nearness, degrees in ((11, 4e-4, 0.01), (21, 4e-4, 0.01), (22, 4e-4, 0.03), (23, 3e-3, 0.5)):
+    if rows is None:
+        far = np.flatnonzero(-table.offset_nm > 0.35 * table.excitation_nm)
+        assert far.size >= 12
+        rows = {int(row): (1e-4, 0.006) for row in far}
+    cantilever = Cantilever(90.0, truth.quality_factor, MASS_NG)
+    impact = tapped(Contact.paper(**truth.parameters), cantilever, jnp.array(pulls))
+    for row, (nearness, degrees) in rows.items():
         drive = (table.excitation_nm[row], table.drive_frequency_khz[row], table.offset_nm[row])
         (amplitude, lag), steady = read_of(impact, cantilever, *map(jnp.asarray, drive))
         assert steady
@@ -118,7 +110,6 @@ def test_taps_hardly_pulled_or_pushed_are_read_as_full_simulations_are(number: i
         assert (lag - table.phase_lag_deg[row] + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=degrees)
 
 
-@pytest.mark.slow
 def test_light_and_hard_taps_beside_each_other_are_both_found():
     """A row of a fit on its way: orbits 0.1 nm/us apart to either side of the first hard tap, where the scan jumps."""
     found: dict[str, Any] = {"relative_humidity": 0.327516, "adhesion_energy_j_per_m2": 0.154908, "viscosity_pa_s": 0.0}

@@ -1,6 +1,5 @@
 """Collisions: the published table, mpmath at other parameters, energy, batches, outcomes."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from afm_jax.solve.lanes import LANES
 from tests import reference_contact as exact
 from tests.collisions_of_eight import collide_in_eights
 
-CAPTURE = 10.938450059496711  # mpmath, 25 digits; test_capture_speed recomputes it
+CAPTURE = 10.938450059496711  # mpmath, 25 digits
 
 
 @pytest.mark.parametrize("method", ["diffrax", "collocation"])
@@ -25,22 +24,30 @@ def test_published_table_to_all_digits_printed(method):
     assert not result.captured.any()
 
 
-@pytest.mark.parametrize("method", ["diffrax", "collocation"])
-def test_default_accuracy_is_reached_from_11_times_the_capture_speed(method):
+def numbers_of(collisions, *names: str) -> list[np.ndarray]:
+    """Return columns of the reference's collisions."""
+    return [np.array([float(getattr(one, name)) for one in collisions]) for name in names]
+
+
+@pytest.fixture(scope="module")
+def of_mpmath():
     speeds = np.array([1.1 * CAPTURE, 12.7, 15.0, 22.0, 45.0, 200.0, 700.0])
+    return speeds, [exact.collision(exact.ContactParameters(), float(speed), digits=20) for speed in speeds]
+
+
+@pytest.mark.parametrize("method", ["diffrax", "collocation"])
+def test_default_accuracy_is_reached_from_11_times_the_capture_speed(of_mpmath, method):
+    speeds, expected = of_mpmath
     result = collide_in_eights(Contact.paper(), speeds, method=method)
-    for place, speed in enumerate(speeds):
-        expected = exact.collision(exact.ContactParameters(), float(speed), digits=20)
-        assert float(result.rebound_speed_nm_per_us[place]) == pytest.approx(
-            float(expected.rebound_speed_nm_per_us), rel=1e-9
-        )
-        assert float(result.collision_delay_us[place]) == pytest.approx(float(expected.delay_us), abs=1e-8)
-        assert float(result.time_in_junction_us[place]) == pytest.approx(float(expected.time_in_junction_us), abs=1e-8)
-        assert float(result.deepest_gap_nm[place]) == pytest.approx(float(expected.deepest_gap_nm), rel=1e-9)
-        assert float(result.viscous_loss_aj[place]) == pytest.approx(float(expected.viscous_loss_aj), rel=1e-7)
+    rebound, deepest, loss = numbers_of(expected, "rebound_speed_nm_per_us", "deepest_gap_nm", "viscous_loss_aj")
+    delay, in_junction = numbers_of(expected, "delay_us", "time_in_junction_us")
+    np.testing.assert_allclose(result.rebound_speed_nm_per_us, rebound, rtol=1e-9)
+    np.testing.assert_allclose(result.collision_delay_us, delay, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(result.time_in_junction_us, in_junction, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(result.deepest_gap_nm, deepest, rtol=1e-9)
+    np.testing.assert_allclose(result.viscous_loss_aj, loss, rtol=1e-7)
 
 
-@pytest.mark.slow
 def test_just_above_capture_the_rebound_is_still_known():
     speed = 1.001 * CAPTURE
     result = collide_in_eights(Contact.paper(), speed)
@@ -77,17 +84,13 @@ def test_other_contacts_agree_with_mpmath(changes):
     speeds = bound * np.array([1.0 - 1e-5, 1.0 + 1e-5, 1.1, 3.0])
     result = collide_in_eights(contact, speeds, mass)
     assert list(np.asarray(result.captured)) == [True, False, False, False]
-    for place in (2, 3):
-        expected = exact.collision(parameters, float(speeds[place]), digits=20)
-        assert int(result.outcome[place]) == CollisionOutcome.REBOUND
-        # 1e-9 is measured at the paper's parameters; dissipation a hundred or a thousand times larger costs digits
-        viscous = parameters.viscosity_pa_s > 0.01
-        assert float(result.rebound_speed_nm_per_us[place]) == pytest.approx(
-            float(expected.rebound_speed_nm_per_us), rel=1e-6 if viscous else 4e-9
-        )
-        assert float(result.collision_delay_us[place]) == pytest.approx(
-            float(expected.delay_us), rel=1e-7, abs=1e-6 if viscous else 2e-8
-        )
+    assert (result.outcome[2:] == CollisionOutcome.REBOUND).all()
+    expected = [exact.collision(parameters, float(speed), digits=20) for speed in speeds[2:]]
+    rebound, delay = numbers_of(expected, "rebound_speed_nm_per_us", "delay_us")
+    # 1e-9 is measured at the paper's parameters; dissipation a hundred or a thousand times larger costs digits
+    speed_error, time_error = (1e-6, 1e-6) if parameters.viscosity_pa_s > 0.01 else (4e-9, 2e-8)
+    np.testing.assert_allclose(result.rebound_speed_nm_per_us[2:], rebound, rtol=speed_error)
+    assert list(result.collision_delay_us[2:]) == pytest.approx(delay, rel=1e-7, abs=time_error)
 
 
 def test_capture_speed():
@@ -95,28 +98,25 @@ def test_capture_speed():
     assert reference == pytest.approx(CAPTURE, rel=1e-15)
     assert float(capture_speed(Contact.paper())) == pytest.approx(reference, rel=1e-9)
     # physics.md prints seven digits
-    assert float(capture_speed(Contact.paper())) == pytest.approx(10.93845, abs=5e-6)
+    assert reference == pytest.approx(10.93845, abs=5e-6)
 
 
 def test_within_a_billionth_of_capture_the_sides_are_told_apart():
     result = collide_in_eights(Contact.paper(), CAPTURE * np.array([1.0 - 1e-9, 1.0 + 1e-9]))
-    assert [int(outcome) for outcome in result.outcome] == [
-        CollisionOutcome.CAPTURED_BY_BRIDGE,
-        CollisionOutcome.REBOUND,
-    ]
-    assert np.isfinite(np.asarray(result.collision_delay_us)).all()
+    assert result.outcome.tolist() == [CollisionOutcome.CAPTURED_BY_BRIDGE, CollisionOutcome.REBOUND]
+    assert np.isfinite(result.collision_delay_us).all()
 
 
-def test_the_energy_ledger_closes():
+@pytest.mark.parametrize("changes", [{}, {"modulus_gpa": 1.0, "adhesion_energy_j_per_m2": 0.1}], ids=str)
+def test_the_energy_ledger_closes(changes):
     speeds = np.array([11.0, 12.0, 20.0, 60.0, 200.0, 1e4])
-    for contact in (Contact.paper(), Contact.paper(modulus_gpa=1.0, adhesion_energy_j_per_m2=0.1)):
-        result = collide_in_eights(contact, speeds, 2.5)
-        kinetic = 0.5 * 2.5 * speeds**2
-        lost = result.bridge_hysteresis_aj + result.junction_hysteresis_aj + result.viscous_loss_aj
-        left = 0.5 * 2.5 * np.asarray(result.rebound_speed_nm_per_us) ** 2
-        free = ~np.asarray(result.captured)
-        assert free.sum() >= 3
-        np.testing.assert_allclose((kinetic - lost)[free], left[free], rtol=0, atol=1e-8 * kinetic[free].min())
+    result = collide_in_eights(Contact.paper(**changes), speeds, 2.5)
+    kinetic = 0.5 * 2.5 * speeds**2
+    lost = result.bridge_hysteresis_aj + result.junction_hysteresis_aj + result.viscous_loss_aj
+    left = 0.5 * 2.5 * np.asarray(result.rebound_speed_nm_per_us) ** 2
+    free = ~np.asarray(result.captured)
+    assert free.sum() >= 3
+    np.testing.assert_allclose((kinetic - lost)[free], left[free], rtol=0, atol=1e-8 * kinetic[free].min())
 
 
 def test_a_static_contact_loses_its_hysteresis_at_every_speed():
@@ -129,21 +129,18 @@ def test_a_static_contact_loses_its_hysteresis_at_every_speed():
 
 
 def test_a_batch_is_its_tips_one_by_one():
-    contact = Contact.paper()
     # more than two blocks, the last one not full, in a shape of its own
     speeds = np.linspace(5.0, 250.0, 2 * (LANES + 44)).reshape(2, -1)
-    result = collide(contact, speeds)
+    result = collide(Contact.paper(), speeds)
     assert result.rebound_speed_nm_per_us.shape == speeds.shape
     for place in ((0, 0), (0, 30), (1, 1), (1, LANES + 43)):
-        alone = collide(contact, speeds[place])
-        for ours, one in zip(result, alone, strict=True):
+        for ours, one in zip(result, collide(Contact.paper(), speeds[place]), strict=True):
             # another program for another size: fused differently
             np.testing.assert_allclose(ours[place], one, rtol=1e-12, atol=1e-12)
 
 
 def test_parameters_may_differ_from_tip_to_tip():
-    humidity = jnp.linspace(0.2, 0.8, 7)
-    mass = jnp.linspace(0.5, 2.0, 7)
+    humidity, mass = jnp.linspace(0.2, 0.8, 7), jnp.linspace(0.5, 2.0, 7)
     many = collide(Contact.paper(relative_humidity=humidity), jnp.full(7, 25.0), mass)
     for place in range(7):
         one = collide(Contact.paper(relative_humidity=float(humidity[place])), 25.0, float(mass[place]))
@@ -152,32 +149,15 @@ def test_parameters_may_differ_from_tip_to_tip():
 
 
 def test_contacts_without_junction_are_errors_alone_and_outcomes_in_a_batch():
-    with pytest.raises(ValueError, match=r"the contact has no junction: .*adhesion_energy_j_per_m2"):
-        collide(Contact.paper(adhesion_energy_j_per_m2=0.05), 20.0)
-    with pytest.raises(ValueError, match="the contact has no junction: "):
-        capture_speed(Contact.paper(adhesion_energy_j_per_m2=0.05))
+    for work in (lambda contact: collide(contact, 20.0), capture_speed):
+        with pytest.raises(ValueError, match=r"the contact has no junction: .*adhesion_energy_j_per_m2"):
+            work(Contact.paper(adhesion_energy_j_per_m2=0.05))
     mixed = collide(Contact.paper(adhesion_energy_j_per_m2=jnp.array([0.05, 0.3])), jnp.array([20.0, 20.0]))
-    assert [int(outcome) for outcome in mixed.outcome] == [CollisionOutcome.NO_JUNCTION, CollisionOutcome.REBOUND]
+    assert mixed.outcome.tolist() == [CollisionOutcome.NO_JUNCTION, CollisionOutcome.REBOUND]
     assert np.isfinite(np.asarray(mixed.rebound_speed_nm_per_us)).all()
 
 
 def test_impossible_speeds_are_outcomes():
     result = collide(Contact.paper(), jnp.array([-3.0, 0.0, jnp.nan, jnp.inf, 20.0]))
-    assert [int(outcome) for outcome in result.outcome] == [CollisionOutcome.INVALID_START] * 4 + [0]
+    assert result.outcome.tolist() == [CollisionOutcome.INVALID_START] * 4 + [CollisionOutcome.REBOUND]
     assert "positive finite" in CollisionOutcome.INVALID_START.sentence
-
-
-@pytest.mark.slow
-def test_the_same_program_serves_other_numbers():
-    traces = []
-
-    @jax.jit
-    def rebound(contact, speeds):
-        traces.append(1)
-        return collide(contact, speeds).rebound_speed_nm_per_us
-
-    first = rebound(Contact.paper(), jnp.array([12.0, 40.0]))
-    second = rebound(Contact.paper(relative_humidity=0.6, modulus_gpa=50.0), jnp.array([13.0, 41.0]))
-    assert len(traces) == 1
-    assert float(first[0]) == pytest.approx(4.8899, abs=5.1e-5)
-    assert np.isfinite(np.asarray(second)).all()

@@ -46,7 +46,6 @@ def test_forward_and_reverse_agree(forward):
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_both_methods_have_the_same_derivatives(forward):
     collocation = np.stack(jax.jit(jax.jacfwd(lambda values: outputs("collocation", values)))(PAPER))
     # each is right to 1e-6 of the derivative itself; where a delay's derivative nearly vanishes, of 1e-2
@@ -81,7 +80,6 @@ def test_the_variable_of_the_integration_has_no_derivative_at_capture():
     np.testing.assert_array_equal(np.stack(slopes), [[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, -0.5, 0.0]])
 
 
-@pytest.mark.slow
 def test_gradients_are_finite_whatever_the_outcome():
     speeds = jnp.array([-1.0, 1e-3, 5.0, 10.938450059, 10.9384500597, 1e4])
 
@@ -94,17 +92,6 @@ def test_gradients_are_finite_whatever_the_outcome():
         assert np.isfinite(np.asarray(part)).all()
 
 
-def conditions(jaxpr):
-    """Return how many equations of a program, and of those inside it, go one of two ways."""
-    count = 0
-    for equation in jaxpr.eqns:
-        count += equation.primitive.name == "cond"
-        for value in jax.tree.leaves(equation.params, is_leaf=lambda part: hasattr(part, "jaxpr")):
-            inner = getattr(value, "jaxpr", value)
-            count += conditions(inner) if hasattr(inner, "eqns") else 0
-    return count
-
-
 def rebound(humidity, speed):
     return collide(Contact.paper(relative_humidity=humidity), speed).rebound_speed_nm_per_us
 
@@ -114,7 +101,7 @@ def test_tips_under_vmap_share_one_question(function):
     # a batch of questions would take all tips the careful way, a thousand times dearer
     of_many = jax.vmap(jax.vmap(function, (None, 0)), (0, None))
     program = jax.make_jaxpr(of_many)(jnp.array([0.3, 0.5]), jnp.array([15.0, 60.0, 20.0]))
-    assert conditions(program.jaxpr) > 0
+    assert "cond[" in str(program)
 
 
 def test_vmap_gives_what_each_contact_gives():

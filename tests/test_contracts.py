@@ -1,4 +1,4 @@
-"""What every public object promises: jit, vmap, jvp and vjp, one compilation, and a clear word on needs."""
+"""What every public object promises: jit and vmap, one compilation, and a clear word on needs."""
 
 from collections.abc import Callable
 from functools import cache
@@ -17,19 +17,17 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import float32_allowed
 from afm_jax.contact.collide import capture_speed, collide, collisions
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.law_of_contact import fit_delay, fit_law
 from afm_jax.contact.time_course import time_course
 from afm_jax.effects.study import study_effects
 from afm_jax.impact import map as poincare
 from afm_jax.impact import orbits as orbits_module
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw, impact_law_of
-from afm_jax.impact.map import iterate_batch, iterate_map, next_impact
+from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import state
-from fitting.simulated.experiment import drives_of, simulate_experiment
-from tests.package_scenes import bouncing, next_impacts, repeated, stacked
+from tests.package_scenes import bouncing, stacked
 
 TIME, VELOCITY = 4.0, 60.0
 
@@ -46,9 +44,8 @@ def platform_motion(scene: Scene) -> Any:
 
 def impact_law(scene: Scene) -> Any:
     law = impact_law_of(scene)
-    return jnp.stack(
-        [law.rebound_speed(40.0), law.rebound_slope(40.0), law.approach_speed(30.0), law.energy_lost(40.0)]
-    )
+    speeds = law.rebound_speed(40.0), law.rebound_slope(40.0), law.approach_speed(30.0)
+    return jnp.stack([*speeds, law.energy_lost(40.0)])
 
 
 def collision_delay(scene: Scene) -> Any:
@@ -77,7 +74,6 @@ def orbits(scene: Scene) -> Any:
 
 
 OBJECTS = [free_flight, platform_motion, impact_law, collision_delay, next_state, three_impacts, jacobian, orbits]
-LIGHT = OBJECTS[:-1]  # the derivatives of orbits have a file of their own
 
 
 def tabulated(scene: Scene, origin: str = "") -> Scene:
@@ -104,17 +100,11 @@ def scenes_with(law: str) -> list[Scene]:
     return scenes if law == "formula" else [tabulated(scene) for scene in scenes]
 
 
-BOTH = [
-    *((function, "formula") for function in OBJECTS),
-    *(pytest.param(function, "table", marks=pytest.mark.slow) for function in OBJECTS[2:]),
-]
-LIGHT_BOTH = [
-    *((function, "formula") for function in LIGHT),
-    *(pytest.param(function, "table", marks=pytest.mark.slow) for function in LIGHT[2:]),
-]
+FORMULAS = [(function, "formula") for function in OBJECTS]
+TABLES = [pytest.param(function, "table", marks=pytest.mark.slow) for function in OBJECTS[2:]]
 
 
-@pytest.mark.parametrize(("function", "law"), BOTH)
+@pytest.mark.parametrize(("function", "law"), FORMULAS + TABLES)
 def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any], law: str):
     scenes = scenes_with(law)
     batch = np.asarray(jax.jit(jax.vmap(function))(stacked(scenes)))
@@ -125,40 +115,12 @@ def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any], law:
     assert not np.allclose(batch[0], batch[1])
 
 
-@pytest.mark.parametrize(("function", "law"), LIGHT_BOTH)
-def test_jvp_vjp_and_differences_agree(function: Callable[[Scene], Any], law: str):
-    scene, random = scenes_with(law)[0], np.random.default_rng(5)
-    direction = jax.tree.map(lambda leaf: leaf * random.uniform(-1, 1), scene)
-    value, rate = jax.jvp(function, (scene,), (direction,))
-    weight = jnp.asarray(random.normal(size=value.shape))
-    (gradient,) = jax.vjp(function, scene)[1](weight)
-    forward = float(jnp.sum(weight * rate))
-    pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True)
-    terms = [float(jnp.sum(slope * step)) for slope, step in pairs]
-    # Sums in another order.
-    assert sum(terms) == pytest.approx(forward, rel=1e-10, abs=1e-12 * float(np.sum(np.abs(terms))))
-    near, far = (
-        np.asarray(
-            function(jax.tree.map(lambda x, d, h=h: x + h * d, scene, direction))
-            - function(jax.tree.map(lambda x, d, h=h: x - h * d, scene, direction))
-        )
-        / (2 * h)
-        for h in (1e-5, 2e-5)
-    )
-    # Fourth order in 1e-5, rounding of 1e-13 over 1e-5; three impacts stretch both.
-    scale = float(np.max(np.abs(rate)))
-    np.testing.assert_allclose(rate, (4 * near - far) / 3, rtol=1e-6, atol=1e-7 * scale)
-
-
-def narrow(scene: Any) -> Any:
-    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scene)
-
-
 @pytest.mark.parametrize("function", OBJECTS[:6])
 def test_single_precision_goes_as_far_as_it_can(function: Callable[[Scene], Any]):
     double = np.asarray(function(scenes_with("formula")[0]))
     with float32_allowed():
-        single = np.asarray(function(narrow(scenes_with("formula")[0])))
+        narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scenes_with("formula")[0])
+        single = np.asarray(function(narrow))
     assert single.dtype == np.float32
     assert np.all(np.isfinite(single))
     # 6e-8 of phases of 10 rad and lengths of 100 nm, stretched by up to three impacts.
@@ -167,44 +129,47 @@ def test_single_precision_goes_as_far_as_it_can(function: Callable[[Scene], Any]
 
 def built_in_many_ways() -> list[tuple[Scene, Any, Any]]:
     """Return scenes of one structure, their numbers given as Python, NumPy and JAX numbers, with a start."""
-    ways = []
+    ways: list[tuple[Scene, Any, Any]] = []
     for number in (float, int, np.float64, np.asarray, jnp.asarray, lambda x: jnp.asarray(float(x))):
         delay = CollisionDelay(number(1), number(6), number(2), corrections=False)
         law = ImpactLaw(r=number(1), epsilon=number(100), viscous_loss=number(1), delay=delay)
-        ways.append(
-            (Scene(Cantilever(number(90), number(40)), Platform(number(4), number(181), number(-1)), law), 4, 60)
-        )
-        ways.append((scenes_with("formula")[len(ways) % 3], number(4), number(60)))
+        scene = Scene(Cantilever(number(90), number(40)), Platform(number(4), number(181), number(-1)), law)
+        ways += [(scene, 4, 60), (scenes_with("formula")[len(ways) % 3], number(4), number(60))]
     return ways
+
+
+def traces(function: Callable[..., Any], calls: list[tuple[Any, ...]]) -> int:
+    """Return how often a function is traced that is called with several arguments."""
+    traced = []
+
+    @jax.jit
+    def counted(*given):
+        traced.append(given)
+        return function(*given)
+
+    for given in calls:
+        jax.block_until_ready(counted(*given))
+    return len(traced)
 
 
 @pytest.mark.parametrize(
     "function", [next_impact, map_jacobian, lambda scene, t, v: iterate_map(scene, t, v, 3).outcome]
 )
 def test_one_compilation_serves_all_values(function: Callable[..., Any]):
-    traced = []
-
-    @jax.jit
-    def counted(scene, time, velocity):
-        traced.append(scene)
-        return function(scene, time, velocity)
-
-    for scene, time, velocity in built_in_many_ways():
-        jax.block_until_ready(counted(scene, jnp.asarray(time, float), jnp.asarray(velocity, float)))
-    assert len(traced) == 1
+    ways = [(scene, jnp.asarray(t, float), jnp.asarray(v, float)) for scene, t, v in built_in_many_ways()]
+    assert traces(function, ways) == 1
 
 
 def test_one_compilation_serves_all_tables_of_one_length():
-    traced = []
+    scenes = [tabulated(scene, origin=f"table {row}") for row, scene in enumerate(scenes_with("formula"))]
+    assert traces(impact_law, [(scene,) for scene in scenes]) == 1
 
-    @jax.jit
-    def counted(scene):
-        traced.append(scene)
-        return impact_law(scene)
 
-    for number, scene in enumerate(scenes_with("formula")):
-        jax.block_until_ready(counted(tabulated(scene, origin=f"table {number}")))
-    assert len(traced) == 1
+@pytest.mark.slow
+def test_one_compilation_serves_all_contacts_and_speeds():
+    calls = [(Contact.paper(), jnp.array([12.0, 40.0]))]
+    calls += [(Contact.paper(relative_humidity=0.6, modulus_gpa=50.0), jnp.array([13.0, 41.0]))]
+    assert traces(collide, calls) == 1
 
 
 def test_calls_without_jit_compile_once_too():
@@ -222,10 +187,8 @@ def test_calls_without_jit_compile_once_too():
 def test_row_sums_of_large_batches_are_right():
     # Wrong above 16,384 rows in jax 0.10.2 on a CPU (jax issue 39103), silently, in the last row.
     rows = np.random.default_rng(2).normal(size=(16_384 + 77, 5))
-    compiled = jax.jit(jax.vmap(jnp.sum))(rows)
     # Five terms in any order.
-    np.testing.assert_allclose(compiled, rows.sum(axis=1), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(jax.vmap(jnp.sum)(jnp.asarray(rows)), compiled, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(jax.jit(jax.vmap(jnp.sum))(rows), rows.sum(axis=1), rtol=0, atol=1e-14)
     # where the sum is of something made of the row: 0.8 % off
     numbers = np.arange(16_385.0)[:, None] * [1.0, 0.0, 0.0]
     squares = jax.jit(jax.vmap(lambda row: jnp.sum((jnp.eye(3) @ row) ** 2)))(numbers)
@@ -250,59 +213,30 @@ def test_writes_in_loops_do_not_copy_the_array():
     assert min(seconds) < 0.04
 
 
-def test_a_large_batch_of_impacts_equals_small_ones():
-    count = 16_384 + 77
-    random = np.random.default_rng(3)
-    scene, times, velocities = bouncing(), random.uniform(0, 5, count), random.uniform(30, 150, count)
-    whole = jax.jit(jax.vmap(next_impact, in_axes=(None, 0, 0)))(scene, times, velocities)
-    blocks = next_impacts(repeated(scene, count), times, velocities)
-    np.testing.assert_array_equal(whole.outcome, blocks.outcome)
-    landed = np.isin(blocks.outcome, [0, 1])
-    # Vectorised differently.
-    np.testing.assert_allclose(whole.time_us[landed], blocks.time_us[landed], rtol=1e-11)
-    after = np.abs(np.asarray(whole.velocity_after_nm_per_us) - blocks.velocity_after_nm_per_us)[landed]
-    assert np.max(after) < 1e-6  # next to capture d u_out/d u_in reaches some 1e4
+# all others ask in the same way (tests/hard_cases/test_single_precision.py)
+OF_SCENES = [next_state, study_effects, jax.jit(next_state)]
+OF_CONTACTS = [
+    lambda contact: collide(contact, 20.0),
+    capture_speed,
+    lambda contact: time_course(contact, 20.0),
+    collisions,
+    lambda contact: simulate(Scene(Cantilever(90.0), Platform(1.0, 180.0), contact), state(0.0, 100.0, 0.0), 10.0),
+]
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda scene: next_impact(scene, TIME, VELOCITY),
-        lambda scene: iterate_map(scene, TIME, VELOCITY, 2),
-        lambda scene: iterate_batch(scene, np.array([TIME]), np.array([VELOCITY]), 2),
-        lambda scene: map_jacobian(scene, TIME, VELOCITY),
-        lambda scene: single_impact_orbits(scene, 1),
-        lambda scene: simulate(scene, state(0.0, 100.0, 0.0), 10.0),
-        study_effects,
-        jax.jit(lambda scene: next_impact(scene, TIME, VELOCITY)),
-    ],
-)
+@pytest.mark.parametrize("call", OF_SCENES)
 def test_a_scene_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Scene], Any]):
     with jax.enable_x64(False):  # noqa: FBT003
         early = bouncing()
-    for scene in (
-        early,
-        Scene(scenes_with("formula")[0].cantilever, early.platform, scenes_with("formula")[0].interaction),
-    ):
+    late = scenes_with("formula")[0]
+    for scene in (early, Scene(late.cantilever, early.platform, late.interaction)):
         with pytest.raises(RuntimeError, match=r"build the scene after .*jax_enable_x64', True") as error:
             call(scene)
         assert "\n" not in str(error.value)
     assert str(error.value).startswith("Scene.platform.amplitude_nm is a 32-bit float")
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda contact: collide(contact, 20.0),
-        capture_speed,
-        lambda contact: time_course(contact, 20.0),
-        collisions,
-        fit_law,
-        fit_delay,
-        lambda contact: simulate_experiment(contact, Cantilever(90.0, 40.0), drives_of([(1, 180.0, 4.0, 0.0)])),
-        lambda contact: simulate(Scene(Cantilever(90.0), Platform(1.0, 180.0), contact), state(0.0, 100.0, 0.0), 10.0),
-    ],
-)
+@pytest.mark.parametrize("call", OF_CONTACTS)
 def test_a_contact_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Contact], Any]):
     with jax.enable_x64(False):  # noqa: FBT003
         early = Contact.paper()
@@ -311,9 +245,7 @@ def test_a_contact_built_before_64_bits_were_asked_for_is_refused(call: Callable
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    "call", [lambda s: next_impact(s, TIME, VELOCITY), lambda s: iterate_map(s, TIME, VELOCITY, 2), jacobian, orbits]
-)
+@pytest.mark.parametrize("call", [next_state, three_impacts, jacobian, orbits])
 def test_entry_points_ask_for_an_impact_law(call: Callable[[Scene], Any]):
     with pytest.raises(TypeError, match="whose interaction is a law, an ImpactLaw or a TabulatedLaw, not Contact"):
         call(Scene(Cantilever(90.0), Platform(1.0, 180.0), Contact.paper()))

@@ -35,9 +35,7 @@ STATIC = {
 @pytest.mark.parametrize("humidity", [0.01, 0.5, 0.99])
 def test_forces_of_the_paper_are_their_formulas_in_mpmath(name, humidity):
     liquid = Liquid(relative_humidity=humidity)
-    force = {"capillary": Capillary(liquid=liquid), "structural": Structural(liquid=liquid), "core": CoreRepulsion()}[
-        name
-    ]
+    force = CoreRepulsion() if name == "core" else type(STATIC[name])(liquid=liquid)
     reference = constants(ContactParameters(relative_humidity=humidity, effects=(name,)))
     for gap in GAPS:
         # a handful of rounded operations; r_K near saturation carries the logarithm's own 1/ln(p/p_s)
@@ -48,18 +46,11 @@ def test_forces_of_the_paper_are_their_formulas_in_mpmath(name, humidity):
     np.testing.assert_allclose(np.diff(levels), np.diff(expected), rtol=1e-12, atol=1e-13)
 
 
-def quadrature(function, ends) -> float:
-    """Return the integral of a float64 function, piece by piece."""
-    return sum(
-        quad(lambda x: float(function(x)), *piece, epsabs=1e-12, epsrel=1e-11)[0] for piece in itertools.pairwise(ends)
-    )
-
-
 @pytest.mark.parametrize("name", STATIC)
 def test_the_force_is_minus_the_slope_of_the_potential(name):
     force = STATIC[name]
     for low, high in itertools.pairwise(GAPS):
-        work = quadrature(force, (low, high))
+        work = quad(lambda gap: float(force(gap)), low, high, epsabs=1e-12, epsrel=1e-11)[0]
         # quadrature of a float64 function
         assert float(force.potential(low) - force.potential(high)) == pytest.approx(work, rel=1e-9, abs=1e-12)
 

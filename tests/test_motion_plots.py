@@ -15,6 +15,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.junction import Phase
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.record import Simulation
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, state
 from afm_jax.plots.motion import draw_motion, look_at, spectrum_figure, spectrum_of
@@ -23,25 +24,20 @@ from afm_jax.scenefile import presets
 ALL = ["time_course.png", "spectrum.png", "gap.png", "poincare.png", "force_gap.png"]
 
 
-def check_pictures(files: list[Path], *, white: float = 0.3, width: int = 1400):
+def drawn(scene: Scene, found: Simulation, folder: Path, *, white: float = 0.3, width: int = 1400) -> list[str]:
+    """Return the names of the pictures of a motion, which are neither empty nor black."""
+    files = draw_motion(scene, found, folder)
     for path in files:
         image = matplotlib.image.imread(path)
         assert image.shape[1] >= width
-        assert white < (image[..., :3].mean(axis=2) > 0.98).mean() < 0.99  # neither empty nor black
+        assert white < (image[..., :3].mean(axis=2) > 0.98).mean() < 0.99
+    return [path.name for path in files]
 
 
 @pytest.fixture(scope="module")
 def bouncing():
     scene = presets.contact_scene(1.01, 4.0, 0.0)
     return scene, simulate(scene, default_start(scene), 120.0)
-
-
-@pytest.mark.slow
-def test_a_contact_scene_has_every_picture(bouncing, tmp_path: Path):
-    scene, found = bouncing
-    files = draw_motion(scene, found, tmp_path)
-    assert [path.name for path in files] == ALL
-    check_pictures(files)
 
 
 def test_the_stretch_shown_ends_with_whole_contacts(bouncing):
@@ -62,9 +58,7 @@ def test_a_free_cantilever_has_the_line_of_its_drive(tmp_path: Path):
     base = BaseDrive(0.5, 88.0, 0.0)
     scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 90.0), None, base)
     found = simulate(scene, state(0.0, 0.0, 0.0), 6000.0)
-    files = draw_motion(scene, found, tmp_path)
-    assert [path.name for path in files] == ["time_course.png", "spectrum.png"]
-    check_pictures(files)
+    assert drawn(scene, found, tmp_path) == ["time_course.png", "spectrum.png"]
     spectrum = spectrum_of(look_at(scene, found))
     line = int(np.argmax(spectrum.amplitude_nm))
     assert spectrum.frequency_khz[line] == pytest.approx(88.0, rel=1e-9)
@@ -83,22 +77,12 @@ def test_batches_and_empty_simulations_are_refused(bouncing, tmp_path: Path):
         draw_motion(scene, replace(found, final=found.start), tmp_path)
 
 
-@pytest.fixture(scope="module")
-def every_other_period():
+def test_a_law_has_no_force_to_draw_and_the_line_at_half_the_drive_is_that_of_the_orbit(tmp_path: Path):
     scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 363.6), ImpactLaw(0.95, 10.0))
-    return scene, simulate(scene, default_start(scene), 1500.0)
-
-
-def test_a_law_has_no_force_to_draw(every_other_period, tmp_path: Path):
-    scene, found = every_other_period
-    files = draw_motion(scene, found, tmp_path)
-    assert [path.name for path in files] == ALL[:-1]
-    check_pictures(files)
-
-
-def test_the_line_at_half_the_drive_is_that_of_the_orbit(every_other_period):
-    scene, found = every_other_period
-    spectrum = spectrum_of(look_at(scene, found))
+    found = simulate(scene, default_start(scene), 1500.0)
+    assert drawn(scene, found, tmp_path) == ALL[:-1]
+    look = look_at(scene, found)
+    spectrum = spectrum_of(look)
     assert spectrum.repeats
     assert spectrum.response_khz == pytest.approx(363.6 / 2.0, rel=1e-12)
     orbits = single_impact_orbits(scene, 2.0)
@@ -106,20 +90,16 @@ def test_the_line_at_half_the_drive_is_that_of_the_orbit(every_other_period):
     line = int(np.argmin(np.abs(spectrum.frequency_khz - spectrum.response_khz)))
     # 64 samples a response period: the harmonics of a kink, 1/k^2, are folded onto the first line
     assert spectrum.amplitude_nm[line] == pytest.approx(float(orbits.lockin_amplitude_nm[slot]), rel=2e-3)
-
-
-def test_subharmonics_of_the_drive_are_marked(every_other_period):
-    (axes,) = spectrum_figure(look_at(*every_other_period)).axes
-    labels = axes.get_legend_handles_labels()[1]
-    assert "subharmonics, drive/2" in labels
+    # subharmonics are marked up to eight times the response frequency, the last of them on the edge
+    (axes,) = spectrum_figure(look).axes
+    assert "subharmonics, drive/2" in axes.get_legend_handles_labels()[1]
     marks = [float(np.asarray(line.get_xdata())[0]) for line in axes.get_lines() if line.get_linestyle() == ":"]
-    np.testing.assert_allclose(marks, 181.8 * np.arange(1, len(marks) + 1), rtol=1e-12)
-    # up to eight times the response frequency, the last of them on the edge
     assert len(marks) in (7, 8)
+    np.testing.assert_allclose(marks, 181.8 * np.arange(1, len(marks) + 1), rtol=1e-12)
 
 
 @pytest.mark.slow
-def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(tmp_path: Path):
+def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(bouncing, tmp_path: Path):
     scene = presets.contact_scene(1.01, 4.0, 0.0)
     # 5 nm/us down onto a sample that has just turned: below the capture speed of 10.9 nm/us
     found = simulate(scene, state(0.0, 9.0, -5.0), 60.0)
@@ -128,8 +108,8 @@ def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(tmp_path: Pa
     arrival = float(found.contacts.arrival_time_us[int(found.count) - 1])
     assert arrival < look.to_us < arrival + 45.0
     assert look.path.phase[-1] == Phase.JUNCTION
-    files = draw_motion(scene, found, tmp_path)
-    expected = [name for name in ALL if look.left or name != "poincare.png"]
-    assert [path.name for path in files] == expected
     # most of the time course is shaded; the gap of one contact is a narrow picture
-    check_pictures(files, white=0.15, width=1000)
+    names = drawn(scene, found, tmp_path, white=0.15, width=1000)
+    assert names == [name for name in ALL if look.left or name != "poincare.png"]
+    # one that bounces has every picture
+    assert drawn(*bouncing, tmp_path) == ALL

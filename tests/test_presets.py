@@ -34,17 +34,16 @@ def test_a_preset_is_the_scene_of_its_caption(name: str, tmp_path: Path):
     # the drive is n times twice 90 kHz: one rounding
     assert float(scene.platform.frequency_khz) == pytest.approx(180.0 * reduced, rel=1e-15)
     assert [float(scene.platform.amplitude_nm), float(scene.platform.offset_nm)] == [amplitude, offset]
-    ramped = name in RAMPS
-    assert (float(scene.platform.offset_rate_nm_per_us) != 0.0) == ramped
-    if ramped:
+    assert (float(scene.platform.offset_rate_nm_per_us) != 0.0) == (name in RAMPS)
+    if name in RAMPS:
         end, after = RAMPS[name]
+        reached = float(scene.platform.offset_nm + after * scene.platform.offset_rate_nm_per_us)
         # two roundings of a few nm
-        assert float(scene.platform.offset_nm + after * scene.platform.offset_rate_nm_per_us) == pytest.approx(
-            end, rel=1e-15
-        )
+        assert reached == pytest.approx(end, rel=1e-15)
         assert f"to {end:g} nm in {after:g} us" in presets.PRESETS[name]
     resolved = name in ("figure8", "figure10", "figure11", "dry")
     assert isinstance(scene.interaction, Contact if resolved else ImpactLaw)
+    assert eqx.tree_equal(scene.interaction, Contact.paper()) == (resolved and name != "dry")
     assert (scene.cantilever.quality_factor is not None) == resolved
     path = tmp_path / "scene.toml"
     save_scene(scene, path, start=presets.read_named_scene(name).start)

@@ -71,27 +71,19 @@ def files(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*.program"))
 
 
-def test_what_is_no_array_of_a_result_is_kept_too(folder):
-    for _ in range(2):
-        found = anew(folder)(*arguments())
-        assert found.inner.sure is True
-        assert found.inner.nothing is None
-        assert found.law.delay is None
-        np.testing.assert_array_equal(found.pair[1], [-1.0, -2.0, -3.0])
-    assert TRACED == [2.0]
-
-
 def test_the_next_process_traces_nothing(folder):
     # twice the sum of 1, 2 and 3
     assert float(anew(folder)(*arguments()).number) == 12.0
-    assert TRACED == [2.0]
-    found = anew(folder)(*arguments(epsilon=5.0))
-    assert isinstance(found.inner, Inner)
-    np.testing.assert_array_equal(found.inner.doubled, [2.0, 4.0, 6.0])
-    assert float(found.number) == 17.0
-    # derivatives are laws that nobody could write
-    assert float(found.law.r) == -1.8
-    assert found.law.delay is None
+    for _ in range(2):
+        found = anew(folder)(*arguments(epsilon=5.0))
+        assert isinstance(found.inner, Inner)
+        np.testing.assert_array_equal(found.inner.doubled, [2.0, 4.0, 6.0])
+        np.testing.assert_array_equal(found.pair[1], [-1.0, -2.0, -3.0])
+        assert float(found.number) == 17.0
+        # derivatives are laws that nobody could write
+        assert float(found.law.r) == -1.8
+        # what is no array of a result is kept, too
+        assert (found.inner.sure, found.inner.nothing, found.law.delay) == (True, None, None)
     assert TRACED == [2.0]
 
 
@@ -175,13 +167,7 @@ def test_inside_other_functions_it_is_the_function(folder):
     assert not files(folder)
 
 
-FIT = """
-import sys
-sys.argv = ["afm-jax", "fit", "--example", "--model", "law", "--json", "--verbose"]
-from afm_jax.__main__ import run
-
-run()
-"""
+COMMAND = "import sys\nsys.argv = ['afm-jax', *{}]\nfrom afm_jax.__main__ import run\nrun()"
 
 
 @pytest.mark.slow
@@ -189,7 +175,8 @@ run()
 def test_fits_find_their_programs_again_and_standard_error_holds_our_own_words_only(tmp_path):
     surroundings: dict[str, str | None] = {"XDG_CACHE_HOME": str(tmp_path), "TF_CPP_MIN_LOG_LEVEL": None}
     surroundings |= {"JAX_COMPILATION_CACHE_DIR": None, "JAX_ENABLE_COMPILATION_CACHE": None}
-    (first, said), (second, said_again) = (outputs(FIT, surroundings) for _ in range(2))
+    fit = COMMAND.format(["fit", "--example", "--model", "law", "--json", "--verbose"])
+    (first, said), (second, said_again) = (outputs(fit, surroundings) for _ in range(2))
     assert first == second
     assert len([line for line in said.splitlines() if line.endswith("was not there: traced and written")]) == 3
     # one line a program and processor with AVX-512 otherwise
@@ -200,14 +187,7 @@ def test_fits_find_their_programs_again_and_standard_error_holds_our_own_words_o
     assert found is not None
     # every operation outside a compiled program would be a program of its own, of 10 ms each: there were 78
     assert int(found[1]) <= 20
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="the cache folder is chosen by another variable")
-def test_programs_of_a_contact_are_kept_and_read_again(tmp_path):
-    """They hold operations of a dialect that those of laws do without."""
-    surroundings: dict[str, str | None] = {"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": None}
-    table = Path(__file__).parent.parent / "fitting" / "examples" / "amplitudes_contact.csv"
-    fit = FIT.replace('"--example", "--model", "law"', f'"{table}", "--model", "contact"')
-    (first, _), (second, _) = (outputs(fit, surroundings) for _ in range(2))
+    # programs of a contact hold operations of a dialect that those of laws do without
+    collide = COMMAND.format(["collide", "--speeds", "20,30", "--json"])
+    (first, _), (second, _) = (outputs(collide, surroundings) for _ in range(2))
     assert first == second

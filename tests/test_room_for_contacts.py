@@ -54,8 +54,9 @@ def test_room_that_was_told_is_not_exceeded():
 
 
 def test_durations_share_a_program(bounced):
-    shorter = simulate(SCENE, state(0.0, START_NM, 0.0), 97.0)
-    room = shorter.contacts.kind.shape[0]
-    assert room == bounced.contacts.kind.shape[0]
+    room, other = (
+        found.contacts.kind.shape[0] for found in (bounced, simulate(SCENE, state(0.0, START_NM, 0.0), 97.0))
+    )
+    assert room == other
     # a power of two
     assert room & (room - 1) == 0

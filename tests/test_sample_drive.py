@@ -63,20 +63,18 @@ LAW = Scene(Cantilever(90.0, 40.0), Platform(2.0, 180.0, 0.0, 0.0), ImpactLaw(0.
 
 
 @pytest.mark.parametrize("drive", [{"base": BaseDrive(0.8, 88.0)}, {"force": ForceDrive(0.6, 93.0)}])
-def test_other_drives_are_not_ignored(drive: dict[str, Any]):
+@pytest.mark.parametrize("second", [True, False])
+def test_other_drives_are_not_ignored(drive: dict[str, Any], second: bool):  # noqa: FBT001
     scene = Scene(LAW.cantilever, LAW.platform, LAW.interaction, **drive)
     (name,) = drive
     with pytest.raises(ValueError, match=f"the scene has `{name}`, a .*: leave it out, or simulate the scene"):
-        require_sample_drive(scene)
-    with pytest.raises(ValueError, match=f"the scene has `{name}`"):
-        require_sample_drive(scene, second_frequency=True)
+        require_sample_drive(scene, second_frequency=second)
 
 
 def test_a_second_frequency_is_not_ignored():
     scene = Scene(LAW.cantilever, Platform(2.0, 180.0, second=Tone(1.0, 33.0)), LAW.interaction)
-    with pytest.raises(ValueError, match=r"the scene has `platform.second`, a second frequency, but only one"):
-        single_impact_orbits(scene, 1)
-    with pytest.raises(ValueError, match=r"the scene has `platform.second`, .* only one cosine of the platform"):
-        require_sample_drive(scene)
+    for ask in (lambda asked: single_impact_orbits(asked, 1), require_sample_drive):
+        with pytest.raises(ValueError, match=r"the scene has `platform.second`, .*but only one"):
+            ask(scene)
     require_sample_drive(scene, second_frequency=True)
     require_sample_drive(LAW)

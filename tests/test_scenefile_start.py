@@ -55,6 +55,8 @@ def test_loop_is_exact(path: Path, interaction: str, start: Start):
     path.unlink()
     save_scene(scene, path, start=start)
     assert read_scene(path).start == start
+    save_scene(scene, path)
+    assert read_scene(path).start is None
 
 
 def test_a_start_that_cannot_be_is_not_saved(path: Path):

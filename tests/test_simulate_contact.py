@@ -11,7 +11,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.motion.record import ContactDetail, MotionOutcome, Simulation, State
+from afm_jax.motion.record import MotionOutcome, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import dense_path, trajectory
 from afm_jax.scenefile.presets import contact_scene
@@ -35,66 +35,45 @@ def state(start) -> State:
     return State(*(jnp.asarray(value, float) for value in start))
 
 
-def detail_of(simulation: Simulation) -> ContactDetail:
-    assert simulation.contacts.detail is not None
-    return simulation.contacts.detail
+def began(system: DrivenContact, speed: float) -> tuple[float, float, float]:
+    """Return a start of physics.md: drive phase 270 degrees, 5 nm above the platform."""
+    return system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)
 
 
-def arrivals(simulation, count):
-    return np.asarray(simulation.contacts.arrival_time_us)[:count]
+def column(contacts, name: str) -> np.ndarray:
+    return np.array([getattr(contact, name) for contact in contacts])
 
 
-# Starts of physics.md: drive phase 270 degrees, 5 nm above the platform. From 40, 60 and 80 nm/us at n = 5.277 some
-# of the first ten contacts form the junction twice; ten contacts are before chaos has made of 1e-9 more than 1e-7.
+# From 40, 60 and 80 nm/us at n = 5.277 some of the first ten contacts form the junction twice; ten contacts are before
+# chaos has made of 1e-9 more than 1e-7.
 @pytest.mark.parametrize(
     ("n", "speed", "double"), [(1.01, 150.0, 0), (5.277, 40.0, 1), (5.277, 60.0, 2), (5.277, 80.0, 1)]
 )
 def test_tenth_crossing_agrees_with_an_independent_integration(n, speed, double):
     system = reference(n, 4.0)
-    start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)
-    course = follow(system, *start, until_us=1000.0, contacts=11)
-    times = np.array([contact.arrival_time_us for contact in course.contacts])
-    simulation = simulate(scene_of(system), state(start), times[-1] - start[0] + 1e-3)
+    start = began(system, speed)
+    contacts = follow(system, *start, until_us=1000.0, contacts=11).contacts
+    times, ten = column(contacts, "arrival_time_us"), contacts[:10]
+    found = simulate(scene_of(system), state(start), times[-1] - start[0] + 1e-3).contacts
     # 1e-7 us is what is promised of the tenth; the junctions are whole numbers
-    np.testing.assert_allclose(arrivals(simulation, 10), times[:10], rtol=0.0, atol=1e-7)
-    detail = detail_of(simulation)
-    formed = np.array([contact.junctions for contact in course.contacts[:10]])
-    assert np.array_equal(np.asarray(detail.junctions)[:10], formed)
-    assert int((formed > 1).sum()) == double
-    deepest = [contact.deepest_gap_nm for contact in course.contacts[:10]]
+    np.testing.assert_allclose(found.arrival_time_us[:10], times[:10], rtol=0.0, atol=1e-7)
+    assert found.detail is not None
+    np.testing.assert_array_equal(found.detail.junctions[:10], column(ten, "junctions"))
+    assert (column(ten, "junctions") > 1).sum() == double
     # the smallest gap is that of a cubic through the steps: some 1e-5 nm
-    np.testing.assert_allclose(np.asarray(detail.deepest_gap_nm)[:10], deepest, rtol=0.0, atol=1e-4)
-    lost = [contact.viscous_loss_aj for contact in course.contacts[:10]]
-    np.testing.assert_allclose(np.asarray(detail.viscous_loss_aj)[:10], lost, rtol=1e-5)
+    deepest = column(ten, "deepest_gap_nm")
+    np.testing.assert_allclose(found.detail.deepest_gap_nm[:10], deepest, rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(found.detail.viscous_loss_aj[:10], column(ten, "viscous_loss_aj"), rtol=1e-5)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "speed"), [(1.01, 150.0), (5.277, 60.0)])
 def test_diffrax_in_time_goes_the_same_way(n, speed):
     system = reference(n, 4.0)
-    start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)
-    times = [contact.arrival_time_us for contact in follow(system, *start, until_us=1000.0, contacts=5).contacts]
+    start = began(system, speed)
+    times = column(follow(system, *start, until_us=1000.0, contacts=5).contacts, "arrival_time_us")
     found = simulate(scene_of(system), state(start), times[-1] - start[0] + 1e-3, method="diffrax")
-    np.testing.assert_allclose(arrivals(found, 4), times[:4], rtol=0.0, atol=1e-8)
-
-
-@pytest.mark.slow
-def test_derivatives_of_a_batch_are_slopes_of_diffrax_in_time():
-    system = reference(5.277, 4.0)
-    begin = [state(system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)) for speed in (40.0, 60.0, 80.0)]
-    speeds = jnp.asarray([float(one.velocity_nm_per_us) for one in begin])
-
-    def arrivals_of(speed, method):
-        start = State(begin[0].time_us, begin[0].position_nm, speed)
-        return simulate(scene_of(system), start, 40.0, max_contacts=6, method=method).contacts.arrival_time_us[:4]
-
-    def slope(speed):
-        return jax.jvp(lambda v: arrivals_of(v, "collocation"), (speed,), (jnp.ones_like(speed),))[1]
-
-    step = 1e-5
-    apart = jax.jit(jax.vmap(lambda v: arrivals_of(v + step, "diffrax") - arrivals_of(v - step, "diffrax")))(speeds)
-    # central differences lose half the digits, and each contact makes their error larger
-    np.testing.assert_allclose(jax.jit(jax.vmap(slope))(speeds), apart / (2.0 * step), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(found.contacts.arrival_time_us[:4], times[:4], rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.slow
@@ -112,17 +91,16 @@ def test_other_scenes_agree_too():
         ),
     ]
     for system, contact in cases:
-        start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=90.0)
-        course = follow(system, *start, until_us=1000.0, contacts=4)
-        times = np.array([one.arrival_time_us for one in course.contacts])
-        simulation = simulate(scene_of(system, contact), state(start), times[-1] - start[0] + 1e-3)
+        start = began(system, 90.0)
+        times = column(follow(system, *start, until_us=1000.0, contacts=4).contacts, "arrival_time_us")
+        found = simulate(scene_of(system, contact), state(start), times[-1] - start[0] + 1e-3)
         # the accuracy of a contact is 1e-10 us, and it grows a little with each
-        np.testing.assert_allclose(arrivals(simulation, 4), times, rtol=0.0, atol=2e-8)
+        np.testing.assert_allclose(found.contacts.arrival_time_us[:4], times, rtol=0.0, atol=2e-8)
 
 
 def test_the_end_may_lie_within_a_contact():
     system = reference(1.01, 4.0)
-    start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=150.0)
+    start = began(system, 150.0)
     first = follow(system, *start, until_us=100.0, contacts=2).contacts[0]
     for share in (0.1, 0.35, 0.5, 0.9):
         end = first.arrival_time_us + share * (first.departure_time_us - first.arrival_time_us)
@@ -133,29 +111,9 @@ def test_the_end_may_lie_within_a_contact():
 
 
 @pytest.mark.slow
-def test_energy_of_a_contact_is_what_the_tip_loses():
-    # no air, a resting sample: spring and kinetic energy change in contacts only
-    scene = Scene(Cantilever(90.0, mass_ng=1.5), Platform(0.0, 180.0, -2.0), Contact.paper())
-    simulation = simulate(scene, state((0.0, 40.0, 0.0)), 60.0)
-    rows, count = simulation.contacts, int(simulation.count)
-    assert count >= 5
-    stiffness = float(scene.cantilever.stiffness_n_per_m)
-
-    def energy(position, velocity):
-        return 0.5 * 1.5 * np.asarray(velocity) ** 2 + 0.5 * stiffness * np.asarray(position) ** 2
-
-    before = energy(rows.arrival_position_nm, rows.arrival_velocity_nm_per_us)[: count - 1]
-    after = energy(rows.departure_position_nm, rows.departure_velocity_nm_per_us)[: count - 1]
-    # the ledger closes to the accuracy of one contact, 1e-9 of the kinetic energy
-    np.testing.assert_allclose(
-        np.asarray(rows.energy_lost_aj)[: count - 1], before - after, rtol=0.0, atol=3e-8 * before[0]
-    )
-
-
-@pytest.mark.slow
 def test_dense_output_agrees_with_an_independent_integration():
     system = reference(5.277, 4.0)
-    start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=40.0)
+    start = began(system, 40.0)
     course = follow(system, *start, until_us=start[0] + 25.0)
     scene = scene_of(system)
     simulation = simulate(scene, state(start), 25.0)
@@ -176,67 +134,51 @@ def test_dense_output_agrees_with_an_independent_integration():
 
 
 @pytest.mark.slow
-def test_batches_agree_with_single_scenes_and_say_which_has_no_junction():
-    speeds = np.array([40.0, 60.0, 150.0])
-    scene = contact_scene(5.277, 4.0, 0.0)
+def test_a_batch_says_which_of_its_scenes_has_no_junction():
     system = reference(5.277, 4.0)
-    starts = [system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed) for speed in speeds]
-    columns = State(*(jnp.asarray(column) for column in zip(*starts, strict=True)))
+    start = state(began(system, 60.0))
 
-    def one_of_many(start, adhesion):
-        contact = Contact.paper(adhesion_energy_j_per_m2=adhesion)
-        return simulate(Scene(scene.cantilever, scene.platform, contact), start, 20.0, max_contacts=ROOM)
+    def one_of_many(adhesion):
+        scene = scene_of(system, Contact.paper(adhesion_energy_j_per_m2=adhesion))
+        return simulate(scene, start, 20.0, max_contacts=ROOM)
 
-    # the last has no junction
-    columns = jax.tree.map(lambda column: jnp.append(column, column[0]), columns)
-    many = jax.jit(jax.vmap(one_of_many))(columns, jnp.array([0.3, 0.3, 0.3, 0.05]))
-    assert [MotionOutcome(one) for one in many.outcome.tolist()] == [MotionOutcome.FINISHED] * 3 + [
-        MotionOutcome.NO_JUNCTION
-    ]
-    for place, start in enumerate(starts):
-        one = simulate(scene, state(start), 20.0, max_contacts=ROOM)
-        assert int(one.count) == int(many.count[place])
-        # the same steps, summed in another order
-        np.testing.assert_allclose(
-            many.contacts.arrival_time_us[place], one.contacts.arrival_time_us, rtol=0.0, atol=1e-10
-        )
+    many, alone = jax.jit(jax.vmap(one_of_many))(jnp.array([0.3, 0.05])), one_of_many(0.3)
+    assert many.outcome.tolist() == [MotionOutcome.FINISHED, MotionOutcome.NO_JUNCTION]
+    # the same steps, summed in another order
+    times, expected = many.contacts.arrival_time_us[0], alone.contacts.arrival_time_us
+    np.testing.assert_allclose(times, expected, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.slow
-def test_derivatives_forward_and_reverse():
-    system = reference(5.277, 4.0)
-    start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=60.0)
+def test_derivatives_forward_and_reverse_alone_and_in_a_batch():
+    at, speeds = jnp.array([0.1, 1.005e-3, 40.0]), jnp.array([40.0, 60.0, 80.0])
+    start = began(reference(5.277, 4.0), 60.0)
 
-    def last_arrival(parameters, *, reverse):
+    def second_arrival(parameters, speed, *, reverse=False):
         offset, viscosity, quality = parameters
-        scene = Scene(
-            Cantilever(90.0, quality, 1.0),
-            Platform(4.0, 180.0 * 5.277, offset),
-            Contact.paper(viscosity_pa_s=viscosity),
-        )
-        simulation = simulate(scene, state(start), 14.0, max_contacts=4, reverse=reverse, max_rounds=8)
-        return simulation.contacts.arrival_time_us[1]
+        contact = Contact.paper(viscosity_pa_s=viscosity)
+        scene = Scene(Cantilever(90.0, quality, 1.0), Platform(4.0, 180.0 * 5.277, offset), contact)
+        begin = State(jnp.asarray(start[0]), jnp.asarray(start[1]), start[2] + speed - 60.0)
+        found = simulate(scene, begin, 14.0, max_contacts=4, reverse=reverse, max_rounds=8)
+        return found.contacts.arrival_time_us[1]
 
-    at = jnp.array([0.1, 1.005e-3, 40.0])
-    forward = jax.jacfwd(lambda p: last_arrival(p, reverse=False))(at)
-    backward = jax.grad(lambda p: last_arrival(p, reverse=True))(at)
-    # the two go different ways through a contact, to 1e-9 each
-    np.testing.assert_allclose(forward, backward, rtol=1e-5)
-
-    def independent(parameters):
+    def independent(parameters, speed):
         offset, viscosity, quality = (float(value) for value in parameters)
-        moved = reference(
-            5.277, 4.0, offset, quality_factor=quality, contact=ContactParameters(viscosity_pa_s=viscosity)
-        )
-        return follow(moved, *start, until_us=100.0, contacts=2).contacts[1].arrival_time_us
+        contact = ContactParameters(viscosity_pa_s=viscosity)
+        moved = reference(5.277, 4.0, offset, quality_factor=quality, contact=contact)
+        begin = (*start[:2], start[2] + float(speed) - 60.0)
+        return follow(moved, *begin, until_us=100.0, contacts=2).contacts[1].arrival_time_us
 
-    for place, step in enumerate((1e-4, 1e-6, 1e-2)):
-        shift = np.zeros(3)
-        shift[place] = step
-        base = np.asarray(at)
-        slope = (independent(base + shift) - independent(base - shift)) / (2.0 * step)
-        # rounding of the differences: 1e-12 us over the steps
-        np.testing.assert_allclose(float(forward[place]), slope, rtol=1e-5, atol=1e-9)
+    forward = np.asarray(jax.jit(jax.vmap(jax.jacfwd(second_arrival), in_axes=(None, 0)))(at, speeds))
+    backward = jax.grad(lambda parameters: second_arrival(parameters, speeds[1], reverse=True))(at)
+    # the two go different ways through a contact, to 1e-9 each
+    np.testing.assert_allclose(forward[1], backward, rtol=1e-5)
+    for row, speed in enumerate(speeds):
+        for place, step in enumerate((1e-4, 1e-6, 1e-2)):
+            shift = step * np.eye(3)[place]
+            slope = (independent(at + shift, speed) - independent(at - shift, speed)) / (2.0 * step)
+            # rounding of the differences: 1e-12 us over the steps
+            np.testing.assert_allclose(forward[row, place], slope, rtol=1e-5, atol=1e-9)
 
 
 def test_too_little_room_is_an_outcome():

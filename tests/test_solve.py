@@ -10,25 +10,11 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import absent, by_tangents, halved, largest
-from afm_jax.solve.lanes import (
-    again_for,
-    again_for_the_open,
-    filled,
-    for_each_lane,
-    in_blocks,
-    map_in_blocks,
-    power_of_two,
-)
+from afm_jax.solve.lanes import again_for, again_for_the_open, in_blocks, map_in_blocks, power_of_two
 from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, newton, newton_rows, shortened
 from afm_jax.solve.quadrature import gauss_nodes, mean_matrix, series_tail
 
 VALUES = np.arange(1.0, 24.0)
-
-
-def test_blocks_are_filled_up_with_the_last_row_and_few_sizes_serve_all():
-    np.testing.assert_array_equal(filled(np.array([[1, 2], [3, 4]]), 4), [[1, 2], [3, 4], [3, 4], [3, 4]])
-    assert [power_of_two(count) for count in (0, 1, 2, 3, 64, 65)] == [1, 1, 2, 4, 64, 128]
-    assert power_of_two(3, least=16) == 16
 
 
 @pytest.mark.parametrize(("count", "sizes"), [(1, {1}), (5, {8}), (16, {16}), (23, {16})])
@@ -45,23 +31,21 @@ def test_many_lanes_are_worked_on_in_blocks_of_one_size(count: int, sizes: set[i
     assert found["x64"].dtype == np.float64
     assert set(seen) == sizes
     assert told == ([(23, 23)] if count == 23 else [])
+    assert power_of_two(count) == {1: 1, 5: 8, 16: 16, 23: 32}[count]
 
 
 @pytest.mark.parametrize("recompute", [False, True])
 def test_blocks_inside_a_program_have_values_and_both_derivatives(recompute: bool):  # noqa: FBT001
-    def total(values, *, whole):
+    def total(values, block):
         lanes = (values, jnp.stack([values, values**2], axis=1))
-        block = len(VALUES) if whole else 5
-        first, second = map_in_blocks(
-            lambda lane: (jnp.sin(lane[0]), lane[1] * 2.0), lanes, block=block, recompute=recompute
-        )
-        return jnp.sum(first * second[:, 1])
+        work = map_in_blocks(lambda one: (jnp.sin(one[0]), one[1] * 2.0), lanes, block=block, recompute=recompute)
+        return jnp.sum(work[0] * work[1][:, 1])
 
     expected = np.sum(2.0 * VALUES**2 * np.sin(VALUES))
     slope = 4.0 * VALUES * np.sin(VALUES) + 2.0 * VALUES**2 * np.cos(VALUES)
-    for whole in (True, False):
-        np.testing.assert_allclose(total(jnp.asarray(VALUES), whole=whole), expected, rtol=1e-14)
-        np.testing.assert_allclose(jax.grad(total)(jnp.asarray(VALUES), whole=whole), slope, rtol=1e-13)
+    for block in (len(VALUES), 5):
+        np.testing.assert_allclose(total(jnp.asarray(VALUES), block), expected, rtol=1e-14)
+        np.testing.assert_allclose(jax.grad(total)(jnp.asarray(VALUES), block), slope, rtol=1e-13)
 
 
 @pytest.mark.parametrize("block", [1, 4, 100])
@@ -103,15 +87,6 @@ def test_open_lanes_are_computed_again_whether_numbers_are_known_or_not():
     assert jax.grad(lambda factor: jnp.sum(both(factor)))(jnp.asarray(3.0)) == pytest.approx(20.0 + 21.0 + 22.0 + 23.0)
     nothing = again_for_the_open(careful, jnp.ones(3, bool), (jnp.asarray(1.0), jnp.ones(3)), {"found": jnp.ones(3)})
     np.testing.assert_array_equal(nothing["found"], 1.0)
-
-
-def test_a_function_of_one_lane_takes_shared_numbers_and_a_value_a_lane():
-    def of_one(both, value):
-        return both["shared"] * jnp.linspace(0.0, value, 3)[1] + both["own"]
-
-    both = {"shared": jnp.asarray(2.0), "own": jnp.arange(4.0)}
-    np.testing.assert_array_equal(for_each_lane(of_one, both, jnp.asarray(3.0)), 3.0 + np.arange(4.0))
-    assert for_each_lane(of_one, both | {"own": jnp.asarray(1.0)}, jnp.asarray(3.0)) == 4.0
 
 
 def coupled(x, p):

@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Junction, Phase, find_junction
+from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.contact.time_course import time_course
 from tests.reference_contact_forces import ContactParameters, constants, mp, static_force, viscous_force
 
@@ -39,17 +39,6 @@ def test_the_way_in_is_that_of_scipy_in_time():
     np.testing.assert_allclose(course.velocity_nm_per_us[inside], path.y[1], rtol=1e-7)
 
 
-def next_phase(junction: Junction, phase: Phase, gap: float) -> Phase:
-    """Return what follows from a phase of the paper's contact once the gap has moved."""
-    if phase == Phase.DRY:
-        return Phase.BRIDGE if gap <= 3.5 else Phase.DRY
-    if (phase == Phase.JUNCTION and gap < junction.breaks_gap_nm) or (
-        phase == Phase.BRIDGE and gap <= junction.forms_gap_nm
-    ):
-        return Phase.JUNCTION
-    return Phase.DRY if gap >= 4.7 else Phase.BRIDGE
-
-
 def test_force_is_the_rate_of_momentum_and_phases_follow_the_hysteresis():
     contact = Contact.paper()
     course = time_course(contact, 20.0, 2.0)
@@ -59,12 +48,19 @@ def test_force_is_the_rate_of_momentum_and_phases_follow_the_hysteresis():
         slope = np.gradient(course.velocity_nm_per_us[chosen], course.time_us[chosen])
         scale = np.abs(course.force_nn[chosen]).max()
         np.testing.assert_allclose(2.0 * slope[1:-1], course.force_nn[chosen][1:-1], rtol=0, atol=0.02 * scale)
-    junction = find_junction(contact)
-    phase = Phase.DRY
-    for gap, expected in zip(course.gap_nm, course.phase, strict=True):
-        phase = next_phase(junction, phase, gap)
+    junction, inwards = find_junction(contact), course.velocity_nm_per_us < 0.0
+    assert set(course.phase) == set(Phase)
+    for phase, way, low, high in (
+        (Phase.DRY, inwards, 3.5, np.inf),
+        (Phase.BRIDGE, inwards, float(junction.forms_gap_nm), 3.5),
+        (Phase.JUNCTION, inwards, -np.inf, float(junction.forms_gap_nm)),
+        (Phase.JUNCTION, ~inwards, -np.inf, float(junction.breaks_gap_nm)),
+        (Phase.BRIDGE, ~inwards, float(junction.breaks_gap_nm), 4.7),
+        (Phase.DRY, ~inwards, 4.7, np.inf),
+    ):
+        gap = course.gap_nm[(course.phase == phase) & way]
         # a point exactly on a threshold may count for either side
-        assert phase == expected or min(abs(gap - edge) for edge in (3.5, 4.7)) < 1e-9
+        assert np.all((gap >= low - 1e-9) & (gap <= high + 1e-9))
 
 
 @pytest.mark.parametrize(("changes", "last"), [({}, Phase.BRIDGE), ({"modulus_gpa": 1.0}, Phase.JUNCTION)])
