@@ -2,6 +2,7 @@
 
 import re
 import struct
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
 from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIONS, raw_curve, true_energy_aj
 from fitting.instruments.columns import parse_columns
-from fitting.instruments.curve import table_text
+from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
 from tests.instrument_files import asylum_ramp, gwyddion_bytes, nanonis_ramp, tapping_rows
@@ -147,7 +148,7 @@ def without_names(separator: str) -> str:
 
 
 RAMP = {"drive": "force"}
-GRAPH: dict[str, Any] = RAMP | {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0, "quality_factor": 200.0}
+GRAPH = RAMP | {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0, "quality_factor": 200.0}
 NUMBERS = {"columns": "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:deg"}
 
 
@@ -184,16 +185,15 @@ def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict,
 
 def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
     curve = read_curve(saved(tmp_path, asylum_ramp()), drive="force")
-    wanted = {
-        "spring_constant_n_per_m": (5.4, "N/m", "note: SpringConstant"),
-        "free_frequency_khz": (90.0, "kHz", "note: ThermalFrequency"),
-        "quality_factor": (200.0, "", "note: ThermalQ"),
-        "drive_frequency_khz": (90.0, "kHz", "note: DriveFrequency"),
-        "deflection_nm_per_volt": (110.0, "nm/V", "note: InvOLS"),
-        "nm_per_volt": (120.0, "nm/V", "note: AmpInvOLS"),
-        "free_amplitude_nm": (39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
-    }
-    for key, (value, unit, origin) in wanted.items():
+    for key, value, unit, origin in (
+        ("spring_constant_n_per_m", 5.4, "N/m", "note: SpringConstant"),
+        ("free_frequency_khz", 90.0, "kHz", "note: ThermalFrequency"),
+        ("quality_factor", 200.0, "", "note: ThermalQ"),
+        ("drive_frequency_khz", 90.0, "kHz", "note: DriveFrequency"),
+        ("deflection_nm_per_volt", 110.0, "nm/V", "note: InvOLS"),
+        ("nm_per_volt", 120.0, "nm/V", "note: AmpInvOLS"),
+        ("free_amplitude_nm", 39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
+    ):
         known = curve.known[key]
         assert (known.value, known.unit, known.origin) == (pytest.approx(value, rel=1e-12), unit, origin)
     assert curve.known["drive"].origin == "option --drive"
@@ -263,71 +263,73 @@ def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
     assert any("if one of the channels P is: --columns phase_lag_deg=CHANNEL:UNIT" in note for note in curve.notes)
 
 
-def test_the_zero_of_the_phase_is_that_of_the_free_rows(tmp_path: Path):
-    offset, amplitude, lag = tapping_rows()
-    path = saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": lag - 33.0}))
-    known: dict[str, Any] = {"drive_frequency_khz": 92.7, "free_frequency_khz": 90.0, "quality_factor": 200.0}
+OFFSET, AMPLITUDE, LAG = tapping_rows()
+NEAR = OFFSET > -38.0
+KNOWN: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "drive": "force"}
+
+
+@pytest.fixture
+def curve_of(tmp_path: Path) -> Callable[..., MeasuredCurve]:
+    """Return what reads the usual curve, some of its columns changed."""
+
+    def read(offset=OFFSET, amplitude=AMPLITUDE, phase=LAG, **options: Any) -> MeasuredCurve:
+        columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": phase}
+        return read_curve(saved(tmp_path, separated(columns)), **options)
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"amplitude": np.sqrt(0.5) * AMPLITUDE}, "an rms amplitude would"),
+        ({"amplitude": 2.0 * AMPLITUDE}, "a peak-to-peak amplitude would"),
+        ({"amplitude": 1.3 * AMPLITUDE}, "is off"),
+        ({"phase": -LAG, **KNOWN}, "Sign: the free tip"),
+        ({"phase": LAG - 90.0, **KNOWN}, "Zero: the free tip"),
+        ({"offset": -OFFSET}, "Direction: "),
+        # turned round by the caller they are what he says
+        ({"columns": "offset_nm=Z:-1"}, "the heights run the other way"),
+        ({"offset": OFFSET[NEAR], "amplitude": AMPLITUDE[NEAR], "phase": LAG[NEAR]}, "There is no flat free part"),
+    ],
+)
+def test_what_is_odd_is_said_and_mended_if_it_can_be(curve_of, changed: dict[str, Any], said: str):
+    curve = curve_of(**changed)
+    assert any(said in one for one in (*curve.notes, *curve.reasons)), curve.notes
+    if not curve.reasons:
+        np.testing.assert_allclose(given(curve.phase_lag_deg), LAG, atol=0.02)
+        np.testing.assert_allclose(np.diff(curve.offset_nm), np.diff(OFFSET), atol=1e-5)
+
+
+def test_the_zero_of_the_phase_is_that_of_the_free_rows(curve_of):
     ratio = 92.7 / 90.0
     gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
     for drive, wanted in (("force", np.angle(gamma)), ("base", np.angle(gamma / (1.0 - gamma)))):
-        curve = read_curve(path, drive=drive, curve=1, **known)
+        curve = curve_of(phase=LAG - 33.0, drive_frequency_khz=92.7, **(KNOWN | {"drive": drive}))
         assert np.median(given(curve.phase_lag_deg)[curve.free]) == pytest.approx(np.rad2deg(wanted), abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("factor", "said"),
-    [(np.sqrt(0.5), "an rms amplitude would"), (2.0, "a peak-to-peak amplitude would"), (1.3, "is off")],
-)
-def test_a_gain_that_is_off_shows_in_the_slope(tmp_path: Path, factor: float, said: str):
-    offset, amplitude, _ = tapping_rows()
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": factor * amplitude})))
-    assert any(said in note for note in curve.notes), curve.notes
-
-
-@pytest.mark.parametrize(
-    ("sign", "zero", "said"), [(-1.0, 0.0, "Sign: the free tip"), (1.0, -90.0, "Zero: the free tip")]
-)
-def test_sign_and_zero_of_the_phase_are_told_by_the_free_rows(tmp_path: Path, sign: float, zero: float, said: str):
-    offset, amplitude, lag = tapping_rows()
-    columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": sign * lag + zero}
-    known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "drive": "force"}
-    path = saved(tmp_path, separated(columns))
-    curve = read_curve(path, **known)
-    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=0.02)
-    assert any(note.startswith(said) for note in curve.notes)
-    # a sign that the caller gives stays
-    kept = read_curve(path, columns="phase_lag_deg=Phase:1", **known)
-    slope = np.polyfit(lag, given(kept.phase_lag_deg), 1)[0]
-    assert slope == pytest.approx(sign, abs=1e-3)
-
-
-def test_radians_that_are_taken_for_degrees_are_told_by_the_free_rows(tmp_path: Path):
-    offset, amplitude, lag = tapping_rows()
+def test_signs_and_units_of_the_phase_that_the_caller_gives_stay(curve_of):
     for sign in (1.0, -1.0):
-        columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": sign * np.deg2rad(lag)}
-        path = saved(tmp_path, separated(columns))
+        kept = curve_of(phase=sign * LAG, columns="phase_lag_deg=Phase:1", **KNOWN)
+        assert np.polyfit(LAG, given(kept.phase_lag_deg), 1)[0] == pytest.approx(sign, abs=1e-3)
         with pytest.raises(TableError, match=r"it is in radians; say --columns phase_lag_deg=CHANNEL:rad"):
-            read_curve(path, **GRAPH)
-    curve = read_curve(path, columns="phase_lag_deg=Phase:rad", **GRAPH)
-    assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(lag), rel=1e-4)
+            curve_of(phase=sign * np.deg2rad(LAG), **KNOWN)
+    curve = curve_of(phase=np.deg2rad(LAG), columns="phase_lag_deg=Phase:rad", **KNOWN)
+    assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(LAG), rel=1e-4)
 
 
-@pytest.mark.parametrize(("waver", "said"), [(0.03, 1), (0.0, 0)])
-def test_a_free_part_that_wavers_is_told(tmp_path: Path, waver: float, said: int):
+def test_a_free_part_that_wavers_is_told(curve_of):
     # as interference of the detector's light does: a period of 8 nm, amplitude 3 %, standard deviation 2.1 %
-    height, rng = np.linspace(0.0, 60.0, 400), np.random.default_rng(2)
-    amplitude = np.where(height > 50.0, 63.0 - height, 13.0 * (1.0 + waver * np.sin(2.0 * np.pi * height / 8.0)))
-    amplitude *= 1.0 + 0.002 * rng.normal(size=400)
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": height, "Amp (nm)": amplitude})))
-    notes = [note for note in curve.notes if note.startswith("Free part: ")]
-    assert len(notes) == said
-    if said:
-        share = re.search(r"wavers by ([\d.]+)%", notes[0])
-        assert share is not None
-        assert float(share[1]) == pytest.approx(2.1, abs=0.3)
+    height = np.linspace(0.0, 60.0, 400)
+    noise = 1.0 + 0.002 * np.random.default_rng(2).normal(size=400)
+    for waver, wanted in ((0.03, [pytest.approx(2.1, abs=0.3)]), (0.0, [])):
+        amplitude = np.where(height > 50.0, 63.0 - height, 13.0 * (1.0 + waver * np.sin(2.0 * np.pi * height / 8.0)))
+        notes = curve_of(height, amplitude * noise, 90.0 + 0.0 * height).notes
+        assert [float(share) for share in re.findall(r"Free part: .*wavers by ([\d.]+)%", "\n".join(notes))] == wanted
 
 
-def test_approach_and_retract_that_are_mixed_are_named(tmp_path: Path):
+def test_approach_and_retract_that_are_mixed_are_named(curve_of):
     made = raw_curve(400, drift=0.0)
     height, amplitude = made.height_nm[0], 42.0 * made.amplitude_v[0]
     order = np.argsort(height, kind="stable")
@@ -340,25 +342,11 @@ def test_approach_and_retract_that_are_mixed_are_named(tmp_path: Path):
         (*in_turn, "as where approach and retract are mixed"),
         (height, amplitude, ""),
     ):
-        curve = read_curve(saved(tmp_path, separated({"Z (nm)": heights, "Amp (nm)": amplitudes})))
+        curve = curve_of(heights, amplitudes, 90.0 + 0.0 * heights)
         assert set(curve.branch) == {"approach"}
         told = [note for note in curve.notes if "mixed" in note or "told apart" in note]
         assert any(said in note for note in told) == bool(said), told
         assert bool(told) == bool(said)
-
-
-def test_heights_that_run_the_other_way_are_turned_and_said(tmp_path: Path):
-    offset, amplitude, _ = tapping_rows()
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": -offset, "Amp (nm)": amplitude})))
-    assert (curve.reasons, set(curve.branch)) == ((), {"approach"})
-    assert any(note.startswith("Direction: ") for note in curve.notes)
-    np.testing.assert_allclose(np.diff(curve.offset_nm), np.diff(offset), atol=1e-5)
-    # turned round by the caller they are what he says
-    path = saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude}))
-    assert "the heights run the other way" in read_curve(path, columns="offset_nm=Z:-1").reasons[0]
-    near = offset > -38.0
-    path = saved(tmp_path, separated({"Z (nm)": offset[near], "Amp (nm)": amplitude[near]}))
-    assert "There is no flat free part" in read_curve(path).reasons[0]
 
 
 EIGHT = "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
@@ -426,11 +414,9 @@ def test_several_curves_of_one_file_in_metres_and_reversed(tmp_path: Path):
             np.testing.assert_allclose(given(curve.amplitude), NM_PER_VOLT * one.amplitude_v.ravel(), rtol=1e-6)
 
 
-def test_a_ramp_there_and_back_is_parted_where_it_turns(tmp_path: Path):
-    there, back = tapping_rows(), tapping_rows(80, retract=True)
-    offset, amplitude = (np.concatenate([there[k], back[k]]) for k in (0, 1))
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude})))
-    assert curve.branch.tolist() == ["approach"] * 120 + ["retract"] * 80
+def test_a_ramp_there_and_back_is_parted_where_it_turns(curve_of):
+    columns = (np.concatenate(both) for both in zip(tapping_rows(), tapping_rows(80, retract=True), strict=True))
+    assert curve_of(*columns).branch.tolist() == ["approach"] * 120 + ["retract"] * 80
 
 
 # ---- wrong and damaged files
