@@ -134,6 +134,10 @@ def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip():
     np.testing.assert_allclose(turned.energy, straight.energy, rtol=1e-12)
     np.testing.assert_allclose(turned.virial, straight.virial, rtol=1e-9)
     assert any(note.startswith("Sign: the free tip reads") for note in turned.notes)
+    known: dict[str, Any] = {key: value for key, value in LEVER.items() if key != "free_phase_deg"}
+    assumed = tapping_map((amplitude, -lag), **known)
+    np.testing.assert_allclose(assumed.energy, straight.energy, rtol=1e-9)
+    assert any(note.startswith("Phase: the free tip is taken to read") for note in assumed.notes)
 
 
 def nanosurf_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
@@ -221,7 +225,8 @@ def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tm
     assert theirs["/0/data/title"] == "Energy of a tap"
     assert theirs["/0/data"].xreal == pytest.approx(2e-6)
     stored = zarr.open_group(str(out / "map.zarr"), mode="r")["energy"]
-    for found in (np.load(out / "map.npz")["energy"], np.asarray(stored), 1e18 * theirs["/0/data"].data):
+    told = np.load(out / "map.npz")["energy"], np.asarray(stored), 1e18 * theirs["/0/data"].data
+    for found in (*told, tapping_map(path, **LEVER).energy):
         np.testing.assert_allclose(found, energy, rtol=2e-4)
     assert run(path, *CALL, "9").exit_code == 3
 
