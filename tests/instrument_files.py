@@ -20,6 +20,7 @@ def tapping_rows(points: int = 120, *, retract: bool = False) -> tuple[np.ndarra
 
 def igor_wave(columns: dict[str, np.ndarray], note: str, *, order: str = "<") -> bytes:
     """Return a binary wave of version 5 (WaveMetrics' Technical Note 003): a column or an image a channel, labelled."""
+    pytest.importorskip("igor2")
     table = np.stack(list(columns.values()), axis=-1)
     data = np.asfortranarray(table).astype(order + "f4").tobytes(order="F")
     labels = b"".join(name.encode().ljust(32, b"\0") for name in ("", *columns))

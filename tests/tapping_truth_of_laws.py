@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
+from scipy.optimize import brentq
 
 from fitting.tables.table import AmplitudeTable
 
@@ -70,35 +71,31 @@ def curve_of_law(tip: Tip, heights_nm: np.ndarray, rebound: Callable[[np.ndarray
     a, b, c, d = flown(period)
     matrix = np.array([[free * (1.0 - a), free * omega * b], [-free * c, free * omega * (d - 1.0)]])
 
-    def phase(u: np.ndarray, height: float) -> np.ndarray:
+    def phase(u: Any, height: float) -> np.ndarray:
         w = rebound(u)
         return np.linalg.solve(matrix, np.stack([(a - 1.0) * height + b * w, c * height + d * w + u]))
 
+    def off(u: Any, height: float) -> Any:
+        return np.sum(phase(u, height) ** 2, axis=0) - 1.0
+
     speeds = np.geomspace(1e-3, 4.0 * free * omega, 600)
     time = np.linspace(0.0, period, 400)[1:-1]
+    p, q, _, _ = flown(time)
     rows = []
     for height in heights_nm.tolist():
-        off = np.sum(phase(speeds, height) ** 2, axis=0) - 1.0
-        for i in np.flatnonzero(off[:-1] * off[1:] < 0.0)[::-1]:
-            low, high = speeds[i], speeds[i + 1]
-            for _ in range(50):
-                middle = np.sqrt(low * high)
-                same = (np.sum(phase(np.array(middle), height) ** 2) - 1.0) * off[i] > 0.0
-                low, high = (middle, high) if same else (low, middle)
-            u = np.array(np.sqrt(low * high))
+        signs = np.sign(off(speeds, height))
+        for i in np.flatnonzero(signs[:-1] * signs[1:] < 0.0)[::-1]:
+            u = brentq(off, speeds[i], speeds[i + 1], args=(height,), xtol=1e-14, rtol=1e-14)
             cosine, sine = phase(u, height)
             angle, w = np.arctan2(sine, cosine), float(rebound(u))
-            p, q, _, _ = flown(time)
             gap = p * (height + free * cosine) + q * (w - free * omega * sine) - height
             if np.min(gap - free * np.cos(omega * time + angle)) < -1e-6 * free:
                 continue
-            force = 2.0 * mass * (float(u) + w) / period * np.exp(-1j * angle)
+            force = 2.0 * mass * (u + w) / period * np.exp(-1j * angle)
             z = -free + force / (tip.stiffness * tip.gamma)
             seen = z if tip.drive == "force" else z + tip.gamma * free
             lag = np.degrees(np.angle(tip.gamma) - np.angle(-seen)) % 360.0
-            rows.append(
-                (height, abs(seen), lag, 0.5 * mass * (float(u) ** 2 - w**2), 0.5 * np.real(force * np.conj(z)))
-            )
+            rows.append((height, abs(seen), lag, 0.5 * mass * (u**2 - w**2), 0.5 * np.real(force * np.conj(z))))
             break
     return Truth(*np.array(rows).T)
 
@@ -219,12 +216,8 @@ def table_of(
     ahead = truth.height_nm.min() - tip.free_nm * np.linspace(0.5, 0.1, free_rows)
 
     def rows(way: Truth) -> list[np.ndarray]:
-        parts = (
-            (ahead, way.height_nm),
-            (np.full(free_rows, free), way.amplitude_nm),
-            (np.full(free_rows, lag), way.lag_deg),
-        )
-        return [np.concatenate(part) for part in parts]
+        at_first = (ahead, np.full(free_rows, free), np.full(free_rows, lag))
+        return [np.concatenate(part) for part in zip(at_first, way[:3], strict=True)]
 
     columns = rows(truth)
     if back is not None:
@@ -237,6 +230,7 @@ def table_of(
         for value, error in zip((tip.frequency_khz, tip.quality, tip.stiffness), stated[:3], strict=True)
     )
     read = amplitude * (1.0 + amplitude_drift * time) * (1.0 + stated.noise * rng.normal(size=len(height)))
+    read_lag = lags + 3.0 + phase_drift_deg * time + stated.phase_noise_deg * rng.normal(size=len(height))
     own: dict[str, Any] = {
         "drive": tip.drive,
         "drive_frequency_khz": tip.ratio * tip.frequency_khz * every,
@@ -244,7 +238,7 @@ def table_of(
         "offset_nm": height,
         "lockin_amplitude_nm": read,
         "lockin_amplitude_error_nm": stated.noise * amplitude,
-        "phase_lag_deg": lags + 3.0 + phase_drift_deg * time + stated.phase_noise_deg * rng.normal(size=len(height)),
+        "phase_lag_deg": read_lag,
         "phase_lag_error_deg": stated.phase_noise_deg * every,
         "free_frequency_khz": frequency,
         "free_frequency_error_khz": stated.frequency * frequency,

@@ -2,6 +2,8 @@
 
 import re
 import struct
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,12 @@ from click.testing import CliRunner
 import fitting.instruments.formats as formats_module
 from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
-from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, RawCurve, raw_curve, true_energy_aj
+from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIONS, raw_curve, true_energy_aj
 from fitting.instruments.columns import parse_columns
-from fitting.instruments.curve import table_text
+from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
-from fitting.instruments.lag import free_lag_deg
 from fitting.tables.table import parse_table
-from tests.instrument_files import asylum_ramp, gwyddion_bytes, igor_wave, nanonis_ramp, tapping_rows
+from tests.instrument_files import asylum_ramp, gwyddion_bytes, nanonis_ramp, tapping_rows
 from tests.strict_reading import strictly
 
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
@@ -55,18 +56,17 @@ def test_neasnom_text_is_read_completely():
     lines = NEASNOM.read_text("utf-8").split("\n")
     head = next(number for number, line in enumerate(lines) if line.startswith("Row"))
     names = lines[head].split("\t")
-    wanted = np.loadtxt(NEASNOM, skiprows=head + 1, usecols=range(len(names) - 1))
+    columns = np.loadtxt(NEASNOM, skiprows=head + 1, usecols=range(len(names) - 1), unpack=True)
+    wanted = dict(zip(names, columns, strict=False))
     curve = read_curve(NEASNOM)
-    assert len(curve.offset_nm) == len(wanted) == 200
-    np.testing.assert_allclose(given(curve.amplitude), wanted[:, names.index("M1A")], rtol=1e-15)
-    lag = np.rad2deg(np.unwrap(wanted[:, names.index("M1P")]))
-    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, rtol=1e-12)
+    assert len(curve.offset_nm) == 200
+    np.testing.assert_allclose(given(curve.amplitude), wanted["M1A"], rtol=1e-15)
+    np.testing.assert_allclose(given(curve.phase_lag_deg), np.rad2deg(np.unwrap(wanted["M1P"])), rtol=1e-12)
     # heights grow towards the tip, from an origin of their own
-    heights = 1e9 * wanted[:, names.index("Z")]
-    np.testing.assert_allclose(np.diff(curve.offset_nm), -np.diff(heights), atol=1e-10)
+    np.testing.assert_allclose(np.diff(curve.offset_nm), -1e9 * np.diff(wanted["Z"]), atol=1e-10)
     assert set(curve.branch) == {"retract"}
-    assert curve.number("drive_frequency_khz") == 264.13261
-    assert curve.known["drive_frequency_khz"].origin == "header: Tip Frequency:"
+    frequency = curve.known["drive_frequency_khz"]
+    assert (frequency.value, frequency.origin) == (264.13261, "header: Tip Frequency:")
     assert {"free_frequency_khz", "quality_factor", "spring_constant_n_per_m"} == set(curve.missing)
     # the amplitude falls by more than the height rises: its scale is off
     assert curve.slope == (pytest.approx(-1.37, abs=0.02), pytest.approx(0.018, abs=0.01))
@@ -76,18 +76,20 @@ def test_neasnom_text_is_read_completely():
     assert rescaled.number("free_amplitude_nm") == pytest.approx(56.4, abs=0.3)
 
 
-@pytest.mark.parametrize("path", [AMPLITUDES, FORCES])
-def test_wsxm_curves_are_read_completely(path: Path):
-    curves = read_curves(path)
+def test_wsxm_curves_are_read_completely():
+    curves = read_curves(AMPLITUDES)
     assert [(len(c.offset_nm), int(np.sum(c.branch == "approach"))) for c in curves] == [(1024, 512)] * 5
-    last = struct.unpack("<2048d", path.read_bytes()[-16384:])
-    recorded = read_recording(path).segments[-2:]
+    last = struct.unpack("<2048d", AMPLITUDES.read_bytes()[-16384:])
+    recorded = read_recording(AMPLITUDES).segments[-2:]
     pairs = np.concatenate([np.stack(list(segment.channels.values()), axis=1) for segment in recorded])
     np.testing.assert_array_equal(pairs.ravel(), last)
     heights = np.array(last[::2])
     assert curves[4].offset_nm - curves[4].offset_nm[0] == pytest.approx(heights - heights[0], abs=1e-12)
     known = {key: curves[0].number(key) for key in ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m")}
     assert known == {"free_frequency_khz": 89.7046, "quality_factor": 201.854, "spring_constant_n_per_m": 5.33904}
+    force = read_curves(FORCES)[0]
+    assert (force.amplitude, force.deflection_unit) == (None, "V")
+    assert given(force.deflection).min() == pytest.approx(-0.755, abs=1e-3)
 
 
 def test_wsxm_curves_whose_free_amplitude_jumps_are_refused_by_name():
@@ -100,19 +102,15 @@ def test_wsxm_curves_whose_free_amplitude_jumps_are_refused_by_name():
     assert any("inverted channel" in note for note in curves[0].notes)
     with pytest.raises(TableError, match=r"--nm-per-volt NM_PER_V\|slope"):
         table_text(curves[0])
-    force = read_curves(FORCES)[0]
-    assert force.amplitude is None
-    assert force.deflection is not None
-    assert (force.deflection_unit, float(force.deflection.min())) == ("V", pytest.approx(-0.755, abs=1e-3))
 
 
 def test_a_nanosurf_spectrum_is_what_their_own_package_reads():
     recording = read_recording(THERMAL)
     channels = recording.segments[0].channels
     assert {len(numbers) for numbers in channels.values()} == {8369}
-    assert recording.known["spring_constant_n_per_m"].value == 27.13
-    assert recording.known["quality_factor"].value == 442.0
-    assert recording.known["temperature_k"].value == pytest.approx(313.15)
+    known = {key: recording.known[key].value for key in ("spring_constant_n_per_m", "quality_factor", "temperature_k")}
+    wanted = {"spring_constant_n_per_m": 27.13, "quality_factor": 442.0, "temperature_k": pytest.approx(313.15)}
+    assert known == wanted
     np.testing.assert_allclose(channels["Frequency"], np.arange(8369) * 319214.0 / 8368.0, rtol=1e-14)
     with pytest.raises(TableError, match="holds a thermal spectrum"):
         read_curve(THERMAL)
@@ -138,60 +136,79 @@ def test_nanosurf_force_curves_are_what_their_own_package_reads():
 # ---- formats of which no real file is at hand
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_asylum_ramps_are_read_with_their_note(tmp_path: Path, order: str):
-    pytest.importorskip("igor2")
-    curve = read_curve(saved(tmp_path, asylum_ramp(order=order), "ramp.ibw"), drive="force")
+def with_units_in_names(sign: str, decimal: str) -> str:
     offset, amplitude, lag = tapping_rows()
-    assert [int(np.sum(curve.branch == name)) for name in ("approach", "retract")] == [120, 120]
-    # 32-bit numbers
-    np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, rtol=2e-7)
-    np.testing.assert_allclose(given(curve.phase_lag_deg)[:120], lag, atol=0.01)
+    return separated({"Z [um]": 1e-3 * offset, "Amp (nm)": amplitude, "Phase/rad": np.deg2rad(lag)}, sign, decimal)
+
+
+def with_words() -> str:
+    """Return approach and retract, told apart by a column of words."""
+    head, *rows = with_units_in_names(",", ".").splitlines()
+    lines = [f"{row},{word}" for word in ("approach", "retract") for row in rows]
+    return "\n".join([f"{head},Branch", *lines]) + "\n"
+
+
+def without_names(separator: str) -> str:
+    decimal = "." if separator.strip() == "," else ","
+    rows = zip(*tapping_rows(), strict=True)
+    return "".join(separator.join(f"{cell:.4f}".replace(".", decimal) for cell in row) + "\n" for row in rows)
+
+
+RAMP = {"drive": "force"}
+GRAPH = RAMP | {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0, "quality_factor": 200.0}
+NUMBERS = {"columns": "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:deg"}
+
+
+@pytest.mark.parametrize(
+    ("write", "options", "precision", "degrees"),
+    [
+        # 32-bit numbers
+        (partial(asylum_ramp, order="<"), RAMP, {"rtol": 2e-7}, 0.01),
+        (partial(asylum_ramp, order=">"), RAMP, {"rtol": 2e-7}, 0.01),
+        (gwyddion_bytes, GRAPH, {"rtol": 1e-12}, 0.01),
+        (nanonis_ramp, {}, {"rtol": 1e-9}, 1e-6),
+        (partial(with_units_in_names, ",", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
+        (partial(with_units_in_names, "\t", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
+        (partial(with_units_in_names, ";", ","), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
+        (partial(with_units_in_names, ";", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
+        (with_words, {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
+        # decimal commas are told from commas that separate
+        *(
+            (partial(without_names, sign), NUMBERS, {"rtol": 0.0, "atol": 1e-4}, 1e-4)
+            for sign in ("\t", ";", " ", ", ")
+        ),
+    ],
+)
+def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict, precision: dict, degrees: float):
+    offset, amplitude, lag = tapping_rows()
+    curve = read_curve(saved(tmp_path, write()), **options)
+    assert int(np.sum(curve.branch == "approach")) == 120
+    assert len(curve.branch) == (240 if options is RAMP or write in (nanonis_ramp, with_words) else 120)
+    np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, **precision)
+    np.testing.assert_allclose(given(curve.phase_lag_deg)[:120], lag, atol=degrees)
+    np.testing.assert_allclose(np.diff(curve.offset_nm[:120]), np.diff(offset), atol=1e-2)
+    # where the amplitude begins to fall the sample is one free amplitude below the rest position
     np.testing.assert_allclose(curve.offset_nm[:120], offset, atol=0.3)
-    wanted = {
-        "spring_constant_n_per_m": (5.4, "N/m", "note: SpringConstant"),
-        "free_frequency_khz": (90.0, "kHz", "note: ThermalFrequency"),
-        "quality_factor": (200.0, "", "note: ThermalQ"),
-        "drive_frequency_khz": (90.0, "kHz", "note: DriveFrequency"),
-        "deflection_nm_per_volt": (110.0, "nm/V", "note: InvOLS"),
-        "nm_per_volt": (120.0, "nm/V", "note: AmpInvOLS"),
-        "free_amplitude_nm": (39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
-    }
-    for key, (value, unit, origin) in wanted.items():
+
+
+def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
+    curve = read_curve(saved(tmp_path, asylum_ramp()), drive="force")
+    for key, value, unit, origin in (
+        ("spring_constant_n_per_m", 5.4, "N/m", "note: SpringConstant"),
+        ("free_frequency_khz", 90.0, "kHz", "note: ThermalFrequency"),
+        ("quality_factor", 200.0, "", "note: ThermalQ"),
+        ("drive_frequency_khz", 90.0, "kHz", "note: DriveFrequency"),
+        ("deflection_nm_per_volt", 110.0, "nm/V", "note: InvOLS"),
+        ("nm_per_volt", 120.0, "nm/V", "note: AmpInvOLS"),
+        ("free_amplitude_nm", 39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
+    ):
         known = curve.known[key]
         assert (known.value, known.unit, known.origin) == (pytest.approx(value, rel=1e-12), unit, origin)
-    assert curve.missing == ()
-
-
-def test_gwyddion_graphs_are_read(tmp_path: Path):
-    _, amplitude, lag = tapping_rows()
-    path = saved(tmp_path, gwyddion_bytes(), "curve.gwy")
-    curve = read_curve(path, drive_frequency_khz=90.0, free_frequency_khz=90.0, quality_factor=200.0, drive="force")
-    np.testing.assert_allclose(given(curve.amplitude), amplitude, rtol=1e-12)
-    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=0.01)
     assert curve.known["drive"].origin == "option --drive"
-
-
-def test_nanonis_ramps_are_read_both_ways(tmp_path: Path):
-    curve = read_curve(saved(tmp_path, nanonis_ramp()))
-    offset, amplitude, _ = tapping_rows()
-    assert [int(np.sum(curve.branch == name)) for name in ("approach", "retract")] == [120, 120]
-    np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, rtol=1e-9)
-    np.testing.assert_allclose(curve.offset_nm[:120], offset, atol=0.3)
-    assert curve.number("free_frequency_khz") == 90.0
-    assert any("grows away from the sample" in note for note in curve.notes)
-
-
-@pytest.mark.parametrize(("sign", "decimal"), [(",", "."), ("\t", "."), (";", ","), (";", ".")])
-def test_separated_text_with_units_in_the_names(tmp_path: Path, sign: str, decimal: str):
-    offset, amplitude, lag = tapping_rows()
-    columns = {"Z [um]": 1e-3 * offset, "Amp (nm)": amplitude, "Phase/rad": np.deg2rad(lag)}
-    curve = read_curve(saved(tmp_path, separated(columns, sign, decimal)))
-    np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-6)
-    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-4)
-    np.testing.assert_allclose(np.diff(curve.offset_nm), np.diff(offset), atol=1e-2)
-    # where the amplitude begins to fall the sample is one free amplitude below the rest position
-    assert curve.offset_nm[0] == pytest.approx(offset[0], abs=0.3)
+    assert curve.missing == ()
+    nanonis = read_curve(saved(tmp_path, nanonis_ramp()))
+    assert nanonis.number("free_frequency_khz") == 90.0
+    assert any("grows away from the sample" in note for note in nanonis.notes)
 
 
 def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
@@ -207,9 +224,9 @@ def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     # six decimals of hundredths
     np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
     np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-5)
-    assert "# tip_calibration = 1 +- 0.02\n" in table_text(
-        read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0), drive_frequency_khz=90.0, free_frequency_khz=90.0)
-    )
+    lever = {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0}
+    text = table_text(read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0), **lever))
+    assert "# tip_calibration = 1 +- 0.02\n" in text
 
 
 def test_names_of_channels_can_be_printed(tmp_path: Path):
@@ -218,19 +235,24 @@ def test_names_of_channels_can_be_printed(tmp_path: Path):
     assert read_recording(path).channels == ["offset_nm", r"'lockin_amplit\x1dude_nm'", "phase_lag_deg"]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("offset_nm", "is no COLUMN=CHANNEL"),
+def test_wrong_column_maps_are_named(tmp_path: Path):
+    for text, said in (
         ("height=Z", "there is no column `height`; it is one of offset_nm, lockin_amplitude_nm"),
         ("offset_nm=Z:V", "`V` is no unit of offset_nm; write one of m, mm, um, nm, pm"),
         ("offset_nm=Z:0", "is no COLUMN=CHANNEL"),
         ("offset_nm=Z:2:3", "is no COLUMN=CHANNEL"),
-    ],
-)
-def test_wrong_column_maps_are_named(text: str, said: str):
-    with pytest.raises(ValueError, match=said):
-        parse_columns(text)
+    ):
+        with pytest.raises(ValueError, match=said):
+            parse_columns(text)
+    path = saved(tmp_path, raw_curve(50).text)
+    one_and_two = "offset_nm=1/2:nm,lockin_amplitude_nm=5:V"
+    for options, said in (
+        ({"columns": one_and_two}, "=5 has one channel where other columns have OUT/BACK"),
+        ({"columns": "offset_nm=1/9:nm"}, "there is no channel `9`; it has 1, 2"),
+        ({}, re.escape("say --columns offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V")),
+    ):
+        with pytest.raises(TableError, match=said):
+            read_curves(path, **options)
 
 
 # ---- what the numbers say themselves
@@ -249,156 +271,101 @@ def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
     assert any("if one of the channels P is: --columns phase_lag_deg=CHANNEL:UNIT" in note for note in curve.notes)
 
 
-def test_the_zero_of_the_phase_is_that_of_the_free_rows(tmp_path: Path):
-    offset, amplitude, lag = tapping_rows()
-    path = saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": lag - 33.0}))
-    known: dict[str, Any] = {"drive_frequency_khz": 92.7, "free_frequency_khz": 90.0, "quality_factor": 200.0}
-    for drive in ("force", "base"):
-        ratio = 92.7 / 90.0
-        gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
-        wanted = np.angle(gamma) if drive == "force" else np.angle(gamma / (1.0 - gamma))
-        curve = read_curve(path, drive=drive, curve=1, **known)
+OFFSET, AMPLITUDE, LAG = tapping_rows()
+NEAR = OFFSET > -38.0
+KNOWN: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "drive": "force"}
+
+
+@pytest.fixture
+def curve_of(tmp_path: Path) -> Callable[..., MeasuredCurve]:
+    """Return what reads the usual curve, some of its columns changed."""
+
+    def read(offset=OFFSET, amplitude=AMPLITUDE, phase=LAG, **options: Any) -> MeasuredCurve:
+        columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": phase}
+        return read_curve(saved(tmp_path, separated(columns)), **options)
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"amplitude": np.sqrt(0.5) * AMPLITUDE}, "an rms amplitude would"),
+        ({"amplitude": 2.0 * AMPLITUDE}, "a peak-to-peak amplitude would"),
+        ({"amplitude": 1.3 * AMPLITUDE}, "is off"),
+        ({"phase": -LAG, **KNOWN}, "Sign: the free tip"),
+        ({"phase": LAG - 90.0, **KNOWN}, "Zero: the free tip"),
+        ({"offset": -OFFSET}, "Direction: "),
+        # turned round by the caller they are what he says
+        ({"columns": "offset_nm=Z:-1"}, "the heights run the other way"),
+        ({"offset": OFFSET[NEAR], "amplitude": AMPLITUDE[NEAR], "phase": LAG[NEAR]}, "There is no flat free part"),
+    ],
+)
+def test_what_is_odd_is_said_and_mended_if_it_can_be(curve_of, changed: dict[str, Any], said: str):
+    curve = curve_of(**changed)
+    assert any(said in one for one in (*curve.notes, *curve.reasons)), curve.notes
+    if not curve.reasons:
+        np.testing.assert_allclose(given(curve.phase_lag_deg), LAG, atol=0.02)
+        np.testing.assert_allclose(np.diff(curve.offset_nm), np.diff(OFFSET), atol=1e-5)
+
+
+def test_the_zero_of_the_phase_is_that_of_the_free_rows(curve_of):
+    ratio = 92.7 / 90.0
+    gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
+    for drive, wanted in (("force", np.angle(gamma)), ("base", np.angle(gamma / (1.0 - gamma)))):
+        curve = curve_of(phase=LAG - 33.0, drive_frequency_khz=92.7, **(KNOWN | {"drive": drive}))
         assert np.median(given(curve.phase_lag_deg)[curve.free]) == pytest.approx(np.rad2deg(wanted), abs=1e-9)
-    assert free_lag_deg("base", 1.0, 200.0) == pytest.approx(90.286, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("factor", "said"),
-    [(np.sqrt(0.5), "an rms amplitude would"), (2.0, "a peak-to-peak amplitude would"), (1.3, "is off")],
-)
-def test_a_gain_that_is_off_shows_in_the_slope(tmp_path: Path, factor: float, said: str):
-    offset, amplitude, _ = tapping_rows()
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": factor * amplitude})))
-    assert any(said in note for note in curve.notes), curve.notes
+def test_signs_and_units_of_the_phase_that_the_caller_gives_stay(curve_of):
+    for sign in (1.0, -1.0):
+        kept = curve_of(phase=sign * LAG, columns="phase_lag_deg=Phase:1", **KNOWN)
+        assert np.polyfit(LAG, given(kept.phase_lag_deg), 1)[0] == pytest.approx(sign, abs=1e-3)
+        with pytest.raises(TableError, match=r"it is in radians; say --columns phase_lag_deg=CHANNEL:rad"):
+            curve_of(phase=sign * np.deg2rad(LAG), **KNOWN)
+    curve = curve_of(phase=np.deg2rad(LAG), columns="phase_lag_deg=Phase:rad", **KNOWN)
+    assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(LAG), rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("sign", "zero", "said"), [(-1.0, 0.0, "Sign: the free tip"), (1.0, -90.0, "Zero: the free tip")]
-)
-def test_sign_and_zero_of_the_phase_are_told_by_the_free_rows(tmp_path: Path, sign: float, zero: float, said: str):
-    offset, amplitude, lag = tapping_rows()
-    columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": sign * lag + zero}
-    known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "drive": "force"}
-    path = saved(tmp_path, separated(columns))
-    curve = read_curve(path, **known)
-    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=0.02)
-    assert any(note.startswith(said) for note in curve.notes)
-    # a sign that the caller gives stays
-    kept = read_curve(path, columns="phase_lag_deg=Phase:1", **known)
-    slope = np.polyfit(lag, given(kept.phase_lag_deg), 1)[0]
-    assert slope == pytest.approx(sign, abs=1e-3)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_radians_that_are_taken_for_degrees_are_told_by_the_free_rows(tmp_path: Path, sign: float):
-    offset, amplitude, lag = tapping_rows()
-    columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": sign * np.deg2rad(lag)}
-    known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "drive": "force"}
-    path = saved(tmp_path, separated(columns))
-    with pytest.raises(TableError, match=r"it is in radians; say --columns phase_lag_deg=CHANNEL:rad"):
-        read_curve(path, **known)
-    curve = read_curve(path, columns="phase_lag_deg=Phase:rad", **known)
-    assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(lag), rel=1e-4)
-
-
-@pytest.mark.parametrize(("waver", "said"), [(0.03, 1), (0.0, 0)])
-def test_a_free_part_that_wavers_is_told(tmp_path: Path, waver: float, said: int):
+def test_a_free_part_that_wavers_is_told(curve_of):
     # as interference of the detector's light does: a period of 8 nm, amplitude 3 %, standard deviation 2.1 %
-    height, rng = np.linspace(0.0, 60.0, 400), np.random.default_rng(2)
-    amplitude = np.where(height > 50.0, 63.0 - height, 13.0 * (1.0 + waver * np.sin(2.0 * np.pi * height / 8.0)))
-    amplitude *= 1.0 + 0.002 * rng.normal(size=400)
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": height, "Amp (nm)": amplitude})))
-    notes = [note for note in curve.notes if note.startswith("Free part: ")]
-    assert len(notes) == said
-    if said:
-        share = re.search(r"wavers by ([\d.]+)%", notes[0])
-        assert share is not None
-        assert float(share[1]) == pytest.approx(2.1, abs=0.3)
+    height = np.linspace(0.0, 60.0, 400)
+    noise = 1.0 + 0.002 * np.random.default_rng(2).normal(size=400)
+    for waver, wanted in ((0.03, [pytest.approx(2.1, abs=0.3)]), (0.0, [])):
+        amplitude = np.where(height > 50.0, 63.0 - height, 13.0 * (1.0 + waver * np.sin(2.0 * np.pi * height / 8.0)))
+        notes = curve_of(height, amplitude * noise, 90.0 + 0.0 * height).notes
+        assert [float(share) for share in re.findall(r"Free part: .*wavers by ([\d.]+)%", "\n".join(notes))] == wanted
 
 
-def test_slope_and_free_amplitude_of_a_curve_with_an_attractive_plateau(tmp_path: Path):
-    made = raw_curve(1200)
-    columns = {
-        "Z (nm)": made.height_nm.ravel(),
-        "Amp (V)": made.amplitude_v.ravel(),
-        "Phase (deg)": made.phase_deg.ravel(),
-    }
-    columns["branch"] = np.repeat([0.0, 1.0], 1200)
-    text = separated(columns).replace(",0.000000\n", ",approach\n").replace(",1.000000\n", ",retract\n")
-    curve = read_curve(saved(tmp_path, text), nm_per_volt="slope")
-    scale = curve.known["nm_per_volt"]
-    assert scale.error is not None
-    # through all rows in contact it would be 150 nm/V
-    assert abs(float(scale.value) - NM_PER_VOLT) < 3.0 * scale.error < 5.0
-    assert re.search(r"steepest settled part \(\d+ rows of the approach from 4[12]", scale.origin)
-    free = curve.number("free_amplitude_nm")
-    assert free is not None
-    assert free / float(scale.value) == pytest.approx(FREE_NM / NM_PER_VOLT, rel=1.5e-3)
-
-
-def test_approach_and_retract_that_are_mixed_are_named(tmp_path: Path):
+def test_approach_and_retract_that_are_mixed_are_named(curve_of):
     made = raw_curve(400, drift=0.0)
-    order = np.random.default_rng(2).permutation(400)
-    columns = {"Z (nm)": made.height_nm[0][order], "Amp (nm)": 42.0 * made.amplitude_v[0][order]}
-    curve = read_curve(saved(tmp_path, separated(columns)))
-    assert set(curve.branch) == {"approach"}
-    assert any("approach and retract cannot be told apart" in note for note in curve.notes)
+    height, amplitude = made.height_nm[0], 42.0 * made.amplitude_v[0]
+    order = np.argsort(height, kind="stable")
+    back = np.interp(height + 1.0, height[order], amplitude[order])
+    shuffled = np.random.default_rng(2).permutation(400)
     # rows of two branches in turn, 1 nm apart in contact
-    there, back = (
-        42.0 * made.amplitude_v[0],
-        np.interp(made.height_nm[0] + 1.0, np.sort(made.height_nm[0]), there_sorted(made)),
-    )
-    heights = np.repeat(made.height_nm[0], 2)
-    both = np.stack([there, back], axis=1).ravel()
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": heights, "Amp (nm)": both})))
-    assert any("as where approach and retract are mixed" in note for note in curve.notes)
-    plain = read_curve(saved(tmp_path, separated({"Z (nm)": made.height_nm[0], "Amp (nm)": there})))
-    assert not any("mixed" in note or "told apart" in note for note in plain.notes)
-
-
-def there_sorted(made: RawCurve) -> np.ndarray:
-    return 42.0 * made.amplitude_v[0][np.argsort(made.height_nm[0], kind="stable")]
-
-
-def test_a_curve_without_a_free_part_is_refused(tmp_path: Path):
-    offset, amplitude, _ = tapping_rows()
-    near = offset > -38.0
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset[near], "Amp (nm)": amplitude[near]})))
-    assert "There is no flat free part" in curve.reasons[0]
-
-
-def test_heights_that_run_the_other_way_are_turned_and_said(tmp_path: Path):
-    offset, amplitude, _ = tapping_rows()
-    path = saved(tmp_path, separated({"Z (nm)": -offset, "Amp (nm)": amplitude}))
-    curve = read_curve(path)
-    assert (curve.reasons, set(curve.branch)) == ((), {"approach"})
-    assert any(note.startswith("Direction: ") for note in curve.notes)
-    np.testing.assert_allclose(np.diff(curve.offset_nm), np.diff(offset), atol=1e-5)
-    # turned round by the caller they are what he says
-    path = saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude}))
-    assert "the heights run the other way" in read_curve(path, columns="offset_nm=Z:-1").reasons[0]
+    in_turn = np.repeat(height, 2), np.stack([amplitude, back], axis=1).ravel()
+    for heights, amplitudes, said in (
+        (height[shuffled], amplitude[shuffled], "approach and retract cannot be told apart"),
+        (*in_turn, "as where approach and retract are mixed"),
+        (height, amplitude, ""),
+    ):
+        curve = curve_of(heights, amplitudes, 90.0 + 0.0 * heights)
+        assert set(curve.branch) == {"approach"}
+        told = [note for note in curve.notes if "mixed" in note or "told apart" in note]
+        assert any(said in note for note in told) == bool(said), told
+        assert bool(told) == bool(said)
 
 
 EIGHT = "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
 LEVER: dict[str, Any] = {"quality_factor": (230.0, 5.0), "free_frequency_khz": (344.6, 0.01), "drive": "force"}
-
-
-@pytest.mark.parametrize("separator", ["\t", ";", " ", ", "])
-def test_decimal_commas_are_told_from_commas_that_separate(tmp_path: Path, separator: str):
-    offset, amplitude, lag = tapping_rows()
-    comma = separator.strip() != ","
-    lines = [separator.join(f"{value:.4f}" for value in row) for row in zip(offset, amplitude, lag, strict=True)]
-    text = "\n".join(line.replace(".", ",") if comma else line for line in lines)
-    columns = "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:deg"
-    curve = read_curve(saved(tmp_path, text + "\n"), columns=columns)
-    np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
-    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-4)
+LEVER |= {"nm_per_volt": NM_PER_VOLT}
 
 
 def test_eight_columns_without_a_head_become_bins_with_the_scatter_in_them(tmp_path: Path):
     made = raw_curve(1200, drift=0.0)
     path = saved(tmp_path, made.text)
-    (curve,) = read_curves(path, columns=EIGHT, nm_per_volt=NM_PER_VOLT, **LEVER)
+    (curve,) = read_curves(path, columns=EIGHT, **LEVER)
     assert [int(np.sum(curve.branch == name)) for name in ("approach", "retract")] == [1200, 1200]
     assert curve.known["drive_frequency_khz"].origin.startswith("assumed: on resonance")
     assert curve.bin_nm == pytest.approx(43.3 / 200.0, rel=0.01)
@@ -424,11 +391,11 @@ def test_eight_columns_without_a_head_become_bins_with_the_scatter_in_them(tmp_p
 def test_bins_of_a_width_asked_for_and_of_equal_heights(tmp_path: Path):
     made = raw_curve(1200)
     path = saved(tmp_path, made.text)
-    (curve,) = read_curves(path, columns=EIGHT, nm_per_volt=NM_PER_VOLT, bin_nm=1.0, **LEVER)
+    (curve,) = read_curves(path, columns=EIGHT, bin_nm=1.0, **LEVER)
     table = parse_table(table_text(curve), "bins")
     assert 86 <= table.rows <= 90
     assert np.all(np.diff(table.offset_nm[:43]) > 0.5)
-    (curve,) = read_curves(path, columns=EIGHT, nm_per_volt=NM_PER_VOLT, bin_nm=0.0, amplitude_error_nm=0.03, **LEVER)
+    (curve,) = read_curves(path, columns=EIGHT, bin_nm=0.0, amplitude_error_nm=0.03, **LEVER)
     table = parse_table(table_text(curve), "merged")
     assert table.rows == sum(len(np.unique(heights)) for heights in made.height_nm)
     _, counts = np.unique(made.height_nm[0], return_counts=True)
@@ -438,46 +405,26 @@ def test_bins_of_a_width_asked_for_and_of_equal_heights(tmp_path: Path):
         read_curves(path, columns=EIGHT, bin_nm=-1.0)
 
 
-@pytest.mark.parametrize("layout", ["side by side", "one below the other"])
-def test_several_curves_of_one_file_in_metres_and_reversed(tmp_path: Path, layout: str):
+def test_several_curves_of_one_file_in_metres_and_reversed(tmp_path: Path):
     made = [raw_curve(300, seed=seed) for seed in (1, 2)]
-    if layout == "side by side":
-        blocks = [[*(-1e-9 * m.height_nm), *m.deflection_v, *m.amplitude_v, *m.phase_deg] for m in made]
-        rows = np.concatenate(blocks).T
-        text = "\n".join(" ".join(f"{cell:.9g}" for cell in row) for row in rows)
-        columns = EIGHT.replace("1/2:nm", "1/2:m")
-    else:
-        rows = np.concatenate(
-            [np.stack([-1e-9 * m.height_nm.ravel(), m.amplitude_v.ravel(), m.phase_deg.ravel()], 1) for m in made]
-        )
-        text = "\n".join(";".join(f"{cell:.9g}" for cell in row) for row in rows)
-        columns = "offset_nm=1:m,lockin_amplitude_nm=2:V,phase_lag_deg=3:deg"
-    curves = read_curves(saved(tmp_path, text + "\n"), columns=columns, nm_per_volt=NM_PER_VOLT, **LEVER)
-    assert [curve.curve for curve in curves] == [1, 2]
-    for curve, one in zip(curves, made, strict=True):
-        approach = curve.branch == "approach"
-        assert abs(int(np.sum(approach)) - 300) <= 2
-        assert any(note.startswith("Direction: ") for note in curve.notes)
-        rise = np.diff(curve.offset_nm[:300])
-        np.testing.assert_allclose(rise, np.diff(one.height_nm[0]), atol=1e-6)
-        np.testing.assert_allclose(given(curve.amplitude), NM_PER_VOLT * one.amplitude_v.ravel(), rtol=1e-6)
+    blocks = [[*(-1e-9 * m.height_nm), *m.deflection_v, *m.amplitude_v, *m.phase_deg] for m in made]
+    side_by_side = np.concatenate(blocks).T, EIGHT.replace("1/2:nm", "1/2:m")
+    below = [np.stack([-1e-9 * m.height_nm.ravel(), m.amplitude_v.ravel(), m.phase_deg.ravel()], 1) for m in made]
+    one_below_the_other = np.concatenate(below), "offset_nm=1:m,lockin_amplitude_nm=2:V,phase_lag_deg=3:deg"
+    for rows, columns in (side_by_side, one_below_the_other):
+        np.savetxt(tmp_path / "curve.dat", rows, fmt="%.9g", delimiter=";")
+        curves = read_curves(tmp_path / "curve.dat", columns=columns, **LEVER)
+        assert [curve.curve for curve in curves] == [1, 2]
+        for curve, one in zip(curves, made, strict=True):
+            assert abs(int(np.sum(curve.branch == "approach")) - 300) <= 2
+            assert any(note.startswith("Direction: ") for note in curve.notes)
+            np.testing.assert_allclose(np.diff(curve.offset_nm[:300]), np.diff(one.height_nm[0]), atol=1e-6)
+            np.testing.assert_allclose(given(curve.amplitude), NM_PER_VOLT * one.amplitude_v.ravel(), rtol=1e-6)
 
 
-def test_two_channels_for_one_column_and_one_for_another_are_named(tmp_path: Path):
-    path = saved(tmp_path, raw_curve(50).text)
-    with pytest.raises(TableError, match="lockin_amplitude_nm=5 has one channel where other columns have OUT/BACK"):
-        read_curves(path, columns="offset_nm=1/2:nm,lockin_amplitude_nm=5:V")
-    with pytest.raises(TableError, match="there is no channel `9`; it has 1, 2"):
-        read_curves(path, columns="offset_nm=1/9:nm")
-    with pytest.raises(TableError, match=re.escape("say --columns offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V")):
-        read_curves(path)
-
-
-def test_a_ramp_there_and_back_is_parted_where_it_turns(tmp_path: Path):
-    there, back = tapping_rows(), tapping_rows(80, retract=True)
-    offset, amplitude = (np.concatenate([there[k], back[k]]) for k in (0, 1))
-    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude})))
-    assert curve.branch.tolist() == ["approach"] * 120 + ["retract"] * 80
+def test_a_ramp_there_and_back_is_parted_where_it_turns(curve_of):
+    columns = (np.concatenate(both) for both in zip(tapping_rows(), tapping_rows(80, retract=True), strict=True))
+    assert curve_of(*columns).branch.tolist() == ["approach"] * 120 + ["retract"] * 80
 
 
 # ---- wrong and damaged files
@@ -488,10 +435,8 @@ def test_what_reads_a_format_is_named_where_it_is_missing(tmp_path: Path, monkey
         raise ModuleNotFoundError(name=name)
 
     monkeypatch.setattr(formats_module, "import_module", missing)
-    with pytest.raises(
-        TableError, match=r"read by the package igor2; install it with: pip install 'afm-jax\[instruments\]'"
-    ):
-        read_curves(saved(tmp_path, asylum_ramp(), "ramp.ibw"))
+    with pytest.raises(TableError, match=r"the package igor2; install it with: pip install 'afm-jax\[instruments\]'"):
+        read_curves(saved(tmp_path, asylum_ramp()))
 
 
 def damaged(data: bytes, random: np.random.Generator) -> bytes:
@@ -505,23 +450,25 @@ def damaged(data: bytes, random: np.random.Generator) -> bytes:
     return bytes(flipped)
 
 
-@pytest.mark.parametrize("kind", ["neasnom", "wsxm", "nid", "ibw", "gwy", "nanonis", "csv"])
-def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, kind: str, capfd: pytest.CaptureFixture[str]):
-    random = np.random.default_rng(20260)
-    offset, amplitude, lag = tapping_rows()
-    whole = {
-        "neasnom": NEASNOM.read_bytes,
-        "wsxm": AMPLITUDES.read_bytes,
-        "nid": THERMAL.read_bytes,
-        "ibw": asylum_ramp,
-        "gwy": gwyddion_bytes,
-        "nanonis": lambda: nanonis_ramp().encode(),
-        "csv": lambda: separated({"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": lag}, ";").encode(),
-    }[kind]()
+@pytest.mark.parametrize(
+    "whole",
+    [
+        *(NEASNOM.read_bytes, AMPLITUDES.read_bytes, THERMAL.read_bytes, asylum_ramp, gwyddion_bytes),
+        lambda: nanonis_ramp().encode(),
+        lambda: with_units_in_names(";", ".").encode(),
+    ],
+)
+def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, whole, capfd: pytest.CaptureFixture[str]):
+    random, data = np.random.default_rng(20260), whole()
     for _ in range(40):
-        path = saved(tmp_path, damaged(whole, random), f"curve.{kind}")
-        fault = fault_of(path)
+        path = saved(tmp_path, damaged(data, random))
+        fault, curves = "", []
+        try:
+            curves = read_curves(path)
+        except TableError as error:
+            fault = str(error)
         assert not fault or (str(path) in fault and "\n" not in fault)
+        assert all(np.all(np.isfinite(curve.offset_nm)) for curve in curves)
     assert capfd.readouterr() == ("", "")
 
 
@@ -530,16 +477,6 @@ def test_a_gwyddion_file_without_the_end_of_a_text_is_refused_at_once(tmp_path: 
     data = gwyddion_bytes().replace(b"unitstr\0sm\0y_unit", b"unitstr\0sm@y_unit")
     with pytest.raises(TableError, match=r"a text at byte \d+ does not end"):
         read_curves(saved(tmp_path, data, "curve.gwy"))
-
-
-def fault_of(path: Path) -> str:
-    """Return the message of a file that is refused; of one that is read its numbers are checked."""
-    try:
-        curves = read_curves(path)
-    except TableError as error:
-        return str(error)
-    assert all(np.all(np.isfinite(curve.offset_nm)) for curve in curves)
-    return ""
 
 
 # ---- the command
@@ -553,23 +490,14 @@ def test_the_command_asks_for_what_is_missing_and_writes_the_table(tmp_path: Pat
     numbers = ["--free-frequency-khz", "264 +- 0.05", "--quality-factor", "500", "--spring-constant", "40 +- 4"]
     result = run(NEASNOM, "--out", out, "--drive", "force", *numbers)
     assert result.exit_code == 0, result.stderr
-    lines = out.read_text("utf-8").splitlines()
-    assert lines[:4] == [
-        "# drive = force",
-        "# free_frequency_khz = 264.0 +- 0.05",
-        "# quality_factor = 500.0",
-        "# spring_constant_n_per_m = 40.0 +- 4.0",
-    ]
-    head = next(line for line in lines if not line.startswith("#")).split(",")
-    assert {"drive_frequency_khz", "free_amplitude_nm", "offset_nm", "lockin_amplitude_nm", "phase_lag_deg"} <= set(
-        head
-    )
-    rows = [line.split(",") for line in lines if line[0] in "0123456789"]
-    assert len(rows) == 200
-    assert float(rows[0][head.index("lockin_amplitude_nm")]) == 70.7583
-    table = read_table(out)
-    np.testing.assert_array_equal(table.offset_nm, [float(row[head.index("offset_nm")]) for row in rows])
-    assert (table.free_frequency_khz, table.quality_factor) == (264.0, 500.0)
+    curve, table = read_curve(NEASNOM), read_table(out)
+    assert (table.drive, table.free_frequency_khz, table.free_frequency_error_khz) == ("force", 264.0, 0.05)
+    assert (table.quality_factor, table.spring_constant_n_per_m) == (500.0, 40.0)
+    assert table.spring_constant_error_n_per_m == 4.0
+    assert table.rows == 200
+    np.testing.assert_allclose(given(table.lockin_amplitude_nm), given(curve.amplitude), rtol=1e-5)
+    np.testing.assert_allclose(np.diff(table.offset_nm), np.diff(curve.offset_nm), atol=1e-3)
+    np.testing.assert_array_equal(table.drive_frequency_khz, 264.13261)
 
 
 def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp_path: Path):
@@ -577,10 +505,8 @@ def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp
     assert result.exit_code == 3
     assert "refused curve 2, 3, 4" in result.stderr
     answer = strictly(result.stdout)
-    assert (answer["format"], [curve["valid"] for curve in answer["curves"]]) == (
-        "afm-jax read",
-        [True, False, False, False, True],
-    )
+    assert answer["format"] == "afm-jax read"
+    assert [curve["valid"] for curve in answer["curves"]] == [True, False, False, False, True]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["wsxm_1.csv", "wsxm_5.csv"]
     # the amplitude in contact is an offset of the detector, in part below zero
     assert "rows whose amplitude is not above zero" in (tmp_path / "wsxm_1.csv").read_text("utf-8")
@@ -588,13 +514,6 @@ def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp
     assert set(given(read_table(tmp_path / "wsxm_1.csv").retract)) == {0.0, 1.0}
     assert run(AMPLITUDES, "--curve", 1).exit_code == 0
     assert run(AMPLITUDES, "--curve", 9).exit_code == 2
-
-
-def test_a_wave_that_is_no_ramp_is_named(tmp_path: Path):
-    pytest.importorskip("igor2")
-    data = igor_wave({"Amp": np.ones(8)}, "")
-    with pytest.raises(TableError, match="no height among the channels Amp"):
-        read_curve(saved(tmp_path, data, "one.ibw"))
 
 
 def test_rows_exactly_on_a_line_have_a_slope(tmp_path: Path):
@@ -631,24 +550,23 @@ def test_the_example_is_a_simulated_raw_file_with_the_defects_of_real_ones():
     np.testing.assert_allclose(columns[0:2], made.height_nm, atol=0.006)
     np.testing.assert_allclose(columns[4:6], made.amplitude_v, atol=6e-6)
     np.testing.assert_allclose(columns[6:8], made.phase_deg, atol=0.006)
-    # volts, repeated and unordered heights, a free amplitude that drifts and a phase with a zero of its own
-    assert 0.2 < columns[4].max() < 0.4
-    assert len(np.unique(columns[0])) < 900 < len(columns[0])
-    assert np.any(np.diff(columns[0]) < 0.0)
-    far = [np.mean(columns[4][:300]), np.mean(columns[5][-300:])]
-    assert far[1] / far[0] - 1.0 == pytest.approx(0.0007, abs=2e-4)
     # a zero of 12.3 degrees, and a lag of 89.7 at 344.6 kHz beside the resonance at 344.604
     assert np.mean(columns[6][:300]) == pytest.approx(102.0, abs=0.1)
+
+
+def test_the_example_gives_the_scale_and_the_energies_that_it_was_made_with():
+    scale = read_curve(EXAMPLE, **OPTIONS).known["nm_per_volt"]
+    assert scale.error is not None
+    # through all rows in contact it would be 150 nm/V
+    assert abs(float(scale.value) - NM_PER_VOLT) < 3.0 * scale.error < 5.0
     answer = CliRunner().invoke(main, ["tapping", "--example", "--no-law", "--json"])
     payload = strictly(answer.stdout)
-    assert answer.exit_code == 0
-    assert payload["valid"]
-    # the energies it was made with
+    assert (answer.exit_code, payload["valid"]) == (0, True)
     for branch in payload["branches"]:
-        curve = branch["curve"]
-        true = true_energy_aj(np.array(curve["amplitude_ratio"]), back=branch["branch"] == "retract")
-        error = (np.array(curve["energy_high_aj"]) - np.array(curve["energy_low_aj"])) / 3.92
-        assert np.all(np.abs(np.array(curve["energy_aj"]) - true) < 3.0 * error)
+        curve = {name: np.array(column) for name, column in branch["curve"].items()}
+        true = true_energy_aj(curve["amplitude_ratio"], back=branch["branch"] == "retract")
+        error = (curve["energy_high_aj"] - curve["energy_low_aj"]) / 3.92
+        assert np.all(np.abs(curve["energy_aj"] - true) < 3.0 * error)
     told = " ".join(payload["notes"])
     assert "The example is simulated; as if it were measured: afm-jax tapping " in told
     assert "slope of the steepest settled part" in told

@@ -1,5 +1,7 @@
 """Readings of traces, compared with closed forms, orbits of the law, and the scatter over seeds of the noise."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -25,9 +27,12 @@ SEEDS = 40
 def phase_apart(result: LockinResult, wanted_deg: float) -> float:
     """Return the phase's difference from the one wanted, modulo 360/N, in degrees."""
     assert result.phase_deg is not None
-    assert result.order is not None
-    turn = 360.0 / result.order
+    turn = 360.0 / (result.order or np.nan)
     return float(np.mod(result.phase_deg - wanted_deg + turn / 2.0, turn) - turn / 2.0)
+
+
+def noisy(height: np.ndarray, noise: float, seed: int = 1) -> np.ndarray:
+    return height + noise * np.random.default_rng(seed).standard_normal(height.size)
 
 
 def test_harmonics_are_those_of_least_squares():
@@ -40,10 +45,9 @@ def test_harmonics_are_those_of_least_squares():
     # well-conditioned normal equations of 300 numbers of order 1
     np.testing.assert_allclose(found.coefficients, wanted[5:], rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(found(angle), (design @ wanted).real, rtol=0.0, atol=1e-11)
-    weights = found.weights(angle)
-    np.testing.assert_allclose(weights @ height, wanted[6], rtol=0.0, atol=1e-12)
-    third = fit_harmonics(angle, height, 5, 3).weights(angle)
-    np.testing.assert_allclose(third @ height, wanted[8], rtol=0.0, atol=1e-12)
+    for harmonic in (1, 3):
+        weights = fit_harmonics(angle, height, 5, harmonic).weights(angle)
+        np.testing.assert_allclose(weights @ height, wanted[5 + harmonic], rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2, 5])
@@ -68,16 +72,14 @@ def test_orbits_of_the_law_with_damping_and_delay(reduced: float, order: int):
     drive = float(scene.platform.frequency_khz)
     time = np.arange(0.0, 120.0 * 1e3 / drive, 1.0 / 9.1)
     height, row = orbit_heights(scene, order, time)
-    noise = 0.2 * np.random.default_rng(order).standard_normal(time.size)
-    trace = trace_of(height + noise, rate=9.1, drive_khz=drive, quality_factor=40.0, offset_nm=-1.0)
+    trace = trace_of(noisy(height, 0.2, order), rate=9.1, drive_khz=drive, quality_factor=40.0, offset_nm=-1.0)
     result = lockin(trace)
     assert result.steady, result.verdict
     assert result.order == order
-    for name in ("peak_amplitude_nm", "lockin_amplitude_nm"):
-        error = getattr(result, name.replace("_nm", "_error_nm"))
+    for name in ("peak_amplitude", "lockin_amplitude"):
+        error = getattr(result, f"{name}_error_nm")
         # four standard errors, which are below 0.1 %
-        assert abs(getattr(result, name) - row[name]) < 4.0 * error
-        assert error < 1e-3 * row[name]
+        assert abs(getattr(result, f"{name}_nm") - row[f"{name}_nm"]) < 4.0 * error < 4e-3 * row[f"{name}_nm"]
     assert result.phase_error_deg is not None
     assert abs(phase_apart(result, row["lockin_phase_deg"])) < 4.0 * result.phase_error_deg
     # what any lock-in reads, whatever the order
@@ -102,10 +104,9 @@ def test_errors_are_the_scatter_over_seeds(periods: float, memory: float):
         trace, value = noisy_bounce(seed, periods=periods, memory=memory)
         result = lockin(trace)
         assert result.steady, result.verdict
-        truths = ((result.peak_amplitude_nm, 70.0, result.peak_amplitude_error_nm),)
-        truths += ((result.lockin_amplitude_nm, abs(value), result.lockin_amplitude_error_nm),)
-        truths += ((phase_apart(result, float(np.degrees(np.angle(value)))), 0.0, result.phase_error_deg),)
-        pulls.append([(found - truth) / error for found, truth, error in truths])  # type: ignore[operator]
+        found = (result.peak_amplitude_nm, result.lockin_amplitude_nm, phase_apart(result, np.degrees(np.angle(value))))
+        errors = (result.peak_amplitude_error_nm, result.lockin_amplitude_error_nm, result.phase_error_deg)
+        pulls.append((np.array(found) - (70.0, abs(value), 0.0)) / np.array(errors))
     spread = np.std(pulls, axis=0)
     # 40 seeds give the scatter to 11 %; errors from few periods scatter themselves, and sampling adds to them
     assert np.all(spread > 0.7)
@@ -137,79 +138,47 @@ def test_motions_of_the_law_are_told_apart(
     assert (result.peak_amplitude_nm is None) == (kind is TraceKind.NOT_PERIODIC)
 
 
-def made(shape: str, time: np.ndarray, drive: float) -> np.ndarray:
-    """Return heights of a motion that is no steady orbit."""
-    height, _ = bounce(time, order=1, drive_khz=drive)
-    return {
-        "stuck": 4.0 * np.cos(2e-3 * np.pi * drive * time) - 1.0,
-        "small sine": 0.4 * np.cos(2e-3 * np.pi * drive * time),
-        "nothing": 0.0 * time,
-        "growing": height * (1.0 + 0.05 * time / time[-1]),
-        "lifted": height + 2.0 * time / time[-1],
-        "alternating": height * (1.0 + 0.01 * (-1.0) ** np.floor((time - 1.3) * drive / 1e3 + 0.5)),
-        "turned": -height,
-    }[shape]
-
-
-@pytest.mark.parametrize(
-    ("shape", "kind"),
-    [
-        ("stuck", TraceKind.STUCK),
-        ("small sine", TraceKind.NO_IMPACT),
-        ("nothing", TraceKind.NO_RESPONSE),
-        ("growing", TraceKind.DRIFTING),
-        ("lifted", TraceKind.DRIFTING),
-        ("alternating", TraceKind.PERIOD_MULTIPLIED),
-        ("turned", TraceKind.UPSIDE_DOWN),
-    ],
-)
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_what_is_no_steady_orbit_is_flagged(shape: str, kind: TraceKind, noise: float):
+def test_what_is_no_steady_orbit_is_flagged(noise: float):
     time = np.arange(0.0, 800.0, 0.1)
-    height = made(shape, time, 181.8) + noise * np.random.default_rng(1).standard_normal(time.size)
-    result = lockin(trace_of(height, rate=10.0, drive_khz=181.8))
-    assert result.kind is kind, result.verdict
-    assert not result.steady
-    assert ("multiply it by -1" in result.verdict) == (shape == "turned")
-
-
-@pytest.mark.parametrize("height", [0.0, 0.1, -1e-300])
-def test_a_constant_deflection_is_no_response(height: float):
-    result = lockin(trace_of(np.full(2000, height), rate=10.0, drive_khz=181.8))
-    assert result.kind is TraceKind.NO_RESPONSE
-    assert result.scatter == 0.0
-    assert f"{height:.4g} nm throughout" in result.verdict
+    height, _ = bounce(time, order=1, drive_khz=181.8)
+    cosine = np.cos(2e-3 * np.pi * 181.8 * time)
+    for motion, kind in (
+        (4.0 * cosine - 1.0, TraceKind.STUCK),
+        (0.4 * cosine, TraceKind.NO_IMPACT),
+        (0.0 * time, TraceKind.NO_RESPONSE),
+        (height * (1.0 + 0.05 * time / time[-1]), TraceKind.DRIFTING),
+        (height + 2.0 * time / time[-1], TraceKind.DRIFTING),
+        (height * (1.0 + 0.01 * (-1.0) ** np.floor((time - 1.3) * 0.1818 + 0.5)), TraceKind.PERIOD_MULTIPLIED),
+        (-height, TraceKind.UPSIDE_DOWN),
+    ):
+        result = lockin(trace_of(noisy(motion, noise), rate=10.0, drive_khz=181.8))
+        assert (result.kind, result.steady) == (kind, False), result.verdict
+        assert ("multiply it by -1" in result.verdict) == (kind is TraceKind.UPSIDE_DOWN)
+    for constant in (0.0, 0.1, -1e-300):
+        result = lockin(trace_of(np.full(2000, constant), rate=10.0, drive_khz=181.8))
+        assert (result.kind, result.scatter) == (TraceKind.NO_RESPONSE, 0.0)
+        assert f"{constant:.4g} nm throughout" in result.verdict
+    for share in (2e-4, 1e-2):
+        result = lockin(trace_of(noisy(height, 0.3), rate=10.0, drive_khz=181.8 * (1.0 + share)))
+        assert result.kind is TraceKind.DRIFTING
+        # the phase over 145 periods fixes the frequency to 1e-5
+        assert float(result.verdict.partition("seems to be ")[2].split()[0]) == pytest.approx(181.8, rel=2e-5)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 @pytest.mark.parametrize("quality", [5.0, 40.0, 300.0])
 def test_a_tip_that_rings_down_freely_is_told_with_its_quality_factor(quality: float, noise: float):
-    time = np.arange(0.0, 400.0, 0.1)
-    omega = 2e-3 * np.pi * 90.0
+    time, omega = np.arange(0.0, 400.0, 0.1), 2e-3 * np.pi * 90.0
     tip = 50.0 * np.exp(-0.5 * omega / quality * time) * np.cos(omega * np.sqrt(1.0 - 0.25 / quality**2) * time)
     driven = 1.5 * np.cos(2e-3 * np.pi * 181.8 * time + 0.3)
-    height = tip + driven + noise * np.random.default_rng(2).standard_normal(time.size)
-    result = lockin(trace_of(height, rate=10.0, drive_khz=181.8))
-    assert result.kind is TraceKind.RINGING
-    assert result.peak_amplitude_nm is None
-    frequency, found = (
-        float(result.verdict.split(before)[1].split()[0].strip(",")) for before in ("vibration of ", "Q = ")
-    )
-    assert frequency == pytest.approx(90.0, rel=1e-3)
+    result = lockin(trace_of(noisy(tip + driven, noise, 2), rate=10.0, drive_khz=181.8))
+    assert (result.kind, result.peak_amplitude_nm) == (TraceKind.RINGING, None)
+    told = re.search(r"vibration of ([\d.]+) .*Q = ([\d.]*\d)", result.verdict)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(90.0, rel=1e-3)
     # three digits are printed
-    assert found == pytest.approx(quality, rel=0.02)
-
-
-@pytest.mark.parametrize("share", [2e-4, 1e-2])
-def test_a_wrong_drive_frequency_is_named(share: float):
-    time = np.arange(0.0, 800.0, 0.1)
-    height, _ = bounce(time, order=1, drive_khz=181.8)
-    noisy = height + 0.3 * np.random.default_rng(1).standard_normal(time.size)
-    result = lockin(trace_of(noisy, rate=10.0, drive_khz=181.8 * (1.0 + share)))
-    assert result.kind is TraceKind.DRIFTING
-    seen = float(result.verdict.partition("seems to be ")[2].split()[0])
-    # the phase over 145 periods fixes the frequency to 1e-5
-    assert seen == pytest.approx(181.8, rel=2e-5)
+    assert float(told[2]) == pytest.approx(quality, rel=0.02)
 
 
 def test_impacts_are_counted_without_the_free_frequency_too():
@@ -226,8 +195,7 @@ def test_sampling_in_step_with_several_drive_periods_makes_no_subharmonics(per_p
     rate = 0.1818 * per_period
     time = np.arange(int(60 * per_period)) / rate
     height, _ = bounce(time, order=1, drive_khz=181.8)
-    height = height + noise * np.random.default_rng(2).standard_normal(time.size)
-    result = lockin(trace_of(height, rate=rate, drive_khz=181.8))
+    result = lockin(trace_of(noisy(height, noise, 2), rate=rate, drive_khz=181.8))
     assert (result.kind, result.order) == (TraceKind.STEADY, 1), result.verdict
 
 
@@ -236,11 +204,9 @@ def test_few_phases_in_step_with_the_drive_are_stated_as_an_error():
     height, value = bounce(time, order=1, drive_khz=181.8)
     result = lockin(trace_of(height, rate=8.0 * 0.1818, drive_khz=181.8))
     assert result.steady
-    assert result.lockin_amplitude_nm is not None
-    assert result.lockin_amplitude_error_nm is not None
-    off = abs(result.lockin_amplitude_nm - abs(value))
+    off = abs((result.lockin_amplitude_nm or 0.0) - abs(value))
     # aliasing is a bias: the stated error covers it, and is not ten times too large
-    assert 0.05 * result.lockin_amplitude_error_nm < off < result.lockin_amplitude_error_nm
+    assert off < (result.lockin_amplitude_error_nm or 0.0) < 20.0 * off
     assert any("distinct phases" in warning for warning in result.warnings)
 
 
@@ -250,31 +216,25 @@ def test_the_reference_column_and_the_drive_phase_shift_the_phase():
     wanted = float(np.degrees(np.angle(value))) - 50.0 / 2.0
     optional = lockin(trace_of(height, rate=10.0, drive_khz=363.6, drive_phase_deg=50.0))
     assert optional.phase_reference == "drive_phase_deg"
-    noise = 0.1 * np.random.default_rng(4).standard_normal(time.size)
-    platform = -1.0 + 4.0 * np.cos(2e-3 * np.pi * 363.6 * time + np.deg2rad(50.0)) + noise
-    settings = TraceSettings(drive_frequency_khz=363.6)
-    column = Trace(
-        deflection_nm=height, start_us=0.0, step_us=0.1, settings=settings, platform=platform, platform_in_nm=True
-    )
-    seen = lockin(column)
+    assert phase_apart(optional, wanted) == pytest.approx(0.0, abs=0.01)
+
+    def with_platform(platform: np.ndarray, *, in_nm: bool) -> LockinResult:
+        settings = TraceSettings(drive_frequency_khz=363.6)
+        columns = {"deflection_nm": height, "platform": platform, "platform_in_nm": in_nm}
+        return lockin(Trace(start_us=0.0, step_us=0.1, settings=settings, **columns))
+
+    platform = -1.0 + 4.0 * np.cos(2e-3 * np.pi * 363.6 * time + np.deg2rad(50.0))
+    seen = with_platform(noisy(platform, 0.1, 4), in_nm=True)
     assert seen.phase_reference == "column"
+    assert (seen.drive_amplitude_nm, seen.offset_nm) == (pytest.approx(4.0, rel=0.01), pytest.approx(-1.0, rel=0.01))
     assert seen.phase_error_deg is not None
     assert optional.phase_error_deg is not None
     # noise of the reference: 0.1 sqrt(2/4000)/4 rad, halved by the order, beside what the deflection's sampling leaves
     added = np.sqrt(seen.phase_error_deg**2 - optional.phase_error_deg**2)
     assert added == pytest.approx(np.degrees(0.1 * np.sqrt(2.0 / 4000.0) / 4.0) / 2.0, rel=0.1)
     assert abs(phase_apart(seen, wanted)) < 4.0 * seen.phase_error_deg
-    assert phase_apart(optional, wanted) == pytest.approx(0.0, abs=0.01)
-    assert (seen.drive_amplitude_nm, seen.offset_nm) == (pytest.approx(4.0, rel=0.01), pytest.approx(-1.0, rel=0.01))
-    slipping = Trace(
-        deflection_nm=height,
-        start_us=0.0,
-        step_us=0.1,
-        settings=settings,
-        platform=np.cos(2e-3 * np.pi * 364.0 * time),
-    )
     with pytest.raises(TableError, match=r"it has 364\.0.* kHz, but drive_frequency_khz is 363\.6"):
-        lockin(slipping)
+        with_platform(np.cos(2e-3 * np.pi * 364.0 * time), in_nm=False)
 
 
 def test_an_expected_order():
@@ -288,11 +248,9 @@ def test_an_expected_order():
 
 def test_traces_of_one_drive_are_one_row():
     time = np.arange(0.0, 200.0, 0.1)
-    shape, value = bounce(time, order=1, drive_khz=181.8)
 
     def read(seed: int, *, size: float = 1.0, drive: float = 181.8) -> LockinResult:
-        height = shape if drive == 181.8 else bounce(time, order=1, drive_khz=drive)[0]
-        height = size * height + 0.3 * np.random.default_rng(seed).standard_normal(time.size)
+        height = noisy(size * bounce(time, order=1, drive_khz=drive)[0], 0.3, seed)
         return lockin(trace_of(height, rate=10.0, drive_khz=drive, offset_nm=-1.0))
 
     one, two, other, far = read(1), read(2), read(3, drive=183.0), read(4, size=1.2)
@@ -304,9 +262,9 @@ def test_traces_of_one_drive_are_one_row():
     assert table.phase_deg is not None
     amplitudes = [result.lockin_amplitude_nm or 0.0 for result in (one, two)]
     assert min(amplitudes) < table.lockin_amplitude_nm[0] < max(amplitudes)
+    _, value = bounce(time, order=1, drive_khz=181.8)
     assert abs(table.lockin_amplitude_nm[0] - abs(value)) < 4.0 * table.lockin_amplitude_error_nm[0]
-    assert one.phase_deg is not None
-    assert table.phase_deg[0] == pytest.approx(one.phase_deg, abs=0.1)
+    assert table.phase_deg[0] == pytest.approx(one.phase_deg or np.nan, abs=0.1)
     # two orbits of one drive: neither is the row
     table = table_of([one, far, other])
     assert table.drive_frequency_khz.tolist() == [183.0]

@@ -9,7 +9,7 @@ from fitting import read_sweep
 from fitting.calibration.sweep import ResonanceSweep
 from fitting.tables.csv_text import TableError
 
-PLAIN = "frequency_khz,amplitude_nm,phase_deg\n89.5,1.25,60\n90,2.5,-3.5e1\n90.5,1.125,-120\n"
+ROWS = ("89.5,1.25,60", "90,2.5,-3.5e1", "90.5,1.125,-120")
 NANONIS = (
     "Experiment\tFrequency Sweep\t\nDate\t27.02.2023 14:26:53\t\nUser\t\t\nf_res (Hz)\t30281.5\t\nQ\t1161\t\n\n[DATA]\n"
     "Frequency Shift (Hz)\tCenter Frequency (Hz)\tAmplitude (m)\tPhase (deg)\tExcitation (V)\n"
@@ -18,41 +18,37 @@ NANONIS = (
 )
 
 
-def written(folder: Path, data: str | bytes) -> Path:
+def read(folder: Path, text: str) -> ResonanceSweep:
     path = folder / "sweep.txt"
-    path.write_bytes(data.encode() if isinstance(data, str) else data)
-    return path
+    path.write_bytes(text.encode())
+    return read_sweep(path)
 
 
-def test_plain_columns_come_back(tmp_path):
-    sweep = read_sweep(written(tmp_path, "# driven at 20 mV\r\n#\r\n" + PLAIN.replace("\n", "\r\n")))
+@pytest.mark.parametrize(("order", "reordered"), [((0, 1, 2), False), ((2, 1, 0), False), ((1, 0, 2), True)])
+def test_plain_columns_come_back_sorted_with_their_lines(tmp_path, order, reordered):
+    head = ["# driven at 20 mV", "#", "frequency_khz,amplitude_nm,phase_deg"]
+    sweep = read(tmp_path, "\r\n".join([*head, *(ROWS[i] for i in order)]))
     assert sweep.frequency_khz.tolist() == [89.5, 90.0, 90.5]
     assert sweep.amplitude.tolist() == [1.25, 2.5, 1.125]
-    assert sweep.phase_deg is not None
-    assert sweep.phase_deg.tolist() == [60.0, -35.0, -120.0]
-    assert sweep.amplitude_unit == "nm"
-    assert sweep.remarks == ("driven at 20 mV",)
-    assert sweep.lines.tolist() == [4, 5, 6]
+    np.testing.assert_array_equal(sweep.phase_deg, [60.0, -35.0, -120.0])
+    assert sweep.lines.tolist() == [4 + order.index(i) for i in range(3)]
+    assert (sweep.reordered, sweep.amplitude_unit, sweep.remarks) == (reordered, "nm", ("driven at 20 mV",))
     assert not sweep.amplitude.flags.writeable
 
 
 def test_hertz_and_amplitudes_of_any_unit(tmp_path):
-    text = "amplitude, frequency_hz, amplitude_error\n0.5,30000,0.01\n1.5,30001.5,0.02\n"
-    sweep = read_sweep(written(tmp_path, text))
+    sweep = read(tmp_path, "amplitude, frequency_hz, amplitude_error\n0.5,30000,0.01\n1.5,30001.5,0.02\n")
     assert sweep.frequency_khz.tolist() == [30.0, 30.0015]
-    assert sweep.amplitude_unit == ""
-    assert sweep.phase_deg is None
-    assert sweep.amplitude_error is not None
-    assert sweep.amplitude_error.tolist() == [0.01, 0.02]
+    assert (sweep.amplitude_unit, sweep.phase_deg) == ("", None)
+    np.testing.assert_array_equal(sweep.amplitude_error, [0.01, 0.02])
 
 
 def test_nanonis_text_comes_back(tmp_path):
-    sweep = read_sweep(written(tmp_path, NANONIS))
+    sweep = read(tmp_path, NANONIS)
     # sums and units of decimal numbers: to the rounding of the last bit
     assert sweep.frequency_khz == pytest.approx([30.2448, 30.3207013], rel=1e-14)
     assert sweep.amplitude == pytest.approx([0.520545, 0.459461], rel=1e-14)
-    assert sweep.phase_deg is not None
-    assert sweep.phase_deg.tolist() == [90.306, -39.635]
+    np.testing.assert_array_equal(sweep.phase_deg, [90.306, -39.635])
     assert sweep.instrument == {"frequency_khz": pytest.approx(30.2815, rel=1e-14), "quality_factor": 1161.0}
     assert sweep.remarks == ("Experiment: Frequency Sweep", "Date: 27.02.2023 14:26:53")
     assert sweep.lines.tolist() == [9, 10]
@@ -60,31 +56,22 @@ def test_nanonis_text_comes_back(tmp_path):
 
 def test_absolute_frequencies_of_nanonis_and_a_missing_phase(tmp_path):
     text = "[DATA]\nFrequency (Hz)\tAmplitude (m)\n30000\t1e-9\n30001\t2e-9\n"
-    sweep = read_sweep(written(tmp_path, text))
+    sweep = read(tmp_path, text)
     assert sweep.frequency_khz.tolist() == [30.0, 30.001]
-    assert sweep.phase_deg is None
-    assert sweep.instrument == {}
+    assert (sweep.phase_deg, sweep.instrument) == (None, {})
     with pytest.raises(TableError, match=r'line 2: the column "Center Frequency \(Hz\)" is missing; add it'):
-        read_sweep(written(tmp_path, text.replace("Frequency (Hz)", "Frequency Shift (Hz)")))
-
-
-@pytest.mark.parametrize(("order", "reordered"), [((2, 1, 0), False), ((1, 0, 2), True), ((0, 1, 2), False)])
-def test_points_are_sorted_with_their_lines(tmp_path, order, reordered):
-    head, *rows = PLAIN.splitlines()
-    sweep = read_sweep(written(tmp_path, "\n".join([head, *(rows[i] for i in order)])))
-    assert sweep.frequency_khz.tolist() == [89.5, 90.0, 90.5]
-    assert sweep.amplitude.tolist() == [1.25, 2.5, 1.125]
-    assert sweep.lines.tolist() == [2 + order.index(i) for i in range(3)]
-    assert sweep.reordered is reordered
+        read(tmp_path, text.replace("Frequency (Hz)", "Frequency Shift (Hz)"))
 
 
 def test_faults_of_sweeps_in_memory():
-    frequency, amplitude = np.array([1.0, 2.0]), np.array([1.0, 2.0])
-    with pytest.raises(TableError, match=r"sweep in memory, column frequency_khz: has the shape \(0,\); every column"):
-        ResonanceSweep(frequency_khz=np.zeros(0), amplitude=np.zeros(0))
-    with pytest.raises(TableError, match="row 2, column amplitude_error: must be finite and above 0, but is 0"):
-        ResonanceSweep(frequency_khz=frequency, amplitude=amplitude, amplitude_error=np.array([0.1, 0.0]))
-    with pytest.raises(TableError, match="the phase has errors but the amplitude has none"):
-        ResonanceSweep(
-            frequency_khz=frequency, amplitude=amplitude, phase_deg=amplitude, phase_error_deg=np.array([1.0, 1.0])
-        )
+    one, none = np.array([1.0, 2.0]), np.zeros(0)
+    for columns, said in (
+        ({"frequency_khz": none, "amplitude": none}, r"sweep in memory, column frequency_khz: has the shape \(0,\)"),
+        (
+            {"amplitude_error": np.array([0.1, 0.0])},
+            "row 2, column amplitude_error: must be finite and above 0, but is 0",
+        ),
+        ({"phase_deg": one, "phase_error_deg": one}, "the phase has errors but the amplitude has none"),
+    ):
+        with pytest.raises(TableError, match=said):
+            ResonanceSweep(**({"frequency_khz": one, "amplitude": one} | columns))

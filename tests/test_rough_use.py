@@ -1,6 +1,7 @@
 """What hard use broke once: full disks, closed streams, hostile names, interrupts, numbers out of all proportion."""
 
 import contextlib
+import itertools
 import os
 import re
 import signal
@@ -19,6 +20,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.cli.main import main
 from afm_jax.sweeps.store import STORE
 from afm_jax.whole_files import read_whole, write_whole
+from tests.fresh_python import outputs
 from tests.fuzz import fuzz_files, fuzz_orbits
 from tests.test_imports import LIBRARY, ROOT
 from tests.writing_commands import CALLS, prepare, unchecked
@@ -61,20 +63,28 @@ def test_new_files_have_the_modes_of_others_and_only_links_named_by_the_user_are
     assert path.read_bytes() == b"b"
 
 
+def shell(arguments: str) -> subprocess.CompletedProcess[str]:
+    """Return what the program did in a shell."""
+    call = f"exec {sys.executable} -m afm_jax {arguments}"
+    return subprocess.run(call, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S602
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-def test_a_full_device_is_named():
+def test_a_full_device_and_a_full_standard_output_are_named(tmp_path):
     with pytest.raises(OSError, match="/dev/full"):
         write_whole("/dev/full", "x", named_by_user=True)
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
-def test_a_full_standard_output_is_named(tmp_path):
     (tmp_path / "curve.csv").write_text("offset_nm,lockin_amplitude_nm\n1,2\n2,3\n", encoding="utf-8")
     for arguments in (f"read {tmp_path}/curve.csv", "--help", "fit --help", "--version"):
-        call = f"exec {sys.executable} -m afm_jax {arguments} >/dev/full"
-        full = subprocess.run(call, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S602
+        full = shell(f"{arguments} >/dev/full")
         assert full.returncode == 2
         assert full.stderr == "afm-jax: standard output: cannot be written (No space left on device)\n"
+
+
+def test_a_closed_standard_output_is_said():
+    closed, silent = shell("--version >&-"), shell("--version 2>&-")
+    assert closed.returncode == 2
+    assert closed.stderr == "afm-jax: standard output is closed; send it to a file or to /dev/null instead\n"
+    assert (silent.returncode, silent.stdout[:8]) == (0, "afm-jax ")
 
 
 def test_nothing_writes_files_another_way():
@@ -143,30 +153,20 @@ def test_a_pipe_is_read_if_somebody_writes_and_named_if_nobody_does(tmp_path, mo
     writer.join()
 
 
+BAD_NUMBERS = ("nan", "inf", "-inf", "1e400", "1:nan:2", "0:inf:1", "r=nan", "40 +- nan", "r=1+-inf", "1:1e400")
+
+
 def test_no_option_takes_numbers_that_are_none():
     """Every option of every command: what compares with no limit, and what has none."""
-    seen = 0
-    for name in main.list_commands(click.Context(main)):
-        command = main.get_command(click.Context(main), name)
-        assert command is not None
-        for option in (part for part in command.params if isinstance(part, click.Option)):
-            for bad in (
-                "nan",
-                "inf",
-                "-inf",
-                "1e400",
-                "1:nan:2",
-                "0:inf:1",
-                "r=nan",
-                "40 +- nan",
-                "r=1+-inf",
-                "1:1e400",
-            ):
-                with contextlib.suppress(click.BadParameter):
-                    value = option.type.convert(bad, option, click.Context(command))
-                    numbers = [part for part in np.ravel(np.array(value, dtype=object)) if isinstance(part, float)]
-                    assert np.all(np.isfinite(numbers)), (name, option.opts, bad)
-                    seen += 1
+    seen, root = 0, click.Context(main)
+    commands = [main.get_command(root, name) for name in main.list_commands(root)]
+    options = [(one, option) for one in commands if one for option in one.params if isinstance(option, click.Option)]
+    for (command, option), bad in itertools.product(options, BAD_NUMBERS):
+        with contextlib.suppress(click.BadParameter):
+            value = option.type.convert(bad, option, click.Context(command))
+            numbers = [part for part in np.ravel(np.array(value, dtype=object)) if isinstance(part, float)]
+            assert np.all(np.isfinite(numbers)), (command.name, option.opts, bad)
+            seen += 1
     assert seen > 100
 
 
@@ -194,22 +194,19 @@ def test_names_cannot_command_the_terminal(tmp_path):
     assert "\x1b" not in run("fit", tmp_path / "none\x1b.csv").output
 
 
-def test_a_closed_standard_output_is_said():
-    call = f"exec {sys.executable} -m afm_jax --version "
-    closed, silent = (
-        subprocess.run(call + end, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S602
-        for end in (">&-", "2>&-")
-    )
-    assert closed.returncode == 2
-    assert closed.stderr == "afm-jax: standard output is closed; send it to a file or to /dev/null instead\n"
-    assert (silent.returncode, silent.stdout[:8]) == (0, "afm-jax ")
-
-
-DEAF = """
-import signal, sys, time, types
+COMMAND = """
+import atexit, os, signal, sys, time, types
+from afm_jax.cli.main import COMMANDS, Command, main
 # a job in the background of a shell is born deaf
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from afm_jax.cli.main import COMMANDS, Command, main
+{}
+sys.modules["rough"] = types.SimpleNamespace(command=command)
+COMMANDS["rough"] = Command(name="rough", group="check", summary="", help="", runs="rough:command", computes=False)
+sys.argv[1:] = ["rough"]
+main()
+"""
+"""A program with one more command."""
+DEAF = """
 class Lost:
     def __del__(self):
         raise KeyboardInterrupt
@@ -224,40 +221,38 @@ def command(session):
         except KeyboardInterrupt:
             # as in the callbacks of a garbage collection: nobody hears it
             Lost()
-sys.modules["deaf"] = types.SimpleNamespace(command=command)
-row = Command(name="deaf", group="check", summary="", help="", runs="deaf:command", computes=False)
-COMMANDS["deaf"] = row
-sys.argv[1:] = ["deaf"]
-main()
 """
-
-
 LEAVING = """
-import atexit, os, signal, sys, types
-from afm_jax.cli.main import COMMANDS, Command, main
 # as of JAX's threads, which still compute while the interpreter is taken down
 atexit.register(lambda: os.kill(os.getpid(), signal.SIGSEGV))
 def command(session):
     print("whole")
     raise KeyboardInterrupt
-sys.modules["leaving"] = types.SimpleNamespace(command=command)
-row = Command(name="leaving", group="check", summary="", help="", runs="leaving:command", computes=False)
-COMMANDS["leaving"] = row
-sys.argv[1:] = ["leaving"]
-main()
+"""
+IMPORTING = """
+def command(session):
+    try:
+        import taken_for_a_fault
+    except BaseException:
+        # as NumPy does, which then tries another way
+        raise RecursionError
 """
 
 
 def test_an_interrupted_program_leaves_before_its_threads_can_crash_it():
-    done = subprocess.run([sys.executable, "-c", LEAVING], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout) == (130, "whole\n")
-    assert done.stderr.strip() == "afm-jax: interrupted"
+    printed, said = outputs(COMMAND.format(LEAVING), {}, codes=(130,))
+    assert (printed, said.strip()) == ("whole", "afm-jax: interrupted")
+
+
+def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
+    (tmp_path / "taken_for_a_fault.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nx = 1\n")
+    there = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
+    assert outputs(COMMAND.format(IMPORTING), there, codes=(130,)) == ("", "afm-jax: interrupted\n")
 
 
 def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
-    with subprocess.Popen(
-        [sys.executable, "-c", DEAF], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+    call = [sys.executable, "-c", COMMAND.format(DEAF)]
+    with subprocess.Popen(call, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
@@ -265,53 +260,20 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
             _, said = process.communicate(timeout=20)
         finally:
             process.kill()
-    assert process.returncode == 130
-    assert said == "afm-jax: interrupted\n"
-
-
-IMPORTING = """
-import os, signal, sys, types
-from afm_jax.cli.main import COMMANDS, Command, main
-signal.signal(signal.SIGINT, signal.default_int_handler)
-def command(session):
-    try:
-        import taken_for_a_fault
-    except BaseException:
-        # as NumPy does, which then tries another way
-        raise RecursionError
-sys.modules["importing"] = types.SimpleNamespace(command=command)
-row = Command(name="importing", group="check", summary="", help="", runs="importing:command", computes=False)
-COMMANDS["importing"] = row
-sys.argv[1:] = ["importing"]
-main()
-"""
-
-
-def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
-    (tmp_path / "taken_for_a_fault.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nx = 1\n")
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORTING],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (130, "", "afm-jax: interrupted\n")
+    assert (process.returncode, said) == (130, "afm-jax: interrupted\n")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="interrupts go to groups of processes")
 def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_own_without_a_word():
     # as a terminal does, to the whole group; started so that interrupts are heard even from the background
-    hear = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     # not by an import, in which an interrupt ends the program at once
-    start = (
-        "import runpy, sys\nsys.argv = ['afm-jax', 'accuracy', 'map']\nrunpy.run_module('afm_jax', run_name='__main__')"
+    code = (
+        "import runpy, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "sys.argv = ['afm-jax', 'accuracy', 'map']\nrunpy.run_module('afm_jax', run_name='__main__')"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", hear + start], cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as process:
+    call = [sys.executable, "-c", code]
+    with subprocess.Popen(call, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
         deadline = time.monotonic() + 100.0
         while not (children.exists() and children.read_text(encoding="ascii")) and time.monotonic() < deadline:
@@ -332,8 +294,7 @@ def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_
 
 WRITING = """
 import sys
-from afm_jax.sweeps.store import STORE
-from afm_jax.whole_files import read_whole, write_whole
+from afm_jax.whole_files import write_whole
 print("ready", flush=True)
 for number in range(10**9):
     write_whole(sys.argv[1], f"{number % 10}" * 3_000_000)

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from afm_jax.cli.main import main
 from fitting.examples import make_raw_curve
 from fitting.instruments.curve import read_curve, table_text
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve, lag_of_free_tip
 from fitting.tapping_curves.energy import energies, instrument_slopes, lags_of, largest_energies
@@ -24,6 +24,7 @@ from fitting.tapping_curves.speeds import _flight, _Seen
 from fitting.tapping_curves.tapping import tapping
 from tests.html_pages import first_screen, read_page
 from tests.strict_reading import strictly
+from tests.tapping_truth_of_laws import Stated, Tip, curve_of_energy, table_of
 
 EXAMPLES = Path(fitting.__file__).parent / "examples"
 EXAMPLE, REAL = EXAMPLES / "tapping_resonance.csv", EXAMPLES / "real"
@@ -32,7 +33,21 @@ ENERGY_AJ = 2.951
 K, F0, Q = 5.4, 90.0, 200.0
 
 
-def linear_curve(*, drive: str, s: float, damping: float, stiffness: float, free_nm: float = 40.0):
+def curve_of_rows(rows: int = 1, **changed: Any) -> TappingCurve:
+    """Return rows of a lever on resonance, 40 nm free, with some of the columns changed; numbers fill a column."""
+    columns = {"offset_nm": -20.0, "amplitude_nm": 20.0, "amplitude_error_nm": 0.1, "lag_deg": 90.0}
+    columns |= {"lag_error_deg": 0.2, "free_amplitude_nm": 40.0, "drive_frequency_khz": F0, "retract": False}
+    also = {name: value for name, value in changed.items() if name not in columns}
+    return TappingCurve(
+        **{name: np.broadcast_to(changed.get(name, value), rows).copy() for name, value in columns.items()},
+        **{"source": "made", "drive": "force", "lines": np.arange(rows), "harmonic_amplitudes_nm": {}} | also,
+        free_frequency_khz=Given(F0),
+        quality_factor=Given(Q),
+        spring_constant_n_per_m=Given(K),
+    )
+
+
+def linear_curve(*, drive: str, s: float, damping: float = 0.02, stiffness: float = 0.3):
     """Return one row, the tip's amplitude and omega: a linear sample, its force -damping z' - stiffness z.
 
     The damping is in nN us/nm, the stiffness in nN/nm. Solved as m z'' + m Omega/Q (z' or lab) + k (z - z_b) = F + f.
@@ -40,70 +55,49 @@ def linear_curve(*, drive: str, s: float, damping: float, stiffness: float, free
     omega, own = 2e-3 * np.pi * s * F0, 2e-3 * np.pi * F0
     mass = K / own**2
     free = K - mass * omega**2 + 1j * omega * mass * own / Q
-    force = free_nm * free
+    force = 40.0 * free
     height = force / (free + stiffness + 1j * omega * damping)
-    free_height = force / free
+    seen, seen_free, reference = height, force / free, force
     if drive == "base":
         # the base's motion acts through the spring, the deflection is seen
-        base = force / K
-        seen, seen_free, reference = height - base, free_height - base, base
-    else:
-        seen, seen_free, reference = height, free_height, force
-    one = np.ones(1)
-    return (
-        TappingCurve(
-            source="linear",
-            drive="base" if drive == "base" else "force",
-            offset_nm=-20.0 * one,
-            amplitude_nm=abs(seen) * one,
-            amplitude_error_nm=0.1 * one,
-            lag_deg=np.degrees(np.angle(reference / seen)) * one,
-            lag_error_deg=0.2 * one,
-            free_amplitude_nm=abs(seen_free) * one,
-            drive_frequency_khz=s * F0 * one,
-            retract=np.zeros(1, bool),
-            free_frequency_khz=Given(F0),
-            quality_factor=Given(Q),
-            spring_constant_n_per_m=Given(K),
-            harmonic_amplitudes_nm=dict.fromkeys(range(2, 41), 0.0 * one),
-            lines=np.arange(1, 2),
-        ),
-        abs(height),
-        omega,
+        reference = force / K
+        seen, seen_free = height - reference, seen_free - reference
+    curve = curve_of_rows(
+        drive=drive,
+        amplitude_nm=abs(seen),
+        lag_deg=np.degrees(np.angle(reference / seen)),
+        free_amplitude_nm=abs(seen_free),
+        drive_frequency_khz=s * F0,
+        harmonic_amplitudes_nm=dict.fromkeys(range(2, 41), np.zeros(1)),
     )
+    return curve, abs(height), omega
 
 
 def test_a_given_number_is_told_with_two_digits_of_its_error():
-    assert [str(Given(1.0, 0.00299914)), str(Given(90.008, 0.01)), str(Given(3.0))] == [
-        "1 +- 0.003",
-        "90.008 +- 0.01",
-        "3",
-    ]
+    told = [str(Given(1.0, 0.00299914)), str(Given(90.008, 0.01)), str(Given(3.0))]
+    assert told == ["1 +- 0.003", "90.008 +- 0.01", "3"]
 
 
 @pytest.mark.parametrize("drive", ["force", "base"])
-@pytest.mark.parametrize("s", [0.98, 1.0, 1.03, 1.1])
-def test_energy_and_virial_of_a_linear_sample_are_the_closed_forms(drive: str, s: float):
-    curve, amplitude, omega = linear_curve(drive=drive, s=s, damping=0.02, stiffness=0.3)
-    found = energies(curve, Instrument(F0, Q))
-    # the damper takes pi c omega A^2 a period, the spring's virial is -k_s A^2/2; rounding only
-    np.testing.assert_allclose(found.energy_aj, np.pi * 0.02 * omega * amplitude**2, rtol=1e-9)
-    np.testing.assert_allclose(found.virial_aj, -0.15 * amplitude**2, rtol=1e-9)
-    assert largest_energies(curve, Instrument(F0, Q))[0] >= found.energy_aj[0]
+def test_energy_and_virial_of_a_linear_sample_are_the_closed_forms(drive: str):
+    for s in (0.98, 1.0, 1.03, 1.1):
+        curve, amplitude, omega = linear_curve(drive=drive, s=s)
+        found = energies(curve, Instrument(F0, Q))
+        # the damper takes pi c omega A^2 a period, the spring's virial is -k_s A^2/2; rounding only
+        np.testing.assert_allclose(found.energy_aj, np.pi * 0.02 * omega * amplitude**2, rtol=1e-9)
+        np.testing.assert_allclose(found.virial_aj, -0.15 * amplitude**2, rtol=1e-9)
+        assert largest_energies(curve, Instrument(F0, Q))[0] >= found.energy_aj[0]
+        np.testing.assert_allclose(lags_of(curve, Instrument(F0, Q), found.energy_aj), curve.lag_deg, atol=0.05)
 
 
 @pytest.mark.parametrize("drive", ["force", "base"])
 def test_slopes_by_the_instrument_are_differences_of_energies(drive: str):
-    one, _, _ = linear_curve(drive=drive, s=1.0, damping=0.02, stiffness=0.3)
-    arrays = {name: np.tile(value, 4) for name, value in vars(one).items() if isinstance(value, np.ndarray)}
-    curve = replace(
-        one,
-        **arrays
-        | {
-            "drive_frequency_khz": np.array([88.0, 90.0, 90.0, 97.0]),
-            "amplitude_nm": np.array([20.0, 15.0, 30.0, 12.0]),
-        }
-        | {"lag_deg": np.array([70.0, 60.0, 110.0, 100.0])},
+    curve = curve_of_rows(
+        4,
+        drive=drive,
+        drive_frequency_khz=[88.0, 90.0, 90.0, 97.0],
+        amplitude_nm=[20.0, 15.0, 30.0, 12.0],
+        lag_deg=[70.0, 60.0, 110.0, 100.0],
         # measured, not measured, and beyond those that count
         harmonic_amplitudes_nm={2: np.array([0.3, np.nan, 0.2, np.nan]), 5: np.full(4, 0.1), 60: np.full(4, 5.0)},
     )
@@ -127,12 +121,10 @@ def test_a_smoother_is_the_mean_of_a_constant_and_a_process():
     place, noise, values = np.sort(rng.uniform(-3.0, 0.0, 23)), rng.uniform(0.5, 2.0, 23), rng.normal(2.0, 1.0, 23)
     bins, process, at = Bins.of(place, noise, most=7), Process(2.0, 0.5), np.linspace(-3.5, 0.5, 9)
     smoother = Smoother.of(bins, process)
-    number = np.arange(23) * 7 // 23
-    average = np.array([np.average(values[number == i], weights=noise[number == i] ** -2.0) for i in range(7)])
+    weights = noise**-2.0 * (np.arange(23) * 7 // 23 == np.arange(7)[:, None])
+    average = weights @ values / weights.sum(axis=1)
     np.testing.assert_allclose(bins.average(values), average, rtol=1e-12)
-    np.testing.assert_allclose(
-        bins.variance, [np.sum(noise[number == i] ** -2.0) ** -1.0 for i in range(7)], rtol=1e-12
-    )
+    np.testing.assert_allclose(bins.variance, 1.0 / weights.sum(axis=1), rtol=1e-12)
     # a constant that is known to a thousand: textbook regression with one covariance
     wide = 1e3**2
     covariance = process.covariance(bins.place, bins.place) + wide + np.diag(bins.variance)
@@ -143,16 +135,12 @@ def test_a_smoother_is_the_mean_of_a_constant_and_a_process():
     left = wide + process.size**2 - np.sum(cross * np.linalg.solve(covariance, cross.T).T, axis=1)
     np.testing.assert_allclose(variance, left, rtol=1e-4)
     np.testing.assert_allclose(smoother.noise_in(average), average - smoother.mean(bins.place, average), rtol=1e-9)
-    whitened = smoother.whitened(average)
+    whitened = smoother.whitened(np.stack([average, average**2], axis=1))[:, 0]
     np.testing.assert_allclose(whitened @ whitened, average @ np.linalg.solve(covariance, average), rtol=1e-4)
-    np.testing.assert_allclose(smoother.whitened(np.stack([average, average**2], axis=1))[:, 0], whitened, rtol=1e-12)
     np.testing.assert_allclose(smoother.log_determinant, np.linalg.slogdet(covariance)[1] - np.log(wide), atol=1e-4)
     # how much a row moves its own mean
-    moved = [
-        smoother.mean(place[[i]], bins.average(values + np.eye(23)[i]))[0] - smoother.mean(place[[i]], average)[0]
-        for i in range(23)
-    ]
-    np.testing.assert_allclose(smoother.leverage(place), moved, rtol=1e-9)
+    others = [smoother.mean(place[[i]], bins.average(values + np.eye(23)[i]))[0] for i in range(23)]
+    np.testing.assert_allclose(smoother.leverage(place), others - smoother.mean(place, average), rtol=1e-9)
 
 
 def test_slopes_of_flights_are_their_differences():
@@ -167,46 +155,16 @@ def test_slopes_of_flights_are_their_differences():
         np.testing.assert_allclose(slopes[:, :, i], by.T, rtol=1e-6, atol=1e-8)
 
 
-def test_lag_of_an_energy_is_the_one_it_came_from():
-    curve, _, _ = linear_curve(drive="base", s=1.03, damping=0.02, stiffness=0.3)
-    instrument = Instrument(F0, Q)
-    found = lags_of(curve, instrument, energies(curve, instrument).energy_aj)
-    np.testing.assert_allclose(found, curve.lag_deg, atol=0.05)
+TIP = Tip(stiffness=K, quality=Q, frequency_khz=F0)
 
 
 def made_curve(seed: int = 0, *, noise: float = 0.003, phase_noise: float = 0.2, frequency_off: float = 0.0):
-    """Return a table on resonance whose taps take 3 aJ exactly, by the balance k pi A (A0 sin phi - A/Q Q) solved here.
-
-    The repulsive branch: the lag is below 90 degrees. Five free rows in front.
-    """
-    rng = np.random.default_rng(seed)
-    amplitude = np.concatenate([np.full(5, 40.0), np.linspace(36.0, 6.0, 16)])
-    wanted = np.concatenate([np.zeros(5), np.full(16, 3.0)])
-    # no harmonics to speak of: one brief impact loses (pi k/Q) sum n^2 |F/k gamma_n|^2, which is put in by iteration
-    lag = np.full(21, 90.0)
-    for _ in range(50):
-        z = -amplitude * np.exp(-1j * (np.radians(lag) - np.pi / 2.0))
-        force = 1j / Q * (z + 40.0)
-        n = np.arange(2, 41)[:, None]
-        lost = 0.9 * np.pi * K / Q * np.sum((n * np.abs(force) / np.abs(1.0 - n**2 + 1j * n / Q)) ** 2, axis=0)
-        sine = ((wanted + lost) / (np.pi * K * amplitude) + amplitude / Q) / (40.0 / Q)
-        lag = np.degrees(np.arcsin(np.minimum(sine, 1.0)))
-    offset = np.concatenate([np.linspace(-60.0, -45.0, 5), -amplitude[5:]])
-    return AmplitudeTable(
-        drive="force",
-        drive_frequency_khz=np.full(21, F0),
-        free_amplitude_nm=np.full(21, 40.0),
-        offset_nm=offset,
-        lockin_amplitude_nm=amplitude * (1.0 + noise * rng.normal(size=21)),
-        lockin_amplitude_error_nm=noise * amplitude,
-        phase_lag_deg=lag + 3.0 + phase_noise * rng.normal(size=21),
-        phase_lag_error_deg=np.full(21, phase_noise),
-        free_frequency_khz=F0 + frequency_off,
-        free_frequency_error_khz=0.01,
-        quality_factor=Q,
-        quality_factor_error=2.0,
-        spring_constant_n_per_m=K,
-    )
+    """Return a table on resonance whose taps all take 3 aJ, with five free rows in front."""
+    truth = curve_of_energy(TIP, np.linspace(0.9, 0.15, 16), np.full(16, 3.0), np.ones(16, bool))
+    stated = Stated(1e-12, 1e-12, 1e-12, noise, phase_noise)
+    errors = {"free_frequency_error_khz": 0.01, "quality_factor_error": 2.0, "calibration": {}}
+    table = table_of(TIP, truth, stated, np.random.default_rng(seed), free_rows=5, **errors)
+    return replace(table, free_frequency_khz=F0 + frequency_off, spring_constant_error_n_per_m=None)
 
 
 @pytest.mark.slow
@@ -222,24 +180,9 @@ def test_noise_free_energy_is_the_one_put_in_even_with_the_frequency_off():
     assert frequency.value == pytest.approx(F0, abs=1e-3)
 
 
-@pytest.mark.slow
-def test_intervals_hold_the_truth_as_often_as_they_say():
-    rng = np.random.default_rng(5)
-    held, pulls = [], []
-    for seed in range(16):
-        result = tapping(made_curve(seed, frequency_off=0.01 * rng.normal()))
-        low, high = result.energy["interval95"]
-        held.append(low <= 3.0 <= high)
-        pulls.append((result.energy["value"] - 3.0) / result.energy["standard_error"])
-    # Q is exact in these tables although 1 % is allowed for: the intervals are wide rather than narrow
-    assert np.mean(held) >= 0.85
-    assert np.std(pulls) < 1.2
-
-
 def test_bundled_curve_gives_the_energy_of_the_simulations_ledger():
     # on resonance, k 5.4 N/m, 40 nm, 0.3 % and 0.2 degrees, the frequency 8 Hz and Q 0.75 % off: the truth within 5 %
-    table = fitting.read_table(EXAMPLE)
-    result = fitting.tapping(table)
+    result = fitting.tapping(fitting.read_table(EXAMPLE))
     assert result.valid
     assert result.energy["value"] == pytest.approx(ENERGY_AJ, rel=0.05)
     low, high = result.energy["interval95"]
@@ -248,7 +191,9 @@ def test_bundled_curve_gives_the_energy_of_the_simulations_ledger():
     # the law is refused, with what to record instead
     assert result.law is None
     assert "3 to 10 % above resonance" in (result.reason or "")
-    assert result.plot().axes[0].get_ylabel() == "amplitude (nm)"
+    text = tapping_summary(result)
+    assert "No impact law: driven at 1.000" in text
+    assert max(map(len, text.splitlines())) <= 160
     branch = next(one for one in result.hysteresis if one.change == "branch")
     assert branch.approach is not None
     assert branch.retract is not None
@@ -261,26 +206,21 @@ def test_bundled_curve_gives_the_energy_of_the_simulations_ledger():
 @pytest.mark.parametrize("width", [0.0, 3.0])
 def test_thresholds_are_found_to_a_tenth_of_a_nanometre(width: float):
     # 0.6 % noise; the amplitude of a tip of 3.2 nm is lost at -1.03 nm and back at -1.03 - width, every 0.1 nm a row
-    rng = np.random.default_rng(2)
     way = np.arange(-10.0, 5.0, 0.1)
-    offset = np.concatenate([way, way[::-1]])
-    retract = np.arange(len(offset)) >= len(way)
+    offset, retract = np.concatenate([way, way[::-1]]), np.repeat([False, True], len(way))
+    rows, rng = len(offset), np.random.default_rng(2)
     amplitude = np.where(offset < np.where(retract, -1.03 - width, -1.03), 3.2, 0.05)
-    curve = replace(
-        linear_curve(drive="force", s=1.0, damping=0.0, stiffness=0.0)[0],
+    curve = curve_of_rows(
+        rows,
         offset_nm=offset,
-        amplitude_nm=amplitude * (1.0 + 0.006 * rng.normal(size=len(offset))),
+        amplitude_nm=amplitude * (1.0 + 0.006 * rng.normal(size=rows)),
         amplitude_error_nm=0.006 * amplitude,
-        lag_deg=np.full(len(offset), np.nan),
-        lag_error_deg=np.full(len(offset), np.nan),
-        free_amplitude_nm=np.full(len(offset), 3.2),
-        drive_frequency_khz=np.full(len(offset), F0),
+        lag_deg=np.nan,
+        lag_error_deg=np.nan,
+        free_amplitude_nm=3.2,
         retract=retract,
-        harmonic_amplitudes_nm={},
-        lines=np.arange(len(offset)),
     )
-    blank = np.full(len(offset), np.nan)
-    free = free_rows(curve)
+    blank, free = np.full(rows, np.nan), free_rows(curve)
     found = {one.change: one for one in changes(curve, free=free, repulsive=~free, energy=blank, noise=blank)}
     for change in ("contact", "half"):
         into, back = found[change].approach, found[change].retract
@@ -300,27 +240,21 @@ def test_a_zero_that_free_rows_were_set_to_is_no_knowledge_besides_frequency_and
     path.write_text(table_text(read_curve(make_raw_curve.EXAMPLE, **make_raw_curve.OPTIONS)), "utf-8")
     table = fitting.read_table(path)
     assert "phase_zero_deg" in table.calibration
-    found, without = (
-        {one.kind: one for one in functions.nuisances}
-        for functions in (
-            tapping(one, law=False).functions
-            for one in (table, replace(table, calibration=table.calibration | {"phase_zero_deg": (0.0, 1e3)}))
-        )
-        if functions is not None
-    )
-    assert found["free_frequency_khz"].standard_error == without["free_frequency_khz"].standard_error
+
+    def instrument(**changed: tuple[float, float]):
+        functions = tapping(replace(table, calibration=table.calibration | changed), law=False).functions
+        assert functions is not None
+        return {one.kind: one for one in functions.nuisances}
+
+    found = instrument()
+    frequency = found["free_frequency_khz"]
+    without = instrument(phase_zero_deg=(0.0, 1e3))["free_frequency_khz"]
+    assert frequency.standard_error == without.standard_error
     # the example's own frequency, which is not the one that is stated
-    assert (
-        abs(found["free_frequency_khz"].value - make_raw_curve.FREE_FREQUENCY_KHZ)
-        < found["free_frequency_khz"].standard_error
-    )
+    assert abs(frequency.value - make_raw_curve.FREE_FREQUENCY_KHZ) < frequency.standard_error
     # a zero that is known better is used
-    true = found["phase_zero_deg"].value
-    sharp = tapping(
-        replace(table, calibration=table.calibration | {"phase_zero_deg": (true, 0.1)}), law=False
-    ).functions
-    assert sharp is not None
-    assert {one.kind: one for one in sharp.nuisances}["free_frequency_khz"].standard_error < 2e-3
+    sharp = instrument(phase_zero_deg=(found["phase_zero_deg"].value, 0.1))["free_frequency_khz"]
+    assert sharp.standard_error < 2e-3
 
 
 def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
@@ -349,11 +283,8 @@ def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
 def test_without_a_spring_constant_energies_are_over_it():
     table = made_curve()
     exact = replace(table, spring_constant_error_n_per_m=1e-6)
-    known = tapping(exact, law=False)
-    found = tapping(
-        replace(table, spring_constant_n_per_m=None, spring_constant_error_n_per_m=None, mass_ng=None), law=False
-    )
-    answer, wanted = found.to_dict(), known.to_dict()
+    found = tapping(replace(table, spring_constant_n_per_m=None, mass_ng=None), law=False)
+    answer, wanted = found.to_dict(), tapping(exact, law=False).to_dict()
     assert answer["energy_per_tap_aj"] is None
     assert answer["energy_per_tap_reason"] == "the spring constant is not known: energies are over it, in nm^2"
     per_tap = answer["energy_per_tap_over_k_nm2"]
@@ -367,8 +298,7 @@ def test_without_a_spring_constant_energies_are_over_it():
     text = tapping_summary(found)
     assert "spring constant not known: energies and virials are over it, in nm^2" in text
     assert re.search(r"Energy of a tap: [\d.]+ \+- [\d.]+ nm\^2 ", text)
-    assert " eV" not in text
-    assert not re.search(r"\d aJ", text)
+    assert not re.search(r" eV|\d aJ", text)
 
 
 def test_without_a_phase_there_is_a_bound():
@@ -394,8 +324,6 @@ def test_command_prints_and_writes_the_report(tmp_path: Path):
     answer = strictly(result.stdout)
     assert answer["format"] == "afm-jax tapping"
     assert set(answer["energy_per_tap_aj"]) >= {"value", "standard_error", "interval95"}
-    assert answer["law"] is None
-    assert "above resonance" in answer["reason"]
     assert len(answer["rows"]) == 64
     assert all(one["reason"].startswith("excluded") for one in answer["set_aside"])
     page = read_page((tmp_path / "tapping.html").read_text(encoding="utf-8"))
@@ -405,26 +333,20 @@ def test_command_prints_and_writes_the_report(tmp_path: Path):
     for name in ("tapping.png", "tapping_frames.png"):
         # a drawn picture has many shades
         assert len(np.unique(imread(tmp_path / name))) > 50
-    text = run(EXAMPLE)
-    assert "No impact law: driven at 1.000" in text.stdout
-    assert max(map(len, text.stdout.splitlines())) <= 160
 
 
 @pytest.mark.slow
 def test_real_files_give_what_they_support():
-    neasnom = run(REAL / "tapping_approach_neasnom.txt")
-    assert neasnom.exit_code == 2
-    assert "--free-frequency-khz" in neasnom.stderr
     known = ("--free-frequency-khz", "264.1 +- 0.3")
-    assert "--quality-factor" in run(REAL / "tapping_approach_neasnom.txt", *known).stderr
+    asked = run(REAL / "tapping_approach_neasnom.txt", *known)
+    assert (asked.exit_code, "--quality-factor" in asked.stderr) == (2, True)
     known += ("--quality-factor", "400 +- 150", "--spring-constant", "40 +- 15")
     bracket = run(REAL / "tapping_approach_neasnom.txt", *known, "--json")
     assert bracket.exit_code == 3
     answer = strictly(bracket.stdout)
     # eight rows in contact, f0 known to more than its width: no energy, and no bracket that says more than that
-    assert answer["energy_per_tap_aj"] is None
+    assert (answer["energy_per_tap_aj"], answer["law"]) == (None, None)
     assert answer["energy_per_tap_reason"]
-    assert answer["law"] is None
     wsxm = run(REAL / "tapping_amplitude_wsxm.f.curves", "--nm-per-volt", "slope", "--json")
     assert wsxm.exit_code == 3
     answer = strictly(wsxm.stdout)

@@ -1,6 +1,5 @@
 """Maps: energies against the formula of a force on the tip, every format against its writer, masks counted."""
 
-import re
 import struct
 import time
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from fitting import TableError, load, tapping_map
+from fitting import TableError, tapping_map
 from fitting.examples.make_raw_curve import (
     DRIVE_KHZ,
     FREE_FREQUENCY_KHZ,
@@ -24,11 +23,12 @@ from fitting.examples.make_raw_curve import (
 )
 from fitting.instruments.gwyddion import images_as_bytes
 from fitting.instruments.images import read_images
-from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
+from fitting.tapping_curves.curve import Instrument
 from fitting.tapping_curves.energy import energies
 from tests.html_pages import read_page
 from tests.instrument_files import igor_wave
 from tests.strict_reading import strictly
+from tests.test_tapping import curve_of_rows
 
 FREE_LAG = float(true_lag_deg(np.ones(1))[0])
 LEVER: dict[str, Any] = {
@@ -40,14 +40,9 @@ LEVER: dict[str, Any] = {
     "free_phase_deg": (FREE_LAG, 0.2),
     "drive": "force",
 }
-CALL = ["--spring-constant", "44", "--quality-factor", "230 +- 5", "--free-frequency-khz", "344.604 +- 0.01"]
-CALL += ["--drive-frequency-khz", "344.6", "--free-amplitude-nm", "13.4", "--free-phase-deg", str(FREE_LAG)]
-CALL += ["--drive", "force"]
-
-
-def lever(**changed: Any) -> dict[str, Any]:
-    """Return what is known of the lever, with some of it changed."""
-    return LEVER | changed
+GRID_CALL = ["--spring-constant", "44", "--quality-factor", "230 +- 5", "--free-frequency-khz", "344.604 +- 0.01"]
+GRID_CALL += ["--drive-frequency-khz", "344.6", "--drive", "force"]
+CALL = [*GRID_CALL, "--free-phase-deg", str(FREE_LAG), "--free-amplitude-nm"]
 
 
 def image(rows: int = 12, columns: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -65,17 +60,14 @@ def test_every_pixel_has_the_energy_of_the_formula_and_its_own_error():
     found = tapping_map((amplitude, lag), amplitude_error_nm=0.03, phase_error_deg=0.12, **LEVER)
     # what the air takes at harmonics is left out of the formula
     np.testing.assert_allclose(found.energy, energy, rtol=2e-4)
-    random = np.random.default_rng(3)
-    shape = (400, *amplitude.shape)
-    noisy = FREE_NM**-2 * (amplitude + 0.03 * random.standard_normal(shape))
-    noisy *= FREE_NM
+    random, shape = np.random.default_rng(3), (400, *amplitude.shape)
+    noisy = amplitude + 0.03 * random.standard_normal(shape)
     lags = np.deg2rad(lag + 0.12 * random.standard_normal(shape))
     s = DRIVE_KHZ / FREE_FREQUENCY_KHZ
-    size = np.abs(1.0 - s**2 + 1j * s / QUALITY_FACTOR)
-    k = np.pi * SPRING_CONSTANT * FREE_NM**2
-    drawn = k * noisy * (size * np.sin(lags) - s * noisy / QUALITY_FACTOR)
+    size, k = np.abs(1.0 - s**2 + 1j * s / QUALITY_FACTOR), SPRING_CONSTANT * noisy
+    drawn = np.pi * k * (FREE_NM * size * np.sin(lags) - s * noisy / QUALITY_FACTOR)
     np.testing.assert_allclose(found.energy_error, drawn.std(axis=0), rtol=0.15)
-    drawn = -0.5 * k / np.pi * noisy * (size * np.cos(lags) - noisy * (1.0 - s**2))
+    drawn = -0.5 * k * (FREE_NM * size * np.cos(lags) - noisy * (1.0 - s**2))
     np.testing.assert_allclose(found.virial, drawn.mean(axis=0), atol=0.01)
     np.testing.assert_allclose(found.virial_error, drawn.std(axis=0), rtol=0.15)
     # the spring constant's part of the common error is its share of the median energy
@@ -93,22 +85,12 @@ def test_maps_are_the_energies_of_curves_row_by_row(drive: Literal["force", "bas
     found = tapping_map((amplitude, 33.0 + behind), drive=drive, **known)
     gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
     lag = np.rad2deg(np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0))
-    ones = np.ones(amplitude.size)
-    curve = TappingCurve(
+    curve = curve_of_rows(
+        amplitude.size,
         drive=drive,
-        source="",
-        offset_nm=ones,
         amplitude_nm=amplitude.ravel(),
-        amplitude_error_nm=ones,
         lag_deg=lag + behind.ravel(),
-        lag_error_deg=ones,
-        free_amplitude_nm=40.0 * ones,
-        drive_frequency_khz=90.0 * ratio * ones,
-        retract=ones < 0.0,
-        free_frequency_khz=Given(90.0),
-        quality_factor=Given(200.0),
-        spring_constant_n_per_m=Given(5.4),
-        lines=np.arange(amplitude.size),
+        drive_frequency_khz=90.0 * ratio,
     )
     wanted = energies(curve, Instrument(90.0, 200.0))
     used = (found.state == 0).ravel()
@@ -130,7 +112,7 @@ def test_pixels_out_of_range_are_masked_and_counted():
     assert np.all(np.isnan(found.energy[masked]))
     np.testing.assert_allclose(found.energy[~masked], energy[~masked], rtol=2e-4)
     assert found.valid
-    wrong = tapping_map((amplitude, lag), **lever(free_amplitude_nm=9.0))
+    wrong = tapping_map((amplitude, lag), **(LEVER | {"free_amplitude_nm": 9.0}))
     assert not wrong.valid
     assert "free amplitude, its phase, quality factor or units do not belong" in wrong.reasons[0]
 
@@ -148,57 +130,70 @@ def test_without_a_spring_constant_energies_are_over_it():
 def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip():
     amplitude, lag, _ = image()
     straight = tapping_map((amplitude, lag), **LEVER)
-    turned = tapping_map((amplitude, -lag), **lever(free_phase_deg=(-FREE_LAG, 0.2)))
+    turned = tapping_map((amplitude, -lag), **(LEVER | {"free_phase_deg": (-FREE_LAG, 0.2)}))
     np.testing.assert_allclose(turned.energy, straight.energy, rtol=1e-12)
     np.testing.assert_allclose(turned.virial, straight.virial, rtol=1e-9)
     assert any(note.startswith("Sign: the free tip reads") for note in turned.notes)
+    known: dict[str, Any] = {key: value for key, value in LEVER.items() if key != "free_phase_deg"}
+    assumed = tapping_map((amplitude, -lag), **known)
+    np.testing.assert_allclose(assumed.energy, straight.energy, rtol=1e-9)
+    assert any(note.startswith("Phase: the free tip is taken to read") for note in assumed.notes)
 
 
 def nanosurf_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
     """Return a NanoSurf file of two images, amplitude in m and phase in degrees, as 32-bit integers of their range."""
     header, data = ["[DataSet]", "Version=2"], b""
+    size = [
+        "SaveBits=32",
+        "Frame=Scan forward",
+        "Dim0Name=X*",
+        "Dim0Unit=m",
+        "Dim0Min=0",
+        "Dim0Range=2e-6",
+        "Dim1Range=1e-6",
+    ]
     for number, (name, unit, values) in enumerate((("Amplitude", "m", 1e-9 * amplitude), ("Phase", "°", phase))):
         low, width = float(values.min()), float(np.ptp(values))
         rows, columns = values.shape
-        header += [f"[DataSet-0:{number}]", f"Points={columns}", f"Lines={rows}", "SaveBits=32", "Frame=Scan forward"]
-        header += ["Dim0Name=X*", "Dim0Unit=m", "Dim0Min=0", "Dim0Range=2e-6", "Dim1Range=1e-6"]
+        header += [f"[DataSet-0:{number}]", f"Points={columns}", f"Lines={rows}", *size]
         header += [f"Dim2Name={name}", f"Dim2Unit={unit}", f"Dim2Min={low!r}", f"Dim2Range={width!r}"]
         counts = np.round((values - low) / width * (2.0**32 - 1.0) - 2.0**31).astype("<i4")
         data += counts.tobytes()
     return "\r\n".join(header).encode("latin-1") + b"\r\n\r\n#!" + data
 
 
+def gwyddion_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
+    """Return a Gwyddion file of two images as the package gwyfile writes them."""
+    gwyfile = pytest.importorskip("gwyfile.objects")
+    content = gwyfile.GwyContainer()
+    for number, (title, unit, values) in enumerate((("Amplitude", "m", 1e-9 * amplitude), ("Phase", "deg", phase))):
+        content[f"/{number}/data/title"] = title
+        sides = {"xreal": 2e-6, "yreal": 1e-6, "si_unit_xy": "m", "si_unit_z": unit}
+        content[f"/{number}/data"] = gwyfile.GwyDataField(values, **sides)
+    return b"GWYP" + content.serialize()
+
+
+def igor_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
+    """Return an Igor wave of three images."""
+    channels = {"HeightRetrace": amplitude, "AmplitudeRetrace": 1e-9 * amplitude, "PhaseRetrace": phase}
+    note = "FastScanSize: 2e-06\rSlowScanSize: 1e-06\r"
+    return igor_wave({name: values.T[:, ::-1] for name, values in channels.items()}, note)
+
+
 def written(folder: Path, kind: str) -> list[Path]:
     amplitude, lag, _ = image()
-    path = folder / f"image.{kind}"
-    match kind:
-        case "npz":
-            np.savez(path, amplitude_nm=amplitude, phase_deg=lag)
-        case "npy":
-            np.save(path, np.stack([amplitude, lag]))
-        case "csv":
-            np.savetxt(path, amplitude, delimiter=",")
-            np.savetxt(folder / "phase.csv", lag, delimiter=",")
-            return [path, folder / "phase.csv"]
-        case "ibw":
-            pytest.importorskip("igor2")
-            channels = {"HeightRetrace": amplitude, "AmplitudeRetrace": 1e-9 * amplitude, "PhaseRetrace": lag}
-            note = "FastScanSize: 2e-06\rSlowScanSize: 1e-06\r"
-            path.write_bytes(igor_wave({name: values.T[:, ::-1] for name, values in channels.items()}, note))
-        case "gwy":
-            gwyfile = pytest.importorskip("gwyfile.objects")
-            content = gwyfile.GwyContainer()
-            for number, (title, unit, values) in enumerate(
-                (("Amplitude", "m", 1e-9 * amplitude), ("Phase", "deg", lag))
-            ):
-                content[f"/{number}/data/title"] = title
-                content[f"/{number}/data"] = gwyfile.GwyDataField(
-                    values, xreal=2e-6, yreal=1e-6, si_unit_xy="m", si_unit_z=unit
-                )
-            path.write_bytes(b"GWYP" + content.serialize())
-        case _:
-            path.write_bytes(nanosurf_image(amplitude, lag))
-    return [path]
+    path, phase = folder / f"image.{kind}", folder / "phase.csv"
+    if kind == "npz":
+        np.savez(path, amplitude_nm=amplitude, phase_deg=lag)
+    elif kind == "npy":
+        np.save(path, np.stack([amplitude, lag]))
+    elif kind == "csv":
+        np.savetxt(path, amplitude, delimiter=",")
+        np.savetxt(phase, lag, delimiter=",")
+    else:
+        write = {"ibw": igor_image, "gwy": gwyddion_image, "nid": nanosurf_image}[kind]
+        path.write_bytes(write(amplitude, lag))
+    return [path, phase] if kind == "csv" else [path]
 
 
 @pytest.mark.parametrize("kind", ["npz", "npy", "csv", "ibw", "gwy", "nid"])
@@ -211,36 +206,29 @@ def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
 
 
 def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tmp_path: Path):
-    pytest.importorskip("zarr")
+    zarr, gwyfile = pytest.importorskip("zarr"), pytest.importorskip("gwyfile")
     (path,) = written(tmp_path, "gwy")
     out = tmp_path / "report"
     formats = ["--format", "npz", "--format", "gwy", "--format", "zarr"]
-    result = run(path, *CALL, *formats, "--out", out, "--json")
+    result = run(path, *CALL, "13.4", *formats, "--out", out, "--json")
     assert result.exit_code == 0, result.stderr
     _, _, energy = image()
     answer = strictly(result.stdout)
     assert answer["pixels"]["used"] == 240
     assert answer["energy"]["median"] == pytest.approx(np.median(energy), rel=1e-3)
     assert set(answer["common"]) >= {"spring_constant", "quality_factor", "free_frequency", "free_phase"}
-    text = (out / "map.txt").read_text("utf-8")
-    assert len(re.findall(r"common error of the energy", text)) == 1
+    assert (out / "map.txt").read_text("utf-8").count("common error of the energy") == 1
     endings = ("html", "png", "json", "txt", "npz", "gwy", "zarr")
     assert {one.name for one in out.iterdir()} == {f"map.{ending}" for ending in endings}
     assert len(list(read_page((out / "map.html").read_text("utf-8")).iter("img"))) == 1
-    np.testing.assert_allclose(np.load(out / "map.npz")["energy"], energy, rtol=2e-4)
-    import zarr  # noqa: PLC0415
-
-    stored = zarr.open_group(str(out / "map.zarr"), mode="r")
-    np.testing.assert_allclose(np.asarray(stored["energy"]), energy, rtol=2e-4)
-    theirs = pytest.importorskip("gwyfile").load(str(out / "map.gwy"))
+    theirs = gwyfile.load(str(out / "map.gwy"))
     assert theirs["/0/data/title"] == "Energy of a tap"
-    np.testing.assert_allclose(theirs["/0/data"].data, 1e-18 * energy, rtol=2e-4)
     assert theirs["/0/data"].xreal == pytest.approx(2e-6)
-    found = tapping_map(path, **LEVER)
-    assert found.to_xarray()["energy"].shape == (12, 20)
-    found.save(tmp_path / "map.json")
-    np.testing.assert_array_equal(load(tmp_path / "map.json").energy, found.energy)
-    assert run(path, *CALL[:-4], "--free-amplitude-nm", "9").exit_code == 3
+    stored = zarr.open_group(str(out / "map.zarr"), mode="r")["energy"]
+    told = np.load(out / "map.npz")["energy"], np.asarray(stored), 1e18 * theirs["/0/data"].data
+    for found in (*told, tapping_map(path, **LEVER).energy):
+        np.testing.assert_allclose(found, energy, rtol=2e-4)
+    assert run(path, *CALL, "9").exit_code == 3
 
 
 def test_masked_pixels_are_masked_in_gwyddion_too():
@@ -256,14 +244,10 @@ def test_masked_pixels_are_masked_in_gwyddion_too():
 
 def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
     curves = [raw_curve(300, seed=seed, drift=0.0) for seed in range(6)]
-    path = tmp_path / "grid.npz"
-    arrays: dict[str, Any] = {
-        name: np.array([getattr(curve, field)[0] for curve in curves]).reshape(2, 3, 300)
-        for name, field in (("amplitude_v", "amplitude_v"), ("phase_deg", "phase_deg"), ("height_nm", "height_nm"))
-    }
-    np.savez(path, **arrays)
-    call = [word for word in CALL if word not in {"--free-amplitude-nm", "13.4", "--free-phase-deg", str(FREE_LAG)}]
-    result = run(path, *call, "--nm-per-volt", "42", "--at", "0.85", "--json")
+    path, names = tmp_path / "grid.npz", ("amplitude_v", "phase_deg", "height_nm")
+    arrays: dict[str, Any] = {name: [getattr(curve, name)[0] for curve in curves] for name in names}
+    np.savez(path, **{name: np.reshape(array, (2, 3, 300)) for name, array in arrays.items()})
+    result = run(path, *GRID_CALL, "--nm-per-volt", "42", "--at", "0.85", "--json")
     assert result.exit_code == 0, result.stderr
     answer = strictly(result.stdout)
     masked = ("amplitude above free", "energy below zero", "not measured")
@@ -273,55 +257,48 @@ def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
     blocks = [[*c.height_nm, *c.deflection_v, *c.amplitude_v, *c.phase_deg] for c in curves]
     np.savetxt(tmp_path / "grid.txt", np.concatenate(blocks).T, delimiter="\t")
     columns = "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
-    words = [*call, "--nm-per-volt", "42", "--at", "0.85", "--columns", columns]
-    again = strictly(run(tmp_path / "grid.txt", *words, "--grid", "2x3", "--json").stdout)
+    call = [tmp_path / "grid.txt", *GRID_CALL, "--nm-per-volt", "42", "--at", "0.85", "--columns", columns, "--grid"]
+    again = strictly(run(*call, "2x3", "--json").stdout)
     assert again["energy"]["median"] == pytest.approx(answer["energy"]["median"], rel=0.01)
-    refused = run(tmp_path / "grid.txt", *words, "--grid", "2x2")
+    refused = run(*call, "2x2")
     assert (refused.exit_code, len(refused.stderr.splitlines())) == (2, 1)
     assert "holds 6 curves, not 2 x 2 = 4" in refused.stderr
 
 
-@pytest.mark.parametrize("ratio", [0.049, 1.0, np.nan])
-def test_an_amplitude_at_which_no_curve_is_read_is_refused(tmp_path: Path, ratio: float):
+def test_an_amplitude_at_which_no_curve_is_read_is_refused(tmp_path: Path):
     (path,) = written(tmp_path, "npz")
-    with pytest.raises(ValueError, match="`ratio` must be at least 0\\.05 and below 1"):
-        read_images(path, ratio=ratio)
+    for ratio in (0.049, 1.0, np.nan):
+        with pytest.raises(ValueError, match="`ratio` must be at least 0\\.05 and below 1"):
+            read_images(path, ratio=ratio)
 
 
-def test_wrong_images_are_one_line(tmp_path: Path):
+def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path):
     amplitude, lag, _ = image()
     np.savez(tmp_path / "one.npz", amplitude=amplitude)
     np.savez(tmp_path / "sizes.npz", amplitude=amplitude, phase=lag[:-1])
     np.savez(tmp_path / "volts.npz", amplitude_v=amplitude, phase_deg=lag)
     (tmp_path / "ragged.csv").write_text("1,2\n3\n")
     (tmp_path / "cut.gwy").write_bytes(b"GWYPGwyContainer\0" + struct.pack("<I", 1000) + b"/0/data\0o")
-    for name, said in (
-        ("one.npz", "none of the images amplitude is called"),
-        ("sizes.npz", "must be of one size"),
-        ("volts.npz", "give --nm-per-volt NM"),
-        ("ragged.csv", "an image is rows of numbers"),
-        ("cut.gwy", "damaged or cut off"),
-        ("missing.npz", "there is no such file"),
+    written(tmp_path, "npz")
+    written(tmp_path, "gwy")
+    lever = [*CALL, "13.4"]
+    for command, name, options, said in (
+        ("tapping-map", "one.npz", lever, "none of the images amplitude is called"),
+        ("tapping-map", "sizes.npz", lever, "must be of one size"),
+        ("tapping-map", "volts.npz", lever, "give --nm-per-volt NM"),
+        ("tapping-map", "ragged.csv", lever, "an image is rows of numbers"),
+        ("tapping-map", "cut.gwy", lever, "damaged or cut off"),
+        ("tapping-map", "missing.npz", lever, "there is no such file"),
+        ("tapping-map", "image.npz", [], "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM"),
+        ("read", "image.gwy", [], "holds images; their energies: afm-jax tapping-map"),
+        ("read", "image.npz", [], "energies of images: afm-jax tapping-map"),
+        ("tapping", "image.npz", [], "energies of images: afm-jax tapping-map"),
     ):
-        result = run(tmp_path / name, *CALL)
+        result = CliRunner().invoke(main, [command, str(tmp_path / name), *options])
         assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1), name
         assert said in result.stderr
-    np.savez(tmp_path / "good.npz", amplitude=amplitude, phase=lag)
-    missing = run(tmp_path / "good.npz")
-    assert "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM" in missing.stderr
     with pytest.raises(TableError, match="must be two arrays"):
         tapping_map((amplitude, lag[0]), **LEVER)
-
-
-def test_curves_say_where_images_go_and_images_where_curves_go(tmp_path: Path):
-    (path,) = written(tmp_path, "gwy")
-    result = CliRunner().invoke(main, ["read", str(path)])
-    assert "holds images; their energies: afm-jax tapping-map" in result.stderr
-    for command in ("read", "tapping"):
-        (arrays,) = written(tmp_path, "npz")
-        result = CliRunner().invoke(main, [command, str(arrays)])
-        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
-        assert "energies of images: afm-jax tapping-map" in result.stderr
 
 
 @pytest.mark.slow
