@@ -90,8 +90,8 @@ def test_impossible_constraints_are_errors(table, model, changes, constraints, s
 
 def with_unseen(table: AmplitudeTable, drive_nm: float) -> AmplitudeTable:
     """Return a table with its last row once more, at another drive, on which no orbit was seen."""
-    columns = {name: np.append(getattr(table, name), np.nan) for name in AMPLITUDES}
-    columns["drive_amplitude_nm"] = np.append(table.drive_amplitude_nm, drive_nm)
+    columns = {name: np.append(np.asarray(getattr(table, name)), np.nan) for name in AMPLITUDES}
+    columns["drive_amplitude_nm"] = np.append(np.asarray(table.drive_amplitude_nm), drive_nm)
     columns["no_orbit"] = np.append(np.zeros(table.rows), 1.0)
     again = np.append(np.arange(table.rows), -1)
     return rows(table, again, **columns, lines=np.arange(1, table.rows + 2))

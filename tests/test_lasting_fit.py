@@ -134,10 +134,9 @@ def test_without_noise_the_law_is_sharp(model):
 
 
 def test_another_contact_without_noise():
-    drier = {"relative_humidity": 0.35}
-    made = simulate_experiment(afm.Contact.paper(**drier), afm.Cantilever(90.0, 150.0), example_drives())
+    made = simulate_experiment(afm.Contact.paper(relative_humidity=0.35), afm.Cantilever(90.0, 150.0), example_drives())
     result = fit(made.exact, model="viscous+delay")
-    assert law_error(result, **drier) < 0.0012
+    assert law_error(result, relative_humidity=0.35) < 0.0012
 
 
 def test_contact_parameters_that_do_the_same_are_said_to(shared):

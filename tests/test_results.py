@@ -343,7 +343,7 @@ def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_pat
     rows = _rows({name: np.asarray(part) for name, part in found._asdict().items()})
     for figure in (found.plot(tmp_path / "collide.png"), collisions_figure(rows)):
         upper, middle, lower = figure.axes
-        drawn = {line.get_label(): line.get_xydata() for line in upper.lines}
+        drawn = {line.get_label(): np.asarray(line.get_xydata()) for line in upper.lines}
         assert drawn["captured"].tolist() == [[5.0, 0.0]]
         np.testing.assert_array_equal(drawn["contact"], [[5.0, np.nan], [20.0, 3.0], [40.0, 1.0]])
         for axes in (middle, lower):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
@@ -451,8 +451,8 @@ class _Finder:
 def _towards(
     scene: Scene,
     tips: Tips,
-    points: Float[ArrayLike, "points 2"],
-    radius: Float[ArrayLike, " points"],
+    points: Float[np.ndarray | Array, "points 2"],
+    radius: Float[np.ndarray | Array, " points"],
     *,
     impacts: int | Int[Array, ""],
 ) -> tuple[Tips, Int[Array, " lanes"]]:

@@ -233,8 +233,8 @@ def _compiling_for(scenes: Scene, accuracy: float) -> AbstractContextManager[Non
     """Compile on another core what will follow the tips of scenes with laws."""
     if isinstance(scenes.interaction, Contact):
         return nullcontext()
-    anywhere = jax.tree.map(np.asarray, (scenes, leaving_tips(scenes)))
-    return compiling(_Sweeper(*anywhere, RECORDED, accuracy).follow_the_firsts)
+    scenes, anywhere = jax.tree.map(np.asarray, (scenes, leaving_tips(scenes)))
+    return compiling(_Sweeper(scenes, anywhere, RECORDED, accuracy).follow_the_firsts)
 
 
 class _SweptRows(NamedTuple):
