@@ -9,18 +9,7 @@ from afm_jax.impact.map import iterate_map
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.outcomes import Outcome
 from tests.package_scenes import bouncing, stacked
-
-NUMBERS = (
-    "velocity_after_nm_per_us",
-    "velocity_before_nm_per_us",
-    "approach_speed_nm_per_us",
-    "rebound_speed_nm_per_us",
-    "delay_us",
-    "peak_amplitude_nm",
-    "lockin_amplitude_nm",
-    "trace",
-    "determinant",
-)
+from tests.test_orbits import NUMBERS
 
 
 @pytest.fixture(scope="module")
