@@ -4,15 +4,14 @@ Phase by phase: DRY -> BRIDGE where the gap falls to `bridge_forms_nm`, BRIDGE -
 JUNCTION -> BRIDGE at D_off (straight to DRY where that lies beyond the bridge), BRIDGE -> DRY at `bridge_breaks_nm`. A
 tip that turns in the bridge may leave without a junction or form it again. Shares nothing with the package.
 
-A run with other steps shows the error of a course (rtol, method or longest_step_us); chaotic motion multiplies it from
-contact to contact.
+A run with other steps shows the error of a course (rtol or method); chaotic motion multiplies it from contact to
+contact.
 """
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from math import inf, nan
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import DOP853, OdeSolver
@@ -21,21 +20,7 @@ from tests.reference_driven_legs import END, Leg, Moment, fly, touch
 from tests.reference_driven_motion import BRIDGE, DRY, JUNCTION, DrivenContact, Motion
 from tests.reference_driven_steps import Steps
 
-__all__ = ["BRIDGE", "DRY", "JUNCTION", "Change", "ContactRecord", "Course", "DrivenContact", "follow"]
-
 SCALES = np.array([0.1, 1.0, 0.01, 1.0])  # gap (nm) or s, rate (nm/us), time (us), loss (aJ): what errors count by
-
-
-class Change(NamedTuple):
-    """One change of phase; gap and its rate are over the platform, position and velocity of the lab."""
-
-    time_us: float
-    before: str
-    after: str
-    gap_nm: float
-    gap_rate_nm_per_us: float
-    position_nm: float
-    velocity_nm_per_us: float
 
 
 @dataclass(kw_only=True)
@@ -56,10 +41,9 @@ class ContactRecord:
 
 @dataclass(kw_only=True)
 class Course:
-    """What happened: changes of phase, contacts, and the final state."""
+    """What happened: contacts, and the final state."""
 
     motion: Motion
-    changes: list[Change] = field(default_factory=list)
     contacts: list[ContactRecord] = field(default_factory=list)
     legs: list[Leg] = field(default_factory=list)
     phase: str = DRY
@@ -67,29 +51,17 @@ class Course:
     position_nm: float = nan
     velocity_nm_per_us: float = nan
 
-    @property
-    def arrival_times_us(self) -> np.ndarray:
-        """The times in us at which a bridge formed."""
-        return np.array([contact.arrival_time_us for contact in self.contacts])
-
     def sample(self, times_us: Iterable[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (nm) and velocities (nm/us) in the lab at times in us, as accurate as the course itself.
-
-        Raises:
-            ValueError: if a time lies outside the course.
-        """
+        """Return positions (nm) and velocities (nm/us) in the lab at times in us, as accurate as the course itself."""
         rows = []
-        first = self.legs[0].start.time_us
         for time in times_us:
-            if not first <= time <= self.time_us:
-                raise ValueError(f"times_us must lie in {first} to {self.time_us}, but one is {time}")
             leg = self.legs[bisect_right(self.legs, time, key=lambda each: each.start.time_us) - 1]
             rows.append(leg.in_lab(self.motion, float(time)))
         return np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
 
     def enter(self, leg: Leg) -> None:
-        """Enter a leg: its change of phase and what it means for the contact, and the state at its end."""
-        time, gap, rate = leg.end
+        """Enter a leg: what it means for the contact, and the state at its end."""
+        time, _, rate = leg.end
         self.legs.append(leg)
         self.phase, self.time_us = leg.phase if leg.after == END else leg.after, time
         self.position_nm, self.velocity_nm_per_us = leg.end.in_lab(self.motion)
@@ -99,7 +71,6 @@ class Course:
             contact.deepest_gap_nm = min(contact.deepest_gap_nm, leg.touch.deepest_gap_nm)
         if leg.after == END:
             return
-        self.changes.append(Change(time, leg.phase, leg.after, gap, rate, self.position_nm, self.velocity_nm_per_us))
         if leg.phase == DRY:
             self.contacts.append(ContactRecord(arrival_time_us=time, approach_speed_nm_per_us=-rate))
         elif leg.after == DRY:
@@ -118,7 +89,6 @@ def follow(
     contacts: int | None = None,
     rtol: float = 1e-12,
     method: Callable[..., OdeSolver] = DOP853,
-    longest_step_us: float = inf,
 ) -> Course:
     """Follow the tip from a start above the sample, dry or, at `bridge_forms_nm` and below, in the bridge.
 
@@ -131,20 +101,12 @@ def follow(
         contacts: at the end of which contact to stop, if that is earlier; a captured tip never gets there.
         rtol: relative tolerance of the steps; the absolute ones follow.
         method: SciPy's method for the steps.
-        longest_step_us: longest step in contact; in the junction at the pace of time at D_on.
-
-    Raises:
-        ValueError: if the tip does not start above D_on, or nothing says when to stop.
     """
-    if until_us == inf and contacts is None:
-        raise ValueError("give until_us or contacts: nothing says when to stop")
     motion = Motion(system)
-    steps = Steps(rtol=rtol, atol=rtol * SCALES, method=method, longest=longest_step_us)
+    steps = Steps(rtol=rtol, atol=rtol * SCALES, method=method)
     base, base_rate, _ = motion.platform(time_us)
     here = Moment(float(time_us), float(position_nm) - base, float(velocity_nm_per_us) - base_rate)
-    lowest = base + motion.solid.snap_on_gap_nm
-    if position_nm <= lowest or until_us <= time_us:
-        raise ValueError(f"the tip must start above {lowest:.6g} nm and before {until_us} us")
+    assert here.gap_nm > motion.solid.snap_on_gap_nm
     phase = DRY if here.gap_nm > motion.numbers.forms else BRIDGE
     course = Course(motion=motion)
     if phase == BRIDGE:

@@ -1,7 +1,6 @@
 """The legs of a driven tip's course: the motion within one phase of contact, from its start to the next change."""
 
 from bisect import bisect_right
-from dataclasses import replace
 from functools import partial
 from math import inf
 from typing import NamedTuple
@@ -90,7 +89,6 @@ def touch(motion: Motion, phase: str, start: Moment, until: float, steps: Steps)
         rates = partial(motion.junction_rates, start.time_us)
         marks += [Mark(DRY if solid.snap_off_gap_nm >= k.breaks else BRIDGE, GAP, FOLD, -1)]
         first = solid.snap_on_s
-        steps = replace(steps, longest=steps.longest / motion.depth_slope(first))
     way = follow_to_mark(rates, np.array([first, start.gap_rate_nm_per_us, 0.0, 0.0]), marks, RATE, steps)
     time = start.time_us + float(way.end[TIME])
     gaps = [moment_of(motion, phase, time, state).gap_nm for state in (*way.starts, way.end)]

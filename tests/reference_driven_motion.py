@@ -42,9 +42,6 @@ class DrivenContact:
 
     `contact` holds the contact's parameters with the paper's defaults; its mass is not used. `viscous` and `structural`
     leave these effects out where False.
-
-    Raises:
-        ValueError: if the cantilever is overdamped (Q <= 1/2), or no junction exists.
     """
 
     amplitude_nm: float
@@ -57,11 +54,6 @@ class DrivenContact:
     contact: ContactParameters = field(default_factory=ContactParameters)
     viscous: bool = True
     structural: bool = True
-
-    def __post_init__(self) -> None:
-        """Check the damping."""
-        if self.quality_factor is not None and self.quality_factor <= 0.5:
-            raise ValueError(f"quality_factor must be above 0.5, but is {self.quality_factor}")
 
     def start(self, *, phase_deg: float, height_nm: float, velocity_nm_per_us: float) -> Start:
         """Return the start at a drive phase and a height above the platform, with a velocity in the lab."""

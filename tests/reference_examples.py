@@ -1,8 +1,8 @@
-"""Parameter sets and the count of right digits, for tests of and with the references."""
+"""Parameter sets for tests with the references."""
 
 from typing import Any
 
-from tests.reference_flight import Parameters, mp
+from tests.reference_flight import Parameters
 
 DELAY = (0.206, 5.64, 0.726)  # the contact model's, physics.md
 
@@ -26,10 +26,3 @@ SCENES = {
     "viscous": scene(r=1.0, viscous_loss=0.48),
     "delayed": scene(r=0.9999, viscous_loss=0.48, delay=DELAY),
 }
-
-
-def digits(value: Any, exact: Any) -> float:
-    """Return how many digits of a number are right."""
-    with mp.workdps(100):
-        difference = abs(value - exact)
-        return float(mp.inf if difference == 0 else -mp.log10(difference / max(abs(exact), mp.mpf(10) ** -30)))

@@ -49,9 +49,6 @@ class Parameters:
         epsilon: absolute loss, nm^2/us^2.
         viscous_loss: loss c per approach speed, nm/us.
         delay: None, or (hertz in us (nm/us)^(1/5), lead in nm, offset in nm).
-
-    Raises:
-        ValueError: if the tip is not underdamped.
     """
 
     frequency_khz: float
@@ -63,11 +60,6 @@ class Parameters:
     epsilon: float
     viscous_loss: float = 0.0
     delay: tuple[float, float, float] | None = None
-
-    def __post_init__(self) -> None:
-        """Check that the flight has the underdamped form used here."""
-        if self.quality_factor is not None and self.quality_factor <= 0.5:
-            raise ValueError(f"quality_factor must be above 0.5 (underdamped), but is {self.quality_factor}")
 
 
 class Constants(NamedTuple):

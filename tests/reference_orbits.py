@@ -1,8 +1,7 @@
 """All single-impact orbits of one order by brute force: scan the closing condition, refine each root to 50 digits.
 
-Without delay the unknown is the impact phase (eq. 9, generalised to damping and viscous loss); with delay it is the
-approach speed, for which closing is linear in the cosine and sine of the phase. What an orbit looks like is then
-worked out by dense sampling and quadrature.
+The unknown is the approach speed, for which closing is linear in the cosine and sine of the phase. What an orbit looks
+like is then worked out by dense sampling and quadrature.
 """
 
 from dataclasses import dataclass
@@ -28,8 +27,6 @@ from tests.reference_map import flights_of, map_jacobian
 from tests.reference_observables import lockin, peak
 from tests.root_scan import refined, sign_changes
 
-PHASES = 4000
-FIRST_PHASE = 1.2345e-4  # so that no sample falls on a root at a quarter turn
 SPEEDS = 20000
 
 
@@ -68,66 +65,13 @@ def single_impact_orbits(p: Parameters, order: int) -> list[Orbit]:
         order: drive periods of a response period.
     """
     k = constants(p)
-    pairs = orbits_by_phase(p, order) if p.delay is None else orbits_by_speed(p, order)
-    orbits = [_orbit(p, k, order, phase, approach) for phase, approach in pairs]
+    orbits = [_orbit(p, k, order, phase, approach) for phase, approach in phases_and_speeds(p, order)]
     return sorted(orbits, key=lambda orbit: orbit.approach_speed_nm_per_us)
 
 
 @high_precision
-def orbits_by_phase(p: Parameters, order: int) -> list[tuple[Number, Number]]:
-    """Return (phase, approach speed) of all orbits without delay from both signs of the root in eq. 9."""
-    k, rough = constants(p), constants(p, np)
-    p11, p12, _, _ = propagator(rough, order * rough.drive_period, np)
-    if abs(1 - p11) < 1e-12 and abs(p12) * rough.free < 1e-12:
-        return []  # whole free periods without damping: the tip would come back rising as it left
-    pairs = []
-    for sign in (1, -1):
-
-        def closing(phase: Floats, sign: int = sign) -> Floats:
-            return _closing_by_phase(rough, order, sign, phase, np)[0]
-
-        def exact(phase: Number, sign: int = sign) -> Number:
-            return _closing_by_phase(k, order, sign, phase, mp)[0]
-
-        for low, high in sign_changes(closing, FIRST_PHASE + np.linspace(0, 2 * np.pi, PHASES + 1)):
-            phase = refined(exact, low, high)
-            if phase is None:
-                continue
-            _, after, before = _closing_by_phase(k, order, sign, phase, mp)
-            fall = platform(k, phase / k.drive)[1]
-            if after > fall > before and fall - before > capture_limit(k):
-                pairs.append((phase % (2 * mp.pi), fall - before))
-    return pairs
-
-
-def _closing_by_phase(k: Constants, order: int, sign: int, phase: Number, lib: Any) -> tuple[Number, Number, Number]:
-    """Return p12 V' - (1 - p11) z0 with V' and V of the law at this phase.
-
-    A flight that comes back to its height z0 has V = K V' with K = (p22 - det p)/(1 - p11), -1 without damping. With
-    it the squared law is a quadratic for V', whose roots carry the sign.
-    """
-    p11, p12, p21, p22 = propagator(k, order * k.drive_period, lib)
-    back = -1 if k.decay == 0 else (p22 - (p11 * p22 - p12 * p21)) / (1 - p11)
-    z0, fall, _ = platform(k, phase / k.drive, lib)
-    first = 1 - k.r**2 * back**2
-    half = -fall + k.r**2 * back * fall - k.viscous * back / 2
-    last = fall**2 * (1 - k.r**2) + k.viscous * fall + k.epsilon
-    # The form without cancellation (and without division by zero for r = 1) needs the sign of `half`.
-    with np.errstate(all="ignore"):
-        root = lib.sqrt(half**2 - first * last)
-        if lib is np:
-            small = np.where(half < 0, last / (root - half), (-half - root) / first)
-            after = (-half + root) / first if sign > 0 else small
-        elif sign > 0:
-            after = (-half + root) / first
-        else:
-            after = last / (root - half) if half < 0 else (-half - root) / first
-    return p12 * after - (1 - p11) * z0, after, back * after
-
-
-@high_precision
-def orbits_by_speed(p: Parameters, order: int) -> list[tuple[Number, Number]]:
-    """Return (phase, approach speed) of all orbits, with or without delay, by scanning the approach speed."""
+def phases_and_speeds(p: Parameters, order: int) -> list[tuple[Number, Number]]:
+    """Return (phase, approach speed) of all orbits by scanning the approach speed."""
     k, rough = constants(p), constants(p, np)
     limit, fastest = capture_limit(rough, np), rough.amplitude * rough.drive + np.sqrt(rough.epsilon) + rough.viscous
     speeds = limit + fastest * np.geomspace(1e-7, 1e6, SPEEDS)

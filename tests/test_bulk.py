@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 import fitting
 from afm_jax.cli.main import main
 from afm_jax.sweeps.plan import plan_of
-from fitting.bulk import _drawn, _table_of, _with_instrument, table_input
+from fitting.bulk import _drawn, _with_instrument, table_input
 from fitting.tables.table import AmplitudeTable, read_table, write_table
 
 AXIS = {"parameter": "table.quality_factor", "list": [38.0, 42.0]}
@@ -22,13 +22,6 @@ def table(scale: float = 1.0) -> AmplitudeTable:
     bundled = read_table(Path(str(fitting.__file__)).parent / "examples" / "amplitudes_law.csv")
     assert bundled.peak_amplitude_nm is not None
     return replace(bundled, peak_amplitude_nm=scale * bundled.peak_amplitude_nm)
-
-
-def test_a_table_survives_the_way_to_a_worker():
-    given = plan_of(table_input([table()], {})).given["tables"][0]
-    there = vars(_table_of(given))
-    for name, value in vars(table()).items():
-        np.testing.assert_array_equal(there[name], value)
 
 
 def test_instruments_change_what_they_say():

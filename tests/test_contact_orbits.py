@@ -4,17 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import afm_jax as afm
-from afm_jax.cli.main import main
 from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.continuation import continue_orbits
 from afm_jax.dynamics.starts import bouncing_tips
 from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 from tests.reference_driven_contact import DrivenContact, follow
-from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
 AMPLITUDE_NM, FREQUENCY_KHZ = 4.0, 181.8
@@ -46,6 +43,15 @@ def next_departure(
     last = follow(system, time_us, height, velocity, contacts=contacts).contacts[-1]
     rate = -amplitude_nm * omega * np.sin(omega * last.departure_time_us)
     return np.array([last.departure_time_us, last.rebound_speed_nm_per_us + rate])
+
+
+def reference_jacobian(time: float, velocity: float, steps: tuple[float, float], amplitude_nm: float) -> np.ndarray:
+    """Return the derivatives of the next departure by central differences of the reference."""
+    columns = []
+    for step, move in zip(steps, np.diag(steps), strict=True):
+        ahead, behind = (next_departure(time + by[0], velocity + by[1], amplitude_nm) for by in (move, -move))
+        columns.append((ahead - behind) / (2.0 * step))
+    return np.stack(columns, axis=1)
 
 
 def test_a_stable_orbit_and_a_saddle_near_capture_close_in_the_reference(found):
@@ -86,13 +92,7 @@ def test_the_multipliers_are_those_of_differences_in_the_reference(found):
     for index in range(2):
         time = float(found.reading.phase_rad[index, 0]) / OMEGA
         velocity = float(found.reading.velocity_after_nm_per_us[index, 0])
-        steps = np.array([1e-4, 1e-3]) if index == 0 else np.array([1e-5, 1e-4])
-        columns = [
-            (next_departure(time + one[0], velocity + one[1]) - next_departure(time - one[0], velocity - one[1]))
-            / (2.0 * step)
-            for step, one in zip(steps, np.diag(steps), strict=True)
-        ]
-        matrix = np.stack(columns, axis=1)
+        matrix = reference_jacobian(time, velocity, (1e-4, 1e-3) if index == 0 else (1e-5, 1e-4), AMPLITUDE_NM)
         assert np.trace(matrix) == pytest.approx(float(found.reading.trace[index]), rel=2e-4)
         assert np.linalg.det(matrix) == pytest.approx(float(found.reading.determinant[index]), rel=2e-4)
 
@@ -111,16 +111,7 @@ def test_the_fold_that_ends_both_orbits_is_one_of_the_reference(scene):
     later = next_departure(time, velocity, fold.parameter)
     assert later[0] - time == pytest.approx(PERIOD_US, abs=1e-7)
     assert later[1] == pytest.approx(velocity, rel=1e-6)
-    steps = np.array([1e-4, 1e-3])
-    columns = [
-        (
-            next_departure(time + one[0], velocity + one[1], fold.parameter)
-            - next_departure(time - one[0], velocity - one[1], fold.parameter)
-        )
-        / (2.0 * step)
-        for step, one in zip(steps, np.diag(steps), strict=True)
-    ]
-    multipliers = np.linalg.eigvals(np.stack(columns, axis=1))
+    multipliers = np.linalg.eigvals(reference_jacobian(time, velocity, (1e-4, 1e-3), fold.parameter))
     assert np.abs(multipliers - 1.0).min() < 2e-4
 
 
@@ -140,23 +131,6 @@ def test_beyond_its_period_doubling_an_orbit_makes_two_contacts_in_the_reference
     assert abs(half[1] - speed) > 1e-3 * abs(speed)
     whole = next_departure(time, speed, amplitude_nm, frequency_khz, contacts=2)
     assert whole == pytest.approx([time + 2e3 / frequency_khz, speed], abs=1e-5)
-
-
-def test_orbits_of_a_contact_scene_are_told_by_the_command(tmp_path):
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\nmass_ng = 1\n[platform]\namplitude_nm = 4\n"
-        'frequency_khz = 181.8\n[interaction]\nmodel = "contact"\n',
-        encoding="utf-8",
-    )
-    result = CliRunner().invoke(main, ["orbits", str(path), "--order", "1", "--json"])
-    assert result.exit_code == 0, result.stderr
-    told = strictly(result.stdout)
-    first = told["orbits"][0]
-    assert first["stable"]
-    assert first["peak_amplitude_nm"] == pytest.approx(98.56, abs=0.01)
-    assert first["impacts"][0]["delay_us"] == pytest.approx(0.078, abs=1e-3)
-    assert told["sticking"] is None
 
 
 def test_scenes_without_a_contact_and_numbers_that_are_none_are_refused(scene):

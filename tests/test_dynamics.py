@@ -19,7 +19,6 @@ from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.starts import bouncing_tips
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
-from tests.strict_reading import strictly
 
 FREQUENCY = "platform.reduced_frequency"
 
@@ -35,56 +34,6 @@ def repeats_after(velocities: np.ndarray, longest: int = 6) -> np.ndarray:
         same = np.abs(velocities[:, -m:] - velocities[:, -2 * m : -m]).max(axis=1) < 1e-7
         found[same] = m
     return found
-
-
-def followed_in_numpy(
-    reduced: float, r: float, phase: np.ndarray, rebound: np.ndarray, impacts: int, kept: int = 12
-) -> np.ndarray:
-    """Return the last rebound velocities of many tips of `law_scene`, flown with sines: (tips, kept).
-
-    A flight is looked at in steps of a sixtieth of a drive period; an arrival is where its gap, or the parabola through
-    three gaps, is below 0 first, improved by bisection.
-    """
-    free, beta, sigma = 2.0 * np.pi * 0.09, 2.0, -1.0
-    omega = 2.0 * reduced * free
-    time, step = phase / omega, 2.0 * np.pi / omega / 60.0
-    velocity = rebound - beta * omega * np.sin(phase)
-    rows = []
-
-    def gap(after, time, height, velocity):
-        path = height * np.cos(free * after) + velocity / free * np.sin(free * after)
-        return path - sigma - beta * np.cos(omega * (time + after))
-
-    for impact in range(impacts):
-        height = sigma + beta * np.cos(omega * time)
-        low, high = np.zeros(len(time)), np.full(len(time), np.nan)
-        left = np.arange(len(time))
-        # just after the impact the gap is that of the rebound, 0 itself is left out
-        old = gap(1e-6 * step, time, height, velocity)
-        older = np.zeros(len(time))
-        for number in range(1, 60 * 12):
-            after = number * step
-            now = gap(after, time[left], height[left], velocity[left])
-            bend = np.where((old < older) & (old < now), now - 2.0 * old + older, np.inf)
-            dips = (number > 1) & (old - (now - older) ** 2 / (8.0 * bend) < 0.0)
-            hit = (now < 0.0) | dips
-            low[left[hit]] = after - step * np.where(dips, 2.0, 1.0)[hit]
-            high[left[hit]] = np.where(dips, after - step - 0.5 * step * (now - older) / bend, after)[hit]
-            left, older, old = left[~hit], old[~hit], now[~hit]
-            if not left.size:
-                break
-        low = np.maximum(low, 1e-6 * step)
-        for _ in range(45):
-            middle = 0.5 * (low + high)
-            above = gap(middle, time, height, velocity) > 0.0
-            low, high = np.where(above, middle, low), np.where(above, high, middle)
-        end = velocity * np.cos(free * high) - height * free * np.sin(free * high)
-        time = (time + high) % (2.0 * np.pi / omega)
-        platform = -beta * omega * np.sin(omega * time)
-        velocity = platform + r * (platform - end)
-        if impact >= impacts - kept:
-            rows.append(velocity)
-    return np.stack(rows, axis=1)
 
 
 def swept_by_one_tip(values: np.ndarray, impacts: int) -> np.ndarray:
@@ -124,31 +73,6 @@ def test_sweeps_in_lanes_are_those_of_one_tip_and_show_hysteresis():
         np.testing.assert_allclose(sweep.height_nm, -1.0 + 2.0 * np.cos(sweep.phase_rad), rtol=0, atol=1e-9)
         # in N periods the platform is highest N times
         assert np.array_equal(np.isfinite(sweep.strobe_height_nm).sum(axis=1)[orbit], n[orbit])
-
-
-@pytest.mark.slow
-def test_a_chart_is_the_orbits_one_by_one_at_resonance_too():
-    x, y = np.linspace(0.5, 2.5, 9), np.array([0.4, 1.0, 3.0])
-    chart = stability_chart(
-        scene_family(law_scene(1.0), FREQUENCY, "platform.amplitude_nm"), x_values=x, y_values=y, last_order=2
-    )
-    assert {1.0, 2.0} <= set(x)
-    verdicts = chart.verdicts
-    for point, (n, beta) in enumerate(zip(*chart.points(), strict=True)):
-        scene = afm.Scene(afm.Cantilever(90.0), afm.Platform(beta, 180.0 * n, -1.0), afm.ImpactLaw(0.8))
-        for order in (1, 2):
-            orbits = afm.single_impact_orbits(scene, order)
-            admissible = np.asarray(orbits.exists & orbits.admissible)
-            stable = admissible & np.asarray(orbits.stable)
-            assert verdicts.admissible[order - 1, point] == admissible.any()
-            assert verdicts.stable[order - 1, point] == stable.any()
-            if stable.any():
-                slot = int(np.argmax(np.where(stable, orbits.peak_amplitude_nm, -1.0)))
-                sizes = np.abs(np.roots([1.0, -float(orbits.trace[slot]), float(orbits.determinant[slot])]))
-                assert verdicts.largest_multiplier[order - 1, point] == pytest.approx(sizes.max(), abs=1e-7)
-                assert verdicts.peak_amplitude_nm[order - 1, point] == pytest.approx(
-                    float(orbits.peak_amplitude_nm[slot])
-                )
 
 
 @pytest.mark.slow
@@ -202,7 +126,9 @@ def test_shares_of_basins_are_those_of_random_starts():
     assert found.plot().axes[0].get_xlabel()
     starts = 10_000
     phase, rebound = np.random.default_rng(7).uniform([[0.0], [0.0]], [[2.0 * np.pi], [15.0]], (2, starts))
-    m = repeats_after(followed_in_numpy(1.57, 0.8, phase, rebound, 300))
+    time = phase / float(scene.platform.angular_frequency)
+    flown = afm.iterate_batch(scene, time, np.asarray(scene.platform.velocity(time)) + rebound, 300)
+    m = repeats_after(np.asarray(flown.velocity_after_nm_per_us))
     for attractor, share, error in zip(found.attractors, found.share, found.share_error, strict=True):
         other = np.mean(m == attractor.impacts)
         assert abs(share - other) < 4.0 * np.hypot(error, np.sqrt(other * (1.0 - other) / starts))
@@ -219,29 +145,20 @@ def test_the_dimension_of_a_line_is_1_and_of_noise_2():
 
 
 @pytest.mark.slow
-def test_commands_write_tables_and_pictures(tmp_path: Path):
+def test_a_chart_is_written_as_a_table_and_as_arrays(tmp_path: Path):
     file = tmp_path / "scene.toml"
     afm.save_scene(law_scene(1.57), file)
-    calls = {
-        "bifurcation": ["--parameter", f"{FREQUENCY}=1.55:1.6:6", "--impacts", "600", "--both", "--picture", "svg"],
-        "chart": ["--x", f"{FREQUENCY}=0.5:2.5:9", "--y", "platform.amplitude_nm=1:3:3", "--orders", "2"],
-        "basins": ["--grid", "100x100", "--picture", "pdf"],
-    }
-    for name, options in calls.items():
-        run = CliRunner().invoke(main, [name, str(file), *options, "--json", "--out", str(tmp_path / name)])
+    options = ["--x", f"{FREQUENCY}=0.5:2.5:9", "--y", "platform.amplitude_nm=1:3:3", "--orders", "2"]
+    for more in ([], ["--zarr"]):
+        run = CliRunner().invoke(main, ["chart", str(file), *options, *more, "--out", str(tmp_path)])
         assert run.exit_code == 0, run.stderr
-        assert strictly(run.stdout)["format"] == f"afm-jax {name}"
-        assert (tmp_path / name / f"{name}.csv").stat().st_size > 100
-        assert list((tmp_path / name).glob(f"{name}.[ps][dnv][fg]"))
-    run = CliRunner().invoke(main, ["chart", str(file), *calls["chart"], "--zarr", "--out", str(tmp_path / "arrays")])
-    assert run.exit_code == 0, run.stderr
-    group = zarr.open_group(str(tmp_path / "arrays" / "chart.zarr"), mode="r")
+    group = zarr.open_group(str(tmp_path / "chart.zarr"), mode="r")
     assert (group.attrs["x"], group.attrs["y"]) == (FREQUENCY, "platform.amplitude_nm")
-    arrays = {name: np.asarray(part) for name, part in group.arrays()}
-    told = json.loads((tmp_path / "arrays" / "chart.zarr" / "stable" / "zarr.json").read_text(encoding="utf-8"))
+    told = json.loads((tmp_path / "chart.zarr" / "stable" / "zarr.json").read_text(encoding="utf-8"))
     assert told["dimension_names"] == ["order", "y", "x"]
+    arrays = {name: np.asarray(part) for name, part in group.arrays()}
     assert arrays["order"].tolist() == [1, 2]
-    with (tmp_path / "chart" / "chart.csv").open(encoding="utf-8") as table:
+    with (tmp_path / "chart.csv").open(encoding="utf-8") as table:
         rows = list(csv.DictReader(table))
     for name in ("stable", "admissible"):
         assert arrays[name].shape == (2, 3, 9)

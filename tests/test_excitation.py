@@ -3,14 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from tests.driven_scenes import BASE, FORCE, MASS, PER_KHZ, PLATFORM, TIMES, both
@@ -71,23 +68,6 @@ def test_a_free_tip_is_free_flight_plus_steady_response(drive: str, quality: flo
     np.testing.assert_allclose(integrate([z0, v0], quality=quality, **signals), free + steady, rtol=0, atol=2e-10)
 
 
-def test_a_resonant_force_moves_the_tip_by_q_times_its_rest_and_a_quarter_late():
-    _, response = surface_of(Scene(Cantilever(90.0, 40.0, MASS), PLATFORM, force=ForceDrive(0.5, 90.0)))
-    assert response is not None
-    (wave,) = response.tones
-    # Q f/k, phase -90 degrees; one rounding each, and that of pi
-    np.testing.assert_allclose(wave.sine, 40.0 * 0.5 / (MASS * OMEGA**2), rtol=1e-14)
-    np.testing.assert_allclose(wave.cosine, 0.0, rtol=0, atol=1e-12)
-
-
-def test_a_slow_base_takes_the_tip_along():
-    slow = BaseDrive(2.0, 1e-4, 60.0)
-    _, response = surface_of(Scene(Cantilever(90.0, 40.0), PLATFORM, base=slow))
-    assert response is not None
-    # H Omega^2 - 1 is i omega/(Omega Q) = 3e-8 there
-    np.testing.assert_allclose(both(response), np.array(slow.position_and_velocity(TIMES)), rtol=0, atol=2e-7)
-
-
 def contact(gap: Any) -> Any:
     """Return a smooth contact force in nN: soft repulsion, some attraction further out."""
     return 40.0 * np.exp(-gap / 1.5) - 6.0 * np.exp(-((gap - 3.0) ** 2) / 4.0)
@@ -119,25 +99,3 @@ def test_the_gap_is_that_of_a_free_cantilever_over_the_surface():
     # 1e-13 a step, and contacts stretch errors by less than 100
     np.testing.assert_allclose(moved + steady, lab, rtol=0, atol=1e-9)
     np.testing.assert_allclose(moved - both(surface), lab - both(PLATFORM), rtol=0, atol=1e-9)
-
-
-def test_a_base_drive_is_the_sample_moved_the_other_way_plus_the_inertial_force():
-    # in the base's frame, d = z - z_b: m d'' + (m Omega/Q) d' + k d = F(d - (z_p - z_b)) - m z_b'' - (m Omega/Q) z_b'
-    amplitude, frequency = 0.8, 97.0
-    omega, loss = PER_KHZ * frequency, OMEGA / 40.0
-    cantilever, resting = Cantilever(90.0, 40.0, MASS), Platform(0.0, frequency, -1.0)
-    size, late = MASS * amplitude * omega * np.hypot(omega, loss), np.rad2deg(np.arctan2(loss, omega))
-    turned = Platform(0.0, 1.0, -1.0, second=Tone(amplitude, frequency, 180.0))
-    other = Scene(cantilever, turned, force=ForceDrive(size, frequency, -late))
-    one, _ = surface_of(Scene(cantilever, resting, base=BaseDrive(amplitude, frequency)))
-    two, _ = surface_of(other)
-    # one surface, so one gap: a few roundings of 5 nm and 3 nm/us
-    np.testing.assert_allclose(both(one), both(two), rtol=0, atol=1e-13)
-
-
-def test_signals_are_those_of_their_definition():
-    # a few roundings of numbers of 1
-    np.testing.assert_allclose(BASE.position_and_velocity(TIMES)[0], base_motion(TIMES), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(FORCE.force(TIMES), tip_force(TIMES), rtol=0, atol=1e-14)
-    rate = [float(jax.grad(lambda t: BASE.position_and_velocity(t)[0])(t)) for t in TIMES]
-    np.testing.assert_allclose(BASE.position_and_velocity(TIMES)[1], rate, rtol=0, atol=1e-14)

@@ -1,9 +1,6 @@
 """Law scenes in time: against the impact map, SciPy's integration, and the balance of energy."""
 
-from typing import Any
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -41,9 +38,7 @@ DRIVEN = LawSystem(
 )
 
 
-@pytest.mark.parametrize(
-    "changes", [{}, {"delay": None}, {"delay": None, "epsilon": 900.0}], ids=["delayed", "instant", "captured"]
-)
+@pytest.mark.parametrize("changes", [{}, {"delay": None, "epsilon": 900.0}], ids=["delayed", "captured"])
 def test_flights_and_impacts_are_those_of_the_map(changes):
     scene, time = bouncing(**changes), 4.0
     rows = iterate_map(scene, time, 60.0, 14)
@@ -52,9 +47,9 @@ def test_flights_and_impacts_are_those_of_the_map(changes):
     assert count >= 12
     assert np.all(np.asarray(contacts.kind)[count:] == ContactKind.NONE)
     captured = int(rows.outcome[count - 1]) == Outcome.CAPTURED
-    assert captured == (changes.get("epsilon") == 900.0)
-    impacts = slice(0, count - 1 if captured else min(count, 14))
+    assert captured == bool(changes)
     arrivals = slice(0, min(count, 14))
+    impacts = slice(0, count - 1) if captured else arrivals
     # the same functions, compiled once more
     for ours, maps, which in (
         (contacts.arrival_time_us, rows.arrival_time_us, arrivals),
@@ -64,20 +59,11 @@ def test_flights_and_impacts_are_those_of_the_map(changes):
     ):
         np.testing.assert_allclose(np.asarray(ours)[which], np.asarray(maps)[which], rtol=1e-12, atol=1e-12)
     if not captured:
-        assert int(result.outcome) == MotionOutcome.FINISHED
-        assert int(result.phase) == Phase.DRY
+        assert (int(result.outcome), int(result.phase)) == (MotionOutcome.FINISHED, Phase.DRY)
         return
-    assert int(result.outcome) == MotionOutcome.HELD
-    assert bool(result.held)
-    assert int(result.phase) == Phase.JUNCTION
-    assert int(contacts.kind[count - 1]) == ContactKind.HELD
-    assert float(contacts.departure_time_us[count - 1]) == np.inf
+    assert (int(result.outcome), int(result.phase)) == (MotionOutcome.HELD, Phase.JUNCTION)
     approach = float(contacts.approach_speed_nm_per_us[count - 1])
     assert float(contacts.energy_lost_aj[count - 1]) == pytest.approx(0.5 * approach**2, rel=1e-14)  # 1 ng
-    # 4 nm at 1.01 times 180 kHz around -1 nm
-    angle = 2e-3 * np.pi * 181.8 * 104.0
-    assert float(result.final.position_nm) == pytest.approx(-1.0 + 4.0 * np.cos(angle), abs=1e-12)
-    assert float(result.final.velocity_nm_per_us) == pytest.approx(-4e-3 * 2 * np.pi * 181.8 * np.sin(angle), abs=1e-11)
 
 
 @pytest.mark.parametrize(
@@ -173,31 +159,15 @@ def test_an_end_within_the_collision_delay_is_on_the_platform():
     assert float(cut.final.position_nm) == pytest.approx(float(scene.platform.position(cut.final.time_us)), abs=1e-12)
 
 
-def end_of_flights(offset: Any, r: Any) -> Any:
-    """Return position and velocity after some impacts under a drive of the base."""
-    scene = Scene(Cantilever(90.0, 40.0), Platform(3.0, 170.0, offset), ImpactLaw(r, 40.0), BaseDrive(1.5, 88.0))
-    final = simulated(scene, (0.4, 18.0, 3.0), 30.0).final
-    return jnp.stack([final.position_nm, final.velocity_nm_per_us])
-
-
-@pytest.mark.slow
-def test_derivatives_are_differences():
-    at = (-1.0, 0.98)
-    value, slopes = jax.jit(lambda *at: (end_of_flights(*at), jax.jacfwd(end_of_flights, argnums=(0, 1))(*at)))(*at)
-    np.testing.assert_allclose(value, end_of_flights(*at), rtol=1e-10)  # the same numbers, compiled otherwise
-    for place, slope in enumerate(slopes):
-        step = 1e-5 * np.eye(2)[place]
-        difference = np.asarray(end_of_flights(*(at + step)) - end_of_flights(*(at - step))) / 2e-5
-        assert np.all(np.abs(difference) > 1e-3)
-        # second order in the step, rounding 1e-12/1e-5
-        np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-5)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("within", [jax.grad, lambda end: jax.jit(jax.grad(end)), jax.hessian])
 def test_reverse_that_was_not_asked_for_is_one_clear_error(within):
+    def end(offset):
+        scene = Scene(Cantilever(90.0, 40.0), Platform(3.0, 170.0, offset), ImpactLaw(0.9, 40.0), BaseDrive(1.5, 88.0))
+        return simulated(scene, (0.4, 18.0, 3.0), 30.0).final.position_nm
+
     with pytest.raises(ValueError, match=r"`simulate` is differentiable in reverse mode .* with `reverse=True` only"):
-        within(lambda offset: end_of_flights(offset, 0.9).sum())(-1.0)
+        within(end)(-1.0)
 
 
 def test_a_batch_is_its_members():

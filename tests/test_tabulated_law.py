@@ -120,15 +120,9 @@ def test_a_law_without_adhesion_captures_nothing():
 @pytest.mark.parametrize(
     ("u", "w", "options", "said"),
     [
-        ([10.0, 20.0, 30.0], [9.0, 19.0, 29.0], {}, "at least four speeds, but has 3"),
-        ([20.0, 15.0, 30.0, 40.0], [9.0, 9.0, 9.0, 9.0], {}, "increase from row to row, but 15 follows 20 in row 2"),
         ([10.0, 15.0, 15.0, 40.0], [9.0, 9.0, 9.0, 9.0], {}, "increase from row to row, but 15 follows 15 in row 3"),
-        ([10.0, 20.0, 30.0, 40.0], [9.0, 21.0, 29.0, 39.0], {}, "not be faster than the approach, but is 21 at 20"),
-        ([10.0, 20.0, 30.0, 40.0], [9.0, np.nan, 29.0, 39.0], {}, "must be finite numbers, but is nan in row 2"),
         ([10.0, 20.0, np.inf, 40.0], [9.0, 9.0, 29.0, 39.0], {}, "must be finite numbers, but is inf in row 3"),
-        ([10.0, 20.0, 30.0, 40.0], [9.0, -1.0, 29.0, 39.0], {}, "must not be negative, but is -1 at 20 in row 2"),
         ([10.0, 20.0, 30.0, 40.0], [9.0, 0.0, 29.0, 39.0], {}, r"is 0 \(captured\) in row 2, but slower tips leave"),
-        ([10.0, 20.0, 30.0, 40.0], [9.0, 19.0, 29.0], {}, "must have a number for each of the 4 speeds, but has 3"),
         ([-1.0, 20.0, 30.0, 40.0], [0.0, 19.0, 29.0, 39.0], {}, "must be positive, but is -1 in row 1"),
         (
             [10.0, 20.0, 30.0, 40.0],
@@ -153,18 +147,11 @@ def scenes() -> tuple[Scene, Scene]:
     return Scene(*parts, WET), Scene(*parts, table_of(WET))
 
 
-def numbers_of(result) -> list[np.ndarray]:
-    return [np.asarray(leaf, float) for leaf in jax.tree.leaves(result)]
-
-
 @pytest.mark.slow
 def test_map_and_jacobian_are_those_of_the_formula(scenes):
-    for function in (
-        lambda scene: afm.next_impact(scene, 4.0, 60.0),
-        lambda scene: afm.map_jacobian(scene, 4.0, 60.0),
-        lambda scene: afm.iterate_map(scene, 4.0, 60.0, 5),
-    ):
-        for ours, theirs in zip(*(numbers_of(function(scene)) for scene in scenes), strict=True):
+    for function in (afm.next_impact, afm.map_jacobian):
+        found = (jax.tree.leaves(function(scene, 4.0, 60.0)) for scene in scenes)
+        for ours, theirs in zip(*found, strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-7)
 
 
@@ -176,10 +163,8 @@ def test_orbits_are_those_of_the_formula(lasts, scenes):
         law = ImpactLaw(0.99, 100.0, 0.3)
         scenes = [Scene(scenes[0].cantilever, scenes[0].platform, one) for one in (law, table_of(law))]
     found = [afm.single_impact_orbits(scene, 1) for scene in scenes]
-    for name in ("approach_speed_nm_per_us", "peak_amplitude_nm", "lockin_amplitude_nm", "trace", "determinant"):
+    numbers = ("approach_speed_nm_per_us", "peak_amplitude_nm", "lockin_amplitude_nm", "trace", "determinant")
+    for name in (*numbers, "stable", "admissible"):
         ours, theirs = (np.asarray(getattr(one, name))[np.asarray(one.exists)] for one in found)
         assert ours.size >= 2
         np.testing.assert_allclose(ours, theirs, rtol=1e-6)
-    for name in ("stable", "admissible"):
-        ours, theirs = (np.asarray(getattr(one, name))[np.asarray(one.exists)] for one in found)
-        np.testing.assert_array_equal(ours, theirs)

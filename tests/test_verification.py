@@ -18,7 +18,7 @@ from afm_jax.verify.fifty_digits import exact_impact
 from afm_jax.verify.samples import DAMPED, DELAYED, EPSILON, PAPER, draw_sample
 from tests.reference_examples import SCENES
 from tests.reference_flight import Parameters, mp
-from tests.reference_map import differenced_jacobian, iterate
+from tests.reference_map import iterate, map_jacobian
 
 
 @pytest.fixture(scope="module")
@@ -52,19 +52,19 @@ def test_the_fifty_digits_cover_ordinary_and_close_states(checks):
 
 
 @pytest.mark.parametrize(
-    ("name", "element", "kind", "fails"),
+    ("name", "element", "factor", "kind", "fails"),
     [
-        ("eq5", (0, 1), PAPER, {"eq. 5"}),
-        ("eq5", (1, 0), PAPER, {"eq. 5"}),
-        ("eq7", (1, 1), PAPER, {"eq. 7"}),
-        ("flight_jacobian", (1, 1), DAMPED, {"eq. 5, damped", "eqs. 5+7, damped"}),
-        ("impact_jacobian", (0, 1), DELAYED, {"eq. 7, damped, delayed", "eqs. 5+7, damped, delayed"}),
+        ("eq5", (1, 0), -1.0, PAPER, {"eq. 5"}),
+        ("eq5", (1, 0), np.nan, PAPER, {"eq. 5"}),
+        ("eq7", (1, 1), -1.0, PAPER, {"eq. 7"}),
+        ("flight_jacobian", (1, 1), -1.0, DAMPED, {"eq. 5, damped", "eqs. 5+7, damped"}),
+        ("impact_jacobian", (0, 1), -1.0, DELAYED, {"eq. 7, damped, delayed", "eqs. 5+7, damped, delayed"}),
     ],
 )
-def test_a_wrong_sign_is_found(monkeypatch, name, element, kind, fails):
+def test_a_wrong_element_is_found(monkeypatch, name, element, factor, kind, fails):
     right = getattr(formulas, name)
-    signs = jnp.ones((2, 2)).at[element].set(-1.0)
-    monkeypatch.setattr(formulas, name, lambda *args: signs * right(*args))
+    factors = jnp.ones((2, 2)).at[element].set(factor)
+    monkeypatch.setattr(formulas, name, lambda *args: factors * right(*args))
     # Not the program that was compiled with the right formula, and a fresh one afterwards.
     monkeypatch.setattr(formulas, "_map_jacobian", jax.jit(inspect.unwrap(formulas._map_jacobian)))
     sample = draw_sample(np.random.default_rng(2), 50, kind)
@@ -77,12 +77,6 @@ def test_a_wrong_trace_is_found(monkeypatch):
     monkeypatch.setattr(formulas, "eq8", lambda *args: (right(*args)[0], 2.0 - right(*args)[1]))
     results = verification._orbit_checks(draw_orbits(np.random.default_rng(2), 50, PAPER))
     assert {check.equation for check in results if not check.passed} == {"eq. 8, T"}
-
-
-def test_what_is_not_a_number_does_not_pass(monkeypatch):
-    monkeypatch.setattr(formulas, "eq5", lambda flight: jnp.full((2, 2), jnp.nan) * flight.C)
-    sample = draw_sample(np.random.default_rng(2), 50, PAPER)
-    assert [check.equation for check in verification._automatic_checks(sample) if not check.passed] == ["eq. 5"]
 
 
 def test_without_mpmath_the_rows_say_so(monkeypatch):
@@ -104,19 +98,14 @@ def test_command_writes_json_and_fails_on_a_wrong_formula(monkeypatch, tmp_path)
     assert (tmp_path / "verify.csv").read_text().startswith("equation,against,where,points")
 
 
-def test_bad_numbers_are_refused():
-    with pytest.raises(ValueError, match="`states` must be a positive integer"):
-        verification.verify(states=0)
-
-
 @pytest.mark.parametrize("name", SCENES)
-def test_fifty_digits_agree_with_central_differences(name: str):
+def test_fifty_digits_agree_with_those_of_the_reference(name: str):
     p = SCENES[name]
     first = iterate(p, 4.0, 60.0, 1)[0]
     exact = exact_impact(mp, _row(p), (4.0, 60.0), float(first.arrival_time_us))
-    differenced = differenced_jacobian(p, 4.0, 60.0, first.arrival_time_us)
+    expected = map_jacobian(p, 4.0, 60.0, first.arrival_time_us)
     # Both are right to 50 digits and rounded to float64 here.
-    np.testing.assert_allclose(exact["eqs. 5+7"], np.array(differenced.tolist(), dtype=float), rtol=1e-14)
+    np.testing.assert_allclose(exact["eqs. 5+7"], np.array(expected.tolist(), dtype=float), rtol=1e-14)
     np.testing.assert_allclose(exact["arrival"], float(first.arrival_time_us), rtol=1e-15)
 
 

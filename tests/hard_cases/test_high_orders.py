@@ -17,7 +17,7 @@ from afm_jax.impact.orbits import single_impact_orbits
 from tests.hard_cases.maps import USUAL
 from tests.package_scenes import scene_of
 from tests.reference_flight import mp
-from tests.reference_orbits import orbits_by_phase
+from tests.reference_orbits import phases_and_speeds
 from tests.reference_orbits import single_impact_orbits as exact_orbits
 
 pytestmark = pytest.mark.slow
@@ -61,7 +61,7 @@ def test_their_slopes_are_differences_of_fifty_digits():
     with mp.workdps(50):
         step = mp.mpf("1e-12")
         ends = [
-            sorted(u for _, u in orbits_by_phase(replace(p, offset_nm=p.offset_nm + s), order)) for s in (step, -step)
+            sorted(u for _, u in phases_and_speeds(replace(p, offset_nm=p.offset_nm + s), order)) for s in (step, -step)
         ]
         want = [float((above - below) / (2 * step)) for above, below in zip(*ends, strict=True)]
     assert want

@@ -4,49 +4,48 @@
 * Amplitudes from 1e-3 to 1e6 nm: nothing in the search may have a scale of its own.
 * Exact and nearly exact resonance: the flight's end and the platform's phase depend on a difference of frequencies.
 * Reduced frequencies of 50 and 0.01: a hundred crossings' worth of platform in a flight; a platform that hardly moves.
+* Restitutions of next to nothing and of one.
 * Within 1e-12 of capture: the rebound is the root of a difference.
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from tests import reference_flight
+from tests import brute_force, reference_flight, reference_map
 from tests.hard_cases.maps import USUAL, compare, leaving
+from tests.reference_flight import Parameters
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("quality_factor", [0.6, 1.0, 1e3, 1e7])
-def test_quality_factors(quality_factor: float):
-    p = replace(USUAL, quality_factor=quality_factor, offset_nm=0.5)
-    compare(p, *leaving(p, 0.7, 8.0))
+CASES: dict[str, tuple[Parameters, float, float]] = {}
+"""The scene, the turns of the drive at the start, and the rebound speed there in units of the top speed."""
+for value in (0.6, 1.0, 1e3, 1e7):
+    CASES[f"Q = {value:g}"] = replace(USUAL, quality_factor=value, offset_nm=0.5), 0.7, 8.0
+for value in (1e-3, 1.0, 1e3, 1e6):
+    moved = replace(USUAL, amplitude_nm=value, offset_nm=-0.3 * value, epsilon=value**2)
+    CASES[f"amplitude {value:g} nm"] = moved, 0.6, 5.0
+for value in (0.0, 1e-15, 1e-12, 1e-9, -1e-6):
+    tuned = replace(USUAL, drive_frequency_khz=180.0 * (1.0 + value), offset_nm=0.0, quality_factor=1e6)
+    CASES[f"{value:g} off resonance"] = tuned, 0.75, 20.0
+for reduced, rebound in ((50.0, 2.5), (50.0, 40.0), (0.01, 30.0), (0.01, 0.5)):
+    driven = replace(USUAL, drive_frequency_khz=180.0 * reduced, epsilon=0.0)
+    CASES[f"n = {reduced:g}, rebound {rebound:g}"] = driven, 0.7, rebound
+for value in (1e-9, 0.5, 1.0 - 1e-12, 1.0):
+    CASES[f"r = {value!r}"] = replace(USUAL, r=value, epsilon=0.0), 0.7, 6.0
 
 
-@pytest.mark.parametrize("amplitude_nm", [1e-3, 1.0, 1e3, 1e6])
-def test_amplitudes(amplitude_nm: float):
-    p = replace(USUAL, amplitude_nm=amplitude_nm, offset_nm=-0.3 * amplitude_nm, epsilon=amplitude_nm**2)
-    compare(p, *leaving(p, 0.6, 5.0))
-
-
-@pytest.mark.parametrize("away", [0.0, 1e-15, 1e-12, 1e-9, -1e-6])
-def test_resonance(away: float):
-    p = replace(USUAL, drive_frequency_khz=180.0 * (1.0 + away), offset_nm=0.0, quality_factor=1e6)
-    compare(p, *leaving(p, 0.75, 20.0))
-
-
-@pytest.mark.parametrize(("reduced", "rebound"), [(50.0, 2.5), (50.0, 40.0), (0.01, 30.0), (0.01, 0.5)])
-def test_fast_and_slow_platforms(reduced: float, rebound: float):
-    p = replace(USUAL, drive_frequency_khz=180.0 * reduced, epsilon=0.0)
-    compare(p, *leaving(p, 0.7, rebound))
+@pytest.mark.parametrize("name", CASES)
+def test_at_the_ends_of_what_can_be_asked_for(name: str):
+    p, phase_turns, rebound = CASES[name]
+    compare(p, *leaving(p, phase_turns, rebound))
 
 
 @pytest.mark.parametrize("away", [1e-3, 1e-6, 1e-9])
@@ -55,19 +54,12 @@ def test_near_capture(away: float, side: float):
     # the loss that leaves, of this very impact, nothing but a little
     free = replace(USUAL, r=1.0, epsilon=0.0)
     time, velocity = leaving(free, 0.7, 6.0)
-    k = reference_flight.constants(free)
-
-    def gap(t):
-        p11, p12, _, _ = reference_flight.propagator(k, t - time)
-        start = reference_flight.platform(k, time)[0]
-        return float(p11 * start + p12 * velocity - reference_flight.platform(k, t)[0])
-
-    times = time + np.linspace(0.3, 20.0, 4000)
-    first = int(np.flatnonzero(np.array([gap(t) for t in times]) < 0.0)[0])
-    arrival: Any = brentq(gap, times[first - 1], times[first], xtol=1e-15)
-    _, _, p21, p22 = reference_flight.propagator(k, arrival - time)
-    speed = reference_flight.platform(k, arrival)[1]
-    approach = float(speed - p21 * reference_flight.platform(k, time)[0] - p22 * velocity)
+    arrival = float(
+        brute_force.first_impact(reference_map.flights_of(free, time, velocity), duration_us=20.0).arrival_time_us[0]
+    )
+    impact = reference_map.next_impact(free, time, velocity, arrival)
+    platform_speed = reference_flight.platform_motion(free, impact.arrival_time_us)[1]
+    approach = float(platform_speed - impact.velocity_before_nm_per_us)
     # of the derivative: rounding over the distance from capture
     compare(replace(free, epsilon=approach**2 * (1.0 - side * away)), time, velocity, slopes=1e-9 + 1e-13 / away)
 

@@ -3,15 +3,14 @@
 Hard: the law cannot be read backwards (1/r), the map ends at its first impact, and a motion is all rides: the tip moves
 with the platform until it lets go, at once where the platform pulls.
 
-Right answer: the event-driven loop of `tests/reference_law_motion.py`; of the next impact the closed flight's first
-zero by bisection.
+Right answer: the event-driven loop of `tests/reference_law_motion.py`; of the next impact the search of
+`tests/brute_force.py`.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import brentq
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -24,6 +23,7 @@ from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.outcomes import Outcome
+from tests.brute_force import Flights, first_impact
 from tests.law_systems import PRESSING, PRESSING_START, assert_same_rows, scene_of, simulated
 from tests.reference_law_motion import Cosines, LawSystem, follow
 
@@ -63,30 +63,13 @@ def test_a_motion_is_that_of_the_events(system: LawSystem, start: tuple[float, f
 
 
 @pytest.mark.slow
-def test_adhesion_holds_the_tip_for_good():
-    result = simulated(
-        scene_of(LawSystem(FAST.platform, r=0.0, epsilon=1.0, quality_factor=40.0)), (0.0, 10.0, 0.0), 80.0
-    )
-    assert int(result.outcome) == MotionOutcome.HELD
-    assert int(result.count) == 1
-
-
-@pytest.mark.slow
 def test_the_map_ends_and_orbits_are_none():
     scene = scene_of(FAST)
     rows = iterate_map(scene, 1.0, 8.0, 2)
     assert rows.outcome.tolist() == [Outcome.CAPTURED, Outcome.NOT_REACHED]
-    omega, decay = 2e-3 * np.pi * 90.0, 2e-3 * np.pi * 90.0 / 80.0
-    damped, drive = np.sqrt(omega**2 - decay**2), 2e-3 * np.pi * 181.8
-    height = 4.0 * np.cos(drive)
-
-    def gap(time):
-        sine = (8.0 + decay * height) / damped * np.sin(damped * time)
-        return np.exp(-decay * time) * (height * np.cos(damped * time) + sine) - 4.0 * np.cos(drive * (1.0 + time))
-
-    times = np.linspace(1e-3, 20.0, 20_000)
-    first = int(np.flatnonzero(gap(times) < 0.0)[0])
-    arrival = 1.0 + float(np.asarray(brentq(gap, times[first - 1], times[first], xtol=1e-14)))
+    drive = 2e-3 * np.pi * 181.8
+    flight = Flights(*(np.array([value]) for value in (90.0, 40.0, 4.0, 181.8, 0.0, 1.0, 8.0)))
+    arrival = float(first_impact(flight, duration_us=20.0).arrival_time_us[0])
     # the search stops at 1e-13 us
     assert float(rows.arrival_time_us[0]) == pytest.approx(arrival, abs=1e-12)
     assert float(rows.velocity_after_nm_per_us[0]) == pytest.approx(-4.0 * drive * np.sin(drive * arrival), abs=1e-10)

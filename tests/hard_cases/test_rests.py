@@ -83,19 +83,6 @@ def test_a_tip_captured_without_adhesion_is_let_go_too():
     assert ContactKind.CHATTER not in np.asarray(result.contacts.kind)
 
 
-def test_a_tip_that_the_platform_never_presses_leaves_at_once():
-    # far below its rest position the platform pulls: a captured tip has nothing that holds it
-    system = LawSystem(Cosines(-6.0, 0.05, ((2.0, 37.0, 0.0),)), r=0.5, viscous_loss=30.0)
-    start = (0.0, -3.0, -9.0)
-    course = follow(system, *start, 60.0)
-    result = simulated(scene_of(system), start, 60.0)
-    assert int(result.count) == len(course.rows) > 1
-    assert_same_rows(result, course, len(course.rows))
-    contacts = result.contacts
-    assert np.all(np.asarray(contacts.departure_time_us) == np.asarray(contacts.arrival_time_us))
-    assert np.all(np.asarray(contacts.rebound_speed_nm_per_us) == 0.0)
-
-
 @pytest.mark.parametrize(
     ("system", "time"),
     [
