@@ -85,7 +85,7 @@ def curve_of_law(tip: Tip, heights_nm: np.ndarray, rebound: Callable[[np.ndarray
     for height in heights_nm.tolist():
         signs = np.sign(off(speeds, height))
         for i in np.flatnonzero(signs[:-1] * signs[1:] < 0.0)[::-1]:
-            u = brentq(off, speeds[i], speeds[i + 1], args=(height,), xtol=1e-14, rtol=1e-14)
+            u: Any = brentq(off, speeds[i], speeds[i + 1], args=(height,), xtol=1e-14, rtol=np.float64(1e-14))
             cosine, sine = phase(u, height)
             angle, w = np.arctan2(sine, cosine), float(rebound(u))
             gap = p * (height + free * cosine) + q * (w - free * omega * sine) - height

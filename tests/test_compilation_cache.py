@@ -135,6 +135,7 @@ def test_a_python_session_shares_the_cache_of_the_commands_and_xla_is_silent(tmp
         "jax.jit(lambda x: jax.numpy.sin(x).sum())(jax.numpy.arange(9.0))\n"
         "print(afm_jax.use_cache() == afm_jax.use_cache(), jax.config.read('jax_enable_x64'))"
     )
+    folder = ""
     for _ in range(2):
         printed, said = outputs(code, with_cache_in(tmp_path))
         folder, same = printed.splitlines()

@@ -224,7 +224,7 @@ def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     # six decimals of hundredths
     np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
     np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-5)
-    lever = {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0}
+    lever: dict[str, Any] = {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0}
     text = table_text(read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0), **lever))
     assert "# tip_calibration = 1 +- 0.02\n" in text
 
@@ -246,11 +246,12 @@ def test_wrong_column_maps_are_named(tmp_path: Path):
             parse_columns(text)
     path = saved(tmp_path, raw_curve(50).text)
     one_and_two = "offset_nm=1/2:nm,lockin_amplitude_nm=5:V"
-    for options, said in (
+    cases: Any = (
         ({"columns": one_and_two}, "=5 has one channel where other columns have OUT/BACK"),
         ({"columns": "offset_nm=1/9:nm"}, "there is no channel `9`; it has 1, 2"),
         ({}, re.escape("say --columns offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V")),
-    ):
+    )
+    for options, said in cases:
         with pytest.raises(TableError, match=said):
             read_curves(path, **options)
 

@@ -4,6 +4,7 @@ import contextlib
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,7 +80,7 @@ def test_an_hdf5_file_says_the_same_as_a_csv_file(tmp_path: Path, group: str | N
     np.testing.assert_array_equal(trace.deflection_nm, HEIGHT.astype(np.float32).astype(np.float64))
 
 
-KNOWN = {"drive_frequency_khz": 180.0, "sampling_rate_mhz": 10.0}
+KNOWN: dict[str, Any] = {"drive_frequency_khz": 180.0, "sampling_rate_mhz": 10.0}
 
 
 def test_faults_of_hdf5_files(tmp_path: Path):

@@ -112,4 +112,5 @@ def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(bouncing, tm
     names = drawn(scene, found, tmp_path, white=0.15, width=1000)
     assert names == [name for name in ALL if look.left or name != "poincare.png"]
     # one that bounces has every picture
-    assert drawn(*bouncing, tmp_path) == ALL
+    scene, found = bouncing
+    assert drawn(scene, found, tmp_path) == ALL

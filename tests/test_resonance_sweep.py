@@ -1,6 +1,7 @@
 """Reading resonance sweeps: both forms, and every fault as one line that says what, where and how to mend it."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,13 +66,14 @@ def test_absolute_frequencies_of_nanonis_and_a_missing_phase(tmp_path):
 
 def test_faults_of_sweeps_in_memory():
     one, none = np.array([1.0, 2.0]), np.zeros(0)
-    for columns, said in (
+    cases: Any = (
         ({"frequency_khz": none, "amplitude": none}, r"sweep in memory, column frequency_khz: has the shape \(0,\)"),
         (
             {"amplitude_error": np.array([0.1, 0.0])},
             "row 2, column amplitude_error: must be finite and above 0, but is 0",
         ),
         ({"phase_deg": one, "phase_error_deg": one}, "the phase has errors but the amplitude has none"),
-    ):
+    )
+    for columns, said in cases:
         with pytest.raises(TableError, match=said):
             ResonanceSweep(**({"frequency_khz": one, "amplitude": one} | columns))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -227,7 +228,7 @@ def test_thirty_curves_of_a_thousand_points_take_less_than_ten_seconds_of_one_co
 @pytest.mark.slow
 def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_path: Path):
     truth, rng = curve_like_graphite(120), np.random.default_rng(4)
-    lever = {"free_frequency_khz": 344.604, "quality_factor": 233.0, "spring_constant_n_per_m": 44.0}
+    lever: dict[str, Any] = {"free_frequency_khz": 344.604, "quality_factor": 233.0, "spring_constant_n_per_m": 44.0}
     lever |= {"free_frequency_error_khz": 0.005, "quality_factor_error": 5.0, "spring_constant_error_n_per_m": 2.0}
     tables = []
     for number in range(4):

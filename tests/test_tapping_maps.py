@@ -112,7 +112,7 @@ def test_pixels_out_of_range_are_masked_and_counted():
     assert np.all(np.isnan(found.energy[masked]))
     np.testing.assert_allclose(found.energy[~masked], energy[~masked], rtol=2e-4)
     assert found.valid
-    wrong = tapping_map((amplitude, lag), **(LEVER | {"free_amplitude_nm": 9.0}))
+    wrong = tapping_map((amplitude, lag), **{**LEVER, "free_amplitude_nm": 9.0})
     assert not wrong.valid
     assert "free amplitude, its phase, quality factor or units do not belong" in wrong.reasons[0]
 
@@ -130,7 +130,7 @@ def test_without_a_spring_constant_energies_are_over_it():
 def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip():
     amplitude, lag, _ = image()
     straight = tapping_map((amplitude, lag), **LEVER)
-    turned = tapping_map((amplitude, -lag), **(LEVER | {"free_phase_deg": (-FREE_LAG, 0.2)}))
+    turned = tapping_map((amplitude, -lag), **{**LEVER, "free_phase_deg": (-FREE_LAG, 0.2)})
     np.testing.assert_allclose(turned.energy, straight.energy, rtol=1e-12)
     np.testing.assert_allclose(turned.virial, straight.virial, rtol=1e-9)
     assert any(note.startswith("Sign: the free tip reads") for note in turned.notes)
@@ -245,8 +245,10 @@ def test_masked_pixels_are_masked_in_gwyddion_too():
 def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
     curves = [raw_curve(300, seed=seed, drift=0.0) for seed in range(6)]
     path, names = tmp_path / "grid.npz", ("amplitude_v", "phase_deg", "height_nm")
-    arrays: dict[str, Any] = {name: [getattr(curve, name)[0] for curve in curves] for name in names}
-    np.savez(path, **{name: np.reshape(array, (2, 3, 300)) for name, array in arrays.items()})
+    arrays: dict[str, Any] = {
+        name: np.reshape([getattr(curve, name)[0] for curve in curves], (2, 3, 300)) for name in names
+    }
+    np.savez(path, **arrays)
     result = run(path, *GRID_CALL, "--nm-per-volt", "42", "--at", "0.85", "--json")
     assert result.exit_code == 0, result.stderr
     answer = strictly(result.stdout)

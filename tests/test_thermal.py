@@ -1,6 +1,7 @@
 """Thermal spectra and stiffness: the likelihood, the real spectrum, Sader's method, slopes, and what intervals hold."""
 
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import mpmath
@@ -204,6 +205,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(known):
     # the whole of kT here: the oscillator is a point, not a lever's first mode
     wanted = np.array([FREQUENCY_KHZ, QUALITY_FACTOR, 0.971 * STIFFNESS_N_PER_M])
     held, apart = np.zeros(3), []
+    result: Any = None
     for _ in range(draws):
         result = calibrate(thermal_spectrum(100.0, random, known=known), background="floor", compare=False, whole=True)
         assert result.explained

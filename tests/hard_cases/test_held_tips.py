@@ -6,6 +6,8 @@ time stretching what it was off, and takes steps without an impact to show for t
 Right answer: SciPy's integration phase by phase (tests/reference_driven_contact.py).
 """
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.motion.simulate import simulate
 from tests.reference_driven_contact import DrivenContact, follow
-from tests.test_simulate_contact import ROOM, detail_of, reference, scene_of, state
+from tests.test_simulate_contact import ROOM, reference, scene_of, state
 
 
 def test_a_held_tip_is_followed():
@@ -36,7 +38,8 @@ def test_a_held_tip_is_followed():
     np.testing.assert_allclose(
         float(simulation.final.velocity_nm_per_us), course.velocity_nm_per_us, rtol=0.0, atol=3e-3
     )
-    assert int(detail_of(simulation).junctions[0]) == course.contacts[0].junctions == 6
+    detail: Any = simulation.contacts.detail
+    assert int(detail.junctions[0]) == course.contacts[0].junctions == 6
 
 
 @pytest.mark.slow
