@@ -228,8 +228,8 @@ def basins_of_attraction(
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
     else:
-        targets = finder.targets()
-        with compiling(lambda: finder.towards(targets, starts, impacts=0)):
+        targets, some = finder.targets(), jax.tree.map(lambda part: part[:_PART], starts)
+        with compiling(lambda: finder.towards(targets, some, impacts=0)):
             finder.look_around(high, low)
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
