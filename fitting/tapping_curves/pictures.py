@@ -51,7 +51,7 @@ def curve_figure(result: Tapping) -> Figure:
         reach = np.maximum(reach, -curve.free_amplitude_nm.max())
         top.plot(reach, -reach, ":", color=GRID, label="the tip just reaches the sample")
     label_axes(top, x="", y="amplitude (nm)")
-    top.legend(fontsize=_SMALL)
+    top.legend(fontsize=_SMALL, loc="lower left")
     if between:
         middle = between[0]
         _points(middle, result, curve.lag_deg, curve.lag_error_deg)
