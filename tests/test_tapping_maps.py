@@ -306,7 +306,7 @@ def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path)
 @pytest.mark.slow
 def test_a_million_pixels_take_less_than_two_seconds():
     amplitude, lag, _ = image(1024, 1024)
-    begun = time.perf_counter()
+    begun = time.process_time()
     found = tapping_map((amplitude, lag), **LEVER)
-    assert time.perf_counter() - begun < 2.0
+    assert time.process_time() - begun < 2.0
     assert found.counts["used"] == 1024**2
