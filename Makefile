@@ -22,7 +22,7 @@ BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
 PIP ?=
 
-.PHONY: help setup fit test newest oldest check thorough lint types coverage slow docs pictures mutations bands tapping energies ranks fuzz kills bench clean
+.PHONY: help setup fit test newest oldest check thorough lint types coverage slow long docs pictures mutations bands tapping energies ranks fuzz kills bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -82,7 +82,10 @@ coverage: $(SETUP) ## make test and make slow with line coverage (at least 90 %)
 	$(BIN)/python -m coverage report --fail-under=90
 
 slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
-	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m $(or $(MARK),"slow and not long") -n auto --dist worksteal --ignore tests/test_mutations.py
+
+long: ## the slow tests of more than a minute each
+	$(MAKE) slow MARK=long
 
 docs: $(SETUP) ## the site, in build/site/index.html; notebooks are run unless `make slow` did
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --config-file notebooks/mkdocs.yml
@@ -120,7 +123,7 @@ kills: $(SETUP) ## a sweep killed at fifty random times and resumed ends in the 
 
 check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
 
-thorough: lint types coverage mutations bands tapping energies ranks fuzz kills newest ## all of make check with line coverage, mutation tests, bands, tapping curves, energies of taps, ranks, fuzzing, kills, the newest Python and JAX
+thorough: lint types coverage long mutations bands tapping energies ranks fuzz kills newest ## all of make check with line coverage, long tests, mutation tests, bands, tapping curves, energies of taps, ranks, fuzzing, kills, the newest Python and JAX
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

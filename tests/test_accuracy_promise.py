@@ -63,6 +63,7 @@ def errors(found: Collision, exact: Collision, rounding: np.ndarray) -> tuple[np
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
+@pytest.mark.long
 def test_every_level_holds_for_random_contacts(tips, reference, method):
     contact, mass, speeds, rounding = tips
     for accuracy in LEVELS:
@@ -73,6 +74,7 @@ def test_every_level_holds_for_random_contacts(tips, reference, method):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_every_level_holds_for_random_driven_contacts():
     tips = random_tips(64, 11)
     right = exact(tips)

@@ -14,6 +14,22 @@ from tests.answers import answer
 
 KHZ, QUALITY, MASS_NG, FREE_NM, RATIO, R, EPSILON, TAP = 90.0, 200.0, 16.9, 80.0, 1.03, 0.98, 0.4, 1.2
 LAW = afm.ImpactLaw(R, EPSILON)
+FILE = f"""\
+[cantilever]
+frequency_khz = {KHZ}
+quality_factor = {QUALITY}
+mass_ng = {MASS_NG}
+[platform]
+amplitude_nm = 0
+reduced_frequency = {RATIO / 2}
+[force]
+free_amplitude_nm = {FREE_NM}
+reduced_frequency = {RATIO / 2}
+[interaction]
+model = "law"
+r = 1
+epsilon = {TAP}
+"""
 OMEGA, DRIVE = 2e-3 * np.pi * KHZ, 2e-3 * np.pi * KHZ * RATIO
 
 
@@ -22,12 +38,12 @@ def gamma_of(quality: float) -> complex:
     return 1.0 - RATIO**2 + 1j * RATIO / quality
 
 
-def driven(kind: str, quality: float = QUALITY, law: afm.ImpactLaw = LAW) -> afm.Scene:
+def driven(kind: str, quality: float = QUALITY) -> afm.Scene:
     cantilever = afm.Cantilever(KHZ, quality, MASS_NG)
     size = FREE_NM * abs(gamma_of(quality))
     force = afm.ForceDrive(size * MASS_NG * OMEGA**2, KHZ * RATIO) if kind == "force" else None
     base = afm.BaseDrive(size, KHZ * RATIO) if kind == "base" else None
-    return afm.Scene(cantilever, afm.Platform(0.0, KHZ * RATIO), law, base=base, force=force)
+    return afm.Scene(cantilever, afm.Platform(0.0, KHZ * RATIO), LAW, base=base, force=force)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +96,7 @@ def test_points_are_the_stable_orbits_of_their_heights_and_lose_what_the_law_say
 @pytest.mark.slow
 def test_the_command_writes_what_tapping_reads(tmp_path: Path):
     # whose taps take half of epsilon times the mass each
-    afm.save_scene(driven("force", law=afm.ImpactLaw(1.0, TAP)), tmp_path / "scene.toml")
+    (tmp_path / "scene.toml").write_text(FILE)
     out, noise = tmp_path / "out", ("--noise", "0.1%", "--phase-noise-deg", "0.1")
     told = answer(out, "simulate", tmp_path / "scene.toml", "--heights", "-88:-8:11", *noise)
     assert sorted(path.name for path in out.iterdir()) == ["curve.csv", "curve.json", "curve.png", "curve_points.csv"]

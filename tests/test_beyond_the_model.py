@@ -57,6 +57,7 @@ def test_five_outliers_leave_a_robust_fit_its_law():
 
 
 @pytest.mark.parametrize("truth", [{"structural_amplitude_n_per_m": 60.0}, {"structural_decay_nm": 0.5}])
+@pytest.mark.long
 def test_what_a_fit_of_the_contact_holds_is_not_exact(truth):
     """The structural force is another one than the fit holds it at: its error is in law, band and intervals."""
     impact = contact_impact(**truth)

@@ -112,6 +112,7 @@ def test_vmap_gives_what_each_contact_gives():
             np.testing.assert_allclose(getattr(whole, name)[place], part, rtol=1e-12, atol=1e-13, err_msg=name)
 
 
+@pytest.mark.long
 def test_second_derivatives_in_any_order_and_under_vmap():
     places = jnp.array([[0.3, 20.0], [0.5, 15.0]])
 

@@ -131,6 +131,7 @@ def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pyt
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_law_without_adhesion_is_a_rival_like_any_other(contact_table_path: Path):
     arguments = ["fit", str(contact_table_path), "--model", "restitution+delay", "--compare", "--json"]
     done = CliRunner().invoke(main, arguments)

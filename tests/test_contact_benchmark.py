@@ -98,6 +98,7 @@ def test_accuracy_command_shows_errors_and_the_cheapest(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_bench_command_measures_the_contact_alone(monkeypatch, tmp_path):
     # every level compiles for seconds: three of them show what all would
     fewer = {"diffrax": [1e-6, 1e-9], "collocation": [1e-6]}

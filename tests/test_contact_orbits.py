@@ -78,6 +78,7 @@ def test_tips_begin_near_the_stable_orbit(scene, found):
     assert float(tips.gap_nm[0]) == pytest.approx(float(scene.interaction.bridge_breaks_nm), rel=0.1)
 
 
+@pytest.mark.long
 def test_a_chart_of_contacts_is_the_orbits_one_by_one(scene, found):
     plane = scene_family(scene, "platform.amplitude_nm", "platform.offset_nm")
     chart = stability_chart(plane, x_values=np.array([0.5, AMPLITUDE_NM]), y_values=np.array([0.0]), last_order=1)
@@ -97,6 +98,7 @@ def test_the_multipliers_are_those_of_differences_in_the_reference(found):
         assert np.linalg.det(matrix) == pytest.approx(float(found.reading.determinant[index]), rel=2e-4)
 
 
+@pytest.mark.long
 def test_the_fold_that_ends_both_orbits_is_one_of_the_reference(scene):
     found = continue_orbits(scene, 1, ParameterRange("platform.amplitude_nm", 1.0, 4.5))
     assert [point.kind for point in found.special] == ["fold"]

@@ -98,6 +98,7 @@ def test_on_resonance_it_is_the_closed_form(mode, r):
 
 
 @pytest.mark.parametrize(("model", "values"), [("law+delay", DELAYED), ("contact", CONTACT)])
+@pytest.mark.long
 def test_forward_and_reverse_agree_with_extrapolated_differences(model, values):
     table = table_of(*ROWS)
     forward, reverse = (amplitude_gradients(table, model, values, mode=mode) for mode in ("forward", "reverse"))

@@ -52,6 +52,7 @@ def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
     assert np.all(np.isfinite(model_errors.model_error))
 
 
+@pytest.mark.long
 def test_the_papers_contact_predicts_the_tables_of_two_programs(shared):
     for table in (shared, read_table(EXAMPLE)):
         problem = problem_of(table, "contact")

@@ -108,6 +108,7 @@ def test_a_start_at_rest_on_the_platform_is_let_go_or_held():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_contact_is_chaotic_at_high_frequency():
     scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0 * 5.277), afm.Contact.paper())
     start = start_of(scene, (270.0, 5.0, 60.0))
