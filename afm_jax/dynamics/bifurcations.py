@@ -251,7 +251,7 @@ class _Sweeper:
     def __init__(self, scenes: Scene, fresh: Tips, impacts: int, accuracy: float):
         self.scenes, self.fresh, self.impacts, self.accuracy = scenes, fresh, impacts, accuracy
         self.count = len(scenes.platform.frequency_khz)
-        self.period_us = np.asarray(scenes.platform.period_us)
+        self.period_us = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
         shortest, longest = (-(-self.count // most) for most in (_MORE_STRETCHES, _STRETCHES))
         self.stretch = max(shortest, min(longest, _LONG_STRETCH))
         self.lanes = -(-self.count // self.stretch)
