@@ -7,7 +7,7 @@ from scipy.stats import chi2, kstest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from fitting import design, drive_grid, fit, prior_of_values, simulate_experiment
-from fitting.experiments.design import standard_errors
+from fitting.experiments.candidates import standard_errors
 from fitting.experiments.result import Design
 from fitting.fits.objective import BATCH, Objective
 from fitting.models import measurement_of

@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from fitting.experiments.design import choose_points, criterion_of, standard_errors
+from fitting.experiments.candidates import standard_errors
+from fitting.experiments.design import choose_points, criterion_of
 
 
 def informations(design: np.ndarray) -> np.ndarray:

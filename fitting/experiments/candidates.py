@@ -279,6 +279,11 @@ def _measured(
     return found._replace(rows=found.rows._replace(measured=measured, free=np.zeros_like(there)))
 
 
+def standard_errors(information: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
+    """Return the standard error of every parameter, the others unknown; infinite where it is not determined."""
+    return np.sqrt(np.diag(covariance_of(information)))
+
+
 def forecast(
     prior: Prior,
     candidates: Candidates,

@@ -2,7 +2,6 @@
 
 What a set of measurements says of the parameters is its Fisher information; its inverse says how good the set is.
 Points are chosen greedily, then exchanged one by one until no exchange helps (Fedorov), then put into the best order.
-Whether to follow the design is said in words: what makes it pointless, and what would help more than its points.
 """
 
 from collections.abc import Sequence
@@ -12,14 +11,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.impact.law import extrapolation_of
-from afm_jax.least_squares import covariance_of
 from afm_jax.version import version_of
-from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
+from fitting.experiments.candidates import AMPLITUDES, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.prior import Prior, prior_of_fit, size_of
 from fitting.experiments.result import Design
+from fitting.experiments.verdict import DesignEvidence, judge_design
 from fitting.fits.result import FitResult
-from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES
+from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import Drives
 
 CRITERIA = ("D", "A")
@@ -85,7 +83,9 @@ def design(  # noqa: PLR0913
     chosen = usable[choose_points(prior.information, each[usable], points, measure)]
     reached = prior.information + each[chosen].sum(axis=0)
     errors = forecast(prior, candidates, chosen, float(noise), phase_noise_deg)
-    reasons, warnings = judge_design(prior, candidates, chosen, reached, errors[-1], wanted, points)
+    reasons, warnings = judge_design(
+        DesignEvidence(prior, candidates, chosen, points, wanted, reached, forecasts=errors[-1])
+    )
     return Design(
         prior=prior,
         interest=wanted,
@@ -158,11 +158,6 @@ def criterion_of(
     return Criterion(kind, matters, size, _RIDGE * np.where(strength > 0.0, strength, size**-2.0))
 
 
-def standard_errors(information: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
-    """Return the standard error of every parameter, the others unknown; infinite where it is not determined."""
-    return np.sqrt(np.diag(covariance_of(information)))
-
-
 _ROUNDS = 50
 _BETTER = 1e-9
 """Gain below which an exchange is rounding."""
@@ -221,100 +216,6 @@ def _exchanged(
         if chosen == before:
             break
     return chosen
-
-
-_MOSTLY = 0.7
-"""Share of a standard error that is left if a quantity of the instrument were exactly known, below which that quantity
-is most of the variance."""
-_ROUGH = 0.5
-"""Standard error relative to a loss beyond which a linear forecast of it is rough."""
-
-
-def judge_design(
-    prior: Prior,
-    candidates: Candidates,
-    chosen: Int[np.ndarray, " points"],
-    reached: Float[np.ndarray, "p p"],
-    forecasts: Float[np.ndarray, " p"],
-    wanted: tuple[str, ...],
-    points: int,
-) -> tuple[list[str], list[str]]:
-    """Return what makes a design invalid, and its warnings; each a sentence.
-
-    Args:
-        prior: what it rests on.
-        candidates: among which was chosen.
-        chosen: their numbers.
-        reached: information after all points, by noise alone.
-        forecasts: standard errors then.
-        wanted: the parameters that matter.
-        points: how many were asked for.
-    """
-    names = prior.problem.names
-    errors = dict(zip(names, forecasts.tolist(), strict=True))
-    unknown = [name for name in wanted if not np.isfinite(errors[name])]
-    if not len(chosen):
-        counts = [f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items()]
-        return [f"No drive can be planned with ({'; '.join(counts)}); try others."], list(prior.notes)
-    reasons = []
-    if unknown:
-        reasons.append(
-            f"The chosen points do not determine {' and '.join(unknown)}: choose more points, or drives at more "
-            "frequencies, amplitudes, orders or offsets."
-        )
-    warnings = list(prior.notes)
-    if len(chosen) < points:
-        warnings.append(f"Only {len(chosen)} of the {points} points asked for can be planned with: all are chosen.")
-    warnings += _dominated(prior, reached, wanted)
-    for name in wanted:
-        index = names.index(name)
-        size = size_of(prior.problem.parameters[index], float(prior.values[index]))
-        if np.isfinite(errors[name]) and errors[name] > _ROUGH * size:
-            what = "1 - r" if name == "r" else name
-            warnings.append(
-                f"The forecast for {name} is rough: its error is {errors[name] / size:.0%} of {what} itself. Expect a "
-                "one-sided limit rather than a value."
-            )
-    warnings += _edges(candidates, chosen, tapping=prior.problem.tapping)
-    beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
-    warnings += [] if beyond is None else [beyond]
-    return reasons, warnings
-
-
-def _dominated(prior: Prior, information: Float[np.ndarray, "p p"], wanted: tuple[str, ...]) -> list[str]:
-    """Name the quantities of the instrument whose uncertainty is most of the error of a parameter that matters."""
-    names = prior.problem.names
-    errors = dict(zip(names, standard_errors(information).tolist(), strict=True))
-    warnings = []
-    for nuisance in (name for name in names if name in NUISANCE_NAMES and name not in wanted):
-        rest = [i for i, name in enumerate(names) if name != nuisance]
-        without = dict(
-            zip((names[i] for i in rest), standard_errors(information[np.ix_(rest, rest)]).tolist(), strict=True)
-        )
-        led = [n for n in wanted if np.isfinite(errors[n]) and without[n] < _MOSTLY * errors[n]]
-        if led:
-            gains = " and ".join(f"{name} to {without[name]:.2g} instead of {errors[name]:.2g}" for name in led)
-            warnings.append(
-                f"Most of the error comes from {nuisance}: if that were exactly known, these points would determine "
-                f"{gains} (by noise alone). Measure it better before adding points."
-            )
-    return warnings
-
-
-def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"], *, tapping: bool) -> list[str]:
-    """Say where most points lie at the end of what can be driven: a wider range may then be better."""
-    drives, usable = candidates.drives, candidates.usable
-    warnings = []
-    what = "free amplitude" if tapping else "drive amplitude"
-    columns = [(drives.amplitude_nm, what), (drives.offset_nm, "offset")]
-    for column, what in columns[:1] if tapping else columns:
-        for end, word in ((column.min(), "smallest"), (column.max(), "largest")):
-            share = float(np.mean(column[chosen] == end))
-            if len(np.unique(column[usable])) > 1 and share > 0.5 and len(chosen) > 1:
-                warnings.append(
-                    f"{share:.0%} of the points are at the {word} {what}, {end:g} nm: values beyond it may be better."
-                )
-    return warnings
 
 
 def _interest(prior: Prior, interest: Sequence[str] | None) -> tuple[str, ...]:

@@ -19,21 +19,16 @@ from fitting.inversion.regression import Laws, distance_from, regressed_laws
 from fitting.inversion.result import (
     Inversion,
     InvertedRows,
-    LawDistance,
     Rebound,
-    RegressedLaw,
-    described,
     on_resonance,
     read_on_resonance,
 )
+from fitting.inversion.verdict import OUTLIER, InversionEvidence, judge_inversion
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table, check_quality_factor
 
 _BLOCK = 64
 """Rows come filled up to a multiple of this, so that one program serves most tables."""
-_IMPROBABLE = 1e-3
-_OUTLIER = 16.0
-"""chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _PACKAGES = ("afm-jax", "jax", "numpy")
 
 
@@ -108,10 +103,8 @@ def invert(
     laws = regressed_laws(rows)
     known, reference = _reference(truth, laws)
     resonance = read_on_resonance(table, law=known, reference=reference)
-    reasons, warnings = _judged(table, laws)
     distance = None if law is None else distance_from(law, table, laws.rows, resonance)
-    if law is not None and distance is not None:
-        warnings.append(_beside(law, distance))
+    reasons, warnings = judge_inversion(InversionEvidence(table, with_phase, laws, law, distance))
     return Inversion(
         table=table,
         rows=laws.rows,
@@ -128,20 +121,6 @@ def invert(
         warnings=warnings,
         versions={name: version_of(name) for name in _PACKAGES},
     )
-
-
-def _beside(law: Law, distance: LawDistance) -> str:
-    """Return what a reader should know of a law beside the rows."""
-    said = f"beside the rows is {described(law)}"
-    far = distance.median_distance_in_errors
-    if far is not None:
-        said += (
-            f"; the {distance.rows_compared} rows within these speeds are "
-            f"{far:.2g} standard errors from it in the median"
-        )
-    if not distance.agrees:
-        said += ": it is not the law of these impacts"
-    return said if distance.extrapolated is None else f"{said}. {distance.extrapolated}"
 
 
 def _with_phase(table: AmplitudeTable) -> np.ndarray:
@@ -182,7 +161,7 @@ def _inverted_rows(table: AmplitudeTable, shared: _Shared) -> InvertedRows:
             moved[good, :, k] = np.stack(other.impact, axis=1)[found.converged] - impact[good]
         for row in np.setdiff1d(chosen, good):
             note[row] = "no flight between two impacts has this amplitude and phase"
-        for row in chosen[np.nan_to_num(chi2[chosen]) > _OUTLIER]:
+        for row in chosen[np.nan_to_num(chi2[chosen]) > OUTLIER]:
             note[row] = f"amplitudes and phase contradict each other (chi2 {chi2[row]:.3g} of one degree of freedom)"
     return InvertedRows(
         impact=impact,
@@ -254,39 +233,3 @@ def _reference(truth: Law | None, laws: Laws) -> tuple[Rebound | None, str]:
         return np.sqrt(np.where(inside & (square > 0.0), square, np.nan))
 
     return regressed, "law"
-
-
-def _is_measured(law: RegressedLaw) -> bool:
-    """Say whether a coefficient of a law differs from no loss by more than two standard errors."""
-    for name, found in law.parameters.items():
-        apart = 1.0 - found.value if name == "r" else found.value
-        if found.standard_error is not None and abs(apart) > 2.0 * found.standard_error:
-            return True
-    return False
-
-
-def _judged(table: AmplitudeTable, laws: Laws) -> tuple[list[str], list[str]]:
-    """Return what makes a result invalid, and what a reader should know besides."""
-    rows, reasons, warnings = laws.rows, [], []
-    phases = _with_phase(table)
-    if phases.any() and not rows.inverted.any():
-        reasons.append("no row could be inverted: check the phases' sign and zero (t = 0 when the platform is highest)")
-    elif phases.any() and not laws.laws:
-        reasons.append(
-            f"{int(rows.regressed.sum())} rows do not determine a law of two coefficients: measure at more drives"
-        )
-    elif laws.laws and max(law.p_value for law in laws.laws.values() if law.p_value == law.p_value) < _IMPROBABLE:
-        reasons.append("neither law explains the rows: check the errors, Q, and the calibration of tip and drive")
-    elif laws.laws and not any(_is_measured(law) for law in laws.laws.values()):
-        reasons.append("the rows determine no coefficient of either law to two standard errors: measure more finely")
-    if not phases.any():
-        warnings.append("the table has no phase: only the paper's reading on resonance, whose phase is assumed")
-    if table.quality_factor is not None and table.quality_factor_error is None:
-        warnings.append("Q comes without an error: its uncertainty is not in the errors here")
-    lost = int((phases & ~rows.inverted).sum())
-    if lost and rows.inverted.any():
-        warnings.append(f"{lost} rows could not be inverted (see their notes)")
-    outliers = int(np.sum(np.nan_to_num(rows.chi2) > _OUTLIER))
-    if outliers:
-        warnings.append(f"{outliers} rows contradict themselves by more than 4 standard errors (see their notes)")
-    return reasons, warnings
