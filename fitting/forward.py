@@ -8,7 +8,6 @@ Below, `linearise` and `predict` do that for all pairs of a set of parameters an
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,7 +28,7 @@ from afm_jax.impact.closure import OrbitPlace, OrbitProblem, follow_root, harmle
 from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
 from afm_jax.impact.orbits import amplitudes, near_fold, steady_orbits
-from afm_jax.solve.lanes import filled, in_blocks
+from afm_jax.solve.lanes import compiling, filled, in_blocks
 from fitting.models import Measurement, Problem, Rows
 
 
@@ -367,15 +366,11 @@ def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: 
     some, points = measurement._replace(rows=rows), batch[index]
     nowhere = branch_near(np.full(index.shape, np.nan))
 
-    def in_thread(program: Callable[..., Any], *more: Any) -> None:
-        # what was switched on for one thread alone is not for another
-        with jax.enable_x64(True):  # noqa: FBT003
-            jax.block_until_ready(program(points, impacts, index, some, problem, *more))
+    def run(program: Callable[..., Any], *more: Any) -> None:
+        jax.block_until_ready(program(points, impacts, index, some, problem, *more))
 
-    with ThreadPoolExecutor(1) as pool:
-        other = pool.submit(in_thread, linearise_pairs, nowhere)
-        in_thread(located)
-        other.result()
+    with compiling(lambda: run(linearise_pairs, nowhere)):
+        run(located)
 
 
 class _Block(NamedTuple):

@@ -235,16 +235,15 @@ class ElasticCurve(eqx.Module):
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the mean slopes by s of work and depth between two roots, without the cancellation of differences."""
         nothing = jnp.zeros_like(second)
-        work, depth = (
-            sum((factor * _mean_power(k, first, second) for k, factor in terms), start=nothing) for terms in self.terms
-        )
+        means = _mean_powers(max(degree for terms in self.terms for degree, _ in terms), first, second)
+        work, depth = (sum((factor * means[k - 1] for k, factor in terms), start=nothing) for terms in self.terms)
         return work, depth
 
 
-def _mean_power(degree: int, first: Float[Array, "..."], second: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return (a^n - b^n)/(a - b) as the sum of a^k b^(n-1-k)."""
-    total, power = jnp.ones_like(second), jnp.ones_like(second)
-    for _ in range(degree - 1):
+def _mean_powers(highest: int, first: Float[Array, "..."], second: Float[Array, "..."]) -> list[Float[Array, "..."]]:
+    """Return (a^n - b^n)/(a - b) = sum of a^k b^(n-1-k) for n = 1 to the highest degree, each from the one before."""
+    means, power = [jnp.ones_like(second)], jnp.ones_like(second)
+    for _ in range(highest - 1):
         power = power * second
-        total = total * first + power
-    return total
+        means.append(means[-1] * first + power)
+    return means
