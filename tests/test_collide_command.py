@@ -13,10 +13,9 @@ from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.main import main
 from afm_jax.cli.values import Numbers
 from afm_jax.contact.collide import _COLUMNS as COLUMNS
-from afm_jax.contact.collide import capture_speed, collide, default_speeds
+from afm_jax.contact.collide import Collisions, capture_speed, collide, default_speeds
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.parameters import PAPER
-from afm_jax.plots.collisions import collisions_figure
 from tests import answers
 from tests.strict_reading import strictly
 
@@ -77,7 +76,7 @@ def test_the_table_holds_what_is_printed(paper: dict[str, Any], out: Path):
 
 def test_picture_shows_curve_capture_delay_and_losses(paper: dict[str, Any]):
     rows = [dict(zip(COLUMNS, row, strict=True)) for row in zip(*(paper[name] for name in COLUMNS), strict=True)]
-    panels = collisions_figure(rows, paper["capture_speed_nm_per_us"]).axes
+    panels = Collisions(rows, paper["capture_speed_nm_per_us"], None, {}, []).plot().axes
     drawn = [{line.get_label(): np.asarray(line.get_ydata())[1:] for line in axes.lines} for axes in panels]
     np.testing.assert_array_equal(drawn[0]["contact"], paper["rebound_speed_nm_per_us"][1:])
     np.testing.assert_array_equal(next(iter(drawn[1].values())), paper["collision_delay_us"][1:])

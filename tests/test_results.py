@@ -23,10 +23,9 @@ import pytest
 import afm_jax as afm
 import fitting
 from afm_jax import results, saved
-from afm_jax.contact.collide import _rows
+from afm_jax.contact.collide import Collisions, _rows
 from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
-from afm_jax.plots.collisions import collisions_figure
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from fitting.fits.comparison import Comparison
 from tests.fit_tables import EXAMPLE, example_fit
@@ -341,7 +340,7 @@ def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_pat
     assert table["approach_speed_nm_per_us"].tolist() == [40.0, 5.0, 20.0, -1.0]
     # the picture of the result, and the command's
     rows = _rows({name: np.asarray(part) for name, part in found._asdict().items()})
-    for figure in (found.plot(tmp_path / "collide.png"), collisions_figure(rows)):
+    for figure in (found.plot(tmp_path / "collide.png"), Collisions(rows, None, None, {}, []).plot()):
         upper, middle, lower = figure.axes
         drawn = {line.get_label(): np.asarray(line.get_xydata()) for line in upper.lines}
         assert drawn["captured"].tolist() == [[5.0, 0.0]]

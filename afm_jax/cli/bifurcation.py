@@ -39,8 +39,5 @@ def bifurcation(  # noqa: PLR0913
         sweeps = [sweep._replace(verdict_probability=each) for sweep, each in zip(sweeps, probabilities, strict=True)]
     if not all(sweep.complete for sweep in sweeps):
         session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
-    probabilities = None if scene.unknowns is None else [sweep.verdict_probability for sweep in sweeps]
-    return Output.of(
-        Ramps(swept.path, sweeps, impacts),
-        files={f"bifurcation.{picture}": picture_of("dynamics:bifurcation_figure", sweeps, swept.path, probabilities)},
-    )
+    ramps = Ramps(swept.path, sweeps, impacts)
+    return Output.of(ramps, files={f"bifurcation.{picture}": picture_of("dynamics:bifurcation_figure", ramps)})

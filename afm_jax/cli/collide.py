@@ -27,11 +27,10 @@ def collide(
         result = collisions(contact, speeds, mass, accuracy=accuracy, method=method)
     settings = {"accuracy": accuracy, "method": method, "default_speeds": speeds is None}
     title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
-    capture = result.capture_speed_nm_per_us
     return Output.of(
         result,
         payload=result.to_dict() | {"contact": description, "mass_ng": mass, "settings": settings},
-        files={"collide.png": picture_of("collisions:collisions_figure", result.rows, capture, title)},
+        files={"collide.png": picture_of("collisions:collisions_figure", result, title)},
         json_file="collide.json",
     )
 
@@ -66,7 +65,7 @@ def contact_as_law(
         files={
             "law.json": lambda path: save_law(result.law, path),
             "law.csv": lambda path: save_law_csv(result.law, path),
-            "law.png": picture_of("collisions:contact_law_figure", result.formulas, result.delay),
+            "law.png": picture_of("collisions:contact_law_figure", result),
         },
         json_file="collide.json",
     )

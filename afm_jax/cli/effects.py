@@ -42,6 +42,6 @@ def effects(
         payload=told,
         text=table.printed(),
         tables=table.tables(),
-        files={"effects.png": picture_of("effects:effects_figure", told["effects"], told["full"], told["accuracy"])},
+        files={"effects.png": picture_of("effects:effects_figure", table)},
         json_file="effects.json",
     )

@@ -537,7 +537,8 @@ class Collisions(NamedTuple):
     junction: dict[str, float]
     unresolved: list[str]
 
-    text = Result.text
+    text, plot = Result.text, Result.plot
+    _picture = "afm_jax.plots.collisions:collisions_figure"
 
     @property
     def reason(self) -> str | None:

@@ -428,7 +428,8 @@ class ContactLaws(NamedTuple):
     delay: ContactDelay
     law: TabulatedLaw
 
-    text = Result.text
+    text, plot = Result.text, Result.plot
+    _picture = "afm_jax.plots.collisions:contact_law_figure"
 
     @property
     def reason(self) -> str | None:

@@ -144,7 +144,8 @@ class Ramps(NamedTuple):
     impacts_each: int
     """Impacts at each value."""
 
-    text = Result.text
+    text, plot = Result.text, Result.plot
+    _picture = "afm_jax.plots.dynamics:bifurcation_figure"
 
     @property
     def reason(self) -> str | None:

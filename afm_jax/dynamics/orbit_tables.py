@@ -5,7 +5,8 @@ one's numbers besides (`orbit_facts`).
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rich.table import Table
 
@@ -16,6 +17,9 @@ from afm_jax.dynamics.sticking_orbits import StickingOrbit
 from afm_jax.impact.orbits import SingleImpactOrbits
 from afm_jax.results import Result
 from afm_jax.words import counted
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _OF_AN_ORBIT = (
     *("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"),
@@ -46,6 +50,10 @@ class OrbitTable(NamedTuple):
     found: SingleImpactOrbits
 
     text = Result.text
+
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
+        return self.found.plot(path)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -111,6 +119,10 @@ class ManyOrbitTable(NamedTuple):
     """The orbit with a rest, or a sentence on why there is none."""
 
     text = Result.text
+
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
+        return self.found.plot(path)
 
     @property
     def rows(self) -> list[dict[str, Any]]:

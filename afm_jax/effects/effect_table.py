@@ -21,7 +21,8 @@ class EffectTable(NamedTuple):
 
     study: EffectStudy
 
-    text = Result.text
+    text, plot = Result.text, Result.plot
+    _picture = "afm_jax.plots.effects:effects_figure"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax effects`."""

@@ -1,36 +1,35 @@
 """The pictures of collisions: rebound speed and delay against approach speed; the laws fitted to them, their errors."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from afm_jax.contact.collide import Collision
-from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw
+from afm_jax.contact.collide import Collision, Collisions
+from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, ContactLaws
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 from afm_jax.results import known_columns
 from afm_jax.words import counted
 
 
-def collisions_figure(
-    found: Collision | Sequence[Mapping[str, Any]], capture_speed_nm_per_us: float | None = None, title: str = ""
-) -> Figure:
+def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     """Return rebound speed, delay and losses of collisions over the approach speed; where tips are captured is shaded.
 
     Rebound speed, delay and losses are unknown where a tip does not leave. From a dozen tips on they are joined by
     lines: fewer say too little of what lies between.
 
     Args:
-        found: collisions, or rows of `afm_jax.contact.collide.Collisions`.
-        capture_speed_nm_per_us: where the captured range ends; None: at the fastest captured tip.
+        found: collisions; where the capture speed is known the captured range ends there, else at the fastest
+            captured tip.
         title: of the picture.
     """
     if isinstance(found, Collision):
+        capture_speed_nm_per_us = None
         columns = {name: array.astype(float).ravel() for name, (array, _) in known_columns(found).items()}
     else:
-        columns = {name: np.array([row[name] for row in found], float) for name in (*_DRAWN, *_LOSSES)}
+        capture_speed_nm_per_us = found.capture_speed_nm_per_us
+        columns = {name: np.array([row[name] for row in found.rows], float) for name in (*_DRAWN, *_LOSSES)}
     usable = np.flatnonzero(columns["approach_speed_nm_per_us"] > 0.0)
     usable = usable[np.argsort(columns["approach_speed_nm_per_us"][usable], kind="stable")]
     columns = {name: array[usable] for name, array in columns.items()}
@@ -90,17 +89,12 @@ _COLOURS = {"law": "#D55E00", "viscous": "#0072B2", "full": "#009E73"}
 _NAMES = {"law": r"$r$, $\epsilon$", "viscous": r"$\epsilon$, $c$", "full": r"$r$, $\epsilon$, $c$"}
 
 
-def contact_law_figure(laws: Sequence[ContactLaw], delay: ContactDelay) -> Figure:
-    """Return the relative errors of the laws on the left, delay, lag, lead and delay law on the right.
-
-    Args:
-        laws: at the same speeds.
-        delay: of the same contact.
-    """
+def contact_law_figure(law: ContactLaws) -> Figure:
+    """Return the relative errors of the laws on the left, delay, lag, lead and delay law on the right."""
     figure = new_figure(11.0, 5.0)
     left, right = figure.subplots(1, 2)
-    _draw_laws(left, laws)
-    _draw_delay(right, delay)
+    _draw_laws(left, law.formulas)
+    _draw_delay(right, law.delay)
     return figure
 
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.dynamics.basins import Attractor, Basins
-from afm_jax.dynamics.bifurcations import Sweep
+from afm_jax.dynamics.bifurcations import Ramps, Sweep
 from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.dynamics.exponents import Lyapunov
 from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
@@ -187,21 +187,15 @@ _STRIP = 0.07
 """Height of the strip for exponents of minus infinity, of the axis."""
 
 
-def bifurcation_figure(
-    sweeps: Sweep | Sequence[Sweep],
-    path: str = "",
-    probabilities: Sequence[Float[np.ndarray, " values"]] | None = None,
-) -> Figure:
+def bifurcation_figure(ramped: Sweep | Ramps) -> Figure:
     """Return a bifurcation diagram: height at impact, and the tip's height whenever the drive's phase is 0.
 
-    Where the motion ended the ground has the ramp's colour.
+    Where the motion ended the ground has the ramp's colour; where a verdict's probability is below 95 % it is grey.
 
     Args:
-        sweeps: one ramp of the parameter, or up and down; where both are, the one down lies over the one up.
-        path: of the parameter.
-        probabilities: of each ramp's verdicts; where one is below 95 % there is a grey ground.
+        ramped: one ramp of a parameter, or up and down; where both are, the one down lies over the one up.
     """
-    sweeps = [sweeps] if isinstance(sweeps, Sweep) else sweeps
+    sweeps, path = ([ramped], "") if isinstance(ramped, Sweep) else (ramped.sweeps, ramped.parameter)
     figure = new_figure(9.0, 8.0)
     panels = figure.subplots(2, 1, sharex=True)
     for sweep in sweeps:
@@ -213,9 +207,9 @@ def bifurcation_figure(
             axes.plot(at, part[there], ".", color=colour, mew=0.0, ms=size, alpha=0.5, label=word, rasterized=True)
             for kind, (what, hatch) in _ENDED.items():
                 _shade(axes, sweep, sweep.verdicts.kind == kind, color=colour, hatch=hatch, label=f"{word}: {what}")
-    for sweep, sure in zip(sweeps, probabilities or (), strict=False):
-        for axes in panels:
-            _shade(axes, sweep, sure < _SURE, color=GRID, label="verdict uncertain")
+        if sweep.verdict_probability is not None:
+            for axes in panels:
+                _shade(axes, sweep, sweep.verdict_probability < _SURE, color=GRID, label="verdict uncertain")
     label_axes(panels[0], x="", y="height at impact (nm)")
     label_axes(panels[1], x=label_of(path) if path else "parameter", y="height at drive phase 0 (nm)")
     # also where the tip is stuck and there is nothing to draw

@@ -8,20 +8,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from afm_jax.effects.effect_table import EffectTable
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 
 _LEAST = 1e-6
 """Relative changes below are drawn as this."""
 
 
-def effects_figure(effects: Sequence[Mapping[str, Any]], full: Mapping[str, Any], accuracy: float | None) -> Figure:
-    """Return a bar of change and one of cost for every effect.
-
-    Args:
-        effects: as in the JSON object of `afm-jax effects`.
-        full: the full scene there.
-        accuracy: drawn as a line; None: none was wanted.
-    """
+def effects_figure(table: EffectTable) -> Figure:
+    """Return a bar of change and one of cost for every effect; a wanted accuracy is a line."""
+    told = table.to_dict()
+    effects, full, accuracy = told["effects"], told["full"], told["accuracy"]
     figure = new_figure(11.0, 2.0 + 0.55 * max(len(effects), 2))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
     _draw_changes(left, effects, accuracy)
