@@ -149,7 +149,8 @@ def collide(
     # one axis of tips inside, the speeds' own shape outside
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
     small = speeds.size <= LANES
-    result = by_tangents(_tips, contact, mass, speeds.ravel(), small=small, setting=setting)
+    stages = (_in_few_steps, _in_many_steps)
+    result = by_tangents(_tips, contact, mass, speeds.ravel(), small=small, stages=stages, setting=setting)
     if not any(leaf.ndim for leaf in jax.tree.leaves(contact)):
         require_junction(contact, result.outcome != CollisionOutcome.NO_JUNCTION)
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
@@ -492,11 +493,28 @@ def _quick(
     contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
 ) -> tuple[Collision, Bool[Array, "..."], Junction]:
     """Return the collisions of a batch in few steps, which of them these resolve, and the junction or junctions."""
-    if any(leaf.ndim for leaf in jax.tree.leaves(contact)):
-        junction = rows_in_blocks(lambda some, _: for_each_lane(find_junction, some), contact, speeds)
-    else:
-        junction = find_junction(contact)
+    junction = _junctions(contact, speeds)
     return *_in_blocks((contact, junction), mass, speeds, setting), junction
+
+
+def _junctions(contact: Contact, speeds: Float[Array, "..."]) -> Junction:
+    """Return the junction of a contact, or of each tip its own."""
+    if any(leaf.ndim for leaf in jax.tree.leaves(contact)):
+        return rows_in_blocks(lambda some, _: for_each_lane(find_junction, some), contact, speeds)
+    return find_junction(contact)
+
+
+def _in_few_steps(
+    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
+) -> tuple[Collision, Bool[Array, "..."]]:
+    return _quick(contact, mass, speeds, setting)[:2]
+
+
+def _in_many_steps(
+    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
+) -> Collision:
+    del setting
+    return _careful((contact, _junctions(contact, speeds)), mass, speeds)
 
 
 @jax.jit

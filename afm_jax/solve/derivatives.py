@@ -30,6 +30,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
 from afm_jax.checks import is_traced
+from afm_jax.solve.lanes import again_for_the_open
 
 _implicit_root = Primitive("implicit_root")
 
@@ -215,7 +216,13 @@ _FORWARD_BY = 4
 """Numbers of a tip up to which passes forward take less time than one in reverse mode, whatever the batch."""
 
 
-def by_tangents(function: Callable[..., Any], *arguments: Any, small: bool, **settings: Hashable) -> Any:
+Stages = tuple[Callable[..., tuple[Any, Array]], Callable[..., Any]]
+"""A function in two stages: results in few steps and where these are enough, and results in many steps."""
+
+
+def by_tangents(
+    function: Callable[..., Any], *arguments: Any, small: bool, stages: Stages | None = None, **settings: Hashable
+) -> Any:
     """Return `function(*arguments, **settings)`, with derivatives that are computed forward.
 
     Args:
@@ -225,10 +232,12 @@ def by_tangents(function: Callable[..., Any], *arguments: Any, small: bool, **se
             At least one has an axis of tips.
         small: whether the batch is so small that forward passes along all numbers are quick; else reverse mode goes
             back through the function itself where more than a few numbers move.
+        stages: the function in two stages of the same arguments: derivatives outside of compiled programs compile the
+            second one only where a tip needs it.
         settings: what is no array.
     """
     leaves, structure = jax.tree.flatten(arguments)
-    return _differentiable(_Work(function, structure, tuple(settings.items())), leaves, small=small)
+    return _differentiable(_Work(function, structure, tuple(settings.items()), stages), leaves, small=small)
 
 
 class _Work(NamedTuple):
@@ -237,6 +246,7 @@ class _Work(NamedTuple):
     function: Callable[..., Any]
     structure: Any
     settings: tuple[tuple[str, Hashable], ...]
+    stages: Stages | None
 
     def of(self, *leaves: Array) -> Any:
         return self.function(*jax.tree.unflatten(self.structure, leaves), **dict(self.settings))
@@ -249,7 +259,12 @@ class _Slopes(NamedTuple):
     moving: tuple[int, ...]
 
     def of(self, *leaves: Array) -> Any:
-        return _with_slopes(leaves, self)
+        work = self.work
+        if isinstance(work, _Slopes) or work.stages is None or any(map(is_traced, leaves)):
+            return _with_slopes(leaves, self)
+        few, many = (_Slopes(work._replace(function=stage), self.moving) for stage in work.stages)
+        (results, enough), (slopes, _) = _with_slopes(leaves, few)
+        return again_for_the_open(lambda *some: _with_slopes(some, many), enough, tuple(leaves), (results, slopes))
 
 
 def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bool) -> Any:
