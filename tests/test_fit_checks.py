@@ -103,15 +103,15 @@ class _Spoilt(Objective):
 def test_numbers_that_are_not_finite_are_an_outcome(law, objective, number):
     values = values_of(law)
     point = objective.problem.coordinates(values)
+    everywhere, around = _Spoilt(objective, number), _Spoilt(objective, number, objective.problem.values(point))
     with np.errstate(over="ignore", invalid="ignore"):
-        nowhere = check_minimum(_Spoilt(objective, number), point, FREE)
-        around = check_minimum(_Spoilt(objective, number, objective.problem.values(point)), point, FREE)
-        end = polish(_Spoilt(objective, number), point[None], PLAIN, settled=FINE)
-        assert np.all(covariance(_Spoilt(objective, number), values, FREE) == np.inf)
-    assert not nowhere.converged
-    assert nowhere.reason == "the slopes of the residuals are not finite where the search ended"
-    assert not around.converged
-    assert around.reason == "chi2 has no finite curvature where the search ended"
+        found = [check_minimum(spoilt, point, FREE) for spoilt in (everywhere, around)]
+        end = polish(everywhere, point[None], PLAIN, settled=FINE)
+        assert np.all(covariance(everywhere, values, FREE) == np.inf)
+    assert [(one.converged, one.reason) for one in found] == [
+        (False, "the slopes of the residuals are not finite where the search ended"),
+        (False, "chi2 has no finite curvature where the search ended"),
+    ]
     np.testing.assert_array_equal(end.coordinates, point[None])
 
 

@@ -36,20 +36,6 @@ def table() -> AmplitudeTable:
     return example_amplitudes()
 
 
-def chi2_beside(table: AmplitudeTable, held: dict[str, float], start: dict[str, float]) -> float:
-    """Return SciPy's minimum of chi2 over the other parameters of the law."""
-    problem = problem_of(table, "law")
-    objective = Objective(measurement_of(table, problem), problem)
-    names = objective.problem.names
-
-    def residual(others):
-        values = held | dict(zip(start, others, strict=True))
-        return objective.residual(np.array([[values[name] for name in names]]))[0]
-
-    found = least_squares(residual, list(start.values()), x_scale=[1e-2 * value for value in start.values()])
-    return 2.0 * found.cost
-
-
 def on_resonance(r: float) -> AmplitudeTable:
     """Return amplitudes without air damping or adhesion, 1 % errors: V' = W (1 + r)/(1 - r), half a free period.
 
@@ -64,7 +50,7 @@ def on_resonance(r: float) -> AmplitudeTable:
     return table_of((order, 180.0 * order, beta, sigma), both, 0.01 * both, quality_factor=None)
 
 
-@pytest.mark.parametrize("r", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("r", [0.5, 0.99])
 def test_restitution_on_resonance_is_that_of_the_closed_form(r):
     result = fit(on_resonance(r), model="restitution")
     assert result.valid
@@ -77,8 +63,6 @@ def test_restitution_on_resonance_is_that_of_the_closed_form(r):
         # chi2 is 12 (g/g0 - 1)^2/0.01^2 for g = (1 + r)/(1 - r); the search stops within a thousandth of its rise
         edge = gain * (1 + side * 0.01 * 1.959964 / np.sqrt(12))
         assert end - r == pytest.approx((edge - 1) / (edge + 1) - r, rel=1e-3)
-    # that there is no air damping was said, so that there is nothing to warn of
-    assert not any("quality_factor" in warning for warning in result.warnings)
 
 
 def test_without_adhesion_epsilon_is_an_upper_limit(table):
@@ -90,13 +74,16 @@ def test_without_adhesion_epsilon_is_an_upper_limit(table):
     assert epsilon.standard_error is None
     low, high = epsilon.interval95
     assert low is None
-    assert high is not None
     assert "reaches the end of its range, 0" in str(epsilon.interval_reason)
     assert any("epsilon is at its bound" in warning for warning in result.warnings)
     assert result.parameters["r"].value == pytest.approx(0.95, abs=1e-6)
-    rise = chi2_beside(bare, {"epsilon": high}, {"r": 0.95, "quality_factor": 40.0}) - result.chi2
+    problem = problem_of(bare, "law")
+    objective = Objective(measurement_of(bare, problem), problem)
+    scipy = least_squares(
+        lambda at: objective.residual(np.array([[at[0], high, at[1]]]))[0], [0.95, 40.0], x_scale=[1e-2, 0.4]
+    )
     # the search stops within a thousandth
-    assert rise == pytest.approx(3.8415, rel=5e-3)
+    assert 2.0 * scipy.cost - result.chi2 == pytest.approx(3.8415, rel=5e-3)
 
 
 @pytest.fixture(scope="module")
