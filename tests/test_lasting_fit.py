@@ -1,5 +1,7 @@
 """Fits of impacts that last: tables of the full contact, made by this program and by another one."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -84,8 +86,7 @@ def test_rows_set_aside_are_named(viscous, shared):
     aside = np.flatnonzero(viscous.rows.set_aside)
     assert aside.size >= 1
     (said,) = [warning for warning in viscous.warnings if warning.startswith("Excluded")]
-    for row in aside:
-        assert str(int(shared.lines[row])) in said
+    assert all(str(int(line)) in said for line in shared.lines[aside])
     assert not np.any(viscous.rows.used & viscous.rows.set_aside)
     assert np.isnan(viscous.rows.residual[aside]).all()
     slowest = np.nanmin(viscous.rows.approach_speed_nm_per_us[viscous.rows.used])
@@ -128,9 +129,8 @@ def test_the_contact_is_read_off_the_shared_table(shared):
         assert abs(parameter.value - truth) < 4.0 * (parameter.standard_error or 0.0)
 
 
-@pytest.mark.parametrize("model", ["viscous+delay", "contact"])
-def test_without_noise_the_law_is_sharp(model):
-    result = fit(paper_experiment().exact, model=model)
+def test_without_noise_the_law_is_sharp():
+    result = fit(paper_experiment().exact, model="contact")
     assert law_error(result) < 0.0012
 
 
@@ -146,5 +146,4 @@ def test_contact_parameters_that_do_the_same_are_said_to(shared):
     result = fit(shared, model="contact", free=free)
     said = " ".join([*result.reasons, *result.warnings])
     assert "Not identified" in said or "Determined only together" in said or "is not identified" in said
-    assert "relative_humidity" in said
-    assert "temperature_k" in said
+    assert {"relative_humidity", "temperature_k"} <= set(re.findall(r"\w+", said))
