@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime, least_squares
 
-from fitting import fit, read_table
-from fitting.examples.make_amplitudes import EXAMPLE
+from fitting import fit
 from fitting.fits.discrepancy import ModelDiscrepancy, with_runs
 from fitting.fits.law_after import (
     LawAfter,
@@ -389,17 +388,3 @@ def test_r_and_epsilon_are_said_once_and_are_those_of_the_closest_formula():
     there, _ = law_at(result.law, speeds)
     apart = np.abs(np.sqrt((r.value * speeds) ** 2 - epsilon.value) / there - 1.0)
     assert result.loss.formula_off == pytest.approx(apart.max(), rel=0.05)
-
-
-@pytest.mark.slow
-def test_the_limit_of_a_parameter_at_its_bound_is_where_chi2_has_risen():
-    # impacts of this table take no time
-    table = read_table(EXAMPLE)
-    result = fit(table, "law+delay")
-    hertz = result.parameters["delay_hertz"]
-    assert hertz.at_bound
-    limit = hertz.interval95[1]
-    assert limit is not None
-    there = fit(table, "law+delay", fixed={"delay_hertz": limit})
-    # chi2 of the minima is AIC less twice the number of parameters
-    assert there.aic + 2.0 - result.aic == pytest.approx(1.96**2, abs=0.1)

@@ -74,14 +74,14 @@ def orbits() -> Orbits:
 def test_the_map_leads_back_to_where_an_orbit_begins(orbits):
     start, period = orbits.start, orbits.order * np.asarray(orbits.scenes.platform.period_us)
     impact = jax.jit(jax.vmap(next_impact))(orbits.scenes, start.time_us, start.velocity_nm_per_us)
-    here = orbits.there
-    np.testing.assert_allclose(
-        np.asarray(impact.time_us)[here], np.asarray(start.time_us + period)[here], rtol=0, atol=1e-11
-    )
-    after = np.asarray(impact.velocity_after_nm_per_us)
-    np.testing.assert_allclose(after[here], np.asarray(start.velocity_nm_per_us)[here], rtol=1e-11)
     approach = orbits.scenes.platform.velocity(impact.arrival_time_us) - impact.velocity_before_nm_per_us
-    np.testing.assert_allclose(np.asarray(approach)[here], orbits.one.approach_speed_nm_per_us[here], rtol=1e-11)
+    for name, found, expected in (
+        ("time", impact.time_us - start.time_us - period, np.zeros(SCENES)),
+        ("velocity", impact.velocity_after_nm_per_us, start.velocity_nm_per_us),
+        ("approach", approach, orbits.one.approach_speed_nm_per_us),
+    ):
+        there = np.asarray(found)[orbits.there], np.asarray(expected)[orbits.there]
+        np.testing.assert_allclose(*there, rtol=1e-11, atol=1e-11 if name == "time" else 0.0, err_msg=name)
 
 
 @pytest.mark.slow

@@ -138,13 +138,12 @@ def cut(table: AmplitudeTable, count: int) -> list[AmplitudeTable]:
 
 
 def test_names_tell_tables_apart():
-    def named(*sources: str) -> tuple[str, ...]:
-        return SeveralTables(tuple(made_table(source=source) for source in sources)).labels
-
-    assert named("x/a.csv", "x/b.csv") == ("a.csv", "b.csv")
-    assert named("x/a.csv", "y/a.csv") == ("x/a.csv", "y/a.csv")
-    assert named("a.csv", "a.csv") == ("a.csv (1)", "a.csv (2)")
-    assert SeveralTables((made_table(source="a.csv"), made_table(source="b.csv"))).row_names[4] == "b.csv:1"
+    for sources, names in (
+        (("x/a.csv", "x/b.csv"), ("a.csv", "b.csv")),
+        (("x/a.csv", "y/a.csv"), ("x/a.csv", "y/a.csv")),
+        (("a.csv", "a.csv"), ("a.csv (1)", "a.csv (2)")),
+    ):
+        assert SeveralTables(tuple(made_table(source=source) for source in sources)).labels == names
 
 
 @pytest.mark.parametrize(
