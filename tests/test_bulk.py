@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 import fitting
 from afm_jax.cli.main import main
 from afm_jax.sweeps.plan import plan_of
-from fitting.bulk import _drawn, _with_instrument, table_input
+from fitting.bulk import _with_instrument, table_input
 from fitting.tables.table import AmplitudeTable, read_table, write_table
 from tests.answers import table as records
 
@@ -72,23 +72,6 @@ def test_every_fit_is_that_of_its_table_alone(tmp_path: Path):
     assert result.exit_code in (0, 3), result.stderr
     told = records(tmp_path / "out" / "fits.csv")
     assert [float(row["r"]) for row in told] == [fitting.fit(own, "law").parameters["r"].value for own in tables]
-
-
-@pytest.mark.slow
-def test_tables_are_drawn_about_their_fit():
-    plain = table()
-    found = fitting.fit(plain, "law")
-    drawn = [_drawn(plain, found, (1, 2, number)) for number in range(40)]
-    for column, predicted, error in (
-        ("peak_amplitude_nm", found.rows.predicted_nm[:, 0], plain.peak_amplitude_error_nm),
-        ("lockin_amplitude_nm", found.rows.predicted_nm[:, 1], plain.lockin_amplitude_error_nm),
-        ("phase_deg", found.rows.predicted_phase_deg, plain.phase_error_deg),
-    ):
-        pulls = (np.array([getattr(each, column) for each in drawn]) - predicted) / np.asarray(error)
-        # of 40 x 93 draws
-        assert abs(np.nanmean(pulls)) < 0.08
-        assert abs(np.nanstd(pulls) - 1.0) < 0.06
-    np.testing.assert_array_equal(_drawn(plain, found, (1, 2, 0)).phase_deg, drawn[0].phase_deg)
 
 
 @pytest.mark.slow

@@ -41,19 +41,16 @@ def test_measured_drives_are_recognised_up_to_rounding():
     assert same_drives(drives, measured).tolist() == [True, False, False, False]
 
 
-@pytest.mark.parametrize(
-    ("kind", "text", "value"),
-    [
+def test_lists_and_errors_are_read():
+    for kind, text, value in (
         (Numbers(positive=False), "0.97:1:0.01", (0.97, 0.98, 0.99, 1.0)),
         (Numbers(positive=False), "170:190:8", (170.0, 178.0, 186.0)),
         (Orders(), "1-3, 2,7", (1, 2, 3, 7)),
         (ValueAndError(), "40+/-2", (40.0, 2.0)),
         (ValueAndError(), "40 ± 2", (40.0, 2.0)),
         (ValueAndError(), "40", (40.0, None)),
-    ],
-)
-def test_lists_and_errors_are_read(kind, text, value):
-    assert kind.convert(text, None, None) == value
+    ):
+        assert kind.convert(text, None, None) == value
 
 
 def test_wrong_ones_are_refused():
