@@ -1,6 +1,5 @@
 """Designs on the instantaneous law: information, forecasts and choices against another search for the orbits."""
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -99,31 +98,6 @@ def test_readings_and_information_are_those_of_other_orbits(of_law, drives):
     # central differences with steps of 1e-5: errors of 1e-10 of the third derivative, rounding 1e-9
     largest = np.abs(wanted).max(axis=(0, 1))
     np.testing.assert_allclose(found.slope[usable] / largest, wanted / largest, rtol=1e-5, atol=1e-6)
-
-
-def determinant(result: Design, chosen: np.ndarray) -> float:
-    """Return the log of the determinant of the covariance of r and epsilon, from the inverse; infinite if singular."""
-    information = result.prior.information + result.candidates.information[chosen].sum(axis=0)
-    return float(np.linalg.slogdet(np.linalg.inv(information)[:2, :2])[1])
-
-
-def test_points_are_the_best_of_all_choices(drives):
-    few = Drives(*(column[::3] for column in drives))
-    result = design(law_prior(), few, points=3, noise=NOISE)
-    usable = np.flatnonzero(result.candidates.usable)
-    assert usable.size > 8
-    best = min(determinant(result, np.array(some)) for some in itertools.combinations(usable.tolist(), 3))
-    # the ridge of the criterion, 1e-9, is what may differ
-    np.testing.assert_allclose(determinant(result, result.chosen), best, atol=1e-6)
-
-
-def test_a_choice_for_one_parameter_is_better_for_it(drives):
-    of_r, of_epsilon = (
-        errors_of(design(law_prior(), drives, points=3, noise=NOISE, interest=(name,)).expected)
-        for name in ("r", "epsilon")
-    )
-    assert not of_epsilon[0] < of_r[0] < np.inf
-    assert not of_r[1] < of_epsilon[1] < np.inf
 
 
 def test_information_follows_the_noise_and_adds_up(drives, of_law):

@@ -44,10 +44,8 @@ def objective() -> Objective:
 
 def test_the_bundled_table_is_what_its_script_makes(table):
     made = example_table()
-    for name in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm"):
+    for name in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm", "quality_factor", "remarks"):
         np.testing.assert_array_equal(getattr(made, name), getattr(table, name))
-    for name in ("free_frequency_khz", "quality_factor", "quality_factor_error", "mass_ng", "remarks"):
-        assert getattr(made, name) == getattr(table, name)
     for ours, stored in zip(amplitudes_and_errors(made), amplitudes_and_errors(table), strict=True):
         # five digits are written: another processor's rounding may turn a last one over, here and there
         last_digit = 10.0 ** (np.floor(np.log10(stored)) - 4.0)

@@ -162,12 +162,10 @@ def test_band_and_intervals_hold_another_minimum_that_the_data_hardly_tell(table
     monkeypatch.setattr("fitting.fits.fit._HARDLY_TOLD", 1e9)
     ends = replace(found.minimum, ends=np.stack([best, other]), chi2=np.zeros(2))
     both = summarise(table, replace(found, minimum=ends))
-    law = both.law
-    u = law.approach_speed_nm_per_us
-    theirs = np.sqrt(np.maximum((other[0] * u) ** 2 - other[1], 0.0))
-    inside = theirs > 0.0
-    assert np.all(theirs[inside] >= law.rebound_low_nm_per_us[inside])
-    assert np.any(theirs[inside] < alone.law.rebound_low_nm_per_us[inside])
+    square = (other[0] * both.law.approach_speed_nm_per_us) ** 2 - other[1]
+    theirs = np.sqrt(np.where(square > 0.0, square, np.nan))
+    assert not np.any(theirs < both.law.rebound_low_nm_per_us)
+    assert np.any(theirs < alone.law.rebound_low_nm_per_us)
     for i, name in enumerate(("r", "epsilon")):
         # what is no minimum has no end to one side
         low, high = both.parameters[name].interval95

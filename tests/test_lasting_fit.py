@@ -112,14 +112,6 @@ def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):
     np.testing.assert_allclose(nearby.residual[there], searched.residual[there], rtol=1e-6, atol=1e-6)
 
 
-def test_restitution_and_adhesion_with_delay_come_close(shared):
-    result = fit(shared, model="law+delay")
-    # the loss by viscosity is not this law's, yet no measured orbit gets lost on the way to its minimum
-    assert result.valid
-    assert 0.75 < per_degree(result) < 1.3
-    assert law_error(result) < 0.009
-
-
 def test_the_contact_is_read_off_the_shared_table(shared):
     result = fit(shared, model="contact")
     assert law_error(result) < 0.0035
