@@ -11,6 +11,7 @@ from fitting.sampling.bootstrap import DataSets, compact, draw_data, fit_data_se
 from tests.fit_tables import (
     example_amplitudes,
     example_fit,
+    fit_of_every_fourth,
     rows,
     simulated,
     standard_errors_of,
@@ -24,13 +25,8 @@ SAMPLES = 200
 
 
 @pytest.fixture(scope="module")
-def table():
-    return simulated(rows(example_amplitudes(), slice(0, None, 3)), ImpactLaw(0.95, 60.0), seed=3)
-
-
-@pytest.fixture(scope="module")
-def result(table):
-    return fit(table, "law")
+def result():
+    return fit_of_every_fourth()
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +35,8 @@ def boot(result):
 
 
 @pytest.mark.parametrize("option", ["scale_errors", "robust"])
-def test_the_objective_is_rebuilt_with_the_rows_and_errors_of_the_fit(table, option):
-    fitted = fit(table, "law", **{option: True})
+def test_the_objective_is_rebuilt_with_the_rows_and_errors_of_the_fit(result, option):
+    fitted = fit(result.table, "law", **{option: True})
     refit = objective_of(fitted)
     assert refit.values == pytest.approx(values_of(fitted), rel=0.0, abs=0.0)
     # the same program at the same values: rounding of the sum only

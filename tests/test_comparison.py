@@ -10,15 +10,11 @@ from afm_jax.cli.main import main
 from fitting.fits import comparison
 from fitting.fits.comparison import compare
 from fitting.fits.fit import find_fit, summarise
-from tests.fit_tables import EXAMPLE, example_amplitudes
+from tests.fit_tables import EXAMPLE, table
 from tests.strict_reading import strictly
 
+__all__ = ["table"]
 MODELS = ("law", "restitution", "viscous")
-
-
-@pytest.fixture(scope="module")
-def table():
-    return example_amplitudes()
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from fitting.fits.law_after import (
 )
 from fitting.fits.objective import Objective
 from fitting.fits.result import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, scaled
-from fitting.fits.step import StepRows, descending_part, longest_run, settled_step, system_of
+from fitting.fits.step import LinearStep, StepRows, StepSystem, descending_part, longest_run, settled_step, system_of
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE
@@ -65,6 +65,16 @@ def rows() -> StepRows:
     )
 
 
+@pytest.fixture(scope="module")
+def system(rows) -> StepSystem:
+    return system_of(rows, LEFT_OUT, FREE)
+
+
+@pytest.fixture(scope="module")
+def step(system) -> LinearStep:
+    return system.step()
+
+
 def stacked(rows: StepRows):
     """Return matrix, right-hand side and number of parameters of one least-squares problem with everything in it."""
     columns = LEFT_OUT.columns(rows.approach, rows.rebound)
@@ -96,11 +106,9 @@ def stacked(rows: StepRows):
     return matrix, np.concatenate([right, rows.residual[-1:], np.zeros(size - 6)])
 
 
-def test_the_step_is_that_of_one_least_squares_problem(rows):
+def test_the_step_is_that_of_one_least_squares_problem(rows, system, step):
     matrix, right = stacked(rows)
     best = np.linalg.lstsq(matrix, -right, rcond=None)[0]
-    system = system_of(rows, LEFT_OUT, FREE)
-    step = system.step()
     assert step.names == (*VALUES, LOSS_SHAPE, DELAY_SHAPE)
     np.testing.assert_allclose(step.change, best[:8], rtol=1e-6)
     np.testing.assert_allclose(step.unknown, best[8:], rtol=1e-5, atol=1e-7)
@@ -110,10 +118,8 @@ def test_the_step_is_that_of_one_least_squares_problem(rows):
     assert system.chi2(step, system.misfit(step)) == pytest.approx(step.chi2, rel=1e-9)
 
 
-def test_chi2_leaves_what_belongs_to_the_rows_at_its_most_likely(rows):
+def test_chi2_leaves_what_belongs_to_the_rows_at_its_most_likely(rows, system, step):
     """The sum of squares with the remainders as unknowns of their own, minimised over these."""
-    system = system_of(rows, LEFT_OUT, FREE)
-    step = system.step()
     misfit = np.random.default_rng(8).normal(size=2 * ROWS)
     half = step.partly(0.5)
     of_rows = system.unknown[:, system.of_law :]
@@ -135,9 +141,7 @@ def computed(misfits: list[np.ndarray]) -> Predicted:
 
 
 @pytest.mark.parametrize("share", [0.25, 0.0])
-def test_a_step_is_damped_until_chi2_falls(rows, share):
-    system = system_of(rows, LEFT_OUT, FREE)
-    step = system.step()
+def test_a_step_is_damped_until_chi2_falls(share, system, step):
 
     def predicted(parts):
         taken = [float(part.change @ step.change / (step.change @ step.change)) for part in parts]
@@ -147,17 +151,13 @@ def test_a_step_is_damped_until_chi2_falls(rows, share):
     found = descending_part(system, predicted)
     np.testing.assert_allclose(found.step.change, share * step.change)
     np.testing.assert_allclose(found.step.unknown, share * step.unknown)
-    if share > 0.0:
-        assert found.stuck is None
-    else:
-        begin, expected = found.stuck
-        assert begin > expected
+    assert (found.stuck is None) == (share > 0.0)
+    begin, expected = found.stuck or (1.0, 0.0)
+    assert begin > expected
 
 
-def test_a_settled_step_explains_the_readings_as_computed(rows):
+def test_a_settled_step_explains_the_readings_as_computed(rows, system, step):
     """Readings bend with the law: the first step's do not fit, the settled one's misfit is that of a fit to them."""
-    system = system_of(rows, LEFT_OUT, FREE)
-    step = system.step()
     looks = []
 
     def bent(part):
@@ -182,10 +182,9 @@ def test_a_settled_step_explains_the_readings_as_computed(rows):
     np.testing.assert_array_equal(found.predicted.misfit.ravel(), bent(found.step))
 
 
-def test_the_law_after_the_step_is_the_formula_with_its_discrepancy(rows):
+def test_the_law_after_the_step_is_the_formula_with_its_discrepancy(step):
     """By hand, of a step large enough that first order is visibly not it."""
     u, values = np.geomspace(25.0, 180.0, 7), np.array(list(VALUES.values()))
-    step = system_of(rows, LEFT_OUT, FREE).step()
     before, moved = (
         LawBefore(loss_and_delay(at, u), np.zeros((2, 7, 6)), 10.9, np.zeros(6)) for at in (values, step.values[:6])
     )
@@ -199,14 +198,13 @@ def test_the_law_after_the_step_is_the_formula_with_its_discrepancy(rows):
     np.testing.assert_allclose(found.law[1], delay, rtol=1e-10)
 
 
-def test_the_band_is_that_of_the_whole_covariance(rows):
+def test_the_band_is_that_of_the_whole_covariance(rows, step):
     matrix, _ = stacked(rows)
     covariance = np.linalg.inv(matrix.T @ matrix)
     u = np.array([30.0, 80.0, 150.0])
     w = np.sqrt(u**2 - 0.5 * u - 113.6)
     slope = np.zeros((2, 3, 6))
     slope[0, :, 0], slope[0, :, 1] = -0.5 / w, -0.5 * u / w
-    step = system_of(rows, LEFT_OUT, FREE).step()
     found = law_after(step, LEFT_OUT, u, LawBefore(np.stack([w, 0.0 * w]), slope, 10.9, np.zeros(6)))
     columns = LEFT_OUT.columns(u, w)
     square = np.concatenate([2.0 * w[:, None] * slope[0], columns.shape[0], columns.unknown[0]], axis=1)
@@ -259,11 +257,10 @@ def loss_and_delay(values: np.ndarray, u: np.ndarray) -> np.ndarray:
     return np.stack([w, hertz * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u])
 
 
-def test_the_parameters_are_those_of_the_closest_formula_and_as_unsure(rows):
+def test_the_parameters_are_those_of_the_closest_formula_and_as_unsure(step):
     u, values = np.geomspace(25.0, 180.0, 30), np.array(list(VALUES.values()))
     slope = np.asarray(approx_fprime(values, lambda at: loss_and_delay(at, u).ravel(), 1e-6)).reshape(2, 30, 6)
     before = LawBefore(loss_and_delay(values, u), slope, 10.9, np.zeros(6))
-    step = system_of(rows, LEFT_OUT, FREE).step()
     after = law_after(step, LEFT_OUT, u, before)
     found = closest_member(step, LEFT_OUT, u, before, FREE)
     assert found is not None

@@ -8,38 +8,22 @@ from scipy.stats import chi2
 from afm_jax import ImpactLaw
 from fitting import fit
 from fitting.examples.make_amplitudes import TRUTH, example_table
-from fitting.fits.objective import Objective
-from fitting.fits.result import FitResult
 from fitting.report.report import summary
-from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
-    example_amplitudes,
-    example_fit,
-    example_objective,
     holds,
+    law,
+    objective,
     rows,
     simulated,
+    table,
     values_of,
     with_amplitudes,
 )
 from tests.reference_examples import scene
 from tests.reference_orbits import single_impact_orbits
 
-
-@pytest.fixture(scope="module")
-def table() -> AmplitudeTable:
-    return example_amplitudes()
-
-
-@pytest.fixture(scope="module")
-def law() -> FitResult:
-    return example_fit()
-
-
-@pytest.fixture(scope="module")
-def objective() -> Objective:
-    return example_objective()
+__all__ = ["law", "objective", "table"]
 
 
 def test_the_bundled_table_is_what_its_script_makes(table):

@@ -12,28 +12,12 @@ from fitting import fit
 from fitting.fits.fit import find_fit, summarise
 from fitting.fits.intervals import check_minimum, covariance
 from fitting.fits.objective import FINE, PLAIN, Objective, polish
-from fitting.fits.result import FitResult
-from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import example_amplitudes, example_fit, example_objective, standard_errors_of, values_of
+from tests.fit_tables import law, objective, standard_errors_of, table, values_of
 from tests.strict_reading import strictly
 
+__all__ = ["law", "objective", "table"]
 FREE = np.ones(3, dtype=bool)
 STEPS = np.array([1e-6, 1e-2, 1e-3])  # of r, epsilon and Q: hundredths of a standard error and less
-
-
-@pytest.fixture(scope="module")
-def table() -> AmplitudeTable:
-    return example_amplitudes()
-
-
-@pytest.fixture(scope="module")
-def law() -> FitResult:
-    return example_fit()
-
-
-@pytest.fixture(scope="module")
-def objective() -> Objective:
-    return example_objective()
 
 
 def differenced(objective: Objective, values: np.ndarray) -> np.ndarray:

@@ -21,19 +21,16 @@ from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
-    example_amplitudes,
     rows,
     simulated,
     standard_errors_of,
+    table,
     table_of,
     values_of,
     with_amplitudes,
 )
 
-
-@pytest.fixture(scope="module")
-def table() -> AmplitudeTable:
-    return example_amplitudes()
+__all__ = ["table"]
 
 
 def on_resonance(r: float) -> AmplitudeTable:

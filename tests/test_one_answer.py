@@ -1,6 +1,6 @@
 """One impact with a delay, one answer: orbits, map, simulation and the fit's prediction of 200 scenes agree."""
 
-from typing import Any, NamedTuple
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +22,6 @@ PERIODS = 100
 NAMES = ("r", "epsilon", *DELAY_NAMES)
 
 
-class Orbits(NamedTuple):
-    """The scenes and what `single_impact_orbits` says of the fastest stable orbit of each, shape (scenes,)."""
-
-    scenes: Any
-    order: np.ndarray
-    there: Any
-    found: Any
-    """All slots."""
-    start: State
-    one: Any
-    """The chosen slot."""
-
-
 def made(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random laws (laws, 5) and drives (drives, 4): order, frequency, amplitude, offset."""
     random = np.random.default_rng(7)
@@ -46,7 +33,8 @@ def made(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def orbits() -> Orbits:
+def orbits() -> SimpleNamespace:
+    """The scenes, what `single_impact_orbits` finds, and of each scene the fastest stable orbit and where it starts."""
     laws, drives = made(DRIVES)
     r, epsilon, hertz, lead, offset = np.repeat(laws, DRIVES, axis=0).T
     order, frequency, amplitude, height = np.tile(drives, (LAWS, 1)).T
@@ -67,7 +55,7 @@ def orbits() -> Orbits:
     time = np.where(there, one.phase_rad / np.asarray(scenes.platform.angular_frequency), 0.0)
     velocity = np.where(there, one.velocity_after_nm_per_us, 100.0)
     start = State(*(jnp.asarray(part) for part in (time, scenes.platform.position(time), velocity)))
-    return Orbits(scenes, order, there, found, start, one)
+    return SimpleNamespace(scenes=scenes, order=order, there=there, found=found, start=start, one=one)
 
 
 @pytest.mark.slow
