@@ -87,7 +87,8 @@ def test_a_measured_table_is_fitted_first(tmp_path):
     table = rows(read_table(EXAMPLE), slice(0, 20))
     path = tmp_path / "table.csv"
     write_table(table, path)
-    frequency, drive, offset = table.drive_frequency_khz[0], table.drive_amplitude_nm[0], table.offset_nm[0]
+    columns = (table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
+    frequency, drive, offset = (float(np.asarray(column)[0]) for column in columns)
     heights = f"{offset},{offset + 0.125}"
     grid = ("--orders", table.order[0], "--frequencies-khz", frequency, "--drive-nm", drive, "--offsets-nm", heights)
     found = run("--measured", path, "--model", "law", *grid, "--points", 1, "--json")

@@ -274,7 +274,8 @@ def test_the_parameters_are_those_of_the_closest_formula_and_as_unsure(step):
         def formula(loss, late):
             return loss_and_delay(values[:5] + unit * np.append(loss, late), u)
 
-        options = {"bounds": (-values[:2] / unit[:2], np.inf)} | dict.fromkeys(("xtol", "ftol", "gtol"), 1e-14)
+        options: dict[str, Any] = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-14)
+        options["bounds"] = (-values[:2] / unit[:2], np.inf)
         loss = least_squares(lambda at: (formula(at, np.zeros(3))[0] - law[0]) / width[0], np.zeros(2), **options).x
         late = least_squares(lambda at: (formula(loss, at)[1] - law[1]) / width[1], np.zeros(3), xtol=1e-14).x
         return np.append(loss, late)

@@ -242,6 +242,7 @@ def test_laws_that_differ_are_named_and_their_scatter_is_found(tmp_path: Path):
     assert differing.valid
     low, high = differing.scatter["r"].interval95
     assert low > 0.0
+    assert high is not None
     # their own standard deviation is 0.0025
     assert low < np.std(truth, ddof=1) < high
     assert holds(differing.parameters["r"], float(np.mean(truth)))

@@ -1,6 +1,7 @@
 """Simulated experiments: tables of the full contact, and of a law whose orbits are known in closed form."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,7 +87,7 @@ def test_impossible_experiments_are_refused():
         # far off every resonance and slower than capture
         ({"drives": drives_of([(1, 250.0, 0.2, 0.0)])}, "no drive has a steady single-impact orbit"),
     ):
-        wanted = {"drives": drives_of(ROWS), "noise": 0.01, "phase_noise_deg": 0.1} | changed
+        wanted: Any = {"drives": drives_of(ROWS), "noise": 0.01, "phase_noise_deg": 0.1} | changed
         with pytest.raises(ValueError, match=said):
             simulate_experiment(LAW, Cantilever(90.0, 40.0), **wanted)
 
