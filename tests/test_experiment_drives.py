@@ -21,9 +21,6 @@ def test_detunings_are_about_each_orders_resonance_and_every_combination_is_ther
     assert found == [(*place, drive, offset) for place in places for drive in (2.0, 4.0) for offset in (-1.0, 1.0)]
 
 
-GIVEN: dict[str, Any] = {"orders": (1,), "amplitudes_nm": (2.0,), "frequencies_khz": (180.0,)}
-
-
 def test_faults_are_named():
     for changes, fault in (
         ({"orders": (1.5,)}, "whole numbers"),
@@ -31,8 +28,9 @@ def test_faults_are_named():
         ({"frequencies_khz": None}, "either `frequencies_khz` or `detunings`"),
         ({"frequencies_khz": None, "detunings": (1.0,)}, "`free_frequency_khz`"),
     ):
+        given: Any = {"orders": (1,), "amplitudes_nm": (2.0,), "frequencies_khz": (180.0,)} | changes
         with pytest.raises(ValueError, match=fault):
-            drive_grid(**GIVEN | changes)
+            drive_grid(**given)
 
 
 def test_measured_drives_are_recognised_up_to_rounding():
