@@ -40,14 +40,8 @@ SLOWEST, FASTEST = 30.0, 200.0
 _SPEEDS = 40
 
 
-class Wanted(NamedTuple):
-    """What is wanted at a noise: mean coverage, and growth of the bands over those of the model taken at its word."""
-
-    coverage: float
-    growth: float
-
-
-WANTED = {0.003: Wanted(0.93, 1.7), 0.01: Wanted(0.95, 1.5), 0.03: Wanted(0.94, 1.3)}
+WANTED = {0.003: (0.93, 1.7), 0.01: (0.95, 1.5), 0.03: (0.94, 1.3)}
+"""Of a noise: mean coverage, and growth of the bands over those of the model taken at its word."""
 WORST_CONTACT = 0.85
 MEDIAN_Z, WORST_Z = 1.2, 2.5
 PER_DEGREE = (0.8, 1.1)
@@ -91,12 +85,8 @@ def measured(truth: ContactTruth, table: AmplitudeTable, model: str) -> Measured
     own = covariance(objective, values, ~at_bound(objective, values))
     used = np.where(result.rows.used, result.rows.approach_speed_nm_per_us, np.nan)
     law = ModelLaw(objective.problem, objective.measurement, values, own)
-    word = law_with_band(
-        law.at,
-        used,
-        lasting=objective.problem.lasting,
-        formula=objective.problem.law(jnp.asarray(values), objective.measurement.fixed),
-    )
+    formula = objective.problem.law(jnp.asarray(values), objective.measurement.fixed)
+    word = law_with_band(law.at, used, lasting=objective.problem.lasting, formula=formula)
     if not (result.valid and np.isfinite(used).any()):
         return Measured(truth.number, False, *(np.full(5, np.nan).tolist()))  # noqa: FBT003
     speeds = np.geomspace(max(SLOWEST, np.nanmin(used)), min(FASTEST, np.nanmax(used)), _SPEEDS)
@@ -141,9 +131,8 @@ def projection(speeds: np.ndarray, rebound: np.ndarray, weight: np.ndarray) -> t
 def held(truth: ContactTruth, table: AmplitudeTable, model: str) -> Held:
     """Return whether the intervals of a fit to a table hold the projection of the true law."""
     result = fit(table, model)
-    nothing = Held(truth.number, np.nan, np.nan)
     if not result.valid:
-        return nothing
+        return Held(truth.number, np.nan, np.nan)
     speeds = result.rows.approach_speed_nm_per_us[result.rows.used]
     right = truth.rebound_and_delay(speeds)[0]
     inside = np.isfinite(right)
@@ -188,7 +177,7 @@ def shortfalls(noise: float, fits: list[Measured], model: str) -> tuple[str, lis
     z, growth, error, degree = (
         np.array([getattr(fit, name) for fit in valid]) for name in ("worst_z", "growth", "error", "per_degree")
     )
-    wanted = WANTED[noise]
+    coverage, widest = WANTED[noise]
     line = (
         f"{100 * noise:g} %: {len(valid)} of {len(fits)} valid; coverage {np.mean(shares):.3f}, worst contact "
         f"{min(shares):.2f} (number {contacts[int(np.argmin(shares))]}); worst |z| {np.median(z):.2f} in the median, "
@@ -196,11 +185,11 @@ def shortfalls(noise: float, fits: list[Measured], model: str) -> tuple[str, lis
         f"law error {100 * np.median(error):.3f} %"
     )
     tests = {
-        f"coverage of {wanted.coverage:g}": np.mean(shares) >= wanted.coverage,
+        f"coverage of {coverage:g}": np.mean(shares) >= coverage,
         f"coverage of {WORST_CONTACT:g} of the worst contact": min(shares) >= WORST_CONTACT,
         f"a median worst |z| of {MEDIAN_Z:g}": np.median(z) <= MEDIAN_Z,
         f"a worst |z| of {WORST_Z:g}": z.max() <= WORST_Z,
-        f"bands {wanted.growth:g} times as wide": np.median(growth) <= wanted.growth,
+        f"bands {widest:g} times as wide": np.median(growth) <= widest,
         f"a chi2/dof of {PER_DEGREE[0]:g} to {PER_DEGREE[1]:g}": PER_DEGREE[0] <= np.median(degree) <= PER_DEGREE[1],
     }
     if noise == 0.01 and model == "viscous+delay":
@@ -218,9 +207,8 @@ def main() -> int:
     parser.add_argument("--truths", type=Path, default=Path(tempfile.gettempdir()) / "afm-jax-truths")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    contacts, seeds, model, look = (
-        ("0:20", 3, "law+delay", held) if options.intervals else ("0:10", 12, "viscous+delay", measured)
-    )
+    usual = ("0:20", 3, "law+delay", held) if options.intervals else ("0:10", 12, "viscous+delay", measured)
+    contacts, seeds, model, look = usual
     first, end = (int(number) for number in (options.contacts or contacts).split(":"))
     model = options.model or model
     fits: dict[float, list[Any]] = {noise: [] for noise in NOISES}

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import fitting.examples
 from afm_jax.apparatus.cantilever import Cantilever
@@ -37,9 +38,21 @@ def example_fit() -> FitResult:
     return fit(example_amplitudes(), model="law")
 
 
-@cache
-def example_objective() -> Objective:
-    """Return chi2 of the bundled table without its phases by the law; tests only ask it."""
+@pytest.fixture(scope="session")
+def table() -> AmplitudeTable:
+    """The bundled table without its phases."""
+    return example_amplitudes()
+
+
+@pytest.fixture(scope="session")
+def law() -> FitResult:
+    """Its fit; tests only read it."""
+    return example_fit()
+
+
+@pytest.fixture(scope="session")
+def objective() -> Objective:
+    """Its chi2 by the law; tests only ask it."""
     problem = problem_of(example_amplitudes(), "law")
     return Objective(measurement_of(example_amplitudes(), problem), problem)
 

@@ -11,18 +11,14 @@ from fitting.fits.intervals import Convergence
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, PARAMETERS
 from fitting.tables.table import AmplitudeTable
+from tests.fit_tables import amplitudes_and_errors, table_of
 
 VALUES = {
     "restitution": {"r": 0.93},
     "law": {"r": 0.987654321, "epsilon": 61.23456789},
     "viscous": {"epsilon": 0.0, "viscous_loss": 0.58371},
-    "law+delay": {
-        "r": 0.998316817,
-        "epsilon": 108.9187,
-        "delay_hertz": 0.2036519,
-        "delay_lead_nm": -6.14712,
-        "delay_offset_nm": 0.575123,
-    },
+    "law+delay": {"r": 0.998316817, "epsilon": 108.9187}
+    | dict(zip(DELAY_NAMES, (0.2036519, -6.14712, 0.575123), strict=True)),
     "contact": {"relative_humidity": 0.479, "viscosity_pa_s": 1.08e-3},
 }
 SPEEDS = np.array([24.0, 40.0, 95.0, 260.0])
@@ -89,18 +85,10 @@ def made_law(values: dict[str, float], *, width: float, lasting: bool) -> Fitted
     hertz, lead, offset = (values.get(name, 0.1) for name in DELAY_NAMES)
     w = np.asarray(law.rebound_speed(u))
     late = np.asarray(CollisionDelay(hertz, lead, offset)(u, w)) if lasting else np.zeros_like(u)
-    errors = width / TWO_SIDED_95 * np.stack([w, np.abs(late)], axis=1)[:, :, None]
-    return FittedLaw(
-        u,
-        w,
-        late,
-        capture_speed_nm_per_us=float(law.capture_speed_nm_per_us),
-        delay=None,
-        lasting=lasting,
-        errors=(errors, np.zeros(1)),
-        mass_ng=1.0,
-        origin="made",
-    )
+    errors = width / TWO_SIDED_95 * np.stack([w, np.abs(late)], axis=1)[:, :, None], np.zeros(1)
+    capture = float(law.capture_speed_nm_per_us)
+    rest: dict[str, Any] = {"delay": None, "lasting": lasting, "mass_ng": 1.0, "origin": "made"}
+    return FittedLaw(u, w, late, capture_speed_nm_per_us=capture, errors=errors, **rest)
 
 
 def made_table(rows: int = 4, **changes: Any) -> AmplitudeTable:
@@ -108,29 +96,15 @@ def made_table(rows: int = 4, **changes: Any) -> AmplitudeTable:
     peak = np.linspace(50.0, 180.0, rows)
     peak[-1] = np.nan
     lockin = np.linspace(20.0, 80.0, rows)
-    columns: dict[str, Any] = {
-        "order": np.ones(rows, dtype=np.int64),
-        "drive_frequency_khz": np.linspace(170.0, 190.0, rows),
-        "drive_amplitude_nm": np.full(rows, 4.0),
-        "offset_nm": np.full(rows, 1.0 / 3.0),
-        "free_frequency_khz": 90.0,
-        "peak_amplitude_nm": peak,
-        "peak_amplitude_error_nm": 0.01 * peak,
-        "lockin_amplitude_nm": lockin,
-        "lockin_amplitude_error_nm": 0.01 * lockin,
-        "quality_factor": 40.0,
-        "quality_factor_error": 0.4,
-        "mass_ng": 1.0,
-        "remarks": ("measured on a Tuesday",),
-    }
-    return AmplitudeTable(**(columns | changes))
+    drives = np.ones(rows), np.linspace(170.0, 190.0, rows), np.full(rows, 4.0), np.full(rows, 1.0 / 3.0)
+    amplitude = np.stack([peak, lockin], axis=1)
+    known = {"quality_factor_error": 0.4, "mass_ng": 1.0, "remarks": ("measured on a Tuesday",)}
+    return table_of(drives, amplitude, 0.01 * amplitude, **(known | changes))
 
 
 def made_rows(table: AmplitudeTable) -> FittedRows:
     """Return rows that fit to half an error."""
-    assert table.peak_amplitude_nm is not None
-    assert table.lockin_amplitude_nm is not None
-    measured = np.stack([table.peak_amplitude_nm, table.lockin_amplitude_nm], axis=1)
+    measured = amplitudes_and_errors(table)[0]
     error = 0.01 * measured
     return FittedRows(
         predicted_nm=measured + 0.5 * error,

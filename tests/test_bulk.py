@@ -1,6 +1,5 @@
 """Many fits at once: each is that of its table alone, whatever the instrument, the draw and the process."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +10,9 @@ from click.testing import CliRunner, Result
 import fitting
 from afm_jax.cli.main import main
 from afm_jax.sweeps.plan import plan_of
-from fitting.bulk import _drawn, _with_instrument, table_input
+from fitting.bulk import _with_instrument, table_input
 from fitting.tables.table import AmplitudeTable, read_table, write_table
+from tests.answers import table as records
 
 AXIS = {"parameter": "table.quality_factor", "list": [38.0, 42.0]}
 
@@ -34,28 +34,21 @@ def test_instruments_change_what_they_say():
     np.testing.assert_array_equal(other.drive_amplitude_nm, plain.drive_amplitude_nm)
 
 
-@pytest.mark.parametrize(
-    ("record", "axes", "message"),
-    [
-        ({"what": "orbits"}, [], 'only `what` = "fit" can be recorded'),
-        ({"modle": "law"}, [], "unknown key modle of 'fit'; it has model"),
-        ({"resamples": 0}, [], "`resamples` must be a positive whole number"),
-        ({}, [{"parameter": "interaction.r", "linear": [0.1, 0.2, 3]}], "interaction.r cannot be an axis of tables"),
-        ({}, [AXIS | {"list": [-1.0]}], "table.quality_factor must be positive"),
-    ],
-)
-def test_impossible_sweeps_over_tables_are_named(record: dict, axes: list, message: str):
-    with pytest.raises(ValueError, match=message):
-        plan_of(table_input([table()], record, axes=axes))
+def test_impossible_sweeps_over_tables_are_named():
+    for axis, message in (
+        ({"parameter": "interaction.r", "linear": [0.1, 0.2, 3]}, "interaction.r cannot be an axis of tables"),
+        (AXIS | {"list": [-1.0]}, "table.quality_factor must be positive"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plan_of(table_input([table()], {}, axes=[axis]))
 
 
-@pytest.fixture
-def fit() -> Callable[..., Result]:
-    return lambda *arguments: CliRunner().invoke(main, ["fit", *map(str, arguments)], prog_name="afm-jax")
+def fit_each(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["fit", "--each", *map(str, arguments)], prog_name="afm-jax")
 
 
 @pytest.mark.slow
-def test_every_fit_is_that_of_its_table_alone(tmp_path: Path, fit: Callable[..., Result]):
+def test_every_fit_is_that_of_its_table_alone(tmp_path: Path):
     tables = [table(), table(1.02)]
     found = fitting.fit_each(tables, "law", axes=[AXIS], out=tmp_path / "kept")
     for number, own in enumerate(tables):
@@ -71,37 +64,18 @@ def test_every_fit_is_that_of_its_table_alone(tmp_path: Path, fit: Callable[...,
     files = [tmp_path / f"{number}.csv" for number in range(2)]
     for own, path in zip(tables, files, strict=True):
         write_table(own, path)
-    result = fit("--each", *files, "--model", "law", "--workers", 1, "--out", tmp_path / "out")
+    result = fit_each(*files, "--model", "law", "--workers", 1, "--out", tmp_path / "out")
     assert result.exit_code in (0, 3), result.stderr
-    told = (tmp_path / "out" / "fits.csv").read_text().splitlines()
-    assert told[0].startswith("table,outcome,r,r_error,r_low,r_high,epsilon,")
-    values = [float(line.split(",")[2]) for line in told[1:]]
-    assert values == [fitting.fit(own, "law").parameters["r"].value for own in tables]
-
-
-@pytest.mark.slow
-def test_tables_are_drawn_about_their_fit():
-    plain = table()
-    found = fitting.fit(plain, "law")
-    drawn = [_drawn(plain, found, (1, 2, number)) for number in range(40)]
-    for column, predicted, error in (
-        ("peak_amplitude_nm", found.rows.predicted_nm[:, 0], plain.peak_amplitude_error_nm),
-        ("lockin_amplitude_nm", found.rows.predicted_nm[:, 1], plain.lockin_amplitude_error_nm),
-        ("phase_deg", found.rows.predicted_phase_deg, plain.phase_error_deg),
-    ):
-        pulls = (np.array([getattr(each, column) for each in drawn]) - predicted) / np.asarray(error)
-        # of 40 x 93 draws
-        assert abs(np.nanmean(pulls)) < 0.08
-        assert abs(np.nanstd(pulls) - 1.0) < 0.06
-    np.testing.assert_array_equal(_drawn(plain, found, (1, 2, 0)).phase_deg, drawn[0].phase_deg)
+    told = records(tmp_path / "out" / "fits.csv")
+    assert [float(row["r"]) for row in told] == [fitting.fit(own, "law").parameters["r"].value for own in tables]
 
 
 @pytest.mark.slow
 def test_fits_of_drawn_tables_scatter_by_their_errors():
-    found = fitting.fit_each([table()], "law", resamples=12, seed=3).isel(table=0)
+    found = fitting.fit_each([table()], "law", resamples=6, seed=3).isel(table=0)
     # noise about noise would make it 2
     assert 0.8 < float((found["chi2"] / found["degrees_of_freedom"]).mean()) < 1.2
-    assert int((found["outcome"] == 0).sum()) >= 11
+    assert int((found["outcome"] == 0).sum()) >= 5
     assert 0.4 < float(found["r"].std() / found["r_error"].mean()) < 1.8
     wrong = fitting.fit_each([table(1.1)], "law", resamples=1).isel(table=0, resample=0)
     assert int(wrong["outcome"]) == -1

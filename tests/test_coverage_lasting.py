@@ -1,8 +1,7 @@
 """A thousand simulated experiments a model, fitted at once: 95 % intervals hold the truth 95 times of a hundred.
 
 The truth is the fitted model itself: what is proved is the fit and its errors, not the model. Intervals are Wald's for
-all thousand, and of the instantaneous law profile intervals for two hundred of them; eight are fitted one by one as
-users do, and come to the values of the batch.
+all thousand, and of the instantaneous law profile intervals for two hundred of them.
 """
 
 import numpy as np
@@ -11,18 +10,17 @@ from scipy.stats import binom, kstest
 
 import fitting.examples
 from afm_jax.impact.law import ImpactLaw
-from fitting import fit, read_table
+from fitting import read_table
 from fitting.fits.intervals import profile_intervals
 from fitting.fits.minimum import model_errors_of, with_inflated_errors
 from fitting.fits.objective import Objective
 from fitting.models import Problem, measurement_of
 from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, draw_data, fit_data_sets
-from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import amplitudes_and_errors, example_amplitudes, rows, simulated, values_of, with_amplitudes
+from tests.fit_tables import example_amplitudes, rows, simulated
 
 pytestmark = pytest.mark.slow
 
-EXPERIMENTS, PROFILED, WHOLE = 1000, 200, 8
+EXPERIMENTS, PROFILED = 1000, 200
 CONTACT_EXAMPLE = fitting.examples.__path__[0] + "/amplitudes_contact.csv"
 DELAY = {"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726}
 TRUTHS = {
@@ -32,17 +30,12 @@ TRUTHS = {
 }
 
 
-def table_for(model: str) -> AmplitudeTable:
-    """Return the drives of a bundled table, with errors of 1 %."""
-    if model != "law":
-        return read_table(CONTACT_EXAMPLE)
-    example = example_amplitudes()
-    return simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 60.0), seed=None)
-
-
 def experiment(model: str) -> Refit:
-    """Return a model at its truth on the drives of a bundled table."""
-    table = table_for(model)
+    """Return a model at its truth on the drives of a bundled table, with errors of 1 %."""
+    if model == "law":
+        table = simulated(rows(example_amplitudes(), slice(0, None, 3)), ImpactLaw(0.95, 60.0), seed=None)
+    else:
+        table = read_table(CONTACT_EXAMPLE)
     problem = Problem(model, tuple(TRUTHS[model]))
     values = np.array(list(TRUTHS[model].values()))
     stated = Objective(measurement_of(table, problem), problem).following(values)
@@ -100,30 +93,3 @@ def test_profile_intervals_cover_the_truth(fits):
     # once in ten thousand of right intervals would lie outside on either side
     limits = binom.ppf(1e-4, PROFILED, 0.95), binom.ppf(1.0 - 1e-4, PROFILED, 0.95)
     assert np.all((limits[0] <= covered) & (covered <= limits[1])), dict(zip(names, covered.tolist(), strict=True))
-
-
-def test_whole_fits_are_those_of_the_batch_and_rarely_warn(fits):
-    refit, data, batch = fits
-    if refit.objective.problem.lasting:
-        pytest.skip("its errors are inflated at the truth, those of a fit where it ends")
-    table = table_for("law")
-    (quality,) = np.flatnonzero(np.isfinite(np.asarray(refit.objective.measurement.constraint_error)))
-    _, error = amplitudes_and_errors(table)
-    results = [
-        fit(
-            with_amplitudes(
-                table, data.amplitude_nm[k, : table.rows, :2], error, quality_factor=data.constraint_value[k, quality]
-            ),
-            "law",
-        )
-        for k in range(WHOLE)
-    ]
-    deviation = np.sqrt(np.diagonal(batch.covariance, axis1=1, axis2=2))[:WHOLE]
-    # a fit ends within a thousandth of an error of its minimum
-    np.testing.assert_allclose(
-        [values_of(one) for one in results] / deviation, (batch.values[:WHOLE]) / deviation, atol=2e-3, rtol=0
-    )
-    np.testing.assert_allclose([one.chi2 for one in results], batch.chi2[:WHOLE], rtol=1e-5)
-    # left to chance: chi2 improbable at 1e-3, and an alarm beyond three standard deviations (0.27 %)
-    assert sum(not one.valid for one in results) <= binom.ppf(1 - 1e-4, WHOLE, 1e-3)
-    assert sum("correlated" in " ".join(one.warnings) for one in results) <= binom.ppf(1 - 1e-4, WHOLE, 2.7e-3)

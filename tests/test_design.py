@@ -1,6 +1,6 @@
 """Designs on the instantaneous law: information, forecasts and choices against another search for the orbits."""
 
-import itertools
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,13 +21,8 @@ NOISE = 0.01
 
 
 def law_prior(**changes) -> Prior:
-    given = {
-        "free_frequency_khz": 90.0,
-        "quality_factor": QUALITY_FACTOR[0],
-        "values": LAW,
-        "constraints": {"quality_factor": QUALITY_FACTOR},
-    }
-    return prior_of_values("law", **(given | changes))
+    given = {"values": LAW, "constraints": {"quality_factor": QUALITY_FACTOR}} | changes
+    return prior_of_values("law", free_frequency_khz=90.0, quality_factor=QUALITY_FACTOR[0], **given)
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +51,11 @@ def test_a_law_is_believed_as_its_closest_formula():
     found = prior_of_values("law", free_frequency_khz=90.0, quality_factor=40.0, law=law)
     np.testing.assert_allclose(found.values, [0.95, 60.0], rtol=1e-9)
     np.testing.assert_allclose(np.linalg.inv(found.information), covariance, rtol=0.02)
-    assert (found.mass_ng, found.source) == (2.0, "a law (a test)")
-    assert found.notes[0].startswith("The law is planned with as the closest formula of law: off by at most")
+    assert found.mass_ng == 2.0
     # what is given counts more; of what the law does not tell the paper's is taken
     found = prior_of_values("law+delay", free_frequency_khz=90.0, law=law, values={"r": 0.9})
     assert found.values[0] == 0.9
-    assert (
-        "Not given, and taken from the paper's contact: delay_hertz, delay_lead_nm, delay_offset_nm" in found.notes[1]
-    )
+    assert "taken from the paper's contact: delay_hertz, delay_lead_nm, delay_offset_nm" in found.notes[1]
     # a formula is a law, too; one that no member is meets it as far as it says
     wet = ImpactLaw(1.0, 114.0, 0.48, CollisionDelay(0.2, 5.6, 0.7))
     found = prior_of_values("viscous+delay", free_frequency_khz=90.0, law=wet)
@@ -76,8 +68,6 @@ def test_a_law_is_believed_as_its_closest_formula():
     assert float(found.notes[0].split("at most ")[1].split(" %")[0]) == pytest.approx(off, rel=0.05)
     with pytest.raises(ValueError, match=r"the law is that of a tip of 2 ng, but the cantilever's `mass_ng` is 1"):
         prior_of_values("law", free_frequency_khz=90.0, mass_ng=1.0, law=law)
-    with pytest.raises(ValueError, match="a law says nothing of a contact's parameters"):
-        prior_of_values("contact", free_frequency_khz=90.0, law=law)
 
 
 POINT = np.array([LAW["r"], LAW["epsilon"], QUALITY_FACTOR[0]])
@@ -89,10 +79,9 @@ def other_amplitudes(drives: Drives, point: np.ndarray = POINT) -> np.ndarray:
     return steady_readings(drives, ImpactLaw(r, epsilon), quality_factor)[:, :2]
 
 
-def error_of(forecast: Forecast | FittedParameter) -> float:
-    """Return the standard error, which there must be."""
-    assert forecast.standard_error is not None
-    return forecast.standard_error
+def errors_of(forecasts: Mapping[str, Forecast | FittedParameter]) -> np.ndarray:
+    """Return the standard errors; NaN where there is none."""
+    return np.array([forecast.standard_error for forecast in forecasts.values()], dtype=float)
 
 
 def test_readings_and_information_are_those_of_other_orbits(of_law, drives):
@@ -109,31 +98,6 @@ def test_readings_and_information_are_those_of_other_orbits(of_law, drives):
     # central differences with steps of 1e-5: errors of 1e-10 of the third derivative, rounding 1e-9
     largest = np.abs(wanted).max(axis=(0, 1))
     np.testing.assert_allclose(found.slope[usable] / largest, wanted / largest, rtol=1e-5, atol=1e-6)
-
-
-def determinant(result: Design, chosen: np.ndarray) -> float:
-    """Return the log of the determinant of the covariance of r and epsilon, from the inverse; infinite if singular."""
-    information = result.prior.information + result.candidates.information[chosen].sum(axis=0)
-    return float(np.linalg.slogdet(np.linalg.inv(information)[:2, :2])[1])
-
-
-def test_points_are_the_best_of_all_choices(drives):
-    few = Drives(*(column[::3] for column in drives))
-    result = design(law_prior(), few, points=3, noise=NOISE)
-    usable = np.flatnonzero(result.candidates.usable)
-    assert usable.size > 8
-    best = min(determinant(result, np.array(some)) for some in itertools.combinations(usable.tolist(), 3))
-    # the ridge of the criterion, 1e-9, is what may differ
-    np.testing.assert_allclose(determinant(result, result.chosen), best, atol=1e-6)
-
-
-def test_a_choice_for_one_parameter_is_better_for_it(drives, of_law):
-    for name, other in (("r", "epsilon"), ("epsilon", "r")):
-        ours, theirs = (design(law_prior(), drives, points=3, noise=NOISE, interest=(n,)) for n in (name, other))
-        mine, yours = ours.expected[name].standard_error, theirs.expected[name].standard_error
-        assert mine is not None
-        assert yours is None or mine <= yours
-    assert of_law.interest == ("r", "epsilon")
 
 
 def test_information_follows_the_noise_and_adds_up(drives, of_law):
@@ -154,26 +118,19 @@ def test_drives_are_left_out_for_a_reason(drives, of_law):
     limited = candidates_of(law_prior(), drives, noise=NOISE, largest_nm=100.0)
     assert np.nanmax(exact[limited.usable, 0]) <= 100.0
     assert limited.left_out["too large"] > 0
-    sure, unsure = (
-        candidates_of(law_prior(uncertainty=share), drives, noise=NOISE).usable.sum() for share in (0.01, 0.9)
-    )
-    assert unsure < sure
-    weak = drive_grid(orders=(1,), amplitudes_nm=(1e-3,), frequencies_khz=(175.0, 180.0))
-    nothing = design(law_prior(), weak)
-    assert not nothing.valid
-    assert "No drive can be planned with" in nothing.reasons[0]
+    unsure = candidates_of(law_prior(uncertainty=0.9), drives, noise=NOISE)
+    assert unsure.usable.sum() < of_law.candidates.usable.sum()
 
 
 def test_a_fit_is_added_to(drives, of_law):
     exact = other_amplitudes(of_law.drives)
     result = fit(table_of(of_law.drives, exact, NOISE * exact, quality_factor_error=QUALITY_FACTOR[1]), "law")
-    for name, forecast in of_law.expected.items():
-        # without noise the fit ends at the believed law: its own minimum is good to 1e-5 standard errors
-        np.testing.assert_allclose(error_of(result.parameters[name]), error_of(forecast), rtol=1e-4)
+    assert [*result.parameters] == [*of_law.expected]
+    # without noise the fit ends at the believed law: its own minimum is good to 1e-5 standard errors
+    np.testing.assert_allclose(errors_of(result.parameters), errors_of(of_law.expected), rtol=1e-4)
     again = design(prior_of_fit(result), drives, points=3, noise=NOISE)
-    for name, parameter in result.parameters.items():
-        # a covariance through its correlations and back
-        np.testing.assert_allclose(error_of(again.measured_so_far[name]), error_of(parameter), rtol=1e-6)
+    # a covariance through its correlations and back
+    np.testing.assert_allclose(errors_of(again.measured_so_far), errors_of(result.parameters), rtol=1e-6)
     assert again.candidates.left_out["measured"] == 5
     assert not {*again.chosen.tolist()} & {*of_law.chosen.tolist()}
     # as good as both measured at once
@@ -186,7 +143,6 @@ def test_a_fit_is_added_to(drives, of_law):
 def test_an_unsure_cantilever_is_named(drives):
     loose = design(law_prior(constraints={"quality_factor": (40.0, 8.0)}), drives, points=6)
     assert any("Most of the error comes from quality_factor" in warning for warning in loose.warnings)
-    assert any("exactly known" in note for note in law_prior(constraints={}).notes)
 
 
 @pytest.mark.slow

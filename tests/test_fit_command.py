@@ -11,7 +11,6 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import chi2 as chi2_distribution
 
-from afm_jax import load_law
 from afm_jax.cli.fit_options import fit_settings
 from afm_jax.cli.main import main
 from fitting import fit
@@ -27,11 +26,11 @@ def run(*arguments: object):
     return CliRunner().invoke(main, ["fit", *(str(argument) for argument in arguments)])
 
 
-def shortened(path: Path, count: int) -> Path:
-    """Write the first rows of the bundled table without its columns of errors and phases."""
-    comments = [line for line in EXAMPLE.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
-    kept = [name for name in records(EXAMPLE)[0] if "error" not in name and "phase" not in name]
-    cells = [",".join(row[name] for name in kept) for row in records(EXAMPLE)[:count]]
+def shortened(path: Path, count: int | None = None, whole: Path = EXAMPLE) -> Path:
+    """Write the first rows of a table, the bundled one or another, without its columns of errors and phases."""
+    comments = [line for line in whole.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+    kept = [name for name in records(whole)[0] if "error" not in name and "phase" not in name]
+    cells = [",".join(row[name] for name in kept) for row in records(whole)[:count]]
     path.write_text("\n".join([*comments, ",".join(kept), *cells]) + "\n", encoding="utf-8")
     return path
 
@@ -50,19 +49,16 @@ def reported(tmp_path_factory):
 def test_report_is_written_and_holds_every_input(reported):
     answer, folder = reported
     assert answer["model"] == "law"
-    assert answer["valid"] is True
     assert answer["degrees_of_freedom"] == 244
+    assert not any("follow the rows" in note for note in answer["warnings"])
     for name in records(EXAMPLE)[0]:
         assert answer["input"][name] == column(EXAMPLE, name).tolist()
     head = {"free_frequency_khz": 90.0, "quality_factor": 40.0, "quality_factor_error": 0.4, "mass_ng": 1.0}
     assert head.items() <= answer["input"].items()
-    assert "seed 1997" in " ".join(answer["input"]["remarks"])
-    text = (folder / "fit.txt").read_text(encoding="utf-8")
-    assert "u_out^2 = r^2 u_in^2 - epsilon" in text
     page = read_page((folder / "fit.html").read_text(encoding="utf-8"))
     # rows, law, residuals over the speed, energy of an impact
     assert sum(1 for _ in page.iter("img")) == 4
-    for said in (text, first_screen(page)):
+    for said in ((folder / "fit.txt").read_text(encoding="utf-8"), first_screen(page)):
         assert "VALID" in said.splitlines()
         # made with r 0.95 and epsilon 60 (its own comments say so)
         assert "0.9494 to 0.9507" in said
@@ -76,23 +72,20 @@ def test_tables_of_the_report_hold_the_fit(reported):
     assert not np.any(delays)
     np.testing.assert_allclose(rebound, np.sqrt(r**2 * speed**2 - epsilon), rtol=1e-12)
     assert np.all((low < rebound) & (rebound < high))
-    law, whole = load_law(folder / "law.csv"), answer["law"]
-    assert float(law.capture_speed_nm_per_us) == whole["capture_speed_nm_per_us"]
-    assert [float(law.mass_ng or 0.0), law.origin.text] == [1.0, whole["origin"]]
-    assert [float(law.slowest_nm_per_us), float(law.fastest_nm_per_us)] == whole["speed_range_nm_per_us"]
-    rows_of_fit = folder / "fit_rows.csv"
     chi2 = ((answer["parameters"]["quality_factor"]["value"] - 40.0) / 0.4) ** 2
-    roundings = {"peak_amplitude_nm": (1e-9, 1e-12), "lockin_amplitude_nm": (1e-9, 1e-12), "phase_deg": (1e-6, 1e-9)}
-    for name, (relative, absolute) in roundings.items():
-        misfit = column(rows_of_fit, f"predicted_{name}") - column(EXAMPLE, name)
-        if name == "phase_deg":
+    for kind, unit, absolute in (
+        ("peak_amplitude", "nm", 1e-12),
+        ("lockin_amplitude", "nm", 1e-12),
+        ("phase", "deg", 1e-9),
+    ):
+        misfit = column(folder / "fit_rows.csv", f"predicted_{kind}_{unit}") - column(EXAMPLE, f"{kind}_{unit}")
+        if kind == "phase":
             # of the N periods of a response any is locked
             turn = 360.0 / column(EXAMPLE, "order")
             misfit = (misfit + 0.5 * turn) % turn - 0.5 * turn
-        kind, unit = name.split("_")[0], name.split("_")[-1]
-        residual = column(rows_of_fit, f"{kind}_residual")
-        error = column(EXAMPLE, f"{name.removesuffix(unit)}error_{unit}")
-        np.testing.assert_allclose(residual, misfit / error, rtol=relative, atol=absolute)
+        residual = column(folder / "fit_rows.csv", f"{kind.split('_')[0]}_residual")
+        misfit /= column(EXAMPLE, f"{kind}_error_{unit}")
+        np.testing.assert_allclose(residual, misfit, rtol=1e3 * absolute, atol=absolute)
         chi2 += np.sum(residual**2)
     assert answer["chi2"] == pytest.approx(chi2, rel=1e-12)
 
@@ -106,19 +99,12 @@ def test_damping_must_be_said_and_energies_need_a_mass(tmp_path, reported):
         refused = CliRunner().invoke(main, [*command, str(path)])
         assert refused.exit_code == 2
         assert f"{path}: the quality factor is missing" in refused.stderr
-        assert "'# quality_factor = 40 +- 2'" in refused.stderr
-        assert "'# quality_factor = none' says that there is no air damping" in refused.stderr
-        assert refused.stderr.count("\n") == 1
     stated = strictly(run(path, "--json", "--quality-factor", "40 +- 0.4").stdout)
-    known = reported[0]
-    assert stated["parameters"] == known["parameters"]
+    assert stated["parameters"] == reported[0]["parameters"]
     assert [one["energy_aj"] for one in stated["loss"]["energies"]] == [None, None, None]
     assert stated["loss"]["energies_reason"] == "the table gives neither mass_ng nor spring_constant_n_per_m"
-    assert stated["loss"]["delta_aj"] is None
-    assert known["loss"]["energies_reason"] is None
-    path.write_text(
-        "\n".join(["# spring_constant_n_per_m = 5.4", "# quality_factor = 40 +- 0.4", *bare]), encoding="utf-8"
-    )
+    head = ["# spring_constant_n_per_m = 5.4", "# quality_factor = 40 +- 0.4"]
+    path.write_text("\n".join([*head, *bare]), encoding="utf-8")
     stiff = strictly(run(path, "--json").stdout)
     mass = 5.4 / (2e-3 * math.pi * 90.0) ** 2
     u, energy = (stiff["loss"]["energies"][0][name] for name in ("approach_speed_nm_per_us", "energy_aj"))
@@ -126,11 +112,10 @@ def test_damping_must_be_said_and_energies_need_a_mass(tmp_path, reported):
     assert energy["value"] == pytest.approx(0.5 * mass * (u**2 * (1.0 - r**2) + epsilon), rel=1e-6)
 
 
-def test_repeated_readings_count_and_tell_the_error(tmp_path, reported):
+def test_repeated_readings_count_and_tell_the_error(tmp_path):
     table = read_table(EXAMPLE)
     # every row twice, the second reading two errors of the peak and one of the lock-in larger
-    kept = [name for name in TABLE.names if getattr(table, name) is not None]
-    again = {name: np.concatenate([column, column]) for name, column in vars(table).items() if name in kept}
+    again = {name: np.tile(getattr(table, name), 2) for name in TABLE.names if getattr(table, name) is not None}
     for name, errors in (("peak", 2.0), ("lockin", 1.0)):
         again[f"{name}_amplitude_nm"][table.rows :] += errors * getattr(table, f"{name}_amplitude_error_nm")
     write_table(dataclasses.replace(table, **again), tmp_path / "twice.csv")
@@ -144,24 +129,18 @@ def test_repeated_readings_count_and_tell_the_error(tmp_path, reported):
         "error_ratio": pytest.approx(math.sqrt(2.5 / 3.0)),
         "p_value": pytest.approx(chi2_distribution.sf(2.5 * table.rows, 3 * table.rows)),
     }
-    assert reported[0]["repeats"] is None
     # amplitudes without errors of their own take their scatter, and it is said
-    lines = (tmp_path / "twice.csv").read_text(encoding="utf-8").splitlines()
-    kept = [name for name in records(tmp_path / "twice.csv")[0] if not name.endswith("_error_nm")]
-    cells = [",".join(row[name] for name in kept) for row in records(tmp_path / "twice.csv")]
-    bare = [*(line for line in lines if line[0] == "#"), ",".join(kept), *cells]
-    (tmp_path / "bare.csv").write_text("\n".join(bare) + "\n", encoding="utf-8")
-    said = " ".join(strictly(run(tmp_path / "bare.csv", "--json").stdout)["warnings"])
+    bare = shortened(tmp_path / "bare.csv", whole=tmp_path / "twice.csv")
+    said = " ".join(strictly(run(bare, "--json").stdout)["warnings"])
     for name in ("peak_amplitude_nm", "lockin_amplitude_nm"):
         assert said.count(f"Errors from repeated readings: {name} +- ") == 1
 
 
 @pytest.mark.slow
-def test_a_drift_of_the_phase_is_noticed_and_fitted_along(reported):
+def test_a_drift_of_the_phase_is_noticed_and_fitted_along():
     table = read_table(EXAMPLE)
     drift = 2.0 * np.linspace(0.0, 1.0, table.rows)
     drifted = dataclasses.replace(table, phase_deg=(np.asarray(table.phase_deg) + drift) % (360.0 / table.order))
-    assert not any("follow the rows" in note for note in reported[0]["warnings"])
     (note,) = [one for one in fit(drifted).warnings if "follow" in one]
     assert "phase +" in note
     assert "say `# rows = in order of time`" in note
@@ -176,24 +155,20 @@ def test_a_drift_of_the_phase_is_noticed_and_fitted_along(reported):
 
 
 def with_factor(table: AmplitudeTable, factor: float, *columns: str) -> AmplitudeTable:
-    """Return a table with some columns, and their errors, in other units."""
-    names = [f"{column}{end}_{unit}" for column in columns for end in ("", "_error") for unit in ("nm", "khz")]
-    scaled = {name: factor * column for name in names if (column := getattr(table, name, None)) is not None}
-    assert scaled
-    return dataclasses.replace(table, **scaled)
+    """Return a table with some columns in other units."""
+    return dataclasses.replace(table, **{column: factor * getattr(table, column) for column in columns})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("columns", "factor", "words"),
+    ("column", "factor", "words"),
     [
-        (("peak_amplitude", "lockin_amplitude"), 1e-3, "the tip's amplitudes times 1000 (micrometres were written"),
-        (("drive_amplitude",), 0.5**0.5, "the drive's amplitude times sqrt 2 (rms"),
-        (("drive_frequency",), 1e3, "the drive's frequency over 1000 (Hz"),
+        ("drive_amplitude_nm", 0.5**0.5, "the drive's amplitude times sqrt 2 (rms"),
+        ("drive_frequency_khz", 1e3, "the drive's frequency over 1000 (Hz"),
     ],
 )
-def test_a_table_in_other_units_is_told_which(columns, factor, words):
-    result = fit(with_factor(read_table(EXAMPLE), factor, *columns))
+def test_a_table_in_other_units_is_told_which(column, factor, words):
+    result = fit(with_factor(read_table(EXAMPLE), factor, column))
     assert not result.valid
     (said,) = [reason for reason in result.reasons if "Check the units" in reason]
     assert said.startswith(f"With {words}")
@@ -203,32 +178,20 @@ def test_a_table_in_other_units_is_told_which(columns, factor, words):
 def test_one_of_several_tables_in_other_units_is_named():
     table = read_table(EXAMPLE)
     first, second = (rows(table, slice(i, None, 2), source=name) for i, name in enumerate(("first.csv", "second.csv")))
-    result = fit([first, with_factor(second, 2.0, "peak_amplitude", "lockin_amplitude")])
+    names = [f"{kind}_amplitude{error}_nm" for kind in ("peak", "lockin") for error in ("", "_error")]
+    result = fit([first, with_factor(second, 2.0, *names)])
     (said,) = [reason for reason in result.reasons if "Check its units" in reason]
     assert said.startswith("second.csv: With the tip's amplitudes halved (peak to peak")
 
 
-def test_errors_come_from_the_noise_option(tmp_path):
-    answer = strictly(run(shortened(tmp_path / "bare.csv", 30), "--json", "--noise", "1%").stdout)
-    assert answer["valid"] is True
-    peaks = np.array(answer["input"]["peak_amplitude_nm"])
-    assert answer["input"]["peak_amplitude_error_nm"] == pytest.approx(0.01 * peaks, rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("option", "package", "said"),
-    [
-        ("--arviz", "h5netcdf", "a file for ArviZ needs the package h5netcdf: pip install 'afm-jax[arviz]'"),
-        ("--posterior", "blackjax", "sampling a posterior needs the package blackjax: pip install 'afm-jax[nuts]'"),
-    ],
-)
-def test_packages_are_asked_for_before_the_fit(tmp_path, monkeypatch, option, package, said):
+def test_packages_are_asked_for_before_the_fit(monkeypatch):
     have = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else have(name))
-    monkeypatch.setitem(sys.modules, package, None)
-    result = run("--example", option, *([tmp_path / "posterior.nc"] if option == "--arviz" else []))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "h5netcdf" else have(name))
+    monkeypatch.setitem(sys.modules, "h5netcdf", None)
+    result = run("--example", "--arviz", "posterior.nc")
     assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr.splitlines() == [f"afm-jax: {said}"]
+    said = "afm-jax: a file for ArviZ needs the package h5netcdf: pip install 'afm-jax[arviz]'"
+    assert result.stderr.splitlines() == [said]
 
 
 def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():

@@ -37,7 +37,7 @@ def test_likelihoods_are_those_of_another_programs_amplitudes(believed):
     known = norm.logpdf(drawn.values[2, :, 2], table.quality_factor, table.quality_factor_error)
     here = drawn.log_likelihood.sum(axis=2)[2] + known - drawn.statistics["lp"][2]
     # up to a constant it is the posterior's
-    assert here == pytest.approx(np.full(250, here[0]), abs=1e-8)
+    assert np.ptp(here) < 1e-8
     z = (drawn.replicated - drawn.predicted) / drawn.error
     assert kstest(z.ravel(), "norm").pvalue > 0.01
 
@@ -77,7 +77,6 @@ def test_arviz_reads_the_file_and_predicts_each_row_by_the_others(believed, tmp_
     groups = {"posterior", "sample_stats", "log_likelihood", "posterior_predictive", "observed_data"}
     # a DataTree since ArviZ 1
     assert groups <= set(data.children if hasattr(data, "children") else data.groups())
-    assert data.posterior["r"].shape == (4, 250)
     assert np.asarray(data.observed_data["peak_amplitude_nm"]) == pytest.approx(result.table.peak_amplitude_nm)
     loo = arviz.loo(data, pointwise=True)
     assert np.asarray(loo.pareto_k).shape == (result.table.rows,)

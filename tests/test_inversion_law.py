@@ -70,9 +70,8 @@ def test_values_without_noise_are_exact(model):
 
 
 def test_errors_of_repeated_experiments_are_those_stated():
-    found = [
-        regress(loss, LOSS_TERMS["viscous"], *impacts("viscous", 25, seed), np.zeros((25, 3, 0))) for seed in range(300)
-    ]
+    nothing = np.zeros((25, 3, 0))
+    found = [regress(loss, LOSS_TERMS["viscous"], *impacts("viscous", 25, seed), nothing) for seed in range(300)]
     pulls = np.array([(one.value - [EPSILON, 0.5]) / np.sqrt(np.diag(one.covariance)) for one in found])
     # the standard deviation of 300 pulls is known to 4 %
     np.testing.assert_allclose(pulls.std(axis=0), 1.0, atol=0.16)
@@ -98,25 +97,12 @@ def test_rows_of_one_speed_leave_errors_infinite():
     assert np.all(np.isinf(found.covariance))
 
 
-def test_too_few_rows_are_an_error():
-    x, covariance = impacts("viscous", 1, 1)
-    with pytest.raises(ValueError, match="1 rows cannot determine 2 coefficients"):
-        regress(loss, LOSS_TERMS["viscous"], x, covariance, np.zeros((1, 3, 0)))
-
-
 def beside(law):
     """Return how far 57 rows of the viscous law, 30 to 300 nm/us, are from a law."""
     table = read_table("fitting/examples/amplitudes_contact.csv")
     x, covariance = impacts("viscous", 57, 3)
-    rows = InvertedRows(
-        impact=x,
-        covariance=covariance,
-        shared=np.zeros((57, 3, 0)),
-        shared_names=(),
-        chi2=np.ones(57),
-        regressed=np.ones(57, bool),
-        note=("",) * 57,
-    )
+    rest = {"shared": np.zeros((57, 3, 0)), "shared_names": (), "chi2": np.ones(57), "note": ("",) * 57}
+    rows = InvertedRows(impact=x, covariance=covariance, regressed=np.ones(57, bool), **rest)
     return distance_from(law, table, rows, read_on_resonance(table, law=None, reference="none"))
 
 
@@ -145,9 +131,7 @@ def test_a_law_of_other_impacts_is_far_from_the_rows():
     assert 20 < found.rows_compared < 40
     said = r"Extrapolated: the law is known from 20 to 100 nm/us, but \d+ of 57 impacts come at 10\d\.\d to 29\d nm/us"
     assert re.match(said, found.extrapolated or "")
-
-
-def test_a_law_of_other_speeds_is_refused():
+    # and one of other speeds is refused
     said = r"a law \(other\.csv\), known from 400 to 900 nm/us, says nothing about .*come at 30.* to .* nm/us; give"
     with pytest.raises(TableError, match=said):
         beside(viscous(400.0, 900.0, EPSILON))

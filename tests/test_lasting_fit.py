@@ -1,5 +1,7 @@
 """Fits of impacts that last: tables of the full contact, made by this program and by another one."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -84,8 +86,7 @@ def test_rows_set_aside_are_named(viscous, shared):
     aside = np.flatnonzero(viscous.rows.set_aside)
     assert aside.size >= 1
     (said,) = [warning for warning in viscous.warnings if warning.startswith("Excluded")]
-    for row in aside:
-        assert str(int(shared.lines[row])) in said
+    assert all(str(int(line)) in said for line in shared.lines[aside])
     assert not np.any(viscous.rows.used & viscous.rows.set_aside)
     assert np.isnan(viscous.rows.residual[aside]).all()
     slowest = np.nanmin(viscous.rows.approach_speed_nm_per_us[viscous.rows.used])
@@ -111,14 +112,6 @@ def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):
     np.testing.assert_allclose(nearby.residual[there], searched.residual[there], rtol=1e-6, atol=1e-6)
 
 
-def test_restitution_and_adhesion_with_delay_come_close(shared):
-    result = fit(shared, model="law+delay")
-    # the loss by viscosity is not this law's, yet no measured orbit gets lost on the way to its minimum
-    assert result.valid
-    assert 0.75 < per_degree(result) < 1.3
-    assert law_error(result) < 0.009
-
-
 def test_the_contact_is_read_off_the_shared_table(shared):
     result = fit(shared, model="contact")
     assert law_error(result) < 0.0035
@@ -128,9 +121,8 @@ def test_the_contact_is_read_off_the_shared_table(shared):
         assert abs(parameter.value - truth) < 4.0 * (parameter.standard_error or 0.0)
 
 
-@pytest.mark.parametrize("model", ["viscous+delay", "contact"])
-def test_without_noise_the_law_is_sharp(model):
-    result = fit(paper_experiment().exact, model=model)
+def test_without_noise_the_law_is_sharp():
+    result = fit(paper_experiment().exact, model="contact")
     assert law_error(result) < 0.0012
 
 
@@ -146,5 +138,4 @@ def test_contact_parameters_that_do_the_same_are_said_to(shared):
     result = fit(shared, model="contact", free=free)
     said = " ".join([*result.reasons, *result.warnings])
     assert "Not identified" in said or "Determined only together" in said or "is not identified" in said
-    assert "relative_humidity" in said
-    assert "temperature_k" in said
+    assert {"relative_humidity", "temperature_k"} <= set(re.findall(r"\w+", said))

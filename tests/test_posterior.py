@@ -25,15 +25,12 @@ from tests.fit_tables import steady_amplitudes as amplitudes_of
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
 
-EVERY_FOURTH = slice(0, None, 4)
-
 
 @pytest.fixture(scope="module")
 def exact_q():
     """A table of a law without adhesion, its quality factor exactly known."""
-    example = example_amplitudes()
-    table = simulated(rows(example, EVERY_FOURTH), ImpactLaw(0.95, 0.0), seed=8)
-    return dataclasses.replace(table, quality_factor=40.0, quality_factor_error=None)
+    every_fourth = rows(example_amplitudes(), slice(0, None, 4), quality_factor=40.0, quality_factor_error=None)
+    return simulated(every_fourth, ImpactLaw(0.95, 0.0), seed=8)
 
 
 @pytest.fixture(scope="module")
@@ -142,11 +139,11 @@ def test_the_samplers_density_is_the_objectives(law, space):
 
 def test_the_prior_is_the_derivative_of_the_values(space):
     z, step = np.array([0.3, -0.4, 0.2]), 1e-5
-    shifts = step * np.eye(3)
-    moved = [
-        [np.asarray(space.values_and_log_prior(jnp.asarray(z + sign * e))[0]) for e in shifts] for sign in (1.0, -1.0)
-    ]
-    jacobian = (np.array(moved[0]) - np.array(moved[1])) / (2.0 * step)
+
+    def values(shift):
+        return np.asarray(space.values_and_log_prior(jnp.asarray(z + shift))[0])
+
+    jacobian = np.array([values(shift) - values(-shift) for shift in step * np.eye(3)]) / (2.0 * step)
     _, log_prior = space.values_and_log_prior(jnp.asarray(z))
     # up to the constant determinant of axes and errors; central differences to 1e-10
     constant = np.linalg.slogdet(space.axes)[1] + np.sum(np.log(space.errors))
@@ -168,13 +165,9 @@ def test_chains_that_disagree_are_not_believed():
     samples = random.normal(size=(4, 100, 1))
     fine = PosteriorChains(samples, np.array([1.001]), np.array([380.0]), 0, 0)
     assert posterior_of_chains(fine, ("r",), ()).converged
-    for bad in (
-        dataclasses.replace(fine, r_hat=np.array([1.05])),
-        dataclasses.replace(fine, r_hat=np.array([np.nan])),
-        dataclasses.replace(fine, effective_samples=np.array([20.0])),
-        dataclasses.replace(fine, divergences=20),
-    ):
-        found = posterior_of_chains(bad, ("r",), ())
+    bad = {"r_hat": np.array([np.nan])}, {"effective_samples": np.array([20.0])}, {"divergences": 20}
+    for changes in bad:
+        found = posterior_of_chains(dataclasses.replace(fine, **changes), ("r",), ())
         assert not found.converged
         assert len(found.reasons) == 1
 
@@ -182,13 +175,6 @@ def test_chains_that_disagree_are_not_believed():
 def test_wrong_calls_are_refused_in_one_line(law, monkeypatch):
     with pytest.raises(ValueError, match="`log_uniform` must name losses"):
         posterior(law, log_uniform=["quality_factor"])
-    with pytest.raises(ValueError, match="`samples` must be at least"):
-        posterior(law, samples=10)
     monkeypatch.setitem(sys.modules, "blackjax", None)
     with pytest.raises(ImportError, match=r"pip install 'afm-jax\[nuts\]'"):
         posterior(law)
-
-
-def test_the_picture_has_its_parameters_at_the_axes(sampled):
-    axes = sampled.plot().axes
-    assert (axes[6].get_xlabel(), axes[7].get_xlabel()) == ("r", "epsilon")
