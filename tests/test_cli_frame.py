@@ -168,9 +168,9 @@ def test_text_fits_the_terminal_and_numbers_stay_whole(
     rows = [[f"{1e5 * (k + 1) / 7 + row:.9g}" for k in range(8)] for row in range(5)]
 
     def body(session: Session) -> None:
-        table = Table(title="Speeds of many tips in a sentence that goes on and on")
-        for head in heads:
-            table.add_column(head.replace(" nm", "\nnm"))
+        table = Table(
+            *(head.replace(" nm", "\nnm") for head in heads), title="Speeds in a sentence that goes on and on"
+        )
         for row in rows:
             table.add_row(*row)
         prose = "12345678.9 " * 20 + "[not markup] " + "end " * 20

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from afm_jax import Cantilever, Contact, Platform, Scene, load_scene, save_scene
 from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, VanDerWaals
 from afm_jax.contact.parameters import CONTACT_RANGES, DRY_PARAMETERS, EFFECTS, PAPER
-from tests.fresh_python import python
 
 HEAD = "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n[interaction]\n"
 CONTACT = HEAD + 'model = "contact"\n'
@@ -93,13 +92,3 @@ def test_what_the_format_has_no_key_for_is_not_saved(path: Path, contact: Any, s
     with pytest.raises((ValueError, TypeError), match=said):
         save_scene(Scene(Cantilever(90.0), Platform(4.0, 181.8), contact), path)
     assert not path.exists()
-
-
-def test_scenes_with_a_law_do_without_the_contact(path: Path):
-    path.write_text(f'{HEAD}model = "law"\nr = 0.9\n', encoding="utf-8")
-    code = (
-        "import sys; from afm_jax.scenefile.scenefile import load_scene, save_scene\n"
-        f"save_scene(load_scene({str(path)!r}), {str(path)!r})\n"
-        "print([name for name in sys.modules if name.startswith(('afm_jax.contact', 'diffrax', 'scipy.optimize'))])"
-    )
-    assert python(code) == "[]"
