@@ -79,7 +79,6 @@ def test_options_and_scenes_reach_the_contact(tmp_path: Path):
     assert found["mass_ng"] == 1.5
     static = answer("--no-viscous", "--speeds", "30")
     assert static["contact"]["effects"] == list(EFFECTS)
-    assert "viscosity_pa_s" not in static["contact"]
 
 
 def test_a_spring_constant_says_the_mass_and_one_that_nothing_says_is_named_as_assumed(tmp_path):

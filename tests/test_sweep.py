@@ -21,7 +21,7 @@ import afm_jax
 from afm_jax.cli.main import main
 from afm_jax.compilation_cache import available_cores
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
+from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.presets import preset
 from afm_jax.scenefile.scenefile import Start
 from afm_jax.sweeps.sweep import run_plan, sweep
@@ -95,19 +95,6 @@ def test_collisions_and_exponents_are_those_of_their_functions():
     np.testing.assert_array_equal(found["kind"], alone.verdicts.kind)
 
 
-@pytest.mark.slow
-def test_simulations_are_those_of_the_command(tmp_path: Path):
-    axes = [{"parameter": AMPLITUDE, "list": [4.0, 8.0]}]
-    found = sweep(preset("figure2"), axes, {"what": "simulation", "periods": 300.0}).isel(platform_amplitude_nm=1)
-    path = tmp_path / "scene.toml"
-    afm_jax.save_scene(scene_family(preset("figure2"), AMPLITUDE)(8.0), path)
-    run = CliRunner().invoke(main, ["simulate", str(path), "--periods", "300", "--until-settled", "--json"])
-    told = json.loads(run.stdout)
-    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "dissipated_in_contact_aj", "dissipated_per_contact_aj"):
-        np.testing.assert_allclose(found[name], told[name], rtol=1e-9)
-    assert (bool(found["settled"]), int(found["order"])) == (told["settled"], told["order"])
-
-
 ON_DEVICES = """
 import hashlib, jax
 jax.config.update("jax_enable_x64", True)
@@ -130,14 +117,6 @@ def test_two_devices_give_the_bits_of_one():
     two = python(ON_DEVICES, XLA_FLAGS=f"{flags} --xla_force_host_platform_device_count=2").split()
     assert (one[::2], two[::2]) == (["1"] * 2, ["2"] * 2)
     assert len({*one[1::2], *two[1::2]}) == 1
-
-
-@pytest.mark.slow
-def test_four_workers_give_the_bytes_of_one(tmp_path: Path):
-    axes = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 5]}, PLANE[1]]
-    for workers in (1, 4):
-        sweep(preset("figure2"), axes, "orbits", out=tmp_path / str(workers), chunk=15, workers=workers)
-    assert contents(tmp_path / "1") == contents(tmp_path / "4")
 
 
 @pytest.mark.slow
