@@ -1,6 +1,7 @@
 """Stability charts of single-impact orbits (figures 2, 3, 9): 50-digit orbits and closed forms."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def test_verdicts_are_those_of_the_50_digit_orbits(epsilon: float):
     stable = generator.choice(np.flatnonzero(chart.verdicts.any_stable()), 10, replace=False)
     for point in (*stable, *generator.choice(frequency.size, 10, replace=False)):
         order = int(chart.lowest_stable_order.ravel()[point]) or max(1, round(float(frequency[point])))
-        drive = {"amplitude_nm": float(amplitude[point]), "drive_frequency_khz": float(180.0 * frequency[point])}
+        drive: Any = {"amplitude_nm": float(amplitude[point]), "drive_frequency_khz": float(180.0 * frequency[point])}
         parameters = Parameters(
             frequency_khz=90.0, quality_factor=None, offset_nm=-1.0, r=0.5, epsilon=epsilon, **drive
         )

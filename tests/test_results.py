@@ -166,7 +166,8 @@ def test_arrays_of_one_shape_are_columns_and_units_are_told():
 
 
 def test_outcomes_are_words_and_traced_values_and_shapes_can_be_told():
-    many = NextImpact(*[jnp.zeros(3)] * 4, jnp.array([0, 0, 1]), jnp.zeros(3, bool))
+    zeros = jnp.zeros(3)
+    many = NextImpact(zeros, zeros, zeros, zeros, jnp.array([0, 0, 1]), jnp.zeros(3, bool))
     assert "2 impact, 1 captured" in repr(many)
     told = []
     jax.jit(lambda x: told.append(repr(SOME(x, x, x))))(np.zeros((2, 3)))
