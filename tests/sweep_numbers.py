@@ -31,13 +31,9 @@ def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noq
             if not path.exists():
                 path.write_text(" ".join(os.environ.get(name, "") for name in ("NPROC", "TF_CPP_MIN_LOG_LEVEL")))
         found = columns["x"] + 0.1 * columns["y"]
+        sums = np.where(found < 2.0, np.nan, found)
         why = np.where(found < 2.0, "the sum is below 2 \u00e4", "")
-        parts = {
-            "sum_nm": np.where(found < 2.0, np.nan, found),
-            "large": found > 4.0,
-            "parts": np.stack([found] * 2, 1),
-        }
-        return parts | {MESSAGE.name: why}
+        return {"sum_nm": sums, "large": found > 4.0, "parts": np.stack([found] * 2, 1), MESSAGE.name: why}
 
     variables = (
         Variable("sum_nm", "x and a tenth of y"),

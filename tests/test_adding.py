@@ -7,6 +7,8 @@ import pytest
 
 from tests.fresh_python import python
 from tests.mutations import before_and_after
+from tests.test_scenefile import CANTILEVER, LAW, PLATFORM
+from tests.test_scenefile import DELAY as DELAY_OF_SCENE
 
 ROOT = Path(__file__).parent.parent
 # by file: text that stands there, and in braces what becomes what, the first time
@@ -47,20 +49,6 @@ DELAY = {
         '{ =>     "delay_late_nm2_per_us": lambda u, w: 1.0 / u**2,\n}    "delay_offset_nm": lambda'
     ],
 }
-SCENE = """
-[cantilever]
-frequency_khz = 90
-[platform]
-amplitude_nm = 4
-frequency_khz = 181.8
-[interaction]
-model = "law"
-r = 0.95
-[interaction.delay]
-hertz = 0.206
-lead_nm = 5.64
-offset_nm = 0.726
-"""
 
 
 def changed(folder: Path, edits: dict[str, list[str]]) -> None:
@@ -84,36 +72,23 @@ def said(folder: Path, code: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_force_is_added_in_three_files(tmp_path: Path):
-    assert len(FORCE) == 3
-    changed(tmp_path, FORCE)
-    assert "--attraction-constant-aj X" in said(
-        tmp_path, "from afm_jax.cli.main import main; main(['collide', '--help'])"
-    )
-    code = (
-        "from afm_jax import Contact; from fitting.parameters import CONTACT_NAMES\n"
-        "less = Contact.paper(effects=('capillary', 'structural', 'core', 'viscous', 'jkr'))\n"
-        "more = float(Contact.paper().forces.static(2.0) - less.forces.static(2.0))\n"
-        "print(more, 'attraction_constant_aj' in CONTACT_NAMES)"
-    )
-    force, fitted = said(tmp_path, code).split()
-    # -H R / (6 D^2)
-    assert float(force) == pytest.approx(-0.01 * 100.0 / 24.0, rel=1e-9)
-    assert fitted == "True"
-
-
-@pytest.mark.slow
-def test_a_parameter_of_the_delay_is_added_in_five_files(tmp_path: Path):
-    assert len(DELAY) == 5
-    changed(tmp_path, DELAY)
+def test_a_force_is_added_in_three_files_and_a_parameter_of_the_delay_in_five(tmp_path: Path):
+    assert (len(FORCE), len(DELAY)) == (3, 5)
+    changed(tmp_path, FORCE | DELAY)
     for name, line in (("old", ""), ("new", "late_nm2_per_us = 3\n")):
-        (tmp_path / f"{name}.toml").write_text(SCENE + line)
+        (tmp_path / f"{name}.toml").write_text(CANTILEVER + PLATFORM + LAW + DELAY_OF_SCENE + line)
     code = (
-        "from afm_jax.scenefile.scenefile import load_scene; from fitting.parameters import model_parameters\n"
+        "from afm_jax import Contact, load_scene; from afm_jax.cli.main import main\n"
+        "from fitting.parameters import CONTACT_NAMES, model_parameters\n"
+        "less = Contact.paper(effects=('capillary', 'structural', 'core', 'viscous', 'jkr'))\n"
+        "print(float(Contact.paper().forces.static(2.0) - less.forces.static(2.0)))\n"
         f"files = [{str(tmp_path)!r} + name for name in ('/old.toml', '/new.toml')]\n"
         "old, new = (load_scene(file).interaction.delay(50.0, 40.0) for file in files)\n"
-        "print(float(new - old), *model_parameters('law+delay'))"
+        "print(float(new - old))\nprint(CONTACT_NAMES, model_parameters('law+delay'))\nmain(['collide', '--help'])"
     )
-    more, *names = said(tmp_path, code).split()
-    assert float(more) == pytest.approx(3.0 / 50.0**2, rel=1e-9)
-    assert "delay_late_nm2_per_us" in names
+    force, later, fitted, *helped = said(tmp_path, code).splitlines()
+    # -H R / (6 D^2)
+    assert float(force) == pytest.approx(-0.01 * 100.0 / 24.0, rel=1e-9)
+    assert float(later) == pytest.approx(3.0 / 50.0**2, rel=1e-9)
+    assert all(f"'{name}'" in fitted for name in ("attraction_constant_aj", "delay_late_nm2_per_us"))
+    assert "--attraction-constant-aj X" in " ".join(helped)

@@ -9,7 +9,7 @@ import pytest
 
 import afm_jax as afm
 import fitting
-from afm_jax.contact.forces import Capillary, CoreRepulsion, Dmt, Hertz, Liquid, VanDerWaals
+from afm_jax.contact.forces import Capillary, Dmt, Hertz, VanDerWaals
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from afm_jax.scenefile.presets import preset
 from tests.fresh_python import python
@@ -81,9 +81,7 @@ def grid(**changes: Any) -> Any:
 IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.Cantilever(TWO[:0]), "`frequency_khz` must be a number or an array .*, but holds none"),
     (lambda: afm.simulate(SCENE, START, 9.0, method="x"), "`method` must be one of collocation, diffrax"),
-    (lambda: afm.simulate(SCENE, START, 9.0, accuracy=-1.0), "`accuracy` must be "),
     (lambda: afm.simulate(SCENE, START, 9.0, max_contacts=0), "`max_contacts` must be 1 or more, but is 0"),
-    (lambda: afm.simulate(SCENE, START, 9.0, max_rounds=0), "`max_rounds` must be 1 or more, but is 0"),
     (lambda: afm.simulate(SCENE, START, TWO), r"`duration_us` must be one number, but has the shape \(2,"),
     (lambda: afm.next_impact(SCENE, TWO, 30.0), r"`time_us` must be one number.*: `iterate_batch` and"),
     (lambda: afm.iterate_map(SCENE, TWO[:0], 30.0, 3), r"`time_us` must be one number, but has the shape \(0,"),
@@ -98,26 +96,16 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.time_course(afm.Contact.paper(), TWO), "`approach_speed_nm_per_us` must be one number"),
     (lambda: afm.capture_speed(afm.Contact.paper(), TWO), "`mass_ng` must be one number"),
     (lambda: afm.scene_family(SCENE, *["interaction.r"] * 2), "named twice: interaction.r, interaction.r"),
-    (lambda: fitting.prior_of_values("law", free_frequency_khz=-9.0), "`free_frequency_khz` must be positive"),
     (lambda: grid(drive="x"), "`drive` must be one of sample, force, base, but is 'x'"),
     (lambda: grid(free_frequency_khz=-1.0), "`free_frequency_khz` must be positive, but is -1"),
-    (lambda: afm.load_scene(""), "an empty path|no such file"),
-    # a cantilever, platforms and drives
-    (lambda: afm.Cantilever(90.0, np.nan), "`quality_factor` must be above 0.5, but is nan"),
+    # a cantilever, platforms and laws
     (lambda: afm.Platform(np.array([1.0, -2.0, 3.0]), 180.0), "`amplitude_nm` must not be negative, but is -2"),
-    (lambda: afm.Platform(1.0, 180.0, 0.0, np.inf), "`offset_rate_nm_per_us` must be a finite number, but is inf"),
-    (lambda: afm.Tone(-1.0, 180.0), "`amplitude` must not be negative, but is -1"),
-    # laws and their maps
-    (lambda: afm.CollisionDelay(0.2, np.inf, 0.7), "`lead_nm` must be a finite number"),
+    (lambda: afm.Platform(np.array([1.0, 1e40]), 180.0), r"at most 1e\+30"),  # its square is no number
     (lambda: afm.iterate_map(SCENE, 4.0, 60.0, 0), "`impacts` must be a positive integer, but is 0"),
     (lambda: afm.iterate_batch(SCENE, np.zeros((2, 1)), TWO, 1), "must have one shape"),
-    (lambda: afm.iterate_batch(SCENE, TWO, TWO, 0), "`impacts` must be a positive integer, but is 0"),
     (lambda: afm.iterate_batch(SCENE, TWO, TWO, 1, block=0), "`block` must be a positive integer, but is 0"),
     (lambda: afm.iterate_batch(SCENE, TWO[:0], TWO[:0], 1), "at least one row"),
     # forces and contacts
-    (lambda: Liquid(temperature_k=-3.0), "`temperature_k` must be positive"),
-    (lambda: CoreRepulsion(constant_aj_nm6=np.nan), "`constant_aj_nm6` must be positive"),
-    (lambda: Dmt(contact_distance_nm=0.0), "`contact_distance_nm` must be positive"),
     (lambda: afm.Contact((VanDerWaals(),), Hertz()), r"Hertz\(\) is a contact without other forces; VanDerWaals\(\)"),
     (lambda: afm.Contact((Capillary(),), Dmt()), r"Capillary\(\) is a force of the liquid bridge"),
     (lambda: afm.Contact((), Hertz(), range_nm=3.0), "`range_nm` is that of a contact with Dmt"),
@@ -127,17 +115,14 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.Contact.of(["van_der_waals", "core", "jkr"]), "'van_der_waals' must hold 'dmt'"),
     (lambda: afm.Contact.of(["dmt", "jkr"]), "'jkr' with 'dmt'"),
     (lambda: afm.collide(PAPER, 20.0, 0.0), "`mass_ng` must be positive"),
-    (lambda: afm.collide(PAPER, 20.0, method="rk4"), "`method` must be one of diffrax, collocation, but is 'rk4'"),
     (
         lambda: afm.collide(afm.Contact.paper(viscosity_pa_s=np.full(3, 1e-3)), TWO),
         r"speeds' shape \(2,\), but one has \(3,\)",
     ),
-    (lambda: afm.time_course(PAPER, -2.0), "`approach_speed_nm_per_us` must be positive"),
     (lambda: afm.time_course(NO_JUNCTION, 20.0), "has no junction"),
     (lambda: afm.time_course(afm.Contact.paper(tip_radius_nm=5.0), 3.0), "turns the tip round"),
     # contacts in time
     (lambda: afm.simulate(WET, afm.State(0.0, 3.95, 60.0), 20.0), "inside the sample"),
-    (lambda: afm.simulate(WET, START, 0.0), "duration_us"),
     (lambda: afm.simulate(WET, START, 20.0, accuracy=1e-15), "accuracy"),
     (lambda: afm.simulate(afm.Scene(WET.cantilever, WET.platform, NO_JUNCTION), START, 20.0), "no junction"),
     # motions that do not repeat
@@ -182,7 +167,7 @@ def test_paths_and_presets_work_where_scenes_and_tables_do(tmp_path: Path):
         np.testing.assert_array_equal(afm.single_impact_orbits(given, 1).phase_rad, wanted.phase_rad)
     with pytest.raises(ValueError, match="nothing: there is no such file or preset; presets are figure2, figure3"):
         afm.single_impact_orbits("nothing", 1)
-    for function in (fitting.fit, fitting.tapping, fitting.invert, fitting.calibrate, fitting.lockin):
+    for function in (fitting.fit, fitting.calibrate, fitting.lockin):
         with pytest.raises(fitting.TableError, match="there is no such file"):
             function(tmp_path / "none.csv")
     table = EXAMPLES / "amplitudes_law.csv"

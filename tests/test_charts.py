@@ -1,5 +1,8 @@
 """Stability charts of single-impact orbits (figures 2, 3, 9): 50-digit orbits and closed forms."""
 
+from functools import cache
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,21 +12,12 @@ from tests.reference_flight import Parameters
 from tests.reference_orbits import single_impact_orbits
 
 
+@cache
 def chart_of(scene_of) -> StabilityChart:
     # Off round numbers: where n is N/2k the flight lasts k free periods, every state returns, and rounding decides.
     return stability_chart(
         scene_of, x_values=np.linspace(0.326, 6.476, 124), y_values=np.linspace(0.025, 2.975, 60), last_order=14
     )
-
-
-@pytest.fixture(scope="module")
-def figure2() -> StabilityChart:
-    return chart_of(presets.figure2_scene)
-
-
-@pytest.fixture(scope="module")
-def figure3() -> StabilityChart:
-    return chart_of(presets.figure3_scene)
 
 
 def adhesion_limit_nm(reduced_frequency: np.ndarray) -> np.ndarray:
@@ -34,22 +28,17 @@ def adhesion_limit_nm(reduced_frequency: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("epsilon", [0.0, presets.ADHESION])
-def test_verdicts_are_those_of_the_50_digit_orbits(epsilon: float, figure2: StabilityChart, figure3: StabilityChart):
-    chart = figure3 if epsilon else figure2
+def test_verdicts_are_those_of_the_50_digit_orbits(epsilon: float):
+    chart = chart_of(presets.figure3_scene if epsilon else presets.figure2_scene)
     frequency, amplitude = chart.points()
     generator = np.random.default_rng(11)
     # Stable for half of the points, anything for the others; the order nearest to resonance has most to tell.
     stable = generator.choice(np.flatnonzero(chart.verdicts.any_stable()), 10, replace=False)
     for point in (*stable, *generator.choice(frequency.size, 10, replace=False)):
         order = int(chart.lowest_stable_order.ravel()[point]) or max(1, round(float(frequency[point])))
+        drive: Any = {"amplitude_nm": float(amplitude[point]), "drive_frequency_khz": float(180.0 * frequency[point])}
         parameters = Parameters(
-            frequency_khz=90.0,
-            quality_factor=None,
-            amplitude_nm=float(amplitude[point]),
-            drive_frequency_khz=float(180.0 * frequency[point]),
-            offset_nm=-1.0,
-            r=0.5,
-            epsilon=epsilon,
+            frequency_khz=90.0, quality_factor=None, offset_nm=-1.0, r=0.5, epsilon=epsilon, **drive
         )
         orbits = [orbit for orbit in single_impact_orbits(parameters, order) if orbit.admissible]
         assert chart.verdicts.admissible[order - 1, point] == bool(orbits)
@@ -98,7 +87,8 @@ def test_elastic_limit_of_the_amplitude(n: float, side: float):
 
 
 @pytest.mark.slow
-def test_orders_above_14_add_nothing(figure2: StabilityChart):
+def test_orders_above_14_add_nothing():
+    figure2 = chart_of(presets.figure2_scene)
     frequency, amplitude = (column.reshape(60, 124)[::2, ::2].ravel() for column in figure2.points())
     higher = orbit_verdicts(batch_of_scenes(presets.figure2_scene, frequency, amplitude), first_order=15, last_order=20)
     assert (higher.any_stable() & ~figure2.any_stable[::2, ::2].ravel()).mean() < 1e-3

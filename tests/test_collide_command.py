@@ -1,6 +1,5 @@
 """`afm-jax collide`: its numbers are those of the functions, its output, and how it ends."""
 
-import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,9 @@ from afm_jax.cli.values import Numbers
 from afm_jax.contact.collide import _COLUMNS as COLUMNS
 from afm_jax.contact.collide import Collisions, capture_speed, collide, default_speeds
 from afm_jax.contact.junction import find_junction
-from afm_jax.contact.parameters import PAPER
 from tests import answers
 from tests.strict_reading import strictly
+from tests.test_scenefile import CANTILEVER, PLATFORM
 
 EFFECTS = ("capillary", "structural", "core", "jkr")
 
@@ -55,23 +54,18 @@ def test_numbers_are_those_of_the_functions(paper: dict[str, Any]):
         assert paper["junction"][name] == pytest.approx(float(getattr(junction, name)), rel=1e-14)
 
 
-def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any]):
+def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any], out: Path):
     assert paper["captured"] == [True, False, False, False, False]
     for name in ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "bridge_hysteresis_aj"):
         assert paper[name][0] is None
         assert None not in paper[name][1:]
     assert "the liquid bridge holds it" in paper["outcome"][0]
     assert paper["end_energy_aj"][0] < 0.0
-    assert paper["capture_speed_reason"] is None
-
-
-def test_the_table_holds_what_is_printed(paper: dict[str, Any], out: Path):
     assert {path.name for path in out.iterdir()} == {"collide.csv", "collide.json", "collide.png"}
     rows = answers.table(out / "collide.csv")
-    assert tuple(rows[0]) == COLUMNS
+    assert [row["captured"] for row in rows] == ["true", "false", "false", "false", "false"]
     assert rows[0]["rebound_speed_nm_per_us"] == ""
     assert [float(row["rebound_speed_nm_per_us"]) for row in rows[1:]] == paper["rebound_speed_nm_per_us"][1:]
-    assert [row["captured"] for row in rows] == ["true", "false", "false", "false", "false"]
 
 
 def test_picture_shows_curve_capture_delay_and_losses(paper: dict[str, Any]):
@@ -98,38 +92,22 @@ def test_options_and_scenes_reach_the_contact(tmp_path: Path):
     changes = {"modulus_gpa": 80.0, "relative_humidity": 0.4, "bridge_forms_nm": 3.0}
     expected = collide(Contact.paper(effects=EFFECTS, **changes), 30.0, 1.5)
     assert found["rebound_speed_nm_per_us"] == pytest.approx([float(expected.rebound_speed_nm_per_us)], rel=1e-14)
-    assert {name: found["contact"][name] for name in changes} == changes
+    assert found["contact"].items() >= changes.items()
     assert found["mass_ng"] == 1.5
-    assert answer(path, "--speeds", "30", "--mass-ng", "1")["mass_ng"] == 1.0
     static = answer("--no-viscous", "--speeds", "30")
     assert static["contact"]["effects"] == list(EFFECTS)
-    assert "viscosity_pa_s" not in static["contact"]
 
 
 def test_a_spring_constant_says_the_mass_and_one_that_nothing_says_is_named_as_assumed(tmp_path):
-    assert "1 ng assumed" in run("--speeds", 40).stdout
+    assert answer("--speeds", 40)["notes"][0].startswith("1 ng assumed")
     mass_ng = pytest.approx(0.5 / (2.0 * np.pi * 0.09) ** 2, rel=1e-14)
     given = ("--speeds", 40, "--spring-constant-n-per-m", 0.5, "--free-frequency-khz", 90)
     assert answer(*given)["mass_ng"] == mass_ng
     path = tmp_path / "scene.toml"
-    head = "[platform]\namplitude_nm = 4\nfrequency_khz = 180\n[interaction]\nmodel = 'contact'\n"
-    head += "[cantilever]\nfrequency_khz = 90\n"
-    path.write_text(head)
-    assert answer(path, "--speeds", 40)["notes"][0].startswith("1 ng assumed")
-    path.write_text(f"{head}spring_constant_n_per_m = 0.5\n")
+    path.write_text(f"{CANTILEVER}spring_constant_n_per_m = 0.5\n{PLATFORM}[interaction]\nmodel = 'contact'\n")
     stated = answer(path, "--speeds", 40)
     assert "notes" not in stated
     assert stated["mass_ng"] == mass_ng
-
-
-def test_help_names_the_papers_values():
-    keywords = inspect.signature(Contact.paper).parameters
-    assert {name: keyword.default for name, keyword in keywords.items() if name != "effects"} == PAPER
-    # wrapped to a width, and indented
-    text = " ".join(CliRunner().invoke(main, ["collide", "--help"]).output.split())
-    for name, value in PAPER.items():
-        said = text.partition(f"--{name.replace('_', '-')} X ")[2].partition("paper: ")[2].partition(". ")[0]
-        assert float(said) == value, name
 
 
 def test_default_speeds_begin_above_the_capture_speed():
@@ -143,25 +121,19 @@ def test_default_speeds_begin_above_the_capture_speed():
 
 def test_speeds_are_read():
     for text, speeds in (
-        ("12,15,20", (12, 15, 20)),
         ("12:200:47", (12, 59, 106, 153, 200)),
         ("12:20:5", (12, 17)),
-        ("7", (7,)),
         (" 30 , 10:12:1", (30, 10, 11, 12)),
     ):
         assert Numbers().read(text) == speeds
     # 0.1 is no binary number: eighty steps of it reach 20 only nearly
     assert len(Numbers().read("12:20:0.1")) == 81
-    assert len(Numbers().read("0.1:0.3:0.1")) == 3
 
 
 def test_that_all_are_captured_is_a_result():
-    result = run("--speeds", "1,2")
-    assert result.exit_code == 0
-    assert "All of these tips are captured; faster ones leave again." in result.stdout
+    assert "All of these tips are captured; faster ones leave again." in run("--speeds", "1,2").stdout
     drowned = answer("--viscosity-pa-s", "1e6", "--speeds", "20")
-    assert drowned["captured"] == [True]
-    assert drowned["capture_speed_nm_per_us"] is None
+    assert (drowned["captured"], drowned["capture_speed_nm_per_us"]) == ([True], None)
     assert "There is no capture speed" in drowned["capture_speed_reason"]
 
 
@@ -172,10 +144,3 @@ def test_unresolved_collisions_end_with_exit_code_3():
     found = json.loads(result.stdout)
     assert found["captured"] == [False, None]
     assert found["rebound_speed_nm_per_us"][1] is None
-
-
-def test_long_lists_are_cut_in_the_text_only():
-    result = run("--speeds", "12:60:1")
-    assert "The first 40 of 49 collisions" in result.stdout
-    assert "unit" not in result.stderr
-    assert len(answer("--speeds", "12:60:1")["captured"]) == 49

@@ -15,7 +15,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import float32_allowed
-from afm_jax.contact.collide import capture_speed, collide, collisions
+from afm_jax.contact.collide import collide, collisions
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.time_course import time_course
 from afm_jax.effects.study import study_effects
@@ -152,15 +152,10 @@ def traces(function: Callable[..., Any], calls: list[tuple[Any, ...]]) -> int:
     return len(traced)
 
 
-@pytest.mark.parametrize(
-    "function", [next_impact, map_jacobian, lambda scene, t, v: iterate_map(scene, t, v, 3).outcome]
-)
-def test_one_compilation_serves_all_values(function: Callable[..., Any]):
+def test_one_compilation_serves_all_values_and_tables_of_one_length():
     ways = [(scene, jnp.asarray(t, float), jnp.asarray(v, float)) for scene, t, v in built_in_many_ways()]
-    assert traces(function, ways) == 1
-
-
-def test_one_compilation_serves_all_tables_of_one_length():
+    for function in (next_impact, map_jacobian):
+        assert traces(function, ways) == 1
     scenes = [tabulated(scene, origin=f"table {row}") for row, scene in enumerate(scenes_with("formula"))]
     assert traces(impact_law, [(scene,) for scene in scenes]) == 1
 
@@ -214,35 +209,28 @@ def test_writes_in_loops_do_not_copy_the_array():
 
 
 # all others ask in the same way (tests/hard_cases/test_single_precision.py)
-OF_SCENES = [next_state, study_effects, jax.jit(next_state)]
-OF_CONTACTS = [
-    lambda contact: collide(contact, 20.0),
-    capture_speed,
-    lambda contact: time_course(contact, 20.0),
-    collisions,
-    lambda contact: simulate(Scene(Cantilever(90.0), Platform(1.0, 180.0), contact), state(0.0, 100.0, 0.0), 10.0),
+ASKING: list[Callable[[Any], Any]] = [
+    jax.jit(next_state),
+    study_effects,
+    lambda scene: collide(scene.interaction, 20.0),
+    lambda scene: time_course(scene.interaction, 20.0),
+    lambda scene: collisions(scene.interaction),
+    lambda scene: simulate(scene, state(0.0, 100.0, 0.0), 10.0),
 ]
 
 
-@pytest.mark.parametrize("call", OF_SCENES)
-def test_a_scene_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Scene], Any]):
+@pytest.mark.parametrize("call", ASKING)
+def test_what_was_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Any], Any]):
     with jax.enable_x64(False):  # noqa: FBT003
-        early = bouncing()
+        early, contact = bouncing(), Contact.paper()
     late = scenes_with("formula")[0]
-    for scene in (early, Scene(late.cantilever, early.platform, late.interaction)):
-        with pytest.raises(RuntimeError, match=r"build the scene after .*jax_enable_x64', True") as error:
+    law = Scene(late.cantilever, early.platform, late.interaction)
+    for scene in (early, law) if call in ASKING[:2] else (Scene(late.cantilever, late.platform, contact),):
+        with pytest.raises(
+            RuntimeError, match=r"is a 32-bit float: build the (contact|scene) after .*x64', T"
+        ) as error:
             call(scene)
         assert "\n" not in str(error.value)
-    assert str(error.value).startswith("Scene.platform.amplitude_nm is a 32-bit float")
-
-
-@pytest.mark.parametrize("call", OF_CONTACTS)
-def test_a_contact_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Contact], Any]):
-    with jax.enable_x64(False):  # noqa: FBT003
-        early = Contact.paper()
-    with pytest.raises(RuntimeError, match=r"is a 32-bit float: build the (contact|scene) after") as error:
-        call(early)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("call", [next_state, three_impacts, jacobian, orbits])

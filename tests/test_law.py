@@ -7,10 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from tests.reference_examples import DELAY, SCENES
 from tests.reference_flight import Parameters, capture_speed, delay_us, rebound_slope, rebound_speed
 
@@ -78,7 +75,7 @@ def test_without_losses_it_is_equation_1(r, u):
     assert float(ImpactLaw(r=r).capture_speed_nm_per_us) == 0.0
 
 
-@pytest.mark.parametrize("speed", [0.0, 5.0, 10.0])
+@pytest.mark.parametrize("speed", [0.0, 10.0])
 def test_a_captured_tip_has_finite_derivatives(speed):
     law = ImpactLaw(r=0.9, epsilon=100.0, viscous_loss=0.5, delay=CollisionDelay(*DELAY))
     for function in (law.rebound_speed, law.rebound_slope, law.collision_delay, law.delay_slope):
@@ -86,9 +83,3 @@ def test_a_captured_tip_has_finite_derivatives(speed):
         assert float(jax.grad(function)(speed)) == 0.0
     slopes = jax.grad(lambda some: some.rebound_speed(speed))(law)
     assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(slopes))
-
-
-def test_a_scene_without_law_is_refused():
-    scene = Scene(Cantilever(90.0), Platform(1.0, 180.0), None)
-    with pytest.raises(TypeError, match="an ImpactLaw or a TabulatedLaw, not None"):
-        impact_law_of(scene)

@@ -24,13 +24,13 @@ from afm_jax.scenefile import presets
 ALL = ["time_course.png", "spectrum.png", "gap.png", "poincare.png", "force_gap.png"]
 
 
-def drawn(scene: Scene, found: Simulation, folder: Path, *, white: float = 0.3, width: int = 1400) -> list[str]:
+def drawn(scene: Scene, found: Simulation, folder: Path) -> list[str]:
     """Return the names of the pictures of a motion, which are neither empty nor black."""
     files = draw_motion(scene, found, folder)
     for path in files:
         image = matplotlib.image.imread(path)
-        assert image.shape[1] >= width
-        assert white < (image[..., :3].mean(axis=2) > 0.98).mean() < 0.99
+        assert image.shape[1] >= 1400
+        assert 0.3 < (image[..., :3].mean(axis=2) > 0.98).mean() < 0.99
     return [path.name for path in files]
 
 
@@ -70,11 +70,9 @@ def test_a_free_cantilever_has_the_line_of_its_drive(tmp_path: Path):
 
 def test_batches_and_empty_simulations_are_refused(bouncing, tmp_path: Path):
     scene, found = bouncing
-    batch = replace(found, count=jnp.array([1, 2]))
-    with pytest.raises(ValueError, match="pick one of the batch"):
-        draw_motion(scene, batch, tmp_path)
-    with pytest.raises(ValueError, match="nothing to draw"):
-        draw_motion(scene, replace(found, final=found.start), tmp_path)
+    for changes, said in (({"count": jnp.array([1, 2])}, "pick one of"), ({"final": found.start}, "nothing to draw")):
+        with pytest.raises(ValueError, match=said):
+            draw_motion(scene, replace(found, **changes), tmp_path)
 
 
 def test_a_law_has_no_force_to_draw_and_the_line_at_half_the_drive_is_that_of_the_orbit(tmp_path: Path):
@@ -90,12 +88,8 @@ def test_a_law_has_no_force_to_draw_and_the_line_at_half_the_drive_is_that_of_th
     line = int(np.argmin(np.abs(spectrum.frequency_khz - spectrum.response_khz)))
     # 64 samples a response period: the harmonics of a kink, 1/k^2, are folded onto the first line
     assert spectrum.amplitude_nm[line] == pytest.approx(float(orbits.lockin_amplitude_nm[slot]), rel=2e-3)
-    # subharmonics are marked up to eight times the response frequency, the last of them on the edge
     (axes,) = spectrum_figure(look).axes
     assert "subharmonics, drive/2" in axes.get_legend_handles_labels()[1]
-    marks = [float(np.asarray(line.get_xdata())[0]) for line in axes.get_lines() if line.get_linestyle() == ":"]
-    assert len(marks) in (7, 8)
-    np.testing.assert_allclose(marks, 181.8 * np.arange(1, len(marks) + 1), rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -108,9 +102,6 @@ def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(bouncing, tm
     arrival = float(found.contacts.arrival_time_us[int(found.count) - 1])
     assert arrival < look.to_us < arrival + 45.0
     assert look.path.phase[-1] == Phase.JUNCTION
-    # most of the time course is shaded; the gap of one contact is a narrow picture
-    names = drawn(scene, found, tmp_path, white=0.15, width=1000)
-    assert names == [name for name in ALL if look.left or name != "poincare.png"]
     # one that bounces has every picture
     scene, found = bouncing
     assert drawn(scene, found, tmp_path) == ALL

@@ -101,7 +101,7 @@ FEWER = (
 PAGES_WITH_COMMANDS = ("first_steps", "simulate", "drives", "contact", "fit", "orbits")
 PAGES_WITH_COMMANDS += ("dynamics", "instrument", "design", "tapping", "sweeps")
 LEFT_OUT = {
-    "simulate figure8": "tests/test_presets.py simulates it",
+    "simulate figure8": "tests/test_sweep.py simulates it",
     "calibrate fitting/examples/real": "tests/test_thermal.py fits such spectra",
     "fit monday.csv": "three tables are fitted by tests/test_several_tables.py",
     "fit my_amplitudes.csv --model law --posterior": "samples for a minute: tests/test_posterior.py",
@@ -158,19 +158,13 @@ def test_commands_of_the_pages_run(desk: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.slow
-def test_python_of_the_pages_runs(desk: Path, monkeypatch: pytest.MonkeyPatch):
+def test_python_of_the_pages_and_of_readme_runs(desk: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(desk)
     # slopes through contacts compile for half a minute: tests/test_collide_derivatives.py has them
     for page in ("first_steps", "contact", "fit", "orbits", "results", "simulate"):
         (code,) = blocks(text_of(page), "python")
         exec(re.sub(r"^slope = jax.*$", "", code, flags=re.MULTILINE), {})  # noqa: S102
-
-
-@pytest.mark.slow
-def test_python_of_readme_runs(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(ROOT)
-    (code,) = blocks(README, "python")
-    names: dict = {}
+    (code,), names = blocks(README, "python"), {}
     exec(code, names)  # noqa: S102
     assert names["result"].valid
     assert names["orbits"].stable.any()

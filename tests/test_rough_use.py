@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from afm_jax.apparatus.platform import Platform
 from afm_jax.cli.main import main
 from afm_jax.sweeps.store import STORE
 from afm_jax.whole_files import read_whole, write_whole
@@ -59,8 +58,7 @@ def test_new_files_have_the_modes_of_others_and_only_links_named_by_the_user_are
         write_whole(link, b"c")
     assert path.read_bytes() == b"a"
     write_whole(link, b"b", named_by_user=True)
-    assert link.is_symlink()
-    assert path.read_bytes() == b"b"
+    assert (link.is_symlink(), path.read_bytes()) == (True, b"b")
 
 
 def shell(arguments: str) -> subprocess.CompletedProcess[str]:
@@ -74,16 +72,16 @@ def test_a_full_device_and_a_full_standard_output_are_named(tmp_path):
     with pytest.raises(OSError, match="/dev/full"):
         write_whole("/dev/full", "x", named_by_user=True)
     (tmp_path / "curve.csv").write_text("offset_nm,lockin_amplitude_nm\n1,2\n2,3\n", encoding="utf-8")
-    for arguments in (f"read {tmp_path}/curve.csv", "--help", "fit --help", "--version"):
-        full = shell(f"{arguments} >/dev/full")
-        assert full.returncode == 2
-        assert full.stderr == "afm-jax: standard output: cannot be written (No space left on device)\n"
-
-
-def test_a_closed_standard_output_is_said():
-    closed, silent = shell("--version >&-"), shell("--version 2>&-")
-    assert closed.returncode == 2
-    assert closed.stderr == "afm-jax: standard output is closed; send it to a file or to /dev/null instead\n"
+    full = "afm-jax: standard output: cannot be written (No space left on device)\n"
+    for arguments, said in (
+        (f"read {tmp_path}/curve.csv >/dev/full", full),
+        ("fit --help >/dev/full", full),
+        ("--version >/dev/full", full),
+        ("--version >&-", "afm-jax: standard output is closed; send it to a file or to /dev/null instead\n"),
+    ):
+        done = shell(arguments)
+        assert (done.returncode, done.stderr) == (2, said)
+    silent = shell("--version 2>&-")
     assert (silent.returncode, silent.stdout[:8]) == (0, "afm-jax ")
 
 
@@ -97,7 +95,7 @@ def test_nothing_writes_files_another_way():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("call", ["calibrate", "chart --zarr", "lockin", "orbits", "read", "simulate", "sweep"])
+@pytest.mark.parametrize("call", CALLS)
 def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
     prepare(tmp_path)
     code, said, written, loose = unchecked(call, tmp_path)
@@ -118,15 +116,13 @@ def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
 
 def test_a_table_named_by_the_user_may_be_a_link_but_no_numbered_one(tmp_path):
     (tmp_path / "link.csv").symlink_to(tmp_path / "meant.csv")
-    file = CALLS["read"][0]
-    assert run("read", *CALLS["read"], "--out", tmp_path / "link.csv").exit_code == 0, file
+    assert run("read", *CALLS["read"], "--out", tmp_path / "link.csv").exit_code == 0
     assert (tmp_path / "link.csv").is_symlink()
     assert (tmp_path / "meant.csv").read_text(encoding="utf-8").startswith("#")
     (tmp_path / "tables").mkdir()
     (tmp_path / "tables" / "curve.csv").symlink_to(tmp_path / "other.csv")
     refused = run("read", *CALLS["read"], "--out", tmp_path / "tables")
     assert (refused.exit_code, (tmp_path / "other.csv").exists()) == (2, False)
-    assert "curve.csv: cannot be written (is a link, which is not followed" in refused.stderr
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
@@ -142,14 +138,15 @@ def test_a_pipe_is_read_if_somebody_writes_and_named_if_nobody_does(tmp_path, mo
 
     def write() -> None:
         with pipe.open("wb") as file:
-            for part in (b"a" * 300_000, b"b", b"c" * 100_000):
+            for part in parts:
                 file.write(part)
                 file.flush()
-                time.sleep(0.2)
+                time.sleep(0.1)
 
+    parts = [b"a" * 300_000, b"b", b"c" * 100_000]
     writer = threading.Thread(target=write)
     writer.start()
-    assert read_whole(pipe) == b"a" * 300_000 + b"b" + b"c" * 100_000
+    assert read_whole(pipe) == b"".join(parts)
     writer.join()
 
 
@@ -170,27 +167,23 @@ def test_no_option_takes_numbers_that_are_none():
     assert seen > 100
 
 
-def test_no_message_quotes_a_name_of_any_length(tmp_path):
-    name = "k" * 200_000
-    path = tmp_path / "scene.toml"
-    for text in (f"{name} = 1\n", f"[{name}]\na = 1\n", f"[{name} b]\n"):
-        path.write_text(LAW.format(4, 1.01) + text, encoding="utf-8")
-        said = run("orbits", path, "--order", "1")
-        assert (said.exit_code, len(said.stderr) < 1000) == (2, True)
+def test_no_message_quotes_a_name_of_any_length_or_what_commands_the_terminal(tmp_path):
+    name, path = "k" * 200_000, tmp_path / "scene.toml"
     path.write_text(LAW.format(4, 1.01), encoding="utf-8")
-    for call in (("bifurcation", path, "--parameter", f"{name}=1:2:3"), (name,), ("fit", name), ("fit", f"--{name}")):
+    calls = [("bifurcation", path, "--parameter", f"{name}=1:2:3"), (name,), ("fit", name), ("fit", f"--{name}")]
+    for number, text in enumerate((f"{name} = 1\n", f"[{name}]\na = 1\n", f"[{name} b]\n")):
+        long = tmp_path / f"{number}.toml"
+        long.write_text(LAW.format(4, 1.01) + text, encoding="utf-8")
+        calls.append(("orbits", long, "--order", "1"))
+    for call in calls:
         said = run(*call)
         assert (said.exit_code, len(said.stderr) < 1000) == (2, True)
-
-
-def test_names_cannot_command_the_terminal(tmp_path):
     path = tmp_path / "a\x1b[31m\x07b.csv"
     path.write_text("order\n1\n", encoding="utf-8")
     for command in ("fit", "lockin"):
         result = run(command, path)
-        assert result.exit_code == 2
+        assert (result.exit_code, "\x1b" in result.output) == (2, False)
         assert "a\\x1b[31m\\x07b.csv" in result.stderr
-        assert "\x1b" not in result.output
     assert "\x1b" not in run("fit", tmp_path / "none\x1b.csv").output
 
 
@@ -264,7 +257,7 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.name != "posix", reason="interrupts go to groups of processes")
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="no list of a process's children")
 def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_own_without_a_word():
     # as a terminal does, to the whole group; started so that interrupts are heard even from the background
     # not by an import, in which an interrupt ends the program at once
@@ -272,13 +265,11 @@ def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_
         "import runpy, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "sys.argv = ['afm-jax', 'accuracy', 'map']\nrunpy.run_module('afm_jax', run_name='__main__')"
     )
-    call = [sys.executable, "-c", code]
+    call, deadline = [sys.executable, "-c", code], time.monotonic() + 100.0
     with subprocess.Popen(call, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-        deadline = time.monotonic() + 100.0
-        while not (children.exists() and children.read_text(encoding="ascii")) and time.monotonic() < deadline:
+        while not (child := children.read_text(encoding="ascii").split()[:1]) and time.monotonic() < deadline:
             time.sleep(0.05)
-        child = children.read_text(encoding="ascii").split()[0]
         time.sleep(2.0)
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate(timeout=60)
@@ -286,7 +277,7 @@ def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_
     assert "Traceback" not in said
     assert said.splitlines()[-1] == "afm-jax: interrupted"
     # gone, or dead and waiting for whoever collects what is left over
-    place, deadline = Path(f"/proc/{child}/stat"), time.monotonic() + 10.0
+    place, deadline = Path(f"/proc/{child[0]}/stat"), time.monotonic() + 10.0
     while place.exists() and place.read_text().rsplit(")", 1)[1].split()[0] != "Z" and time.monotonic() < deadline:
         time.sleep(0.05)
     assert time.monotonic() < deadline
@@ -323,8 +314,3 @@ def test_a_kill_at_any_time_leaves_no_half_file(tmp_path):
 def test_a_little_random_work_finds_nothing():
     fuzz_orbits(256, 3)
     fuzz_files(200, 3)
-
-
-def test_numbers_whose_squares_are_none_are_refused():
-    with pytest.raises(ValueError, match=r"at most 1e\+30"):
-        Platform(amplitude_nm=np.array([1.0, 1e40]), frequency_khz=180.0)

@@ -15,27 +15,11 @@ from hypothesis import strategies as st
 from afm_jax import Cantilever, Contact, Platform, Scene, load_scene, save_scene
 from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, VanDerWaals
 from afm_jax.contact.parameters import CONTACT_RANGES, DRY_PARAMETERS, EFFECTS, PAPER
-from tests.fresh_python import python
 
 HEAD = "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n[interaction]\n"
 CONTACT = HEAD + 'model = "contact"\n'
 # near the paper's values, where every contact has its junction
-CHANGED: dict[str, Any] = {
-    "relative_humidity": 0.41,
-    "temperature_k": 300.5,
-    "surface_tension_n_per_m": 0.07,
-    "molar_volume_cm3_per_mol": 18.2,
-    "viscosity_pa_s": 1.3e-3,
-    "tip_radius_nm": 77.7,
-    "structural_amplitude_n_per_m": 33.0,
-    "structural_decay_nm": 0.57,
-    "structural_offset_nm": 0.62,
-    "core_constant_j_m6": 3.3e-78,
-    "adhesion_energy_j_per_m2": 0.37,
-    "modulus_gpa": 81.0,
-    "bridge_forms_nm": 3.3,
-    "bridge_breaks_nm": 5.1,
-}
+CHANGED: dict[str, Any] = {name: 1.01 * value for name, value in PAPER.items()}
 
 
 @pytest.fixture
@@ -44,18 +28,13 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_keys_and_ranges_are_those_of_the_contact():
-    keywords = inspect.signature(Contact.paper).parameters
-    assert {"effects", *PAPER} == set(keywords)
-    assert set(CHANGED) == set(PAPER)
+    assert {"effects", *PAPER} == set(inspect.signature(Contact.paper).parameters)
     assert {*PAPER, *(parameter.name for parameter in DRY_PARAMETERS)} == set(CONTACT_RANGES)
 
 
-def test_what_is_left_out_is_the_papers(path: Path):
+def test_effects_are_chosen_in_any_order_and_what_is_left_out_is_the_papers(path: Path):
     path.write_text(CONTACT, encoding="utf-8")
     assert eqx.tree_equal(load_scene(path), Scene(Cantilever(90.0), Platform(4.0, 181.8), Contact.paper()))
-
-
-def test_effects_are_chosen_in_any_order(path: Path):
     path.write_text(f'{CONTACT}effects = ["jkr", "viscous", "core"]\nstructural_decay_nm = 0.5\n', encoding="utf-8")
     contact = load_scene(path).interaction
     assert contact.effects == ("core", "viscous", "jkr")
@@ -75,7 +54,6 @@ def test_loop_is_exact_for_every_choice_of_effects(path: Path, effects: tuple[st
     scene = Scene(Cantilever(90.0, 40.0, 1.5), Platform(4.0, 181.8, -1.0, 1e-3), contact)
     save_scene(scene, path)
     assert eqx.tree_equal(load_scene(path), scene)
-    assert load_scene(path).interaction.effects == effects
 
 
 @given(values=st.fixed_dictionaries({name: st.floats(0.98 * value, 1.02 * value) for name, value in CHANGED.items()}))
@@ -105,28 +83,12 @@ def test_loop_is_exact_in_32_bits(path: Path):
     ("contact", "said"),
     [
         (Contact(Capillary() + CoreRepulsion() + VanDerWaals()), "the contact has capillary, core, van_der_waals, jkr"),
-        (Contact(CoreRepulsion() + CoreRepulsion()), "the contact has core, core, jkr"),
-        (Contact(Capillary() + CoreRepulsion(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),
         (Contact(CoreRepulsion(), junction=Jkr(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),
+        (Jkr(), "holds an ImpactLaw or a Contact as interaction, not Jkr"),
         (Contact.paper(relative_humidity=jnp.array([0.4, 0.5])), r"has shape \(2,\), but a scene file holds one scene"),
     ],
 )
-def test_what_the_format_has_no_key_for_is_not_saved(path: Path, contact: Contact, said: str):
-    with pytest.raises(ValueError, match=said):
+def test_what_the_format_has_no_key_for_is_not_saved(path: Path, contact: Any, said: str):
+    with pytest.raises((ValueError, TypeError), match=said):
         save_scene(Scene(Cantilever(90.0), Platform(4.0, 181.8), contact), path)
     assert not path.exists()
-
-
-def test_another_interaction_is_not_saved(path: Path):
-    with pytest.raises(TypeError, match="holds an ImpactLaw or a Contact as interaction, not Jkr"):
-        save_scene(Scene(Cantilever(90.0), Platform(4.0, 181.8), Jkr()), path)
-
-
-def test_scenes_with_a_law_do_without_the_contact(path: Path):
-    path.write_text(f'{HEAD}model = "law"\nr = 0.9\n', encoding="utf-8")
-    code = (
-        "import sys; from afm_jax.scenefile.scenefile import load_scene, save_scene\n"
-        f"save_scene(load_scene({str(path)!r}), {str(path)!r})\n"
-        "print([name for name in sys.modules if name.startswith(('afm_jax.contact', 'diffrax', 'scipy.optimize'))])"
-    )
-    assert python(code) == "[]"

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -48,14 +47,9 @@ def test_reads_every_key(path: Path):
 
 
 @pytest.mark.parametrize(("drive", "frequency"), [(BASE, 88.0), (FORCE, 90.0)])
-@pytest.mark.parametrize("interaction", [NONE, LAW, '[interaction]\nmodel = "contact"\n'])
+@pytest.mark.parametrize("interaction", [NONE, LAW])
 def test_a_platform_under_another_drive_may_rest(path: Path, drive: str, frequency: float, interaction: str):
-    for text, khz in (
-        ("amplitude_nm = 0\n", frequency),
-        ("amplitude_nm = 0.0\nfrequency_khz = 10\n", 10.0),
-        ("frequency_khz = 10\n", 10.0),
-        ("", frequency),
-    ):
+    for text, khz in (("amplitude_nm = 0\n", frequency), ("frequency_khz = 10\n", 10.0), ("", frequency)):
         scene = loaded(path, CANTILEVER, RESTING, text, drive, interaction)
         assert eqx.tree_equal(scene.platform, Platform(0.0, khz, 7.0))
     save_scene(scene, path)
@@ -108,36 +102,28 @@ def test_a_drive_is_as_strong_as_the_free_tips_amplitude_says(path: Path, ratio:
     # z = a/(k gamma), gamma = 1 - s^2 + i s/Q, of a force a; of a base a/gamma
     size = 40.0 * abs(1.0 - (2.0 * ratio) ** 2 + 2.0j * ratio / 40.0)
     lines = f"free_amplitude_nm = 40\nreduced_frequency = {ratio}\n"
-    base = loaded(path, CANTILEVER, RESTING, "[base]\n", lines, LAW).base
-    force = loaded(path, CANTILEVER, RESTING, "[force]\n", lines, LAW).force
-    assert base is not None
-    assert force is not None
+    base: Any = loaded(path, CANTILEVER, RESTING, "[base]\n", lines, LAW).base
+    force: Any = loaded(path, CANTILEVER, RESTING, "[force]\n", lines, LAW).force
     assert float(base.amplitude_nm) == pytest.approx(size, rel=1e-12)
     assert float(force.amplitude_nn) == pytest.approx(size * (2e-3 * np.pi * 90.0) ** 2, rel=1e-12)
 
 
+TWO = np.array([1.0, 2.0])
+
+
 @pytest.mark.parametrize(
-    ("platform", "drives", "said"),
+    ("drives", "said"),
     [
         (
-            Platform(1.0, 50.0, second=Tone(1.0, 50.0, 90.0)),
-            {},
+            {"platform": Platform(1.0, 50.0, second=Tone(1.0, 50.0, 90.0))},
             "the second frequency of `platform` is that of the first: add the two up to one cosine",
         ),
-        (Platform(1.0, 50.0), {"base": BaseDrive(1.0, 90.0)}, "`base` drives an undamped cantilever"),
-        (
-            Platform(1.0, 50.0),
-            {"base": BaseDrive(np.array([1.0, 2.0]), 91.0)},
-            r"`amplitude_nm` has shape \(2,\), but a scene file holds one scene",
-        ),
-        (
-            Platform(1.0, 50.0),
-            {"force": ForceDrive(1.0, 1.0, 0.0, Tone(jnp.array([1.0, 2.0]), 91.0))},
-            r"`amplitude_nn` has shape \(2,\), but a scene file holds one scene",
-        ),
+        ({"base": BaseDrive(1.0, 90.0)}, "`base` drives an undamped cantilever"),
+        ({"base": BaseDrive(TWO, 91.0)}, r"`amplitude_nm` has shape \(2,\), but a scene file holds one scene"),
+        ({"force": ForceDrive(1.0, 1.0, 0.0, Tone(TWO, 91.0))}, r"`amplitude_nn` has shape \(2,\), but a scene file"),
     ],
 )
-def test_what_cannot_be_loaded_is_not_saved(path: Path, platform: Platform, drives: dict[str, Any], said: str):
+def test_what_cannot_be_loaded_is_not_saved(path: Path, drives: dict[str, Any], said: str):
     with pytest.raises(ValueError, match=said):
-        save_scene(Scene(Cantilever(90.0), platform, **drives), path)
+        save_scene(Scene(Cantilever(90.0), **{"platform": Platform(1.0, 50.0), **drives}), path)
     assert not path.exists()

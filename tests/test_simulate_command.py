@@ -71,59 +71,42 @@ def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path,
 def test_the_text_says_the_same(law_file: Path):
     answer = json_of(law_file, "--periods", 60.5)
     text = simulate(law_file, "--periods", 60.5).stdout
-    assert f"{answer['impacts']} contacts" in text
     assert "Settled: the motion repeats: 1 contact in 1 drive period." in text
     assert f"Peak amplitude {answer['peak_amplitude_nm']:.6g} nm" in text
-    assert "At the drive's frequency (181.8 kHz): " in text
-    assert "Energy of a drive period" in text
-    assert answer["impacts"] == 60
+    assert (answer["impacts"], answer["final"]["phase"]) == (60, "dry")
     period = float(LAW.platform.period_us)
     np.testing.assert_allclose(answer["final"]["time_us"] - answer["start"]["time_us"], 60.5 * period, rtol=1e-12)
-    assert answer["final"]["phase"] == "dry"
-
-
-def test_too_short_to_settle_is_said_and_no_failure(law_file: Path):
-    answer = json_of(law_file, "--duration-us", 20)
-    assert (answer["settled"], answer["order"]) == (False, None)
-    assert "no sequence" in answer["settled_reason"]
-    assert "Not settled: " in simulate(law_file, "--duration-us", 20).stdout
 
 
 @pytest.mark.slow
 def test_a_part_of_a_response_period_has_no_mean(law_file: Path):
     answer = json_of(law_file, "--duration-us", 3, "--harmonics", "1,2")
     assert answer["window"]["responses"] == 0
+    # too short to settle is no failure
+    assert (answer["settled"], answer["order"]) == (False, None)
+    assert "no sequence" in answer["settled_reason"]
     assert nulls(answer) == answer["null_reasons"].keys()
     short = {name for name, reason in answer["null_reasons"].items() if "shorter than a response period" in reason}
-    assert short >= {"lockin_amplitude_nm", "lockin_phase_deg", "mean_height_nm", "given_by_drives_aj", "virial_aj"}
-    assert short >= {"drive_lockin_amplitude_nm", "drive_lockin_phase_deg"}
-    for multiple, harmonic in enumerate(answer["harmonics"], start=1):
-        assert harmonic["frequency_khz"] == pytest.approx(multiple * answer["response_frequency_khz"])
-        assert (harmonic["amplitude_nm"], harmonic["phase_deg"]) == (None, None)
+    assert short >= {"lockin_amplitude_nm", "mean_height_nm", "virial_aj", "drive_lockin_phase_deg"}
+    assert all(harmonic["amplitude_nm"] is None for harmonic in answer["harmonics"])
     # the highest it has been is known
     assert answer["peak_amplitude_nm"] > 0.0
-    text = simulate(law_file, "--duration-us", 3).stdout
-    assert "Less than a response period" in text
-    assert "Energy" not in text
-    assert "At the drive's frequency" not in text
+    assert "Less than a response period" in simulate(law_file, "--duration-us", 3).stdout
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order", [1, 3])
-def test_lockin_reads_the_trace_it_writes(tmp_path: Path, order: int):
-    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8 * order, -1.0), LAW.interaction)
+def test_lockin_reads_the_trace_it_writes(tmp_path: Path):
+    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 3.0 * 181.8, -1.0), LAW.interaction)
     save_scene(scene, tmp_path / "scene.toml")
     answer = answers.answer(tmp_path / "out", "simulate", tmp_path / "scene.toml", "--samples", "uniform")
     trace = read_trace(tmp_path / "out" / "trace.csv")
     assert (trace.settings.drive_amplitude_nm, trace.settings.offset_nm, trace.settings.quality_factor) == (4, -1, 40)
-    read = lockin(trace)
+    read: Any = lockin(trace)
     assert (read.steady, read.order) == (True, answer["order"])
-    assert read.lockin_amplitude_nm is not None
-    assert read.peak_amplitude_nm is not None
     # two ways through the same motion: integrals over flights, and a fit of harmonics to 400 samples a drive period
     np.testing.assert_allclose(read.lockin_amplitude_nm, answer["lockin_amplitude_nm"], rtol=1e-3)
     np.testing.assert_allclose(read.peak_amplitude_nm, answer["peak_amplitude_nm"], rtol=1e-4)
-    turn = 360.0 / order
+    turn = 360.0 / 3
     assert abs((read.phase_deg - answer["lockin_phase_deg"] + 0.5 * turn) % turn - 0.5 * turn) < 0.05
 
 
@@ -146,23 +129,18 @@ def test_the_drives_frequency_is_read_and_named_whatever_harmonics_are_asked_for
     path = tmp_path / "forced.toml"
     law, force = ImpactLaw(0.99, 0.1, 0.01), ForceDrive(45.7, 545.4)
     save_scene(Scene(Cantilever(90.0, 40.0), Platform(0.0, 33.0, -1.0), law, force=force), path)
-    several = [json_of(path, "--harmonics", asked) for asked in ("1", "2", "3,4,6")]
+    several = [json_of(path, "--harmonics", asked) for asked in ("1", "3,4,6")]
     keys = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
     for answer in several:
         assert answer["order"] == 3
         # neither is one of those asked for, nor depends on them
         assert [answer[key] for key in keys] == [several[0][key] for key in keys]
-        assert answer["drive_frequency_khz"] == pytest.approx(545.4, rel=1e-12)
         assert answer["response_frequency_khz"] == pytest.approx(181.8, rel=1e-12)
-    third = several[2]["harmonics"][0]
+    third = several[1]["harmonics"][0]
     assert (third["multiple"], third["amplitude_nm"]) == (3, several[0]["drive_lockin_amplitude_nm"])
     assert third["frequency_khz"] == pytest.approx(545.4, rel=1e-12)
     # lines are broken where a terminal ends
     said = " ".join(simulate(path, "--harmonics", "3,4,6").stdout.split())
-    slow_size, slow_phase, size, phase = (f"{several[0][key]:.6g}" for key in keys)
-    assert f"At the drive's frequency (545.4 kHz): {size} nm, {phase} deg." in said
-    assert f"At the response frequency (181.8 kHz, 1/3 of the drive's): {slow_size} nm, {slow_phase} deg." in said
+    assert "At the drive's frequency (545.4 kHz): {drive_lockin_amplitude_nm:.6g} nm, ".format(**several[0]) in said
     assert "At 4 times the response frequency (727.2 kHz, 4/3 of the drive's): " in said
-    assert "At 2 times the drive's frequency (1090.8 kHz): " in said
-    lag = f"{several[0]['phase_lag_deg']:.6g}"
-    assert f"Phase lag of the height behind the force at the drive's frequency: {lag} deg." in said
+    assert "at the drive's frequency: {phase_lag_deg:.6g} deg.".format(**several[0]) in said

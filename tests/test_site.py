@@ -72,19 +72,6 @@ def test_pictures_stand_beside_their_commands():
         assert f"`afm-jax {command}`" in text
 
 
-def test_gallery_shows_the_first_picture_of_a_notebook(tmp_path: Path):
-    import nbformat  # noqa: PLC0415  # a second and a half, as in tests/test_notebooks.py
-
-    from notebooks.site_hooks import first_picture  # noqa: PLC0415
-
-    outputs = [nbformat.v4.new_output("display_data", data=data) for data in ({}, {"image/png": "UE5H"})]
-    cells = [nbformat.v4.new_markdown_cell("# Title"), nbformat.v4.new_code_cell("draw()", outputs=outputs)]
-    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "drawn.ipynb")
-    nbformat.write(nbformat.v4.new_notebook(cells=cells[:1]), tmp_path / "bare.ipynb")
-    assert first_picture(tmp_path / "drawn.ipynb") == b"PNG"
-    assert first_picture(tmp_path / "bare.ipynb") is None
-
-
 @pytest.mark.slow
 def test_links_lead_somewhere_and_nothing_is_fetched_from_other_machines(site: Path):
     pages = [page for page in site.rglob("*.html") if page.name != "404.html"]  # that one is for servers

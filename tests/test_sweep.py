@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,10 +20,10 @@ from click.testing import CliRunner
 import afm_jax
 from afm_jax.cli.main import main
 from afm_jax.compilation_cache import available_cores
-from afm_jax.dynamics.exponents import Lyapunov, lyapunov_spectrum
-from afm_jax.dynamics.verdicts import Verdicts
-from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
+from afm_jax.dynamics.exponents import lyapunov_spectrum
+from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.presets import preset
+from afm_jax.scenefile.scenefile import Start
 from afm_jax.sweeps.sweep import run_plan, sweep
 from tests.fresh_python import python
 from tests.kills import ROOT, chunks_done, survive
@@ -96,46 +95,12 @@ def test_collisions_and_exponents_are_those_of_their_functions():
     np.testing.assert_array_equal(found["kind"], alone.verdicts.kind)
 
 
-@pytest.mark.slow
-def test_exponents_of_contacts_are_followed_in_rows_of_one_length(monkeypatch: pytest.MonkeyPatch):
-    asked = []
-
-    def spectrum(scenes: afm_jax.Scene, **settings: Any) -> Lyapunov:
-        values = np.asarray(scenes.platform.amplitude_nm)
-        asked.append((len(values), settings))
-        whole = values.astype(int)
-        pairs = np.stack([values, -values], axis=1)
-        return Lyapunov(
-            pairs, 2.0 * pairs, pairs, pairs, values, whole, whole, whole, Verdicts(whole, whole, whole, values), pairs
-        )
-
-    monkeypatch.setattr("afm_jax.sweeps.scenes.lyapunov_spectrum", spectrum)
-    axes = [{"parameter": AMPLITUDE, "linear": [3.0, 20.0, 18]}]
-    found = sweep(preset("figure8"), axes, {"what": "lyapunov", "impacts": 40, "transient": 7}, accuracy=1e-5, chunk=18)
-    assert asked == [(32, {"impacts": 40, "transient": 7, "accuracy": 1e-5})]
-    np.testing.assert_array_equal(found["exponents_per_us"].sel(exponent=2.0), -2.0 * np.arange(3.0, 21.0))
-    np.testing.assert_array_equal(found["orbit_periods"], np.arange(3, 21))
-
-
-@pytest.mark.slow
-def test_simulations_are_those_of_the_command(tmp_path: Path):
-    axes = [{"parameter": AMPLITUDE, "list": [4.0, 8.0]}]
-    found = sweep(preset("figure2"), axes, {"what": "simulation", "periods": 300.0}).isel(platform_amplitude_nm=1)
-    path = tmp_path / "scene.toml"
-    afm_jax.save_scene(scene_family(preset("figure2"), AMPLITUDE)(8.0), path)
-    run = CliRunner().invoke(main, ["simulate", str(path), "--periods", "300", "--until-settled", "--json"])
-    told = json.loads(run.stdout)
-    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "dissipated_in_contact_aj", "dissipated_per_contact_aj"):
-        np.testing.assert_allclose(found[name], told[name], rtol=1e-9)
-    assert (bool(found["settled"]), int(found["order"])) == (told["settled"], told["order"])
-
-
 ON_DEVICES = """
 import hashlib, jax
 jax.config.update("jax_enable_x64", True)
 from afm_jax.scenefile.presets import preset
 from afm_jax.sweeps.sweep import sweep
-axes = [{"random": {"platform.amplitude_nm": [1.0, 8.0], "interaction.r": [0.5, 0.9]}, "count": 40_001, "seed": 1}]
+axes = [{"random": {"platform.amplitude_nm": [1.0, 8.0], "interaction.r": [0.5, 0.9]}, "count": 10_001, "seed": 1}]
 # more blocks than a call has, and fewer than one
 for chunk in (None, 700):
     found = sweep(preset("figure2"), axes, "orbits", chunk=chunk)
@@ -152,14 +117,6 @@ def test_two_devices_give_the_bits_of_one():
     two = python(ON_DEVICES, XLA_FLAGS=f"{flags} --xla_force_host_platform_device_count=2").split()
     assert (one[::2], two[::2]) == (["1"] * 2, ["2"] * 2)
     assert len({*one[1::2], *two[1::2]}) == 1
-
-
-@pytest.mark.slow
-def test_four_workers_give_the_bytes_of_one(tmp_path: Path):
-    axes = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 5]}, PLANE[1]]
-    for workers in (1, 4):
-        sweep(preset("figure2"), axes, "orbits", out=tmp_path / str(workers), chunk=15, workers=workers)
-    assert contents(tmp_path / "1") == contents(tmp_path / "4")
 
 
 @pytest.mark.slow
@@ -218,53 +175,18 @@ def test_a_sweep_killed_twice_ends_in_the_same_bytes(tmp_path: Path):
     assert contents(whole) == contents(broken)
 
 
-FULL = """
-mount -t tmpfs -o size=400k tmpfs "$1" || exit 77
-"$2" -m afm_jax sweep "$3" --out "$1" --workers 1 --json && exit 1
-echo "code $?"
-mount -o remount,size=8m "$1"
-"$2" -m afm_jax sweep "$3" --out "$1" --workers 1 --json
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs a file system of its own")
-def test_a_disk_that_is_full_in_fact(tmp_path: Path):
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "sweep.toml").write_text(
-        'scene = "figure2"\nchunk = 20\n[record]\nwhat = "orbits"\n'
-        f'[[axes]]\nparameter = "{FREQUENCY}"\nlinear = [0.8, 2.2, 300]\n'
-    )
-    line = ["unshare", "-rm", "sh", "-c", FULL, "sh", str(tmp_path / "disk"), sys.executable]
-    done = subprocess.run([*line, str(tmp_path / "sweep.toml")], cwd=ROOT, capture_output=True, text=True, check=False)
-    if done.returncode == 77 or "unshare" in done.stderr:
-        pytest.skip("this machine lends no file system")
-    assert "No space left on device" in done.stderr, done.stderr
-    assert "of 15 chunks are kept; mend that, and give the same command again" in done.stderr
-    code, told = done.stdout.splitlines()[-2:]
-    assert code == "code 2"
-    found = json.loads(told)
-    assert found["chunks_kept"] + found["chunks_computed"] == 15
-    assert found["chunks_kept"] > 0
-
-
 def test_the_command_says_why_points_have_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def follow(scene: afm_jax.Scene, *_: Any, **__: Any) -> None:
         raise ValueError("too wide" if scene.platform.amplitude_nm > 1.8 else "it will not go")
 
     monkeypatch.setattr("afm_jax.sweeps.scenes.follow_long", follow)
-    afm_jax.save_scene(preset("figure2"), tmp_path / "scene.toml")
-    with (tmp_path / "scene.toml").open("a") as file:
-        file.write("[start]\nphase_deg = 0.0\nheight_above_platform_nm = 1.0\nvelocity_nm_per_us = 0.0\n")
+    afm_jax.save_scene(preset("figure2"), tmp_path / "scene.toml", start=Start(0.0, 1.0, 0.0))
     (tmp_path / "sweep.toml").write_text(
         'scene = "scene.toml"\nchunk = 2\n[record]\nwhat = "simulation"\n'
         f'[[axes]]\nparameter = "{AMPLITUDE}"\nlinear = [1, 2, 3]\n'
     )
     line = ["sweep", str(tmp_path / "sweep.toml"), "--out", str(tmp_path), "--workers", "1"]
-    run = CliRunner().invoke(main, line)
-    assert run.exit_code == 0, run.stderr
-    assert "3 points have no result to be trusted (`message` says why), most of them:\n" in run.stdout
-    assert "\n  2: it will not go\n  1: too wide\n" in run.stdout
+    assert "\n  2: it will not go\n  1: too wide\n" in CliRunner().invoke(main, line).stdout
     told = json.loads(CliRunner().invoke(main, [*line, "--json"]).stdout)
     assert (told["without_result"], told["messages"]) == (3, {"it will not go": 2, "too wide": 1})
     found = xarray.open_zarr(str(tmp_path / "sweep.zarr")).load()

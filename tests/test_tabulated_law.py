@@ -22,7 +22,6 @@ def table_of(law: Law, *, rows: int = 20, low: float = 1.15, high: float = 300.0
 @pytest.mark.parametrize(
     ("r", "epsilon", "c", "rows", "lasts"),
     [
-        (0.998, 123.0, 0.0, 4, False),
         (0.9999, 114.0, 0.48, 20, True),
         (0.5, 0.5, 0.0, 2 * MOST_KNOTS, True),
         (1.0, 0.0, 0.7, 4, False),
@@ -91,9 +90,8 @@ def test_slopes_and_the_inverse_are_derivatives():
 def test_it_says_where_it_is_extrapolated():
     law = table_of(WET, low=1.5, high=200.0)
     slowest = 1.5 * float(WET.capture_speed_nm_per_us)
-    np.testing.assert_array_equal(
-        law.extrapolated(np.array([slowest - 1.0, slowest + 1.0, 199.0, 201.0])), [True, False, False, True]
-    )
+    beyond = law.extrapolated(np.array([slowest - 1.0, slowest + 1.0, 199.0, 201.0]))
+    assert beyond.tolist() == [True, False, False, True]
     assert not bool(WET.extrapolated(1e4))
     said = extrapolation_of(law, [[slowest + 1.0, 250.0], [np.nan, 300.0]])
     known = f"the law is known from {slowest:.4g} to 200 nm/us"
@@ -101,15 +99,11 @@ def test_it_says_where_it_is_extrapolated():
     assert (extrapolation_of(law, [150.0, np.nan]), extrapolation_of(WET, [1e4])) == (None, None)
 
 
-def test_rows_that_are_captured_bound_the_capture_speed():
+def test_rows_that_are_captured_bound_the_capture_speed_and_without_adhesion_there_are_none():
     u = np.array([5.0, 9.0, 12.0, 20.0, 60.0, 200.0])
     law = TabulatedLaw(u, np.where(u > 10.0, odd(np.maximum(u, 10.0)), 0.0))
     assert 9.0 <= float(law.capture_speed_nm_per_us) < 12.0
     assert not bool(law.captures(12.0))
-
-
-def test_a_law_without_adhesion_captures_nothing():
-    u = np.geomspace(2.0, 200.0, 9)
     law = TabulatedLaw(u, 0.8 * u)
     assert float(law.capture_speed_nm_per_us) == 0.0
     assert not bool(law.adheres)
@@ -117,21 +111,18 @@ def test_a_law_without_adhesion_captures_nothing():
     assert float(law.rebound_speed(0.01)) == pytest.approx(0.008, rel=1e-12)
 
 
+FOUR, SLOWER = [10.0, 20.0, 30.0, 40.0], [9.0, 19.0, 29.0, 39.0]
+
+
+# what a file can hold, too, is refused by lines of the corpus (`tests.malformed`)
 @pytest.mark.parametrize(
     ("u", "w", "options", "said"),
     [
-        ([10.0, 15.0, 15.0, 40.0], [9.0, 9.0, 9.0, 9.0], {}, "increase from row to row, but 15 follows 15 in row 3"),
-        ([10.0, 20.0, np.inf, 40.0], [9.0, 9.0, 29.0, 39.0], {}, "must be finite numbers, but is inf in row 3"),
-        ([10.0, 20.0, 30.0, 40.0], [9.0, 0.0, 29.0, 39.0], {}, r"is 0 \(captured\) in row 2, but slower tips leave"),
-        ([-1.0, 20.0, 30.0, 40.0], [0.0, 19.0, 29.0, 39.0], {}, "must be positive, but is -1 in row 1"),
-        (
-            [10.0, 20.0, 30.0, 40.0],
-            [9.0, 19.0, 29.0, 39.0],
-            {"capture_speed_nm_per_us": 11.0},
-            "below the slowest tip that leaves, 10 nm/us, but is 11",
-        ),
-        ([10.0, 20.0, 30.0, 40.0], [9.0, 19.0, 29.0, 39.0], {"delay": DELAY}, "needs the column `collision_delay_us`"),
-        ([10.0, 20.0, 30.0, 40.0], [9.0, 19.0, 29.0, 39.0], {"mass_ng": -1.0}, "`mass_ng` must be positive"),
+        ([-1.0, *FOUR[1:]], SLOWER, {}, "must be positive, but is -1 in row 1"),
+        (FOUR, [9.0, 0.0, 29.0, 39.0], {}, r"is 0 \(captured\) in row 2, but slower tips leave"),
+        (FOUR, SLOWER, {"capture_speed_nm_per_us": 11.0}, "below the slowest tip that leaves, 10 nm/us, but is 11"),
+        (FOUR, SLOWER, {"delay": DELAY}, "needs the column `collision_delay_us`"),
+        (FOUR, SLOWER, {"mass_ng": -1.0}, "`mass_ng` must be positive"),
     ],
 )
 def test_what_is_no_table(u, w, options, said):
