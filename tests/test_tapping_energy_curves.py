@@ -207,9 +207,9 @@ def test_bands_hold_the_energies_of_random_curves():
 
 
 @pytest.mark.slow
-def test_ten_curves_of_a_thousand_points_take_less_than_four_seconds_of_one_core():
+def test_ten_curves_of_a_thousand_points_take_less_than_three_seconds_of_one_core():
     # in a process of its own: tests check the types of all arguments
-    assert float(python(TEN_CURVES)) < 4.0
+    assert float(python(TEN_CURVES)) < 3.3
 
 
 @pytest.mark.slow

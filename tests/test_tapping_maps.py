@@ -107,8 +107,6 @@ def test_pixels_out_of_range_are_masked_and_counted():
     assert "free amplitude, its phase, quality factor or units do not belong" in wrong.reasons[0]
 
 
-
-
 def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip_and_without_a_stiffness_energies_are_over_it():
     amplitude, lag, energy = image()
     straight = tapping_map((amplitude, lag), **LEVER)
@@ -190,7 +188,8 @@ def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tm
     zarr, gwyfile = pytest.importorskip("zarr"), pytest.importorskip("gwyfile")
     (path,) = written(tmp_path, "gwy")
     out = tmp_path / "report"
-    result = run(path, *CALL, "13.4", *"--format npz --format gwy --format zarr --json --out".split(), out)
+    formats = ["--format", "npz", "--format", "gwy", "--format", "zarr"]
+    result = run(path, *CALL, "13.4", *formats, "--json", "--out", out)
     assert result.exit_code == 0, result.stderr
     _, _, energy = image()
     answer = strictly(result.stdout)
@@ -220,7 +219,9 @@ def test_masked_pixels_are_masked_in_gwyddion_too():
 def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
     curves = [raw_curve(300, seed=seed, drift=0.0) for seed in range(6)]
     names = ("amplitude_v", "phase_deg", "height_nm")
-    arrays: dict[str, Any] = {name: np.reshape([getattr(one, name)[0] for one in curves], (2, 3, 300)) for name in names}
+    arrays: dict[str, Any] = {
+        name: np.reshape([getattr(one, name)[0] for one in curves], (2, 3, 300)) for name in names
+    }
     np.savez(tmp_path / "grid.npz", **arrays)
     lever = [*GRID_CALL, "--nm-per-volt", "42", "--at", "0.85", "--json"]
     result = run(tmp_path / "grid.npz", *lever)
@@ -239,8 +240,6 @@ def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
     refused = run(*call, "2x2")
     assert (refused.exit_code, len(refused.stderr.splitlines())) == (2, 1)
     assert "holds 6 curves, not 2 x 2 = 4" in refused.stderr
-
-
 
 
 def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path):
