@@ -4,33 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
 import afm_jax as afm
 import fitting
-from afm_jax.cli.main import main
 from afm_jax.motion.approach_curve import CurveOutcome
 from tests.answers import answer
 
 KHZ, QUALITY, MASS_NG, FREE_NM, RATIO, R, EPSILON = 90.0, 200.0, 16.9, 80.0, 1.03, 0.98, 0.4
 LAW = afm.ImpactLaw(R, EPSILON)
-FILE = f"""\
-[cantilever]
-frequency_khz = {KHZ}
-quality_factor = {QUALITY}
-mass_ng = {MASS_NG}
-[platform]
-amplitude_nm = 0
-reduced_frequency = {RATIO / 2}
-[force]
-free_amplitude_nm = {FREE_NM}
-reduced_frequency = {RATIO / 2}
-[interaction]
-model = "law"
-r = {R}
-epsilon = {EPSILON}
-"""
 OMEGA, DRIVE = 2e-3 * np.pi * KHZ, 2e-3 * np.pi * KHZ * RATIO
 
 
@@ -127,7 +109,7 @@ def test_a_point_agrees_with_scipy():
 
 @pytest.mark.slow
 def test_the_command_writes_what_tapping_reads(tmp_path: Path):
-    (tmp_path / "scene.toml").write_text(FILE)
+    afm.save_scene(driven("force"), tmp_path / "scene.toml")
     out, noise = tmp_path / "out", ("--noise", "0.1%", "--phase-noise-deg", "0.1")
     told = answer(out, "simulate", tmp_path / "scene.toml", "--heights", "-88:-8:11", *noise)
     assert sorted(path.name for path in out.iterdir()) == ["curve.csv", "curve.json", "curve.png", "curve_points.csv"]
@@ -141,21 +123,6 @@ def test_the_command_writes_what_tapping_reads(tmp_path: Path):
     found = fitting.tapping(table, law=False).rows
     taken = np.array([energy for energy, none in zip(told["dissipated_in_contact_aj"], lost, strict=True) if not none])
     assert np.max(np.abs(found.energy_aj - taken) / found.energy_noise_aj) < 4.0
-
-
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        (("--heights", "-88:-8"), "must be from:to:count"),
-        (("--heights", "-8:-8:3"), "must be from:to:count"),
-        (("--heights", "-88:-8:5", "--duration-us", "100"), "leave out --duration-us"),
-        (("--noise", "1%"), "--noise is that of an approach curve"),
-    ],
-)
-def test_a_wrong_call_says_how_to_mend_it(more: tuple[str, ...], said: str):
-    result = CliRunner().invoke(main, ["simulate", "figure8", *more], prog_name="afm-jax")
-    assert result.exit_code == 2
-    assert said in result.stderr
 
 
 def test_scenes_that_have_no_approach_curve_are_refused():

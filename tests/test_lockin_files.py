@@ -99,20 +99,6 @@ def test_faults_of_hdf5_files(tmp_path: Path):
             read_trace(place, group=group, **KNOWN)
 
 
-
-
-
-
-
-
-
-
-
-
-
-
-
-
 def announced(count: int, **how: Any) -> Any:
     """Return what writes a data set of so many numbers that are not there."""
     return lambda file, _: file.create_dataset("deflection_nm", shape=(count,), dtype="f8", **how)

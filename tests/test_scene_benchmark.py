@@ -1,6 +1,5 @@
 """The benchmark of driven scenes: its contacts one by one, its reference, SciPy's baseline, its judgement. No times."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,16 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from afm_jax.bench import timing as own_process
 from afm_jax.bench.problems import batch_run, bouncing_starts, single_contacts, spread_starts
 from afm_jax.bench.scenes import REFERENCE, contact_errors
 from afm_jax.bench.scipy_contacts import diffrax_driven_contact, scipy_driven_contact
-from afm_jax.cli.bench import PARTS
-from afm_jax.cli.main import main
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.scenefile.presets import contact_scene
+from tests.answers import answer
 from tests.reference_driven_contact import DrivenContact, follow
 
 SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
@@ -49,13 +46,14 @@ def followed(scene):
 def test_the_reference_is_that_of_an_independent_integration(followed):
     starts, found, *_ = followed
     for tip in (0, 5):
-        state = [float(part[tip]) for part in starts]
-        expected = follow(SYSTEM, *state, contacts=2).contacts
-        for row, contact in enumerate(expected):
-            own = [getattr(found.contacts, name)[tip, row] for name in ("arrival_time_us", "rebound_speed_nm_per_us")]
+        for row, contact in enumerate(follow(SYSTEM, *[float(part[tip]) for part in starts], contacts=2).contacts):
+            arrival, rebound = (
+                found.contacts.arrival_time_us[tip, row],
+                found.contacts.rebound_speed_nm_per_us[tip, row],
+            )
             # two contacts multiply rounding and step errors by less than a thousand
-            assert float(own[0]) == pytest.approx(contact.arrival_time_us, abs=1e-8)
-            assert float(own[1]) == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-8)
+            assert float(arrival) == pytest.approx(contact.arrival_time_us, abs=1e-8)
+            assert float(rebound) == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-8)
 
 
 @pytest.mark.slow
@@ -120,23 +118,21 @@ def changed(found, **columns):
 
 @pytest.mark.slow
 def test_starts_are_those_of_tips_that_keep_bouncing(scene):
-    def run(_, starts, until):
-        assert np.all(np.asarray(until > starts.time_us))
-        held = np.asarray(starts.velocity_nm_per_us) > 90.0
-        return SimpleNamespace(outcome=np.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED))
+    def held_above(fastest: float):
+        def run(_, starts, until):
+            assert np.all(np.asarray(until > starts.time_us))
+            held = np.asarray(starts.velocity_nm_per_us) > fastest
+            return SimpleNamespace(outcome=np.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED))
 
-    starts, share = bouncing_starts(scene, run, 20, 10.0)
-    assert starts.velocity_nm_per_us.shape == (20,)
-    assert float(jnp.max(starts.velocity_nm_per_us)) <= 90.0
-    assert len(np.unique(np.asarray(starts.velocity_nm_per_us))) == 20
+        return run
+
+    starts, share = bouncing_starts(scene, held_above(90.0), 20, 10.0)
+    velocities = np.asarray(starts.velocity_nm_per_us)
+    assert (len(np.unique(velocities)), velocities.shape, velocities.max() <= 90.0) == (20, (20,), True)
     # of 38 to 120 nm/us a share of 30/82
     assert share == pytest.approx(30.0 / 82.0, abs=0.05)
-
-    def none_left(_scene, _starts, until):
-        return SimpleNamespace(outcome=np.full(until.shape, MotionOutcome.HELD))
-
     with pytest.raises(ValueError, match="only 0 keep bouncing"):
-        bouncing_starts(scene, none_left, 20, 10.0)
+        bouncing_starts(scene, held_above(0.0), 20, 10.0)
 
 
 BATCH = {"what": "bouncing tips, accuracy 1e-06", "scene": "n = 5.277", "batch": 1000, "periods": 150}
@@ -153,14 +149,9 @@ def test_command_writes_its_table_and_judges(tmp_path: Path, monkeypatch: pytest
         return {"rows": ROWS, "reference_error": 1e-11, "reference_error_us": 1e-12}
 
     monkeypatch.setattr(own_process, "run_in_own_process", measured)
-    result = CliRunner().invoke(main, ["bench", "--only", "scenes", "--quick", "--out", str(tmp_path)])
-    assert result.exit_code == 0, result.stderr
-    assert "13.0%" in result.stdout
-    assert "at most 1 wanted, 1.5 reached, not met" in result.stdout
-    assert (tmp_path / "bench_scenes.csv").read_text("utf-8").splitlines()[0] == ",".join(PARTS[2].table.columns)
-    payload = json.loads((tmp_path / "bench.json").read_text("utf-8"))
-    assert payload["scene_rows"] == ROWS
-    assert payload["scene_reference_error_us"] == 1e-12
+    payload = answer(tmp_path, "bench", "--only", "scenes", "--quick")
+    assert (tmp_path / "bench_scenes.csv").exists()
+    assert (payload["scene_rows"], payload["scene_reference_error_us"]) == (ROWS, 1e-12)
     assert [aim["met"] for aim in payload["aims"]] == [True, True, True, False, True, False]
     reached = {aim["aim"]: (aim["reached"], aim["at_most"]) for aim in payload["aims"]}
     assert reached["driven contact, n = 5.277, us at 1e-6"] == (11.0, 12.0)

@@ -22,6 +22,7 @@ from fitting.tapping_curves.energy_fit import Bins, Process, Smoother
 from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.speeds import _flight, _Seen
 from fitting.tapping_curves.tapping import tapping
+from tests.answers import answer
 from tests.html_pages import first_screen, read_page
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_laws import Stated, Tip, curve_of_energy, table_of
@@ -262,16 +263,16 @@ def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
 def test_without_a_spring_constant_energies_are_over_it():
     table = made_curve()
     found = tapping(replace(table, spring_constant_n_per_m=None, mass_ng=None), law=False)
-    answer = found.to_dict()
+    told = found.to_dict()
     wanted = tapping(replace(table, spring_constant_error_n_per_m=1e-6), law=False).to_dict()
-    assert answer["energy_per_tap_aj"] is None
-    per_tap = answer["energy_per_tap_over_k_nm2"]
+    assert told["energy_per_tap_aj"] is None
+    per_tap = told["energy_per_tap_over_k_nm2"]
     assert per_tap["value"] == pytest.approx(wanted["energy_per_tap_aj"]["value"] / K, rel=1e-3)
-    for one, other in zip(answer["branches"], wanted["branches"], strict=True):
+    for one, other in zip(told["branches"], wanted["branches"], strict=True):
         np.testing.assert_allclose(one["curve"]["energy_over_k_nm2"], np.array(other["curve"]["energy_aj"]) / K, 1e-2)
         assert "energy_aj" not in one["curve"]
     # m/k cancels in it
-    assert answer["epsilon_nm2_per_us2"]["value"] == pytest.approx(wanted["epsilon_nm2_per_us2"]["value"], rel=1e-3)
+    assert told["epsilon_nm2_per_us2"]["value"] == pytest.approx(wanted["epsilon_nm2_per_us2"]["value"], rel=1e-3)
     text = tapping_summary(found)
     assert re.search(r"Energy of a tap: [\d.]+ \+- [\d.]+ nm\^2 ", text)
     assert not re.search(r" eV|\d aJ", text)
@@ -285,40 +286,33 @@ def test_without_a_phase_there_is_a_bound():
     assert result.energy["interval95"] == (0.0, pytest.approx(np.pi * K * 40.0**2 / (4.0 * Q), rel=0.03))
 
 
-def run(*arguments: object):
-    return CliRunner().invoke(main, ["tapping", *map(str, arguments)])
-
-
 @pytest.mark.slow
 def test_command_prints_and_writes_the_report(tmp_path: Path):
-    result = run(EXAMPLE, "--json", "--out", tmp_path)
-    assert result.exit_code == 0, result.stderr
-    answer = strictly(result.stdout)
-    assert len(answer["rows"]) == 64
-    assert all(one["reason"].startswith("excluded") for one in answer["set_aside"])
-    assert strictly((tmp_path / "tapping.json").read_text(encoding="utf-8")) == answer
+    told = answer(tmp_path, "tapping", EXAMPLE)
+    assert len(told["rows"]) == 64
+    assert all(one["reason"].startswith("excluded") for one in told["set_aside"])
     page = read_page((tmp_path / "tapping.html").read_text(encoding="utf-8"))
     assert "VALID" in first_screen(page)
-    assert len(list(page.iter("img"))) == 2
-    assert (tmp_path / "tapping.png").exists()
+    assert len(list(page.iter("img"))) == len(list(tmp_path.glob("*.png"))) == 2
 
 
 @pytest.mark.slow
 def test_real_files_give_what_they_support():
+    def told(name: str, *options: str) -> dict[str, Any]:
+        result = CliRunner().invoke(main, ["tapping", str(REAL / name), "--json", *options])
+        assert result.exit_code == 3
+        return strictly(result.stdout)
+
     known = ("--free-frequency-khz", "264.1 +- 0.3", "--quality-factor", "400 +- 150", "--spring-constant", "40 +- 15")
-    bracket = run(REAL / "tapping_approach_neasnom.txt", *known, "--json")
-    assert bracket.exit_code == 3
-    answer = strictly(bracket.stdout)
+    neasnom = told("tapping_approach_neasnom.txt", *known)
     # eight rows in contact, f0 known to more than its width: no energy, and no bracket that says more than that
-    assert (answer["energy_per_tap_aj"], answer["law"]) == (None, None)
-    assert answer["energy_per_tap_reason"]
-    wsxm = run(REAL / "tapping_amplitude_wsxm.f.curves", "--nm-per-volt", "slope", "--json")
-    assert wsxm.exit_code == 3
-    answer = strictly(wsxm.stdout)
-    assert [one["curve"] for one in answer["refused"]] == [2, 3, 4]
-    assert answer["half_width_nm"]["mean"] == pytest.approx(6.2, abs=0.3)
-    assert len(answer["half_widths_nm"]) == 5
-    for curve in answer["curves"]:
+    assert (neasnom["energy_per_tap_aj"], neasnom["law"]) == (None, None)
+    assert neasnom["energy_per_tap_reason"]
+    wsxm = told("tapping_amplitude_wsxm.f.curves", "--nm-per-volt", "slope")
+    assert [one["curve"] for one in wsxm["refused"]] == [2, 3, 4]
+    assert wsxm["half_width_nm"]["mean"] == pytest.approx(6.2, abs=0.3)
+    assert len(wsxm["half_widths_nm"]) == 5
+    for curve in wsxm["curves"]:
         assert curve["energy_per_tap_aj"]["kind"] == "upper bound"
         # pi k A0^2/(4 Q) at 3.16 nm, 5.34 N/m and Q 202, with the error of the slope on top
         assert 0.2 < curve["energy_per_tap_aj"]["interval95"][1] < 0.25

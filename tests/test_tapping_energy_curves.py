@@ -17,7 +17,6 @@ from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
 from fitting.tapping_curves.together import tapping_together
 from tests.coverage_of_tapping import random_curve
-from tests.fresh_python import python
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_laws import (
     GRAPHITE,
@@ -32,24 +31,6 @@ from tests.tapping_truth_of_laws import (
 )
 
 ONE_ENERGY_AJ = 5.53
-TEN_CURVES = """
-import time
-from dataclasses import replace
-import numpy as np
-from fitting.tapping_curves.together import tapping_together
-from tests.tapping_truth_of_laws import GRAPHITE, SHARP, Stated, curve_like_graphite, table_of
-
-truth, rng = curve_like_graphite(970), np.random.default_rng(4)
-curves = [table_of(GRAPHITE, truth, Stated(**SHARP), rng, free_rows=30) for _ in range(10)]
-# of one lever
-names = ("source", "lockin_amplitude_nm", "phase_lag_deg")
-tables = [replace(curves[0], **{name: getattr(one, name) for name in names}) for one in curves]
-tapping_together(tables[:2])
-begin = time.process_time()
-tapping_together(tables)
-# of all threads together
-print(time.process_time() - begin)
-"""
 
 
 def deviations(result: Tapping, truth: Truth, free_nm: float) -> np.ndarray:
@@ -204,12 +185,6 @@ def test_bands_hold_the_energies_of_random_curves():
     changes = np.concatenate([one.hysteresis for one in found])
     assert len(changes) == 10
     assert np.abs(changes).max() < 2.0
-
-
-@pytest.mark.slow
-def test_ten_curves_of_a_thousand_points_take_less_than_three_seconds_of_one_core():
-    # in a process of its own: tests check the types of all arguments
-    assert float(python(TEN_CURVES)) < 3.3
 
 
 @pytest.mark.slow
