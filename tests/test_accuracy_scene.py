@@ -71,7 +71,7 @@ def of_settings(law_file: str) -> dict:
 @pytest.fixture(scope="module")
 def of_models(law_file: str) -> dict:
     start = numbers(scene_to_study(law_file)[1])
-    return fidelity_ladder(scene=law_file, start=start, duration_us=400.0, law=None, repetitions=1)
+    return fidelity_ladder(scene=law_file, start=start, duration_us=800.0, law=None, repetitions=1)
 
 
 @pytest.mark.slow
