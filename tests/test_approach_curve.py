@@ -128,10 +128,11 @@ def test_a_point_agrees_with_scipy():
 
 def test_scenes_that_have_no_approach_curve_are_refused():
     force = driven("force")
-    sample, moving = afm.Platform(4.0, 180.0), afm.Platform(1.0, KHZ * RATIO)
+    undriven = afm.Scene(force.cantilever, afm.Platform(4.0, 180.0), LAW)
+    moving = afm.Scene(force.cantilever, afm.Platform(1.0, KHZ * RATIO), LAW, force=force.force)
     for scene, heights, said in (
-        (afm.Scene(force.cantilever, sample, force.interaction), [-5.0], r"give the scene a \[force\] or a \[base\]"),
-        (afm.Scene(force.cantilever, moving, force.interaction, force=force.force), [-5.0], "`platform.amplitude_nm`"),
+        (undriven, [-5.0], r"give the scene a \[force\] or a \[base\]"),
+        (moving, [-5.0], "`platform.amplitude_nm`"),
         (force, [], "at least one"),
     ):
         with pytest.raises(ValueError, match=said):

@@ -269,14 +269,6 @@ def test_a_frequency_in_hz_under_the_name_of_khz_is_pointed_out():
 
 
 @pytest.mark.slow
-def test_the_background_is_chosen_by_akaikes_criterion():
-    result = calibrate(synthetic_sweep(noise=1e-3, slope=0.1))
-    assert (result.background, result.valid) == ("linear", True)
-    assert off(result.quality_factor, QUALITY_FACTOR) < 4.0
-    assert calibrate(synthetic_sweep(noise=1e-3)).background == "constant"
-
-
-@pytest.mark.slow
 def test_errors_are_those_of_correlated_noise():
     clean, values, errors = synthetic_sweep(noise=0.0, points=200), [], []
     response = clean.amplitude * np.exp(1j * np.deg2rad(np.asarray(clean.phase_deg)))

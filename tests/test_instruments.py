@@ -141,8 +141,7 @@ def with_units_in_names(sign: str, decimal: str) -> str:
 def with_words() -> str:
     """Return approach and retract, told apart by a column of words."""
     head, *rows = with_units_in_names(",", ".").splitlines()
-    lines = [f"{row},{word}" for word in ("approach", "retract") for row in rows]
-    return "\n".join([f"{head},Branch", *lines]) + "\n"
+    return "\n".join([f"{head},Branch", *(f"{row},{word}" for word in ("approach", "retract") for row in rows)]) + "\n"
 
 
 def without_names(separator: str) -> str:
@@ -187,13 +186,13 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
     curve = read_curve(saved(tmp_path, asylum_ramp()), drive="force")
     for key, value, unit, origin in (
         ("free_frequency_khz", 90.0, "kHz", "note: ThermalFrequency"),
-        ("deflection_nm_per_volt", 110.0, "nm/V", "note: InvOLS"),
         ("free_amplitude_nm", 39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
     ):
         known = curve.known[key]
         assert (known.value, known.unit, known.origin) == (pytest.approx(value, rel=1e-12), unit, origin)
-    others = ("spring_constant_n_per_m", "quality_factor", "drive_frequency_khz", "nm_per_volt")
-    assert [curve.number(key) for key in others] == pytest.approx([5.4, 200.0, 90.0, 120.0], rel=1e-12)
+    lever = ("spring_constant_n_per_m", "quality_factor", "drive_frequency_khz")
+    others = (*lever, "deflection_nm_per_volt", "nm_per_volt")
+    assert [curve.number(key) for key in others] == pytest.approx([5.4, 200.0, 90.0, 110.0, 120.0], rel=1e-12)
     assert (curve.known["drive"].origin, curve.missing) == ("option --drive", ())
     nanonis = read_curve(saved(tmp_path, nanonis_ramp()))
     assert nanonis.number("free_frequency_khz") == 90.0
@@ -377,10 +376,11 @@ def test_bins_of_a_width_asked_for_and_of_equal_heights(tmp_path: Path):
 def test_several_curves_of_one_file_in_metres_and_reversed(tmp_path: Path):
     made = [raw_curve(300, seed=seed) for seed in (1, 2)]
     blocks = [[*(-1e-9 * m.height_nm), *m.deflection_v, *m.amplitude_v, *m.phase_deg] for m in made]
-    side_by_side = np.concatenate(blocks).T, EIGHT.replace("1/2:nm", "1/2:m")
     below = [np.stack([-1e-9 * m.height_nm.ravel(), m.amplitude_v.ravel(), m.phase_deg.ravel()], 1) for m in made]
-    one_below_the_other = np.concatenate(below), "offset_nm=1:m,lockin_amplitude_nm=2:V,phase_lag_deg=3:deg"
-    for rows, columns in (side_by_side, one_below_the_other):
+    for rows, columns in (
+        (np.concatenate(blocks).T, EIGHT.replace("1/2:nm", "1/2:m")),
+        (np.concatenate(below), "offset_nm=1:m,lockin_amplitude_nm=2:V,phase_lag_deg=3:deg"),
+    ):
         np.savetxt(tmp_path / "curve.dat", rows, fmt="%.9g", delimiter=";")
         curves = read_curves(tmp_path / "curve.dat", columns=columns, **LEVER)
         assert [curve.curve for curve in curves] == [1, 2]

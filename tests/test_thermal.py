@@ -17,6 +17,7 @@ from fitting.calibration.model import deviance_root
 from fitting.calibration.result import CalibratedValue, Calibration
 from fitting.calibration.stiffness import BOLTZMANN, Stiffness, air_at, disagreement, hydrodynamic_function
 from fitting.calibration.sweep import DENSITY, ResonanceSweep
+from tests.answers import answer
 from tests.strict_reading import strictly
 
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
@@ -121,11 +122,7 @@ def test_the_sensitivity_is_the_slope_of_the_rows_in_contact(tmp_path):
     assert found.value.value == pytest.approx(1.0 / np.mean(slopes), rel=0.08)
     low, high = found.value.interval95
     assert (low or np.inf) < found.value.value < (high or 0.0)
-    answer = run(FORCES, "--slope", "--json", "--out", tmp_path)
-    assert answer.exit_code == 0, answer.stderr
-    assert strictly(answer.stdout)["deflection_nm_per_volt"]["value"] == found.value.value
-    assert (tmp_path / "calibration.png").exists()
-    assert (tmp_path / "calibration.txt").read_text("utf-8").startswith("deflection_nm_per_volt: ")
+    assert answer(tmp_path, "calibrate", FORCES, "--slope")["deflection_nm_per_volt"]["value"] == found.value.value
     assert run(THERMAL, "--slope").exit_code == 2
     assert "--slope reads the sensitivity" in run(FORCES).stderr
     with pytest.raises(TableError, match="no deflection in V"):
@@ -161,27 +158,27 @@ def test_a_line_of_three_points_hides_no_resonance(quality: float, points: int):
 def test_the_real_spectrum_meets_the_vendors_numbers(tmp_path):
     result = run(THERMAL, "--json", "--length-um", "225 +- 2", "--width-um", "40 +- 1")
     assert result.exit_code == 0, result.stderr
-    answer = strictly(result.stdout)
-    assert answer["valid"] is True
-    assert answer["frequency_khz"]["value"] == pytest.approx(179.8, rel=1e-3)
-    assert answer["quality_factor"]["value"] == pytest.approx(442.0, rel=0.05)
-    stiffness = answer["spring_constant_n_per_m"]
+    told = strictly(result.stdout)
+    assert told["valid"] is True
+    assert told["frequency_khz"]["value"] == pytest.approx(179.8, rel=1e-3)
+    assert told["quality_factor"]["value"] == pytest.approx(442.0, rel=0.05)
+    stiffness = told["spring_constant_n_per_m"]
     assert stiffness["sader"]["value"] == pytest.approx(27.13, rel=0.1)
     # the deflection's own scale says less than half: it was not calibrated, and that is said
     assert stiffness["equipartition"]["value"] == pytest.approx(9.7, rel=0.05)
     assert stiffness["equipartition"]["standard_error"] is None
-    assert "are 1.65 times the true ones" in answer["note"]
-    assert any("Fitted from 178.5" in warning for warning in answer["warnings"])
-    assert {row["quantity"] for row in answer["budget"]} >= {"quality_factor", "spring_constant_n_per_m (Sader)"}
+    assert "are 1.65 times the true ones" in told["note"]
+    assert any("Fitted from 178.5" in warning for warning in told["warnings"])
+    assert {row["quantity"] for row in told["budget"]} >= {"quality_factor", "spring_constant_n_per_m (Sader)"}
     # without the lever's size the instrument's own k tells as much, and no spring constant is left
     alone = run(THERMAL, "--json", "--out", tmp_path)
     assert alone.exit_code == 3
     assert "The spring constant is not calibrated." in alone.stderr
     assert "#spring_constant" not in (tmp_path / "calibration.txt").read_text("utf-8").replace(" ", "")
-    answer = strictly(alone.stdout)
-    lone = answer["spring_constant_n_per_m"]["equipartition"]
-    assert (answer["valid"], lone["standard_error"], lone["interval95"]) == (False, None, [None, None])
-    assert answer["quality_factor"]["standard_error"] > 0.0
+    told = strictly(alone.stdout)
+    lone = told["spring_constant_n_per_m"]["equipartition"]
+    assert (told["valid"], lone["standard_error"], lone["interval95"]) == (False, None, [None, None])
+    assert told["quality_factor"]["standard_error"] > 0.0
     half = run(THERMAL, "--length-um", "225")
     assert half.exit_code == 2
     assert "needs both --length-um and --width-um" in half.stderr
