@@ -47,13 +47,11 @@ def test_the_reference_is_that_of_an_independent_integration(followed):
     starts, found, *_ = followed
     for tip in (0, 5):
         for row, contact in enumerate(follow(SYSTEM, *[float(part[tip]) for part in starts], contacts=2).contacts):
-            arrival, rebound = (
-                found.contacts.arrival_time_us[tip, row],
-                found.contacts.rebound_speed_nm_per_us[tip, row],
-            )
+            names = ("arrival_time_us", "rebound_speed_nm_per_us")
+            arrival, rebound = (float(getattr(found.contacts, name)[tip, row]) for name in names)
             # two contacts multiply rounding and step errors by less than a thousand
-            assert float(arrival) == pytest.approx(contact.arrival_time_us, abs=1e-8)
-            assert float(rebound) == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-8)
+            assert arrival == pytest.approx(contact.arrival_time_us, abs=1e-8)
+            assert rebound == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-8)
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from fitting.calibration.model import deviance_root
 from fitting.calibration.result import CalibratedValue, Calibration
 from fitting.calibration.stiffness import BOLTZMANN, Stiffness, air_at, disagreement, hydrodynamic_function
 from fitting.calibration.sweep import DENSITY, ResonanceSweep
-from tests.answers import answer
 from tests.strict_reading import strictly
 
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
@@ -122,7 +121,10 @@ def test_the_sensitivity_is_the_slope_of_the_rows_in_contact(tmp_path):
     assert found.value.value == pytest.approx(1.0 / np.mean(slopes), rel=0.08)
     low, high = found.value.interval95
     assert (low or np.inf) < found.value.value < (high or 0.0)
-    assert answer(tmp_path, "calibrate", FORCES, "--slope")["deflection_nm_per_volt"]["value"] == found.value.value
+    told = run(FORCES, "--slope", "--json", "--out", tmp_path)
+    assert told.exit_code == 0, told.stderr
+    assert strictly(told.stdout)["deflection_nm_per_volt"]["value"] == found.value.value
+    assert (tmp_path / "calibration.png").exists()
     assert run(THERMAL, "--slope").exit_code == 2
     assert "--slope reads the sensitivity" in run(FORCES).stderr
     with pytest.raises(TableError, match="no deflection in V"):
