@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,7 +141,7 @@ def profile_end(residual, best, index: int, step: float) -> float:
 @pytest.mark.parametrize(("phase", "given"), [(True, True), (False, False)])
 def test_intervals_cover_the_truth(phase, given):
     count, pulls, inside = 60 if phase else 40, [], 0
-    noisy = {"noise": 0.02, "background": 0.05 + 0.02j, "phase": phase, "given": given, "points": 60}
+    noisy: dict[str, Any] = {"noise": 0.02, "background": 0.05 + 0.02j, "phase": phase, "given": given, "points": 60}
     for seed in range(count):
         result = calibrate(synthetic_sweep(**noisy, seed=seed, half_widths=4.0), compare=False)
         for value, truth in ((result.frequency_khz, FREQUENCY_KHZ), (result.quality_factor, QUALITY_FACTOR)):

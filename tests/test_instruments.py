@@ -217,13 +217,17 @@ def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
 
 def test_wrong_column_maps_are_named(tmp_path: Path):
     path = saved(tmp_path, raw_curve(50).text)
-    for columns, said in (
-        ("offset_nm=1/2:nm,lockin_amplitude_nm=5:V", "=5 has one channel where other columns have OUT/BACK"),
-        ("offset_nm=1/9:nm", "there is no channel `9`; it has 1, 2"),
-        ("", re.escape("say --columns offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V")),
-    ):
+    cases: Any = (
+        (
+            {"columns": "offset_nm=1/2:nm,lockin_amplitude_nm=5:V"},
+            "=5 has one channel where other columns have OUT/BACK",
+        ),
+        ({"columns": "offset_nm=1/9:nm"}, "there is no channel `9`; it has 1, 2"),
+        ({}, re.escape("say --columns offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V")),
+    )
+    for options, said in cases:
         with pytest.raises(TableError, match=said):
-            read_curves(path, **({"columns": columns} if columns else {}))
+            read_curves(path, **options)
 
 
 # ---- what the numbers say themselves
