@@ -107,30 +107,21 @@ def two_ways(stated: Stated, rng: np.random.Generator, rows: int = 50) -> TwoWay
 
 def points_of(tip: Tip, result: Tapping, truths: dict[tuple[bool, bool], Truth], stated: Stated) -> Points:
     """Return how far the energies and virials of a result are from the truth of its branches, point by point."""
-    free = tip.free_reading[0]
-    columns: list[list[np.ndarray]] = [[] for _ in Points._fields]
+    free, parts = tip.free_reading[0], []
     for branch in result.branches:
         curve, truth = branch.curve, truths[branch.retract, branch.repulsive]
         energy, virial = (truth.at(f"{name}_aj", curve.amplitude_ratio, free) for name in ("energy", "virial"))
-        implied = truth._replace(energy_aj=error_implied(tip, truth, stated)).at(
-            "energy_aj", curve.amplitude_ratio, free
-        )
-        found = (energy, curve.energy_aj - energy, curve.energy_error_aj, implied)
-        for column, part in zip(columns, (*found, (curve.virial_aj - virial) / curve.virial_error_aj), strict=True):
-            column.append(part)
-    return Points(*map(np.concatenate, columns))
+        errors = truth._replace(energy_aj=error_implied(tip, truth, stated))
+        implied, off = errors.at("energy_aj", curve.amplitude_ratio, free), curve.energy_aj - energy
+        parts.append((energy, off, curve.energy_error_aj, implied, (curve.virial_aj - virial) / curve.virial_error_aj))
+    return Points(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def hysteresis_off(result: Tapping, heights_nm: tuple[float, float]) -> np.ndarray:
     """Return how far the heights at which the branch changes are off, out and back, in their errors."""
     (change,) = (one for one in result.hysteresis if one.change == "branch")
-    ends = (change.approach, change.retract)
-    return np.array(
-        [
-            np.inf if end is None else (end.offset_nm - true) / end.standard_error
-            for end, true in zip(ends, heights_nm, strict=True)
-        ]
-    )
+    ends = zip((change.approach, change.retract), heights_nm, strict=True)
+    return np.array([np.inf if end is None else (end.offset_nm - true) / end.standard_error for end, true in ends])
 
 
 def random_curve(number: int, stated: Stated) -> Simulated:
@@ -183,11 +174,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
     parser.add_argument("--curves", type=int, default=200, help="curves of each set")
     numbers = range(parser.parse_args().curves)
-    sets = (
-        ("f0 to 1e-05", Stated(), np.inf),
-        ("f0 to 1e-04", Stated(frequency=1e-4), np.inf),
-        ("exact instrument", EXACT, LARGEST_EXACT),
-    )
+    sets = [(f"f0 to {error:g}", Stated(frequency=error), np.inf) for error in (1e-5, 1e-4)]
+    sets.append(("exact instrument", EXACT, LARGEST_EXACT))
     return sum(not judge(name, [random_curve(n, stated) for n in numbers], most) for name, stated, most in sets)
 
 

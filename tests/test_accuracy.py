@@ -11,17 +11,12 @@ from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
 from tests.answers import answer
 
 
-@pytest.fixture(scope="module")
-def study() -> dict:
-    return map_accuracy(
-        root_tolerances_us=[1e-2, 1e-6, 1e-13], scipy_tolerances=[1e-9], batch=20, impacts=5, lanes=2, repetitions=1
-    )
-
-
 @pytest.mark.slow
-def test_achieved_errors_are_what_tolerances_and_rounding_allow(study: dict):
+def test_achieved_errors_are_what_tolerances_and_rounding_allow():
+    few = {"batch": 20, "impacts": 5, "lanes": 2, "repetitions": 1}
+    study = map_accuracy(root_tolerances_us=[1e-2, 1e-13], scipy_tolerances=[1e-9], **few)
     assert {row["scene"] for row in study["rows"]} == {"regular", "grazing", "order 5"}
-    assert len(study["rows"]) == 3 * (2 * 3 + 1)
+    assert len(study["rows"]) == 3 * (2 * 2 + 1)
     assert study["reference_error_us"] < 1e-40  # fifty digits
     for row in study["rows"]:
         assert set(row) <= set(MAP.columns)
@@ -33,9 +28,8 @@ def test_achieved_errors_are_what_tolerances_and_rounding_allow(study: dict):
             # a coarse tolerance is made use of, in the first scene at least
             assert error > 1e-4 or tolerance < 1e-2 or row["scene"] != "regular", row
         elif row["method"] == "SciPy DOP853":
-            assert row["missed_impacts"] == 0
             # 1e-9 relative of 10 nm/us, divided by slow approaches
-            assert error < 1e-6
+            assert (row["missed_impacts"], error < 1e-6) == (0, True)
         elif tolerance == 1e-13:
             # float32: times of 1 to 30 us have a rounding of 1e-7 to 4e-6; slow impacts multiply it
             assert 1e-8 < error < 1e-3, row
@@ -58,17 +52,15 @@ def test_cheapest_is_the_fastest_that_is_good_enough():
 @pytest.mark.slow
 def test_every_integrator_comes_to_the_same_impacts_and_orbit():
     """All solve one problem: at a tight tolerance each is right, by 50 digits, which are none of them."""
-    rivals = {"SciPy DOP853", "SciPy LSODA", "SUNDIALS CVODE Adams", "Diffrax Dopri8 with Event"}
-    few = {"tolerances": [1e-9], "integrators": ["DOP853", "LSODA", "CVODE Adams"], "batch": 10, "repetitions": 1}
+    rivals = {"SciPy DOP853", "SUNDIALS CVODE Adams", "Diffrax Dopri8 with Event"}
+    few = {"tolerances": [1e-9], "integrators": ["DOP853", "CVODE Adams"], "batch": 4, "repetitions": 1}
     found = impacts(root_tolerances_us=[1e-13], impacts=3, **few)
-    assert {row["method"] for row in found["rows"] if not row["own"]} == rivals
-    for row in found["rows"]:
-        limit = 1e-13 if row["method"] == "next_impact float64" else 1e-3 if "float32" in row["method"] else 1e-6
-        assert row["error"] < limit, row
     closed = orbits(**few)
+    assert {row["method"] for row in found["rows"] if not row["own"]} == rivals
     assert {row["method"] for row in closed["rows"] if not row["own"]} == {f"{one}, shooting" for one in rivals}
-    for row in closed["rows"]:
-        assert row["error"] < (1e-13 if row["own"] else 1e-6), row
+    for row in (*found["rows"], *closed["rows"]):
+        limit = 1e-3 if "float32" in row["method"] else 1e-13 if row["own"] else 1e-6
+        assert row["error"] < limit, row
 
 
 def test_the_cheapest_way_to_an_error_here_and_elsewhere():

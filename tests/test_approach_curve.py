@@ -1,36 +1,19 @@
 """Approach curves: the free tip, the law's own loss, orbits in closed form, SciPy, and the way to `tapping`."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
 import afm_jax as afm
 import fitting
-from afm_jax.cli.main import main
 from afm_jax.motion.approach_curve import CurveOutcome
 from tests.answers import answer
 
 KHZ, QUALITY, MASS_NG, FREE_NM, RATIO, R, EPSILON = 90.0, 200.0, 16.9, 80.0, 1.03, 0.98, 0.4
 LAW = afm.ImpactLaw(R, EPSILON)
-FILE = f"""\
-[cantilever]
-frequency_khz = {KHZ}
-quality_factor = {QUALITY}
-mass_ng = {MASS_NG}
-[platform]
-amplitude_nm = 0
-reduced_frequency = {RATIO / 2}
-[force]
-free_amplitude_nm = {FREE_NM}
-reduced_frequency = {RATIO / 2}
-[interaction]
-model = "law"
-r = {R}
-epsilon = {EPSILON}
-"""
 OMEGA, DRIVE = 2e-3 * np.pi * KHZ, 2e-3 * np.pi * KHZ * RATIO
 
 
@@ -45,11 +28,6 @@ def driven(kind: str, quality: float = QUALITY) -> afm.Scene:
     force = afm.ForceDrive(size * MASS_NG * OMEGA**2, KHZ * RATIO) if kind == "force" else None
     base = afm.BaseDrive(size, KHZ * RATIO) if kind == "base" else None
     return afm.Scene(cantilever, afm.Platform(0.0, KHZ * RATIO), LAW, base=base, force=force)
-
-
-@pytest.fixture(scope="module")
-def curve() -> afm.ApproachCurve:
-    return afm.approach_curve(driven("force"), np.linspace(-88.0, -8.0, 11))
 
 
 @pytest.mark.slow
@@ -67,31 +45,54 @@ def test_a_free_tip_has_the_amplitude_and_the_lag_of_a_driven_oscillator(kind: s
     np.testing.assert_allclose(found.dissipated_in_contact_aj, 0.0, atol=1e-12)
 
 
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """Return what the command says of a curve out and back, and its folder."""
+    folder = tmp_path_factory.mktemp("curve")
+    afm.save_scene(driven("force"), folder / "scene.toml")
+    heights = ("--heights", "-88:-8:11", "--noise", "0.1%", "--phase-noise-deg", "0.1")
+    return answer(folder / "out", "simulate", folder / "scene.toml", *heights), folder / "out"
+
+
 @pytest.mark.slow
-def test_points_are_the_stable_orbits_of_their_heights_and_lose_what_the_law_says(curve: afm.ApproachCurve):
-    scene = driven("force")
-    taps = np.flatnonzero(curve.outcome == CurveOutcome.TAPS)
-    assert taps.size > 15
+def test_points_are_the_stable_orbits_of_their_heights_and_lose_what_the_law_says(told):
+    scene, (curve, _) = driven("force"), told
+    taps = [point for point, outcome in enumerate(curve["outcome"]) if outcome == "taps"]
+    assert len(taps) > 15
     for point in taps[::4]:
-        platform = afm.Platform(0.0, KHZ * RATIO, curve.height_nm[point])
-        here = afm.Scene(scene.cantilever, platform, scene.interaction, force=scene.force)
-        orbits = afm.single_impact_orbits(here, 1)
+        height, amplitude, lag, energy = (
+            curve[name][point] for name in ("height_nm", "amplitude_nm", "phase_lag_deg", "dissipated_in_contact_aj")
+        )
+        platform = afm.Platform(0.0, KHZ * RATIO, height)
+        orbits = afm.single_impact_orbits(afm.Scene(scene.cantilever, platform, LAW, force=scene.force), 1)
         those = np.asarray(orbits.stable & orbits.admissible)
         # N = 1: the response's frequency is the drive's
-        amplitudes = np.asarray(orbits.lockin_amplitude_nm)[those]
-        nearest = int(np.argmin(np.abs(amplitudes - curve.amplitude_nm[point])))
-        np.testing.assert_allclose(amplitudes[nearest], curve.amplitude_nm[point], rtol=1e-5)
-        assert orbits.phase_lag_deg is not None
-        lag = np.asarray(orbits.phase_lag_deg)[those][nearest]
-        np.testing.assert_allclose(lag, curve.phase_lag_deg[point], atol=1e-3)
-        speed = float(np.asarray(orbits.approach_speed_nm_per_us)[those][nearest])
-        lost = 0.5 * MASS_NG * ((1.0 - R**2) * speed**2 + EPSILON)
-        np.testing.assert_allclose(curve.dissipated_in_contact_aj[point], lost, rtol=1e-4)
+        found = (orbits.lockin_amplitude_nm, orbits.phase_lag_deg, orbits.approach_speed_nm_per_us)
+        amplitudes, lags, speeds = (np.asarray(column)[those] for column in found)
+        nearest = int(np.argmin(np.abs(amplitudes - amplitude)))
+        np.testing.assert_allclose(amplitudes[nearest], amplitude, rtol=1e-5)
+        np.testing.assert_allclose(lags[nearest], lag, atol=1e-3)
+        lost = 0.5 * MASS_NG * ((1.0 - R**2) * speeds[nearest] ** 2 + EPSILON)
+        np.testing.assert_allclose(energy, lost, rtol=1e-4)
 
     # the way back keeps to the branch of the taps
-    highest = curve.height_nm == -88.0
-    assert [CurveOutcome(one) for one in curve.outcome[highest]] == [CurveOutcome.FREE, CurveOutcome.TAPS]
-    assert curve.amplitude_nm[highest][1] > curve.free_amplitude_nm + 3.0
+    out, back = (point for point, height in enumerate(curve["height_nm"]) if height == -88.0)
+    assert (curve["outcome"][out], curve["outcome"][back]) == ("free", "taps")
+    assert curve["amplitude_nm"][back] > curve["free_amplitude_nm"] + 3.0
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_tapping_reads(told):
+    curve, out = told
+    assert sorted(path.name for path in out.iterdir()) == ["curve.csv", "curve.json", "curve.png", "curve_points.csv"]
+    assert (curve["drive"], curve["free_amplitude_nm"]) == ("force", pytest.approx(FREE_NM, rel=1e-9))
+    assert len(curve["height_nm"]) == 21
+    table = fitting.read_table(out / "curve.csv")
+    lost = np.array([name not in ("taps", "free") for name in curve["outcome"]])
+    np.testing.assert_array_equal(np.asarray(table.no_orbit) == 1.0, lost)
+    found = fitting.tapping(table, law=False).rows
+    taken = np.array(curve["dissipated_in_contact_aj"], dtype=float)[~lost]
+    assert np.max(np.abs(found.energy_aj - taken) / found.energy_noise_aj) < 4.0
 
 
 @pytest.mark.slow
@@ -125,45 +126,13 @@ def test_a_point_agrees_with_scipy():
     np.testing.assert_allclose(found.phase_lag_deg[2], -np.degrees(np.angle(lockin)) % 360.0, atol=1e-3)
 
 
-@pytest.mark.slow
-def test_the_command_writes_what_tapping_reads(tmp_path: Path):
-    (tmp_path / "scene.toml").write_text(FILE)
-    out, noise = tmp_path / "out", ("--noise", "0.1%", "--phase-noise-deg", "0.1")
-    told = answer(out, "simulate", tmp_path / "scene.toml", "--heights", "-88:-8:11", *noise)
-    assert sorted(path.name for path in out.iterdir()) == ["curve.csv", "curve.json", "curve.png", "curve_points.csv"]
-    assert told["drive"] == "force"
-    assert told["free_amplitude_nm"] == pytest.approx(FREE_NM, rel=1e-9)
-    assert len(told["height_nm"]) == 21
-    table = fitting.read_table(out / "curve.csv")
-    assert table.no_orbit is not None
-    lost = [name not in ("taps", "free") for name in told["outcome"]]
-    assert (table.no_orbit == 1.0).tolist() == lost
-    found = fitting.tapping(table, law=False).rows
-    taken = np.array([energy for energy, none in zip(told["dissipated_in_contact_aj"], lost, strict=True) if not none])
-    assert np.max(np.abs(found.energy_aj - taken) / found.energy_noise_aj) < 4.0
-
-
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        (("--heights", "-88:-8"), "must be from:to:count"),
-        (("--heights", "-8:-8:3"), "must be from:to:count"),
-        (("--heights", "-88:-8:5", "--duration-us", "100"), "leave out --duration-us"),
-        (("--noise", "1%"), "--noise is that of an approach curve"),
-    ],
-)
-def test_a_wrong_call_says_how_to_mend_it(more: tuple[str, ...], said: str):
-    result = CliRunner().invoke(main, ["simulate", "figure8", *more], prog_name="afm-jax")
-    assert result.exit_code == 2
-    assert said in result.stderr
-
-
 def test_scenes_that_have_no_approach_curve_are_refused():
     force = driven("force")
-    sample, moving = afm.Platform(4.0, 180.0), afm.Platform(1.0, KHZ * RATIO)
+    undriven = afm.Scene(force.cantilever, afm.Platform(4.0, 180.0), LAW)
+    moving = afm.Scene(force.cantilever, afm.Platform(1.0, KHZ * RATIO), LAW, force=force.force)
     for scene, heights, said in (
-        (afm.Scene(force.cantilever, sample, force.interaction), [-5.0], r"give the scene a \[force\] or a \[base\]"),
-        (afm.Scene(force.cantilever, moving, force.interaction, force=force.force), [-5.0], "`platform.amplitude_nm`"),
+        (undriven, [-5.0], r"give the scene a \[force\] or a \[base\]"),
+        (moving, [-5.0], "`platform.amplitude_nm`"),
         (force, [], "at least one"),
     ):
         with pytest.raises(ValueError, match=said):

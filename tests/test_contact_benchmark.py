@@ -6,7 +6,7 @@ import pytest
 from afm_jax.accuracy.collisions import cheapest_collision
 from afm_jax.bench import collisions
 from afm_jax.bench import timing as own_process
-from afm_jax.bench.collisions import REFERENCE, aims, errors_against, speeds_of
+from afm_jax.bench.collisions import REFERENCE, errors_against, speeds_of
 from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
@@ -69,13 +69,6 @@ def test_the_cheapest_contestant_meets_both_errors():
     assert [len(axes.lines) for axes in collide_accuracy_figure(rows).axes] == [4, 4, 4]
 
 
-def test_aims_name_what_was_reached():
-    rows = [{"what": "diffrax, accuracy 1e-06", "microseconds_per_impact": 1.25, "rebound_error": 1e-7}]
-    reached = {name: (value, bound) for name, value, bound in aims(rows)}
-    assert reached["contact, us an impact at 1e-6"] == (1.25, 1.5)
-    assert reached["contact, us an impact at 1e-9"] == (None, 3.0)
-
-
 def run_quickly(monkeypatch, folder, *arguments):
     """Return what a command prints as JSON, its measurement made in this process."""
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
@@ -90,11 +83,9 @@ def test_accuracy_command_shows_errors_and_the_cheapest(monkeypatch, tmp_path):
     for row in payload["rows"]:
         accuracy = row.get("accuracy", 1e-4)
         assert row["rebound_error"] <= accuracy
-        assert row["delay_error_us"] <= 10.0 * accuracy
-        assert row["slope_error"] is None or row["slope_error"] <= 10.0 * accuracy
+        assert max(row["delay_error_us"], row["slope_error"] or 0.0) <= 10.0 * accuracy
     assert payload["cheapest"]["method"].startswith("collide")
     assert len(table(tmp_path / "accuracy.csv")) == len(payload["rows"])
-    assert (tmp_path / "accuracy.png").exists()
 
 
 @pytest.mark.slow

@@ -40,16 +40,13 @@ def plain(table) -> FitResult:
 
 def test_a_wrong_calibration_of_the_tip_is_found(table):
     amplitude, error = amplitudes_and_errors(table)
-    known = {"tip_calibration": (1.0, 0.05)}
-    off = table_with(table, 1.04 * amplitude, 1.04 * error, calibration=known)
-    blind = fit(dataclasses.replace(off, calibration={}), model="law")
-    assert not blind.valid
+    off = table_with(table, 1.04 * amplitude, 1.04 * error, calibration={"tip_calibration": (1.0, 0.05)})
+    assert not fit(dataclasses.replace(off, calibration={}), model="law").valid
     result = fit(off, model="law")
     assert result.valid
     assert list(result.parameters) == ["r", "epsilon", "quality_factor", "tip_calibration"]
     for name, truth in {"r": 0.95, "epsilon": 60.0, "tip_calibration": 1.04}.items():
         assert holds(result.parameters[name], truth), name
-    assert result.parameters["tip_calibration"].constraint == (1.0, 0.05)
     calibration, quality = (result.parameters[name].value for name in ("tip_calibration", "quality_factor"))
     pulls = ((calibration - 1.0) / 0.05) ** 2 + ((quality - 40.0) / 0.4) ** 2
     assert result.chi2 == pytest.approx(np.nansum(result.rows.residual**2) + pulls, rel=1e-12)
@@ -58,16 +55,14 @@ def test_a_wrong_calibration_of_the_tip_is_found(table):
 
 def test_a_wrong_calibration_of_drive_and_offsets_is_found(table):
     """The stated drive is 5 % less than the true one, the stated offsets lack 0.3 nm."""
-    stated = dataclasses.replace(
-        table, drive_amplitude_nm=table.drive_amplitude_nm / 1.05, offset_nm=table.offset_nm - 0.3
-    )
+    drive, offset = table.drive_amplitude_nm / 1.05, table.offset_nm - 0.3
+    stated = dataclasses.replace(table, drive_amplitude_nm=drive, offset_nm=offset)
     result = fit(stated, model="law", constraints={"drive_calibration": (1.0, 0.1), "offset_origin_nm": (0.0, 1.0)})
     assert result.valid
     truth = {"r": 0.95, "epsilon": 60.0, "drive_calibration": 1.05, "offset_origin_nm": 0.3}
     for name, value in truth.items():
         # three errors, of four parameters
         assert abs(result.parameters[name].value - value) < 3.0 * (result.parameters[name].standard_error or 0.0)
-    assert result.settings["constraints"]["drive_calibration"] == (1.0, 0.1)
 
 
 SAME = "offset_origin_nm and delay_offset_nm shift the same thing"
@@ -76,7 +71,6 @@ SAME = "offset_origin_nm and delay_offset_nm shift the same thing"
 @pytest.mark.parametrize(
     ("model", "changes", "constraints", "said"),
     [
-        ("law", {}, {"tip_calibration": (1.0, 0.0)}, "must be a value and a positive error"),
         ("law", {}, {"tip_calibration": (float("nan"), 0.1)}, "must be a value and a positive error"),
         ("law", {}, {"viscous_loss": (1.0, 0.1)}, "is on no parameter: choose from r, epsilon, quality_factor"),
         ("law+delay", {}, {"offset_origin_nm": (0.0, 0.3)}, SAME),
@@ -113,34 +107,20 @@ def test_an_orbit_that_was_not_seen_counts_three_errors(table, plain):
     assert np.all(np.abs(values_of(result) - values_of(plain)) < 1e-3 * standard_errors_of(plain))
 
 
-@pytest.fixture(scope="module")
-def spoilt(table) -> AmplitudeTable:
-    """Return the table with three amplitudes that are far off."""
+def test_outliers_hardly_move_a_robust_fit_and_are_named(table, plain):
+    # three amplitudes that are far off
     amplitude, error = amplitudes_and_errors(table)
     amplitude[[5, 30, 60], [0, 1, 0]] *= [1.3, 0.75, 1.5]
-    return table_with(table, amplitude, error)
-
-
-@pytest.fixture(scope="module")
-def robust(spoilt) -> FitResult:
-    return fit(spoilt, model="law", robust=True)
-
-
-def test_outliers_hardly_move_a_robust_fit_and_are_named(spoilt, plain, robust):
-    pulled = fit(spoilt, model="law")
+    spoilt = table_with(table, amplitude, error)
+    pulled, robust = fit(spoilt, model="law"), fit(spoilt, model="law", robust=True)
     shift = np.abs(values_of(robust) - values_of(plain)) / standard_errors_of(plain)
     assert shift.max() < 1.0
     assert shift.max() < np.abs(values_of(pulled) - values_of(plain)).max()
-    assert not pulled.valid
-    assert robust.valid
-    assert np.isnan(robust.p_value)
+    assert (pulled.valid, robust.valid, np.isnan(robust.p_value)) == (False, True, True)
     (said,) = [warning for warning in robust.warnings if "Robust loss" in warning]
     named = ", ".join(str(int(spoilt.lines[row])) for row in (5, 30, 60))
     assert f"outliers: lines {named}" in said
-    assert robust.settings["robust"] is not None
-
-
-def test_robust_residuals_are_reported_as_they_are(spoilt, robust):
+    # residuals are reported as they are
     amplitude, error = amplitudes_and_errors(spoilt)
     residual = (robust.rows.predicted_nm - amplitude) / error
     np.testing.assert_allclose(robust.rows.residual, residual, rtol=1e-12)

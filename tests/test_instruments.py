@@ -15,7 +15,6 @@ import fitting.instruments.formats as formats_module
 from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
 from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIONS, raw_curve, true_energy_aj
-from fitting.instruments.columns import parse_columns
 from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
@@ -59,12 +58,11 @@ def test_neasnom_text_is_read_completely():
     columns = np.loadtxt(NEASNOM, skiprows=head + 1, usecols=range(len(names) - 1), unpack=True)
     wanted = dict(zip(names, columns, strict=False))
     curve = read_curve(NEASNOM)
-    assert len(curve.offset_nm) == 200
     np.testing.assert_allclose(given(curve.amplitude), wanted["M1A"], rtol=1e-15)
     np.testing.assert_allclose(given(curve.phase_lag_deg), np.rad2deg(np.unwrap(wanted["M1P"])), rtol=1e-12)
     # heights grow towards the tip, from an origin of their own
     np.testing.assert_allclose(np.diff(curve.offset_nm), -1e9 * np.diff(wanted["Z"]), atol=1e-10)
-    assert set(curve.branch) == {"retract"}
+    assert (len(curve.offset_nm), set(curve.branch)) == (200, {"retract"})
     frequency = curve.known["drive_frequency_khz"]
     assert (frequency.value, frequency.origin) == (264.13261, "header: Tip Frequency:")
     assert {"free_frequency_khz", "quality_factor", "spring_constant_n_per_m"} == set(curve.missing)
@@ -72,8 +70,7 @@ def test_neasnom_text_is_read_completely():
     assert curve.slope == (pytest.approx(-1.37, abs=0.02), pytest.approx(0.018, abs=0.01))
     assert any("falls by 1.37" in note for note in curve.notes)
     assert curve.number("free_amplitude_nm") == pytest.approx(77.26, abs=0.02)
-    rescaled = read_curve(NEASNOM, nm_per_volt="slope")
-    assert rescaled.number("free_amplitude_nm") == pytest.approx(56.4, abs=0.3)
+    assert read_curve(NEASNOM, nm_per_volt="slope").number("free_amplitude_nm") == pytest.approx(56.4, abs=0.3)
 
 
 def test_wsxm_curves_are_read_completely():
@@ -144,8 +141,7 @@ def with_units_in_names(sign: str, decimal: str) -> str:
 def with_words() -> str:
     """Return approach and retract, told apart by a column of words."""
     head, *rows = with_units_in_names(",", ".").splitlines()
-    lines = [f"{row},{word}" for word in ("approach", "retract") for row in rows]
-    return "\n".join([f"{head},Branch", *lines]) + "\n"
+    return "\n".join([f"{head},Branch", *(f"{row},{word}" for word in ("approach", "retract") for row in rows)]) + "\n"
 
 
 def without_names(separator: str) -> str:
@@ -167,16 +163,11 @@ NUMBERS = {"columns": "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:d
         (partial(asylum_ramp, order=">"), RAMP, {"rtol": 2e-7}, 0.01),
         (gwyddion_bytes, GRAPH, {"rtol": 1e-12}, 0.01),
         (nanonis_ramp, {}, {"rtol": 1e-9}, 1e-6),
-        (partial(with_units_in_names, ",", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         (partial(with_units_in_names, "\t", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         (partial(with_units_in_names, ";", ","), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
-        (partial(with_units_in_names, ";", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         (with_words, {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         # decimal commas are told from commas that separate
-        *(
-            (partial(without_names, sign), NUMBERS, {"rtol": 0.0, "atol": 1e-4}, 1e-4)
-            for sign in ("\t", ";", " ", ", ")
-        ),
+        *((partial(without_names, sign), NUMBERS, {"rtol": 0.0, "atol": 1e-4}, 1e-4) for sign in (" ", ", ")),
     ],
 )
 def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict, precision: dict, degrees: float):
@@ -194,18 +185,15 @@ def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict,
 def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
     curve = read_curve(saved(tmp_path, asylum_ramp()), drive="force")
     for key, value, unit, origin in (
-        ("spring_constant_n_per_m", 5.4, "N/m", "note: SpringConstant"),
         ("free_frequency_khz", 90.0, "kHz", "note: ThermalFrequency"),
-        ("quality_factor", 200.0, "", "note: ThermalQ"),
-        ("drive_frequency_khz", 90.0, "kHz", "note: DriveFrequency"),
-        ("deflection_nm_per_volt", 110.0, "nm/V", "note: InvOLS"),
-        ("nm_per_volt", 120.0, "nm/V", "note: AmpInvOLS"),
         ("free_amplitude_nm", 39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
     ):
         known = curve.known[key]
         assert (known.value, known.unit, known.origin) == (pytest.approx(value, rel=1e-12), unit, origin)
-    assert curve.known["drive"].origin == "option --drive"
-    assert curve.missing == ()
+    lever = ("spring_constant_n_per_m", "quality_factor", "drive_frequency_khz")
+    others = (*lever, "deflection_nm_per_volt", "nm_per_volt")
+    assert [curve.number(key) for key in others] == pytest.approx([5.4, 200.0, 90.0, 110.0, 120.0], rel=1e-12)
+    assert (curve.known["drive"].origin, curve.missing) == ("option --drive", ())
     nanonis = read_curve(saved(tmp_path, nanonis_ramp()))
     assert nanonis.number("free_frequency_khz") == 90.0
     assert any("grows away from the sample" in note for note in nanonis.notes)
@@ -213,41 +201,27 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
 
 def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     offset, amplitude, lag = tapping_rows()
-    columns = {"a": -1e-3 * offset, "b": 0.01 * amplitude, "c": -lag}
-    path = saved(tmp_path, separated(columns, ";"))
+    path = saved(tmp_path, separated({"a": -1e-3 * offset, "b": 0.01 * amplitude, "c": -lag}, ";"))
     with pytest.raises(TableError, match="no height among the channels a, b, c; say --columns offset_nm=CHANNEL:UNIT"):
         read_curve(path)
     wanted = "offset_nm=a:um:-1,lockin_amplitude_nm=b:V,phase_lag_deg=c:-1"
     curve = read_curve(path, columns=wanted)
     assert (curve.amplitude_unit, "nm_per_volt" in curve.missing) == ("V", True)
-    curve = read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0))
+    lever: dict[str, Any] = {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0}
+    curve = read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0), **lever)
     # six decimals of hundredths
     np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
     np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-5)
-    lever: dict[str, Any] = {"drive_frequency_khz": 90.0, "free_frequency_khz": 90.0}
-    text = table_text(read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0), **lever))
-    assert "# tip_calibration = 1 +- 0.02\n" in text
-
-
-def test_names_of_channels_can_be_printed(tmp_path: Path):
-    path = tmp_path / "curve.csv"
-    path.write_text("offset_nm,lockin_amplit\x1dude_nm,phase_lag_deg\n" + "1,2,3\n" * 9, encoding="utf-8")
-    assert read_recording(path).channels == ["offset_nm", r"'lockin_amplit\x1dude_nm'", "phase_lag_deg"]
+    assert "# tip_calibration = 1 +- 0.02\n" in table_text(curve)
 
 
 def test_wrong_column_maps_are_named(tmp_path: Path):
-    for text, said in (
-        ("height=Z", "there is no column `height`; it is one of offset_nm, lockin_amplitude_nm"),
-        ("offset_nm=Z:V", "`V` is no unit of offset_nm; write one of m, mm, um, nm, pm"),
-        ("offset_nm=Z:0", "is no COLUMN=CHANNEL"),
-        ("offset_nm=Z:2:3", "is no COLUMN=CHANNEL"),
-    ):
-        with pytest.raises(ValueError, match=said):
-            parse_columns(text)
     path = saved(tmp_path, raw_curve(50).text)
-    one_and_two = "offset_nm=1/2:nm,lockin_amplitude_nm=5:V"
     cases: Any = (
-        ({"columns": one_and_two}, "=5 has one channel where other columns have OUT/BACK"),
+        (
+            {"columns": "offset_nm=1/2:nm,lockin_amplitude_nm=5:V"},
+            "=5 has one channel where other columns have OUT/BACK",
+        ),
         ({"columns": "offset_nm=1/9:nm"}, "there is no channel `9`; it has 1, 2"),
         ({}, re.escape("say --columns offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V")),
     )
@@ -260,16 +234,14 @@ def test_wrong_column_maps_are_named(tmp_path: Path):
 
 
 def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
-    path = tmp_path / "curve.csv"
-    path.write_text("Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n")
-    curve = read_curve(path)
+    curve = read_curve(saved(tmp_path, "Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n"))
     asked = "if one of the channels A, P is: --columns lockin_amplitude_nm=CHANNEL:UNIT"
     assert any(asked in note for note in curve.notes)
     with pytest.raises(TableError, match=re.escape(asked)):
         table_text(curve)
-    path.write_text(path.read_text().replace("A", "Amplitude"))
-    curve = read_curve(path)
-    assert any("if one of the channels P is: --columns phase_lag_deg=CHANNEL:UNIT" in note for note in curve.notes)
+    # names that cannot be printed are quoted
+    strange = saved(tmp_path, "offset_nm,lockin_amplit\x1dude_nm,phase_lag_deg\n" + "1,2,3\n" * 9)
+    assert read_recording(strange).channels == ["offset_nm", r"'lockin_amplit\x1dude_nm'", "phase_lag_deg"]
 
 
 OFFSET, AMPLITUDE, LAG = tapping_rows()
@@ -286,6 +258,11 @@ def curve_of(tmp_path: Path) -> Callable[..., MeasuredCurve]:
         return read_curve(saved(tmp_path, separated(columns)), **options)
 
     return read
+
+
+def test_a_ramp_there_and_back_is_parted_where_it_turns(curve_of):
+    columns = (np.concatenate(both) for both in zip(tapping_rows(), tapping_rows(80, retract=True), strict=True))
+    assert curve_of(*columns).branch.tolist() == ["approach"] * 120 + ["retract"] * 80
 
 
 @pytest.mark.parametrize(
@@ -311,19 +288,17 @@ def test_what_is_odd_is_said_and_mended_if_it_can_be(curve_of, changed: dict[str
 
 
 def test_the_zero_of_the_phase_is_that_of_the_free_rows(curve_of):
-    ratio = 92.7 / 90.0
-    gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
+    gamma = 1.0 - 1.03**2 + 1j * 1.03 / 200.0
     for drive, wanted in (("force", np.angle(gamma)), ("base", np.angle(gamma / (1.0 - gamma)))):
         curve = curve_of(phase=LAG - 33.0, drive_frequency_khz=92.7, **(KNOWN | {"drive": drive}))
         assert np.median(given(curve.phase_lag_deg)[curve.free]) == pytest.approx(np.rad2deg(wanted), abs=1e-9)
 
 
 def test_signs_and_units_of_the_phase_that_the_caller_gives_stay(curve_of):
-    for sign in (1.0, -1.0):
-        kept = curve_of(phase=sign * LAG, columns="phase_lag_deg=Phase:1", **KNOWN)
-        assert np.polyfit(LAG, given(kept.phase_lag_deg), 1)[0] == pytest.approx(sign, abs=1e-3)
-        with pytest.raises(TableError, match=r"it is in radians; say --columns phase_lag_deg=CHANNEL:rad"):
-            curve_of(phase=sign * np.deg2rad(LAG), **KNOWN)
+    kept = curve_of(phase=-LAG, columns="phase_lag_deg=Phase:1", **KNOWN)
+    assert np.polyfit(LAG, given(kept.phase_lag_deg), 1)[0] == pytest.approx(-1.0, abs=1e-3)
+    with pytest.raises(TableError, match=r"it is in radians; say --columns phase_lag_deg=CHANNEL:rad"):
+        curve_of(phase=-np.deg2rad(LAG), **KNOWN)
     curve = curve_of(phase=np.deg2rad(LAG), columns="phase_lag_deg=Phase:rad", **KNOWN)
     assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(LAG), rel=1e-4)
 
@@ -344,18 +319,16 @@ def test_approach_and_retract_that_are_mixed_are_named(curve_of):
     order = np.argsort(height, kind="stable")
     back = np.interp(height + 1.0, height[order], amplitude[order])
     shuffled = np.random.default_rng(2).permutation(400)
-    # rows of two branches in turn, 1 nm apart in contact
-    in_turn = np.repeat(height, 2), np.stack([amplitude, back], axis=1).ravel()
     for heights, amplitudes, said in (
-        (height[shuffled], amplitude[shuffled], "approach and retract cannot be told apart"),
-        (*in_turn, "as where approach and retract are mixed"),
-        (height, amplitude, ""),
+        (height[shuffled], amplitude[shuffled], ["approach and retract cannot be told apart"]),
+        # rows of two branches in turn, 1 nm apart in contact
+        (np.repeat(height, 2), np.stack([amplitude, back], axis=1).ravel(), ["approach and retract are mixed"]),
+        (height, amplitude, []),
     ):
         curve = curve_of(heights, amplitudes, 90.0 + 0.0 * heights)
         assert set(curve.branch) == {"approach"}
-        told = [note for note in curve.notes if "mixed" in note or "told apart" in note]
-        assert any(said in note for note in told) == bool(said), told
-        assert bool(told) == bool(said)
+        notes = "\n".join(curve.notes)
+        assert re.findall("approach and retract (?:cannot be told apart|are mixed)", notes) == said
 
 
 EIGHT = "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
@@ -400,19 +373,18 @@ def test_bins_of_a_width_asked_for_and_of_equal_heights(tmp_path: Path):
     table = parse_table(table_text(curve), "merged")
     assert table.rows == sum(len(np.unique(heights)) for heights in made.height_nm)
     _, counts = np.unique(made.height_nm[0], return_counts=True)
-    approach = given(table.retract) == 0.0
-    np.testing.assert_allclose(given(table.lockin_amplitude_error_nm)[approach], 0.03 / np.sqrt(counts), rtol=1e-9)
-    with pytest.raises(ValueError, match="`bin_nm` must be finite and not below 0"):
-        read_curves(path, columns=EIGHT, bin_nm=-1.0)
+    errors = given(table.lockin_amplitude_error_nm)[given(table.retract) == 0.0]
+    np.testing.assert_allclose(errors, 0.03 / np.sqrt(counts), rtol=1e-9)
 
 
 def test_several_curves_of_one_file_in_metres_and_reversed(tmp_path: Path):
     made = [raw_curve(300, seed=seed) for seed in (1, 2)]
     blocks = [[*(-1e-9 * m.height_nm), *m.deflection_v, *m.amplitude_v, *m.phase_deg] for m in made]
-    side_by_side = np.concatenate(blocks).T, EIGHT.replace("1/2:nm", "1/2:m")
     below = [np.stack([-1e-9 * m.height_nm.ravel(), m.amplitude_v.ravel(), m.phase_deg.ravel()], 1) for m in made]
-    one_below_the_other = np.concatenate(below), "offset_nm=1:m,lockin_amplitude_nm=2:V,phase_lag_deg=3:deg"
-    for rows, columns in (side_by_side, one_below_the_other):
+    for rows, columns in (
+        (np.concatenate(blocks).T, EIGHT.replace("1/2:nm", "1/2:m")),
+        (np.concatenate(below), "offset_nm=1:m,lockin_amplitude_nm=2:V,phase_lag_deg=3:deg"),
+    ):
         np.savetxt(tmp_path / "curve.dat", rows, fmt="%.9g", delimiter=";")
         curves = read_curves(tmp_path / "curve.dat", columns=columns, **LEVER)
         assert [curve.curve for curve in curves] == [1, 2]
@@ -421,11 +393,6 @@ def test_several_curves_of_one_file_in_metres_and_reversed(tmp_path: Path):
             assert any(note.startswith("Direction: ") for note in curve.notes)
             np.testing.assert_allclose(np.diff(curve.offset_nm[:300]), np.diff(one.height_nm[0]), atol=1e-6)
             np.testing.assert_allclose(given(curve.amplitude), NM_PER_VOLT * one.amplitude_v.ravel(), rtol=1e-6)
-
-
-def test_a_ramp_there_and_back_is_parted_where_it_turns(curve_of):
-    columns = (np.concatenate(both) for both in zip(tapping_rows(), tapping_rows(80, retract=True), strict=True))
-    assert curve_of(*columns).branch.tolist() == ["approach"] * 120 + ["retract"] * 80
 
 
 # ---- wrong and damaged files
@@ -463,21 +430,15 @@ def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, whole, capfd: py
     random, data = np.random.default_rng(20260), whole()
     for _ in range(40):
         path = saved(tmp_path, damaged(data, random))
-        fault, curves = "", []
+        fault, curves = str(path), []
         try:
             curves = read_curves(path)
         except TableError as error:
             fault = str(error)
-        assert not fault or (str(path) in fault and "\n" not in fault)
+        assert str(path) in fault
+        assert "\n" not in fault
         assert all(np.all(np.isfinite(curve.offset_nm)) for curve in curves)
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_gwyddion_file_without_the_end_of_a_text_is_refused_at_once(tmp_path: Path):
-    # the package gwyfile, which read it before, does not come back
-    data = gwyddion_bytes().replace(b"unitstr\0sm\0y_unit", b"unitstr\0sm@y_unit")
-    with pytest.raises(TableError, match=r"a text at byte \d+ does not end"):
-        read_curves(saved(tmp_path, data, "curve.gwy"))
 
 
 # ---- the command
@@ -493,9 +454,8 @@ def test_the_command_asks_for_what_is_missing_and_writes_the_table(tmp_path: Pat
     assert result.exit_code == 0, result.stderr
     curve, table = read_curve(NEASNOM), read_table(out)
     assert (table.drive, table.free_frequency_khz, table.free_frequency_error_khz) == ("force", 264.0, 0.05)
-    assert (table.quality_factor, table.spring_constant_n_per_m) == (500.0, 40.0)
-    assert table.spring_constant_error_n_per_m == 4.0
-    assert table.rows == 200
+    lever = (table.quality_factor, table.spring_constant_n_per_m, table.spring_constant_error_n_per_m)
+    assert (table.rows, lever) == (200, (500.0, 40.0, 4.0))
     np.testing.assert_allclose(given(table.lockin_amplitude_nm), given(curve.amplitude), rtol=1e-5)
     np.testing.assert_allclose(np.diff(table.offset_nm), np.diff(curve.offset_nm), atol=1e-3)
     np.testing.assert_array_equal(table.drive_frequency_khz, 264.13261)
@@ -505,25 +465,20 @@ def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp
     result = run(AMPLITUDES, "--json", "--nm-per-volt", "slope", "--out", tmp_path / "wsxm.csv")
     assert result.exit_code == 3
     assert "refused curve 2, 3, 4" in result.stderr
-    answer = strictly(result.stdout)
-    assert answer["format"] == "afm-jax read"
-    assert [curve["valid"] for curve in answer["curves"]] == [True, False, False, False, True]
+    assert [curve["valid"] for curve in strictly(result.stdout)["curves"]] == [True, False, False, False, True]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["wsxm_1.csv", "wsxm_5.csv"]
     # the amplitude in contact is an offset of the detector, in part below zero
     assert "rows whose amplitude is not above zero" in (tmp_path / "wsxm_1.csv").read_text("utf-8")
     # approach and retract pass the same heights
     assert set(given(read_table(tmp_path / "wsxm_1.csv").retract)) == {0.0, 1.0}
-    assert run(AMPLITUDES, "--curve", 1).exit_code == 0
-    assert run(AMPLITUDES, "--curve", 9).exit_code == 2
+    assert [run(AMPLITUDES, "--curve", number).exit_code for number in (1, 9)] == [0, 2]
 
 
 def test_rows_exactly_on_a_line_have_a_slope(tmp_path: Path):
     # found by tests/fuzz.py: the line's error is 0, and its weight was none
-    path = tmp_path / "curve.csv"
     offsets = [-50, -49, -48, -47, 46, *range(-45, -30)]
     rows = "".join(f"{offset},{min(40, 50 - row)},{95 + row}\n" for row, offset in enumerate(offsets))
-    path.write_text(f"offset_nm,lockin_amplitude_nm,phase_lag_deg\n{rows}", encoding="utf-8")
-    (curve,) = read_curves(path)
+    (curve,) = read_curves(saved(tmp_path, f"offset_nm,lockin_amplitude_nm,phase_lag_deg\n{rows}"))
     assert curve.slope is not None
     assert curve.slope[0] == pytest.approx(-1.0, rel=1e-12)
     assert 0.0 < curve.slope[1] < 1e-8
@@ -536,23 +491,9 @@ def test_tapping_takes_a_raw_file_in_one_step(tmp_path: Path):
     missing = CliRunner().invoke(main, call)
     assert (missing.exit_code, missing.stdout) == (2, "")
     assert "--nm-per-volt NM_PER_V|slope" in missing.stderr
-    answer = strictly(CliRunner().invoke(main, [*call, "--nm-per-volt", "42", "--bin-nm", "0.5"]).stdout)
+    told = strictly(CliRunner().invoke(main, [*call, "--nm-per-volt", "42", "--bin-nm", "0.5"]).stdout)
     # 87 bins of half a nm each way over 43 nm
-    assert 170 <= len(answer["rows"]) <= 176
-    table = saved(tmp_path, "# drive = force\n# free_frequency_khz = 90\noffset_nm,lockin_amplitude_nm\n", "table.csv")
-    refused = CliRunner().invoke(main, ["tapping", str(table), "--bin-nm", "1"])
-    assert (refused.exit_code, len(refused.stderr.splitlines())) == (2, 1)
-    assert "--bin-nm is for an instrument's file" in refused.stderr
-
-
-def test_the_example_is_a_simulated_raw_file_with_the_defects_of_real_ones():
-    columns = np.loadtxt(EXAMPLE, unpack=True)
-    made = raw_curve()
-    np.testing.assert_allclose(columns[0:2], made.height_nm, atol=0.006)
-    np.testing.assert_allclose(columns[4:6], made.amplitude_v, atol=6e-6)
-    np.testing.assert_allclose(columns[6:8], made.phase_deg, atol=0.006)
-    # a zero of 12.3 degrees, and a lag of 89.7 at 344.6 kHz beside the resonance at 344.604
-    assert np.mean(columns[6][:300]) == pytest.approx(102.0, abs=0.1)
+    assert 170 <= len(told["rows"]) <= 176
 
 
 def test_the_example_gives_the_scale_and_the_energies_that_it_was_made_with():
@@ -572,5 +513,3 @@ def test_the_example_gives_the_scale_and_the_energies_that_it_was_made_with():
     assert "The example is simulated; as if it were measured: afm-jax tapping " in told
     assert "slope of the steepest settled part" in told
     assert "rows repeat a height" in told
-    both = CliRunner().invoke(main, ["tapping", "--example", str(EXAMPLE)])
-    assert (both.exit_code, len(both.stderr.splitlines())) == (2, 1)

@@ -1,6 +1,5 @@
 """The benchmark of driven scenes: its contacts one by one, its reference, SciPy's baseline, its judgement. No times."""
 
-import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,16 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from afm_jax.bench import timing as own_process
 from afm_jax.bench.problems import batch_run, bouncing_starts, single_contacts, spread_starts
 from afm_jax.bench.scenes import REFERENCE, contact_errors
 from afm_jax.bench.scipy_contacts import diffrax_driven_contact, scipy_driven_contact
-from afm_jax.cli.bench import PARTS
-from afm_jax.cli.main import main
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.scenefile.presets import contact_scene
+from tests.answers import answer
 from tests.reference_driven_contact import DrivenContact, follow
 
 SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
@@ -49,13 +46,12 @@ def followed(scene):
 def test_the_reference_is_that_of_an_independent_integration(followed):
     starts, found, *_ = followed
     for tip in (0, 5):
-        state = [float(part[tip]) for part in starts]
-        expected = follow(SYSTEM, *state, contacts=2).contacts
-        for row, contact in enumerate(expected):
-            own = [getattr(found.contacts, name)[tip, row] for name in ("arrival_time_us", "rebound_speed_nm_per_us")]
+        for row, contact in enumerate(follow(SYSTEM, *[float(part[tip]) for part in starts], contacts=2).contacts):
+            names = ("arrival_time_us", "rebound_speed_nm_per_us")
+            arrival, rebound = (float(getattr(found.contacts, name)[tip, row]) for name in names)
             # two contacts multiply rounding and step errors by less than a thousand
-            assert float(own[0]) == pytest.approx(contact.arrival_time_us, abs=1e-8)
-            assert float(own[1]) == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-8)
+            assert arrival == pytest.approx(contact.arrival_time_us, abs=1e-8)
+            assert rebound == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-8)
 
 
 @pytest.mark.slow
@@ -63,15 +59,14 @@ def test_a_single_contact_is_that_of_the_motion(followed):
     _, found, _, alone = followed
     assert np.all(np.asarray(alone.count) == 1)
     assert np.all(np.asarray(alone.outcome) == MotionOutcome.FINISHED)
-    times = np.asarray(found.contacts.arrival_time_us)
+    every, single = (jax.tree.map(np.asarray, one.contacts) for one in (found, alone))
     for tip in range(6):
-        arrival = float(alone.contacts.arrival_time_us[tip, 0])
-        place = np.unravel_index(np.argmin(np.abs(times - arrival)), times.shape)
+        arrival = single.arrival_time_us[tip, 0]
+        place = np.unravel_index(np.argmin(np.abs(every.arrival_time_us - arrival)), every.arrival_time_us.shape)
         # taken up 1e-4 us before it, the contact begins where and as it did: rounding of 30 us
-        assert times[place] == pytest.approx(arrival, abs=1e-12)
+        assert every.arrival_time_us[place] == pytest.approx(arrival, abs=1e-12)
         for column in ("departure_time_us", "rebound_speed_nm_per_us"):
-            expected = float(getattr(found.contacts, column)[place])
-            assert float(getattr(alone.contacts, column)[tip, 0]) == pytest.approx(expected, rel=1e-9)
+            assert getattr(single, column)[tip, 0] == pytest.approx(getattr(every, column)[place], rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -102,12 +97,10 @@ def test_errors_are_shown_apart_for_contacts_that_turn(followed):
     left = alone.contacts.departure_time_us + jnp.linspace(0.0, 1e-5, 6)[:, None]
     wrong = changed(alone, rebound_speed_nm_per_us=speeds, departure_time_us=left)
     row = contact_errors(wrong, alone, single._replace(turning=turning))
-    assert row["turning_share"] == pytest.approx(1.0 / 3.0, rel=1e-12)
+    wanted = {"turning_rebound_error_median": 1e-3, "straight_rebound_error_worst": 1e-6}
+    wanted |= {"straight_time_error_us_worst": 1e-5, "turning_time_error_us_worst": 2e-6, "turning_share": 1.0 / 3.0}
+    assert {name: row[name] for name in wanted} == pytest.approx(wanted, rel=1e-6)
     assert row["different"] == 0
-    assert row["turning_rebound_error_median"] == pytest.approx(1e-3, rel=1e-9)
-    assert row["straight_rebound_error_worst"] == pytest.approx(1e-6, rel=1e-6)
-    assert row["straight_time_error_us_worst"] == pytest.approx(1e-5, rel=1e-6)
-    assert row["turning_time_error_us_worst"] == pytest.approx(2e-6, rel=1e-6)
     # a contact that does not end has no error: it is counted
     lost = changed(wrong, kind=alone.contacts.kind.at[3, 0].set(int(ContactKind.HELD)))
     assert contact_errors(lost, alone, single)["different"] == 1
@@ -120,23 +113,21 @@ def changed(found, **columns):
 
 @pytest.mark.slow
 def test_starts_are_those_of_tips_that_keep_bouncing(scene):
-    def run(_, starts, until):
-        assert np.all(np.asarray(until > starts.time_us))
-        held = np.asarray(starts.velocity_nm_per_us) > 90.0
-        return SimpleNamespace(outcome=np.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED))
+    def held_above(fastest: float):
+        def run(_, starts, until):
+            assert np.all(np.asarray(until > starts.time_us))
+            held = np.asarray(starts.velocity_nm_per_us) > fastest
+            return SimpleNamespace(outcome=np.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED))
 
-    starts, share = bouncing_starts(scene, run, 20, 10.0)
-    assert starts.velocity_nm_per_us.shape == (20,)
-    assert float(jnp.max(starts.velocity_nm_per_us)) <= 90.0
-    assert len(np.unique(np.asarray(starts.velocity_nm_per_us))) == 20
+        return run
+
+    starts, share = bouncing_starts(scene, held_above(90.0), 20, 10.0)
+    velocities = np.asarray(starts.velocity_nm_per_us)
+    assert (len(np.unique(velocities)), velocities.shape, velocities.max() <= 90.0) == (20, (20,), True)
     # of 38 to 120 nm/us a share of 30/82
     assert share == pytest.approx(30.0 / 82.0, abs=0.05)
-
-    def none_left(_scene, _starts, until):
-        return SimpleNamespace(outcome=np.full(until.shape, MotionOutcome.HELD))
-
     with pytest.raises(ValueError, match="only 0 keep bouncing"):
-        bouncing_starts(scene, none_left, 20, 10.0)
+        bouncing_starts(scene, held_above(0.0), 20, 10.0)
 
 
 BATCH = {"what": "bouncing tips, accuracy 1e-06", "scene": "n = 5.277", "batch": 1000, "periods": 150}
@@ -153,14 +144,9 @@ def test_command_writes_its_table_and_judges(tmp_path: Path, monkeypatch: pytest
         return {"rows": ROWS, "reference_error": 1e-11, "reference_error_us": 1e-12}
 
     monkeypatch.setattr(own_process, "run_in_own_process", measured)
-    result = CliRunner().invoke(main, ["bench", "--only", "scenes", "--quick", "--out", str(tmp_path)])
-    assert result.exit_code == 0, result.stderr
-    assert "13.0%" in result.stdout
-    assert "at most 1 wanted, 1.5 reached, not met" in result.stdout
-    assert (tmp_path / "bench_scenes.csv").read_text("utf-8").splitlines()[0] == ",".join(PARTS[2].table.columns)
-    payload = json.loads((tmp_path / "bench.json").read_text("utf-8"))
-    assert payload["scene_rows"] == ROWS
-    assert payload["scene_reference_error_us"] == 1e-12
+    payload = answer(tmp_path, "bench", "--only", "scenes", "--quick")
+    assert (tmp_path / "bench_scenes.csv").exists()
+    assert (payload["scene_rows"], payload["scene_reference_error_us"]) == (ROWS, 1e-12)
     assert [aim["met"] for aim in payload["aims"]] == [True, True, True, False, True, False]
     reached = {aim["aim"]: (aim["reached"], aim["at_most"]) for aim in payload["aims"]}
     assert reached["driven contact, n = 5.277, us at 1e-6"] == (11.0, 12.0)

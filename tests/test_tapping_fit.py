@@ -176,12 +176,12 @@ def with_free_ends(table: AmplitudeTable) -> AmplitudeTable:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("degrees", "share", "begin"), [(1.0, 0.03, -0.5), (5.0, 0.03, 0.0)])
-def test_drifts_along_the_rows_are_told_by_free_rows(degrees: float, share: float, begin: float):
+def test_drifts_along_the_rows_are_told_by_free_rows():
+    degrees, share = 5.0, 0.03
     truth = tapping_truth(0)
     steady = with_free_ends(as_measured(exact_table(truth, RATIO, TABLES)))
     # the phase drifts, and the free amplitude away from what the table says of it
-    course = np.linspace(begin, begin + 1.0, steady.rows)
+    course = np.linspace(0.0, 1.0, steady.rows)
     noise = np.random.default_rng(1).normal(size=(3, steady.rows))
     read = {name: np.asarray(getattr(steady, name)) for name in steady.form.names if getattr(steady, name) is not None}
     drifted = dataclasses.replace(

@@ -106,6 +106,7 @@ print(collide._quick._cache_size(), collide._careful._cache_size())
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "slowest", "accuracies", "compiled"),
     [("diffrax", 11.0, [1e-9], "5 1"), ("collocation", 20.0, [1e-9, 1e-11], "10 0")],
