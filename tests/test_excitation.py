@@ -80,11 +80,7 @@ def test_the_gap_is_that_of_a_free_cantilever_over_the_surface():
 
     start = np.array([6.0, -20.0])
     lab = integrate(
-        start,
-        quality=40.0,
-        base=base_motion,
-        force=tip_force,
-        contact=lambda t, state: contact(state[0] - height(t)),
+        start, quality=40.0, base=base_motion, force=tip_force, contact=lambda t, state: contact(state[0] - height(t))
     )
     surface, response = surface_of(Scene(Cantilever(90.0, 40.0, MASS), PLATFORM, None, BASE, FORCE))
     assert response is not None

@@ -9,26 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from afm_jax.contact.forces import (
-    Capillary,
-    CoreRepulsion,
-    ForceSum,
-    Jkr,
-    Liquid,
-    Structural,
-    VanDerWaals,
-    Viscous,
-)
+from afm_jax.contact.forces import Capillary, CoreRepulsion, ForceSum, Jkr, Liquid, Structural, VanDerWaals, Viscous
 from afm_jax.contact.forces import jkr as jkr_formulas
 from tests.reference_contact_forces import ContactParameters, constants, static_force, static_potential
 
 GAPS = (0.11, 0.2, 0.7, 1.3, 3.1, 6.0)
-STATIC = {
-    "capillary": Capillary(),
-    "structural": Structural(),
-    "core": CoreRepulsion(),
-    "van der Waals": VanDerWaals(),
-}
+STATIC = {"capillary": Capillary(), "structural": Structural(), "core": CoreRepulsion(), "van der Waals": VanDerWaals()}
 
 
 @pytest.mark.parametrize("name", ["capillary", "structural", "core"])

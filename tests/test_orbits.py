@@ -32,10 +32,7 @@ CASES = {
     "both signs of eq. 9": (scene(1.1, **SOFT, offset_nm=1.0, amplitude_nm=0.75), 3),
     "resonance": (scene(1.0, **SOFT, offset_nm=2.0), 1),
     "resonance, order 3": (scene(3.0, quality_factor=None, r=0.8, epsilon=1.0, offset_nm=-2.0), 3),
-    "resonance, order 5 through the sample": (
-        scene(3.0, quality_factor=None, r=0.8, epsilon=1.0, offset_nm=-2.0),
-        5,
-    ),
+    "resonance, order 5 through the sample": (scene(3.0, quality_factor=None, r=0.8, epsilon=1.0, offset_nm=-2.0), 5),
     "no orbit: whole free periods": (scene(1.0, **SOFT), 2),
     "viscous, undamped": (scene(1.99, quality_factor=None, r=0.9999, viscous_loss=0.48, offset_nm=3.0), 2),
     "damped": (scene(1.03, offset_nm=2.0), 1),
