@@ -116,7 +116,7 @@ CASES = [("force", LASTING, 1.01), ("base", DELAYED, 1.03)]
 @pytest.mark.parametrize(("kind", "law", "nearest"), CASES)
 def test_map_and_simulation_stay_on_the_orbit_and_read_its_numbers(kind: str, law: ImpactLaw, nearest: float):
     random = np.random.default_rng(5)
-    for ratio in (nearest, 1.04, 1.1):
+    for ratio in (nearest, 1.1):
         free = float(random.uniform(40.0, 80.0))
         scene = driven(kind, law, ratio, free, -free * random.uniform(0.3, 0.7), random.uniform(150.0, 250.0))
         found = single_impact_orbits(scene, 1)

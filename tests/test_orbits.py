@@ -24,7 +24,6 @@ SOFT = {"quality_factor": None, "r": 0.5, "epsilon": 1.0}  # the charts of the p
 CASES = {
     "paper, order 1": (SCENES["paper"], 1),
     "paper, order 2": (SCENES["paper"], 2),
-    "paper, order 3": (SCENES["paper"], 3),
     "figure 3": (scene(0.8, **SOFT), 1),
     "figure 3, order 3": (scene(0.8, **SOFT), 3),
     "figure 2": (scene(1.02, **{**SOFT, "epsilon": 0.0}), 1),
@@ -37,12 +36,10 @@ CASES = {
     "viscous, undamped": (scene(1.99, quality_factor=None, r=0.9999, viscous_loss=0.48, offset_nm=3.0), 2),
     "damped": (scene(1.03, offset_nm=2.0), 1),
     "damped resonance": (scene(1.0), 1),
-    "damped, order 4": (scene(4.05), 4),
     "damped, order 5": (scene(5.05, offset_nm=0.0), 5),
     "damped, captured": (scene(1.01, amplitude_nm=0.5), 1),
     "viscous": (SCENES["viscous"], 1),
     "delayed": (SCENES["delayed"], 1),
-    "delayed, order 2": (scene(2.02, delay=DELAY, offset_nm=0.0), 2),
     "delayed, order 3": (scene(3.02, delay=DELAY, offset_nm=2.0), 3),
     "late and slow": (scene(1.1, delay=(0.3, 0.0, 0.0), r=0.9, epsilon=10.0, offset_nm=1.0), 1),
 }
