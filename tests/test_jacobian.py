@@ -82,11 +82,6 @@ def test_undamped_map_scales_areas_by_restitution_and_speeds():
     assert float(jnp.linalg.det(map_jacobian(scene, *STARTS[0]))) == pytest.approx(expected, rel=1e-11)
 
 
-def test_a_captured_tip_has_no_jacobian():
-    scene = scene_of(SCENES["paper"])
-    assert np.all(np.isnan(map_jacobian(scene, 0.0, 2.0)))
-
-
 def _cubic(x, p):
     return x**3 + p * x - 1.0
 

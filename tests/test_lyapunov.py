@@ -17,15 +17,12 @@ from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.parameter_paths import scene_batch
+from tests.test_dynamics import law_scene
 
 REGULAR, CHAOTIC, RESTING = (0.99, 1.05, 1.2), 1.4875, 0.2
 LONG: dict[str, Any] = {"impacts": 1000, "transient": 200}
 """Of all motions here: they share programs."""
 OPTIONS = [f"--{name}={value}" for name, value in LONG.items()]
-
-
-def law_scene(reduced: float, r: float = 0.8) -> afm.Scene:
-    return afm.Scene(afm.Cantilever(90.0), afm.Platform(2.0, 180.0 * reduced, -1.0), afm.ImpactLaw(r))
 
 
 def growth(scene: afm.Scene, time: Any, later: Any, velocity: Any, faster: Any) -> np.ndarray:
@@ -121,27 +118,21 @@ def test_the_contact_is_chaotic_at_high_frequency():
     assert larger > 3.0 * error
     assert found.exponents_per_impact.sum() == pytest.approx(found.mean_log_determinant, abs=1e-10)
     # pairs of close tips, simulated: how far they part from the third contact to the tenth
-    longest, lanes, few = 3, 10, 24
+    lanes, few = 10, 24
     scenes, tips = batch_and_tips(scene, start)
     _, record = tips_after_contacts(scenes, tips, skip=40, record=few * lanes, accuracy=1e-6)
-    omega = 2e-3 * np.pi * 180.0 * 5.277
     time, velocity = record.departure_us[0, ::lanes], record.velocity_after_nm_per_us[0, ::lanes]
 
     def contacts(time, velocity):
-        height = scene.platform.position(time) + scene.interaction.bridge_breaks_nm
-        return afm.simulate(
-            scene, State(time, height, velocity), 40.0 * lanes, max_contacts=lanes, accuracy=1e-9
-        ).contacts
+        begin = State(time, scene.platform.position(time) + scene.interaction.bridge_breaks_nm, velocity)
+        found = afm.simulate(scene, begin, 40.0 * lanes, max_contacts=lanes, accuracy=1e-9).contacts
+        return found.departure_time_us, found.departure_velocity_nm_per_us
 
     flown = jax.jit(jax.vmap(contacts))
-    one, other = flown(time, velocity), flown(time, velocity + 1e-6)
-    apart = np.hypot(
-        omega * np.asarray(other.departure_time_us - one.departure_time_us),
-        np.asarray(other.departure_velocity_nm_per_us - one.departure_velocity_nm_per_us) / (4.0 * omega),
-    )
-    growth = np.log(apart[:, -1] / apart[:, longest - 1]) / (lanes - longest)
-    assert np.isfinite(growth).all()
-    assert np.mean(growth) == pytest.approx(larger, abs=4.0 * np.hypot(error, np.std(growth) / np.sqrt(few)))
+    (one, slow), (other, fast) = flown(time, velocity), flown(time, velocity + 1e-6)
+    grown = growth(scene, one, other, slow, fast)
+    assert np.isfinite(grown).all()
+    assert np.mean(grown) == pytest.approx(larger, abs=4.0 * np.hypot(error, np.std(grown) / np.sqrt(few)))
 
 
 @pytest.mark.slow
