@@ -105,10 +105,9 @@ def test_within_a_billionth_of_capture_the_sides_are_told_apart():
     assert np.isfinite(result.collision_delay_us).all()
 
 
-@pytest.mark.parametrize("changes", [{}, {"modulus_gpa": 1.0, "adhesion_energy_j_per_m2": 0.1}], ids=str)
-def test_the_energy_ledger_closes(changes):
+def test_the_energy_ledger_closes():
     speeds = np.array([11.0, 12.0, 20.0, 60.0, 200.0, 1e4])
-    result = collide_in_eights(Contact.paper(**changes), speeds, 2.5)
+    result = collide_in_eights(Contact.paper(modulus_gpa=1.0, adhesion_energy_j_per_m2=0.1), speeds, 2.5)
     kinetic = 0.5 * 2.5 * speeds**2
     lost = result.bridge_hysteresis_aj + result.junction_hysteresis_aj + result.viscous_loss_aj
     left = 0.5 * 2.5 * np.asarray(result.rebound_speed_nm_per_us) ** 2

@@ -45,8 +45,8 @@ def speeds_found(problem: OrbitProblem) -> np.ndarray:
 
 
 def test_without_a_duration_they_are_the_instantaneous_laws():
-    count, laws = 0, [(0.95, 0.0, 0.0), (1.0, 60.0, 2.0)]
-    for (order, reduced, amplitude, offset), (r, epsilon, loss) in itertools.product(DRIVES, laws):
+    count, laws = 0, itertools.cycle([(0.9, 60.0, 0.0), (0.95, 0.0, 0.0), (1.0, 60.0, 2.0)])
+    for (order, reduced, amplitude, offset), (r, epsilon, loss) in zip(DRIVES, laws, strict=False):
         p = scene(reduced, amplitude_nm=amplitude, offset_nm=offset, r=r, epsilon=epsilon, viscous_loss=loss)
         found = steady(problem_of(p, order, delay=CollisionDelay(0.0, 0.0, 0.0)))
         orbits = afm.single_impact_orbits(scene_of(p), order)
@@ -55,7 +55,7 @@ def test_without_a_duration_they_are_the_instantaneous_laws():
         # the closing conditions are written differently: rounding near resonance
         np.testing.assert_allclose(np.asarray(found.amplitude_nm)[np.asarray(found.steady), :2], expected, rtol=1e-9)
         count += len(expected)
-    assert count > len(DRIVES) * len(laws) // 2
+    assert count > len(DRIVES) // 2
 
 
 @pytest.mark.parametrize("drive", DRIVES[::2])
