@@ -22,6 +22,7 @@ from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow
+from tests.reference_driven_motion import Motion
 
 SPAN_US = 12.0
 EACH = 16
@@ -101,11 +102,10 @@ def exact(tips: Tips, method: type[DOP853] = Closer) -> tuple[np.ndarray, np.nda
             quality_factor=float(tips.quality[tip]),
             contact=ContactParameters(**values),
         )
-        angle = 2e-3 * np.pi * system.drive_frequency_khz
-        time = float(tips.time[tip])
-        height = system.amplitude_nm * np.cos(angle * time) + 3.6
-        speed = -system.amplitude_nm * angle * np.sin(angle * time) + float(tips.rate[tip])
-        course = follow(system, time, height, speed, until_us=time + SPAN_US, contacts=1, rtol=3e-14, method=method)
+        time, rate = float(tips.time[tip]), float(tips.rate[tip])
+        base, speed, _ = Motion(system).platform(time)
+        ends_us = time + SPAN_US
+        course = follow(system, time, base + 3.6, speed + rate, until_us=ends_us, contacts=1, rtol=3e-14, method=method)
         first = course.contacts[0] if course.contacts else None
         ends.append((np.nan, np.nan) if first is None else (first.departure_time_us, first.rebound_speed_nm_per_us))
     departure, rebound = np.array(ends).T

@@ -22,7 +22,6 @@ from tests.reference_contact_forces import (
     jkr_potential,
     mp,
     static_force,
-    static_potential,
 )
 from tests.reference_contact_junction import Junction, junction
 
@@ -40,21 +39,14 @@ PUBLISHED = {
 
 
 class Collision(NamedTuple):
-    """One collision, in the program's units; rebound speed and delay are nan where the tip is captured.
-
-    `end_energy_aj` is the kinetic energy at the end, or minus the energy a captured tip lacks at its stop to leave
-    without further viscous loss: the two meet at 0.
-    """
+    """One collision, in the program's units; rebound speed and delay are nan where the tip is captured."""
 
     captured: bool
     rebound_speed_nm_per_us: Number
     delay_us: Number
     time_in_junction_us: Number
     deepest_gap_nm: Number
-    bridge_hysteresis_aj: Number
-    junction_hysteresis_aj: Number
     viscous_loss_aj: Number
-    end_energy_aj: Number
 
 
 class Differences(NamedTuple):
@@ -93,10 +85,7 @@ def collision(p: ContactParameters, approach_speed: Number, *, digits: int = DIG
             delay_us=delay,
             time_in_junction_us=way_out.time_in_junction_us,
             deepest_gap_nm=solid.shift_nm - jkr_depth(k, turn),
-            bridge_hysteresis_aj=solid.bridge_hysteresis_aj,
-            junction_hysteresis_aj=solid.junction_hysteresis_aj,
             viscous_loss_aj=way_in.viscous_loss_aj + way_out.viscous_loss_aj,
-            end_energy_aj=way_out.end_energy_aj,
         )
 
 
@@ -108,32 +97,22 @@ class WayOut(NamedTuple):
     gap_nm: Number  # at the end of contact
     speed_nm_per_us: Number
     viscous_loss_aj: Number
-    end_energy_aj: Number
 
 
 def leave(k: Constants, solid: Junction, turn: Number, energy: Number) -> WayOut:
     """Follow the tip from D_on on its way in, given its turning point and its energy at the fold in aJ."""
     off, nothing = solid.snap_off_gap_nm, mp.mpf(0)
     if energy <= 0:
-        ahead = static_potential(k, max(off, k.breaks)) - static_potential(k, off)
-        return WayOut(mp.nan, mp.nan, off, mp.nan, nothing, energy - ahead)
+        return WayOut(mp.nan, mp.nan, off, mp.nan, nothing)
     duration = junction_time(k, solid.snap_on_s, turn) + junction_time(k, fold(), turn)
     speed = mp.sqrt(2 * energy / k.mass)
     if off >= k.breaks:
-        return WayOut(duration, duration, off, speed, nothing, energy)
+        return WayOut(duration, duration, off, speed, nothing)
     bridge = cross_bridge(k, off, speed, k.breaks)
     if not bridge.reached:
-        ahead = static_potential(k, k.breaks) - static_potential(k, bridge.gap_nm)
-        return WayOut(mp.nan, duration, bridge.gap_nm, mp.nan, bridge.viscous_loss_aj, -ahead)
-    speed = bridge.velocity_nm_per_us
-    return WayOut(
-        time_us=duration + bridge.time_us,
-        time_in_junction_us=duration,
-        gap_nm=bridge.gap_nm,
-        speed_nm_per_us=speed,
-        viscous_loss_aj=bridge.viscous_loss_aj,
-        end_energy_aj=k.mass * speed**2 / 2,
-    )
+        return WayOut(mp.nan, duration, bridge.gap_nm, mp.nan, bridge.viscous_loss_aj)
+    time, speed = duration + bridge.time_us, bridge.velocity_nm_per_us
+    return WayOut(time, duration, bridge.gap_nm, speed, bridge.viscous_loss_aj)
 
 
 def capture_speed(p: ContactParameters, *, digits: int = DIGITS) -> Number:

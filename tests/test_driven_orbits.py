@@ -62,11 +62,8 @@ def angular_frequency(scene: Scene) -> float:
 
 
 def started(scene: Scene, found: SingleImpactOrbits, slot: int) -> State:
-    return State(
-        jnp.asarray(found.phase_rad[slot] / angular_frequency(scene)),
-        scene.platform.offset_nm,
-        found.velocity_after_nm_per_us[slot],
-    )
+    time = jnp.asarray(found.phase_rad[slot] / angular_frequency(scene))
+    return State(time, scene.platform.offset_nm, found.velocity_after_nm_per_us[slot])
 
 
 def fly(scene: Scene, time: float, velocity: float, duration: float, **options: Any) -> Any:
@@ -116,7 +113,7 @@ CASES = [("force", LASTING, 1.01), ("base", DELAYED, 1.03)]
 @pytest.mark.parametrize(("kind", "law", "nearest"), CASES)
 def test_map_and_simulation_stay_on_the_orbit_and_read_its_numbers(kind: str, law: ImpactLaw, nearest: float):
     random = np.random.default_rng(5)
-    for ratio in (nearest, 1.04, 1.1):
+    for ratio in (nearest, 1.1):
         free = float(random.uniform(40.0, 80.0))
         scene = driven(kind, law, ratio, free, -free * random.uniform(0.3, 0.7), random.uniform(150.0, 250.0))
         found = single_impact_orbits(scene, 1)
@@ -125,17 +122,15 @@ def test_map_and_simulation_stay_on_the_orbit_and_read_its_numbers(kind: str, la
         once = next_impact(scene, start.time_us, start.velocity_nm_per_us)
         assert float(once.time_us - start.time_us) == pytest.approx(period, abs=1e-10)
         assert float(once.velocity_after_nm_per_us - start.velocity_nm_per_us) == pytest.approx(0.0, abs=1e-9)
-        assert float(once.velocity_before_nm_per_us) == pytest.approx(
-            float(found.velocity_before_nm_per_us[slot]), abs=1e-9
-        )
+        before = float(found.velocity_before_nm_per_us[slot])
+        assert float(once.velocity_before_nm_per_us) == pytest.approx(before, abs=1e-9)
         seen = observe(scene, simulate(scene, start, 60.0 * period))
         assert seen.settled.settled
         assert seen.settled.periods == 1
         lockin = ("lockin_amplitude_nm", "lockin_phase_deg")
-        for name in lockin:
+        for name in (*lockin, *(f"deflection_{name}" for name in lockin)):
             # at order 1 the response has the drive's frequency
-            assert getattr(seen, f"drive_{name}") == getattr(seen, name)
-            assert getattr(seen, f"deflection_drive_{name}") == getattr(seen, f"deflection_{name}")
+            assert getattr(seen, name.replace("lockin", "drive_lockin")) == getattr(seen, name)
         deflection = ("peak_deflection_nm", *(f"deflection_{name}" for name in lockin))
         for name in ("peak_amplitude_nm", "phase_lag_deg", *lockin, *deflection):
             value = getattr(seen, name)
@@ -246,13 +241,12 @@ def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit():
     period = 2.0 * np.pi / angular_frequency(scene)
     seen = state_at(scene, simulate(scene, started(scene, orbits, slot), 3.0 * period), 2.0 * period)
     assert seen is not None
-    assert swept.strobe_height_nm[0][np.isfinite(swept.strobe_height_nm[0])][-1] == pytest.approx(
-        float(seen.position_nm), abs=1e-6
-    )
+    heights = swept.strobe_height_nm[0]
+    assert heights[np.isfinite(heights)][-1] == pytest.approx(float(seen.position_nm), abs=1e-6)
     lyapunov = lyapunov_spectrum(scene, impacts=400, transient=400)
     multipliers = multipliers_of(*(np.asarray(part)[[slot]] for part in (orbits.trace, orbits.determinant)))[0]
     assert lyapunov.exponents_per_impact == pytest.approx(np.log(np.abs(multipliers)), abs=1e-8)
-    basins = basins_of_attraction(scene, columns=12, rows=8)
+    basins = basins_of_attraction(scene, columns=6, rows=4)
     (orbit,) = (one for one in basins.attractors if one.name == "(1,1)")
     assert (orbit.phase_rad[0], orbit.velocity_nm_per_us[0]) == pytest.approx(place, rel=1e-6)
     plane = scene_family(scene, "platform.offset_nm", "interaction.r")

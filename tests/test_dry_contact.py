@@ -46,7 +46,7 @@ def integrated(speed, *, mass=1.0, viscous=False, **changed):
     return state[1], time - reach / speed - reach / state[1], turn[0], state[2]
 
 
-@pytest.mark.parametrize("speed", [0.5, 20.0, 300.0])
+@pytest.mark.parametrize("speed", [0.5, 20.0])
 def test_hertz_collision_time_is_the_closed_form(speed):
     contact = Contact(forces=(), junction=Hertz(modulus_gpa=3.0, tip_radius_nm=20.0))
     result = collide(contact, speed, 2.0)
@@ -60,9 +60,14 @@ def test_hertz_collision_time_is_the_closed_form(speed):
     assert float(result.rebound_speed_nm_per_us) == pytest.approx(speed, rel=1e-14)
 
 
-@pytest.mark.parametrize("viscous", [False, True])
 @pytest.mark.parametrize(
-    "changed", [{}, {"modulus_gpa": 0.1}, {"hamaker_constant_aj": 1.0, "range_nm": 50.0}, {"contact_distance_nm": 0.4}]
+    ("changed", "viscous"),
+    [
+        ({}, False),
+        ({"modulus_gpa": 0.1}, True),
+        ({"hamaker_constant_aj": 1.0, "range_nm": 50.0}, False),
+        ({"contact_distance_nm": 0.4}, True),
+    ],
 )
 def test_collisions_are_those_of_an_independent_integration(changed, viscous):
     effects = ["van_der_waals", "dmt"] + ["viscous"] * viscous
@@ -101,7 +106,7 @@ def test_the_ledger_closes_with_drag_alone_and_the_slowest_tip_is_captured():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("effects", [["van_der_waals", "dmt"], ["van_der_waals", "viscous", "dmt"], ["hertz"]])
+@pytest.mark.parametrize("effects", [["van_der_waals", "viscous", "dmt"], ["hertz"]])
 def test_derivatives_forward_and_reverse_are_central_differences(effects):
     names = ["modulus_gpa", "tip_radius_nm"] if "hertz" in effects else list(DRY)
     start = jnp.array([DRY[name] for name in names] + [25.0])

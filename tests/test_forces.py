@@ -9,30 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from afm_jax.contact.forces import (
-    Capillary,
-    CoreRepulsion,
-    ForceSum,
-    Jkr,
-    Liquid,
-    Structural,
-    VanDerWaals,
-    Viscous,
-)
+from afm_jax.contact.forces import Capillary, CoreRepulsion, ForceSum, Jkr, Liquid, Structural, VanDerWaals, Viscous
 from afm_jax.contact.forces import jkr as jkr_formulas
 from tests.reference_contact_forces import ContactParameters, constants, static_force, static_potential
 
 GAPS = (0.11, 0.2, 0.7, 1.3, 3.1, 6.0)
-STATIC = {
-    "capillary": Capillary(),
-    "structural": Structural(),
-    "core": CoreRepulsion(),
-    "van der Waals": VanDerWaals(),
-}
+STATIC = {"capillary": Capillary(), "structural": Structural(), "core": CoreRepulsion(), "van der Waals": VanDerWaals()}
 
 
 @pytest.mark.parametrize("name", ["capillary", "structural", "core"])
-@pytest.mark.parametrize("humidity", [0.01, 0.5, 0.99])
+@pytest.mark.parametrize("humidity", [0.01, 0.99])
 def test_forces_of_the_paper_are_their_formulas_in_mpmath(name, humidity):
     liquid = Liquid(relative_humidity=humidity)
     force = CoreRepulsion() if name == "core" else type(STATIC[name])(liquid=liquid)
@@ -47,17 +33,12 @@ def test_forces_of_the_paper_are_their_formulas_in_mpmath(name, humidity):
 
 
 @pytest.mark.parametrize("name", STATIC)
-def test_the_force_is_minus_the_slope_of_the_potential(name):
+def test_force_and_stiffness_are_minus_slopes_of_potential_and_force(name):
     force = STATIC[name]
     for low, high in itertools.pairwise(GAPS):
         work = quad(lambda gap: float(force(gap)), low, high, epsabs=1e-12, epsrel=1e-11)[0]
         # quadrature of a float64 function
         assert float(force.potential(low) - force.potential(high)) == pytest.approx(work, rel=1e-9, abs=1e-12)
-
-
-@pytest.mark.parametrize("name", STATIC)
-def test_stiffness_is_minus_the_slope_of_the_force(name):
-    force = STATIC[name]
     for gap in GAPS:
         step = 1e-6 * gap
         slope = (float(force(gap + step)) - float(force(gap - step))) / (2.0 * step)

@@ -17,7 +17,7 @@ from tests import reference_map
 from tests.package_scenes import scene_of
 from tests.reference_examples import SCENES
 
-STARTS = [(4.0, 60.0), (0.7, 35.0), (2.2, 120.0)]
+STARTS = [(4.0, 60.0), (0.7, 35.0)]
 
 
 def ends(start, scene):
@@ -69,22 +69,6 @@ def test_equation_7_without_adhesion_is_that_of_equation_1(r, phase, velocity):
     turn = -(1.0 + r) * 2.0 * float(platform.angular_frequency) ** 2 * np.cos(phase)
     # V' = -r V + (1 + r) v_p: a few roundings.
     np.testing.assert_allclose(matrix, [[1.0, 0.0], [turn, -r]], rtol=1e-13, atol=1e-14)
-
-
-def test_undamped_map_scales_areas_by_restitution_and_speeds():
-    scene = scene_of(SCENES["paper"])
-    impact = next_impact(scene, *STARTS[0])
-    platform = scene.platform
-    leaving = STARTS[0][1] - float(platform.velocity(STARTS[0][0]))
-    rebound = float(impact.velocity_after_nm_per_us - platform.velocity(impact.time_us))
-    # det = r^2 u_out(1)/u_out(2): the flight turns u_out(1) into u_in(2), the law r^2 u_in/u_out.
-    expected = SCENES["paper"].r ** 2 * leaving / rebound
-    assert float(jnp.linalg.det(map_jacobian(scene, *STARTS[0]))) == pytest.approx(expected, rel=1e-11)
-
-
-def test_a_captured_tip_has_no_jacobian():
-    scene = scene_of(SCENES["paper"])
-    assert np.all(np.isnan(map_jacobian(scene, 0.0, 2.0)))
 
 
 def _cubic(x, p):

@@ -42,12 +42,10 @@ def test_numbers_of_the_paper_to_five_digits():
     [
         {},
         {"modulus_gpa": 10.0},
-        {"modulus_gpa": 1000.0},
         {"relative_humidity": 0.01},
         {"relative_humidity": 0.99},
         {"tip_radius_nm": 20.0},
         {"adhesion_energy_j_per_m2": 0.08},
-        {"adhesion_energy_j_per_m2": 3.0},
         {"core_constant_j_m6": 1e-79},
         {"effects": ("capillary", "core", "jkr")},
     ],

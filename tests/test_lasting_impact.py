@@ -79,14 +79,14 @@ def around(pull: float, jerk: float = 0.0) -> Middle:
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize(("of_pull", "of_jerk"), [(0.35, 0.0), (0.0, 0.1), (0.35, 0.1), (0.8, -0.1), (2.0, 0.01)])
+@pytest.mark.parametrize(("of_pull", "of_jerk"), [(0.35, 0.0), (0.0, 0.1), (0.8, -0.1), (2.0, 0.01)])
 def test_corrections_are_those_of_an_integrated_hertz_contact(sign, of_pull, of_jerk):
     pull, jerk = sign * of_pull / HERTZ_TIME, sign * of_jerk / HERTZ_TIME**2
     rebound, duration = integrated(pull, jerk)
     found = corrected(lasting(HERTZ_TIME), around(pull, jerk), UNDAMPED, impact_of(HERTZ_TIME, 0.0))
     # exact in the pull, of first order in its change, 0.1 at most; the corrections reach 0.03 and 0.3
     assert float(found.rebound) == pytest.approx(rebound, abs=2e-4)
-    assert float(found.delay) / HERTZ_TIME == pytest.approx(duration / HERTZ_TIME, abs=5e-3)
+    assert float(found.delay) == pytest.approx(duration, abs=5e-3 * HERTZ_TIME)
     if of_jerk == 0.0:
         assert float(found.delay) == pytest.approx(duration, rel=1e-6)
 
@@ -134,7 +134,7 @@ def test_a_spring_and_a_lockin_make_an_indentation_count_less():
     assert float(found) == pytest.approx(under_pull(0.0)[1] * (1.0 - missed), rel=1e-6)
 
 
-@pytest.mark.parametrize("pull", [-0.2, 0.2, 0.4])
+@pytest.mark.parametrize("pull", [-0.2, 0.4])
 def test_a_delay_with_an_offset_is_that_of_a_raised_surface(pull):
     """Parabolas to gap 0 from a Hertz contact whose surface stands above it, and what they leave of the way below."""
     raised, coming = 0.3, np.sqrt(1.0 + 0.6 * pull)
@@ -200,17 +200,9 @@ def test_a_lead_is_covered_sooner_with_a_push(pull):
     assert delay == pytest.approx(-later * lead / (USUAL_LEAD * BRIDGE_NM), rel=1e-9)
 
 
-CONTACTS = {
-    "paper": {},
-    "humid": {"relative_humidity": 0.7},
-    "soft": {"modulus_gpa": 30.0},
-    "viscous": {"viscosity_pa_s": 3e-3},
-}
-
-
-@pytest.mark.parametrize("name", CONTACTS)
-def test_a_table_is_the_contacts_collisions(name):
-    contact = afm.Contact.paper(**CONTACTS[name])
+@pytest.mark.parametrize("numbers", [{}, {"relative_humidity": 0.7, "modulus_gpa": 30.0, "viscosity_pa_s": 3e-3}])
+def test_a_table_is_the_contacts_collisions(numbers):
+    contact = afm.Contact.paper(**numbers)
     table = jax.jit(tabulated)(contact, jnp.array(1.0))
     speeds = float(table.lowest) * np.geomspace(1.25, 20.0, 17)
     truth = afm.collide(contact, speeds)
@@ -260,7 +252,7 @@ def check_against_collisions(numbers: dict[str, Any]) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("seed", "count", "with_junction"), [(11, 12, 10), pytest.param(12, 200, 190, marks=pytest.mark.slow)]
+    ("seed", "count", "with_junction"), [(11, 12, 10), pytest.param(12, 60, 57, marks=pytest.mark.slow)]
 )
 def test_random_contacts_are_tabulated_from_capture_on(seed, count, with_junction):
     rng = np.random.default_rng(seed)
@@ -271,9 +263,7 @@ def test_random_contacts_are_tabulated_from_capture_on(seed, count, with_junctio
 @pytest.mark.parametrize("numbers", [{}, WET, {"modulus_gpa": 10.0, "adhesion_energy_j_per_m2": 0.6}])
 def test_a_table_begins_at_the_capture_speed(numbers):
     contact = afm.Contact.paper(**numbers)
-    table = tabulated(contact, jnp.array(1.0))
-    expected = float(capture_speed(contact))
-    assert float(table.lowest) == pytest.approx(expected, rel=1e-9)
+    assert float(tabulated(contact, jnp.array(1.0)).lowest) == pytest.approx(float(capture_speed(contact)), rel=1e-9)
 
 
 def test_a_contact_too_extreme_for_its_table_is_known():
@@ -291,9 +281,8 @@ def test_a_tables_derivatives_are_those_of_collisions():
     speeds, usual = np.array([17.0, 33.0, 90.0]), 1.005e-3
 
     def of_table(viscosity):
-        found = jax.vmap(tabulated(afm.Contact.paper(viscosity_pa_s=viscosity), jnp.array(1.0)).speeds)(
-            jnp.asarray(speeds)
-        )
+        table = tabulated(afm.Contact.paper(viscosity_pa_s=viscosity), jnp.array(1.0))
+        found = jax.vmap(table.speeds)(jnp.asarray(speeds))
         return found.rebound, found.delay
 
     slopes = jax.jacfwd(of_table)(jnp.array(usual))

@@ -74,9 +74,9 @@ def fold_of(p: Parameters) -> tuple[Any, Any]:
         return approach, drive_amplitude(p, approach)
 
 
-@pytest.mark.parametrize("name", ["damped", "delayed"])
 @pytest.mark.parametrize(
-    ("beyond", "orbits", "flagged"), [(-1e-6, 0, False), (1e-9, 2, True), (1e-7, 2, True), (0.3, 2, False)]
+    ("name", "beyond", "orbits", "flagged"),
+    [("damped", 1e-9, 2, True), ("damped", 0.3, 2, False), ("delayed", -1e-6, 0, False), ("delayed", 1e-7, 2, True)],
 )
 def test_orbits_that_almost_merge_are_found_and_flagged(name, beyond, orbits, flagged):
     p = SCENES[name]

@@ -66,11 +66,12 @@ def test_after_a_capture_the_rows_say_so():
     rows = iterate_map(made, 4.0, 40.0, 30)
     ends = np.flatnonzero(rows.outcome != Outcome.IMPACT)
     last = int(ends[0])
+    rest = slice(last + 1, None)
     assert int(rows.outcome[last]) == Outcome.CAPTURED
-    assert np.all(rows.outcome[last + 1 :] == Outcome.NOT_REACHED)
-    assert np.all(np.isinf(rows.time_us[last + 1 :]))
-    assert np.all(np.isnan(rows.velocity_after_nm_per_us[last + 1 :]))
-    assert not np.any(rows.near_grazing[last + 1 :])
+    assert np.all(rows.outcome[rest] == Outcome.NOT_REACHED)
+    assert np.all(np.isinf(rows.time_us[rest]))
+    assert np.all(np.isnan(rows.velocity_after_nm_per_us[rest]))
+    assert not np.any(rows.near_grazing[rest])
     # A captured tip moves with the platform.
     wall = float(made.platform.velocity(rows.time_us[last]))
     assert float(rows.velocity_after_nm_per_us[last]) == pytest.approx(wall, rel=1e-12)
@@ -92,7 +93,6 @@ def test_every_end_of_a_flight_is_said():
         (far, (0.0, 8.0), {}, Outcome.NO_FURTHER_IMPACT),
         (made, (4.0, 60.0), {"max_steps": 3}, Outcome.STEP_LIMIT),
         (made, (1.0, below), {}, Outcome.INVALID_START),
-        (made, (np.nan, 60.0), {}, Outcome.INVALID_START),
         (made, (4.0, np.nan), {}, Outcome.INVALID_START),
         (made, (np.inf, 60.0), {}, Outcome.INVALID_START),
         (late, (4.0, 60.0), {}, Outcome.DELAY_EXCEEDS_FLIGHT),

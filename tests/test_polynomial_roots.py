@@ -55,7 +55,7 @@ def test_roots_of_any_quartic_are_those_of_mpmath(coefficients):
     np.testing.assert_allclose(found, real, rtol=1e-9)
 
 
-@pytest.mark.parametrize("gap", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("gap", [1e-2, 1e-6])
 def test_a_close_pair_is_told_apart(gap):
     exact = np.array([2.0, 2.0 + gap, 5.0, 11.0])
     with mpmath.workdps(50):

@@ -44,11 +44,9 @@ def column(contacts, name: str) -> np.ndarray:
     return np.array([getattr(contact, name) for contact in contacts])
 
 
-# From 40, 60 and 80 nm/us at n = 5.277 some of the first ten contacts form the junction twice; ten contacts are before
-# chaos has made of 1e-9 more than 1e-7.
-@pytest.mark.parametrize(
-    ("n", "speed", "double"), [(1.01, 150.0, 0), (5.277, 40.0, 1), (5.277, 60.0, 2), (5.277, 80.0, 1)]
-)
+# At n = 5.277 two of the first ten contacts form the junction twice; ten contacts are before chaos has made of 1e-9
+# more than 1e-7.
+@pytest.mark.parametrize(("n", "speed", "double"), [(1.01, 150.0, 0), (5.277, 60.0, 2)])
 def test_tenth_crossing_agrees_with_an_independent_integration(n, speed, double):
     system = reference(n, 4.0)
     start = began(system, speed)
@@ -67,10 +65,9 @@ def test_tenth_crossing_agrees_with_an_independent_integration(n, speed, double)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "speed"), [(1.01, 150.0), (5.277, 60.0)])
-def test_diffrax_in_time_goes_the_same_way(n, speed):
-    system = reference(n, 4.0)
-    start = began(system, speed)
+def test_diffrax_in_time_goes_the_same_way():
+    system = reference(5.277, 4.0)
+    start = began(system, 60.0)
     times = column(follow(system, *start, until_us=1000.0, contacts=5).contacts, "arrival_time_us")
     found = simulate(scene_of(system), state(start), times[-1] - start[0] + 1e-3, method="diffrax")
     np.testing.assert_allclose(found.contacts.arrival_time_us[:4], times[:4], rtol=0.0, atol=1e-8)
@@ -78,19 +75,15 @@ def test_diffrax_in_time_goes_the_same_way(n, speed):
 
 @pytest.mark.slow
 def test_other_scenes_agree_too():
-    cases = [
+    few = [name for name in EFFECTS if name not in ("structural", "viscous")]
+    fewer = reference(1.3, 2.5, 1.5, quality_factor=None, mass_ng=2.5, structural=False, viscous=False)
+    # the junction outlives the bridge and breaks straight into free flight
+    soft = reference(1.01, 4.0, contact=ContactParameters(modulus_gpa=1.0))
+    for system, contact in (
         (reference(0.97, 2.0, -0.5, offset_rate_nm_per_us=0.02), Contact.paper()),
-        (
-            reference(1.3, 2.5, 1.5, quality_factor=None, mass_ng=2.5, structural=False, viscous=False),
-            Contact.paper(effects=[name for name in EFFECTS if name not in ("structural", "viscous")]),
-        ),
-        (
-            # soft: the junction outlives the bridge and breaks straight into free flight
-            reference(1.01, 4.0, contact=ContactParameters(modulus_gpa=1.0)),
-            Contact.paper(modulus_gpa=1.0),
-        ),
-    ]
-    for system, contact in cases:
+        (fewer, Contact.paper(effects=few)),
+        (soft, Contact.paper(modulus_gpa=1.0)),
+    ):
         start = began(system, 90.0)
         times = column(follow(system, *start, until_us=1000.0, contacts=4).contacts, "arrival_time_us")
         found = simulate(scene_of(system, contact), state(start), times[-1] - start[0] + 1e-3)
@@ -145,13 +138,12 @@ def test_a_batch_says_which_of_its_scenes_has_no_junction():
     many, alone = jax.jit(jax.vmap(one_of_many))(jnp.array([0.3, 0.05])), one_of_many(0.3)
     assert many.outcome.tolist() == [MotionOutcome.FINISHED, MotionOutcome.NO_JUNCTION]
     # the same steps, summed in another order
-    times, expected = many.contacts.arrival_time_us[0], alone.contacts.arrival_time_us
-    np.testing.assert_allclose(times, expected, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(many.contacts.arrival_time_us[0], alone.contacts.arrival_time_us, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.slow
 def test_derivatives_forward_and_reverse_alone_and_in_a_batch():
-    at, speeds = jnp.array([0.1, 1.005e-3, 40.0]), jnp.array([40.0, 60.0, 80.0])
+    at, speeds = jnp.array([0.1, 1.005e-3, 40.0]), jnp.array([40.0, 60.0])
     start = began(reference(5.277, 4.0), 60.0)
 
     def second_arrival(parameters, speed, *, reverse=False):

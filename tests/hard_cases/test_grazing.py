@@ -21,7 +21,7 @@ from tests.reference_flight import Parameters, constants, high_precision, mp, pl
 
 pytestmark = pytest.mark.slow
 
-LIFTS_NM = (1e-3, 1e-6, 1e-9, 1e-11, 1e-12)
+LIFTS_NM = (1e-3, 1e-8, 1e-12)
 
 
 class Touch(NamedTuple):

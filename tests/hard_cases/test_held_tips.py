@@ -28,27 +28,26 @@ def test_a_held_tip_is_followed():
     course = follow(system, *start, until_us=start[0] + 9.0)
     simulation = simulate(scene_of(system), state(start), 9.0)
     assert course.phase == "junction"
+    last = int(simulation.count) - 1
     assert int(simulation.outcome) == MotionOutcome.HELD
     assert bool(simulation.held)
-    assert int(simulation.contacts.kind[int(simulation.count) - 1]) == ContactKind.HELD
-    assert np.isinf(simulation.contacts.departure_time_us[int(simulation.count) - 1])
+    assert int(simulation.contacts.kind[last]) == ContactKind.HELD
+    assert np.isinf(simulation.contacts.departure_time_us[last])
     assert float(simulation.final.time_us) == pytest.approx(start[0] + 9.0, abs=1e-12)
     # six junctions form and break, hardly: the error of 1e-9 grows tenfold with each
-    np.testing.assert_allclose(float(simulation.final.position_nm), course.position_nm, rtol=0.0, atol=1e-4)
-    np.testing.assert_allclose(
-        float(simulation.final.velocity_nm_per_us), course.velocity_nm_per_us, rtol=0.0, atol=3e-3
-    )
+    assert float(simulation.final.position_nm) == pytest.approx(course.position_nm, abs=1e-4)
+    assert float(simulation.final.velocity_nm_per_us) == pytest.approx(course.velocity_nm_per_us, abs=3e-3)
     detail: Any = simulation.contacts.detail
     assert int(detail.junctions[0]) == course.contacts[0].junctions == 6
 
 
 @pytest.mark.slow
 def test_a_tip_that_is_held_for_long_is_followed_to_the_end():
-    # held for five periods of a slow cantilever, 5,000 oscillations in the junction: room for 64 contacts is enough
+    # held for a period of a slow cantilever, 1,000 oscillations in the junction: room for 64 contacts is enough
     scene = Scene(Cantilever(5.0, 40.0), Platform(4.0, 10.1), Contact.paper(modulus_gpa=70.0))
-    simulation = simulate(scene, state((0.0, 10.0, -8.0)), 1000.0)
+    simulation = simulate(scene, state((0.0, 10.0, -8.0)), 200.0)
     assert MotionOutcome(int(simulation.outcome)) == MotionOutcome.HELD
-    assert float(simulation.final.time_us) == 1000.0
+    assert float(simulation.final.time_us) == 200.0
     assert int(simulation.count) == 1
 
 

@@ -27,18 +27,18 @@ pytestmark = pytest.mark.slow
 
 CASES: dict[str, tuple[Parameters, float, float]] = {}
 """The scene, the turns of the drive at the start, and the rebound speed there in units of the top speed."""
-for value in (0.6, 1.0, 1e3, 1e7):
+for value in (0.6, 1e7):
     CASES[f"Q = {value:g}"] = replace(USUAL, quality_factor=value, offset_nm=0.5), 0.7, 8.0
-for value in (1e-3, 1.0, 1e3, 1e6):
+for value in (1e-3, 1e6):
     moved = replace(USUAL, amplitude_nm=value, offset_nm=-0.3 * value, epsilon=value**2)
     CASES[f"amplitude {value:g} nm"] = moved, 0.6, 5.0
-for value in (0.0, 1e-15, 1e-12, 1e-9, -1e-6):
+for value in (0.0, 1e-12, -1e-6):
     tuned = replace(USUAL, drive_frequency_khz=180.0 * (1.0 + value), offset_nm=0.0, quality_factor=1e6)
     CASES[f"{value:g} off resonance"] = tuned, 0.75, 20.0
 for reduced, rebound in ((50.0, 2.5), (50.0, 40.0), (0.01, 30.0), (0.01, 0.5)):
     driven = replace(USUAL, drive_frequency_khz=180.0 * reduced, epsilon=0.0)
     CASES[f"n = {reduced:g}, rebound {rebound:g}"] = driven, 0.7, rebound
-for value in (1e-9, 0.5, 1.0 - 1e-12, 1.0):
+for value in (1e-9, 1.0 - 1e-12, 1.0):
     CASES[f"r = {value!r}"] = replace(USUAL, r=value, epsilon=0.0), 0.7, 6.0
 
 
@@ -48,16 +48,14 @@ def test_at_the_ends_of_what_can_be_asked_for(name: str):
     compare(p, *leaving(p, phase_turns, rebound))
 
 
-@pytest.mark.parametrize("away", [1e-3, 1e-6, 1e-9])
+@pytest.mark.parametrize("away", [1e-3, 1e-9])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_near_capture(away: float, side: float):
     # the loss that leaves, of this very impact, nothing but a little
     free = replace(USUAL, r=1.0, epsilon=0.0)
     time, velocity = leaving(free, 0.7, 6.0)
-    arrival = float(
-        brute_force.first_impact(reference_map.flights_of(free, time, velocity), duration_us=20.0).arrival_time_us[0]
-    )
-    impact = reference_map.next_impact(free, time, velocity, arrival)
+    found = brute_force.first_impact(reference_map.flights_of(free, time, velocity), duration_us=20.0)
+    impact = reference_map.next_impact(free, time, velocity, float(found.arrival_time_us[0]))
     platform_speed = reference_flight.platform_motion(free, impact.arrival_time_us)[1]
     approach = float(platform_speed - impact.velocity_before_nm_per_us)
     # of the derivative: rounding over the distance from capture

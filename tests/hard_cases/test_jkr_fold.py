@@ -19,9 +19,8 @@ from afm_jax.contact.forces import jkr as jkr_formulas
 
 def test_jkr_at_its_fold_and_at_its_largest_tension():
     solid = Jkr()
-    assert float(solid.force(solid.pull_off_depth_nm)) == pytest.approx(
-        -5.0 / 6.0 * float(solid.load_scale_nn), rel=1e-7
-    )
+    pull = float(solid.force(solid.pull_off_depth_nm))
+    assert pull == pytest.approx(-5.0 / 6.0 * float(solid.load_scale_nn), rel=1e-7)
     # load control: -3/2 pi w R where s^3 = sqrt(6)/2
     deepest = float(jkr_formulas.load((6.0**0.5 / 2.0) ** (1.0 / 3.0)))
     assert deepest == pytest.approx(-1.5, rel=1e-15)
@@ -32,7 +31,7 @@ def test_jkr_at_its_fold_and_at_its_largest_tension():
         assert rise == pytest.approx(work, rel=1e-8, abs=1e-10)
 
 
-@pytest.mark.parametrize("away", [1e-2, 1e-5, 1e-8, 1e-11, 1e-14])
+@pytest.mark.parametrize("away", [1e-2, 1e-8, 1e-14])
 def test_force_and_stiffness_next_to_the_fold_lose_half_of_the_digits_and_no_more(away: float):
     depth = float(jkr_formulas.FOLD_DEPTH) * (1.0 - away)
     with mpmath.workdps(50):

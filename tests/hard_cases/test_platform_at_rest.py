@@ -27,7 +27,7 @@ OMEGA = 2e-3 * np.pi * 90.0
 
 
 @pytest.mark.parametrize("quality_factor", [0.6, 40.0, np.inf])
-@pytest.mark.parametrize("r", [1e-12, 0.7, 1.0])
+@pytest.mark.parametrize("r", [1e-12, 1.0])
 def test_every_flight_lasts_half_a_ringing_period(quality_factor: float, r: float):
     scene = Scene(Cantilever(90.0, quality_factor), Platform(0.0, 181.8), ImpactLaw(r, 0.0))
     decay = 0.5 * OMEGA / quality_factor
@@ -43,7 +43,7 @@ def test_every_flight_lasts_half_a_ringing_period(quality_factor: float, r: floa
         assert float(jacobian[1, 1]) == pytest.approx(kept, rel=1e-12)
 
 
-@pytest.mark.parametrize("rebound", [1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("rebound", [1e-2, 1e-6])
 def test_a_start_that_hardly_leaves_the_platform(rebound: float):
     # at three tenths of a turn the platform presses: the tip is back after 2 u/(N/m)
     p = replace(USUAL, epsilon=0.0)

@@ -25,7 +25,7 @@ from tests.reference_law_motion import Cosines, LawSystem, follow
 
 
 def test_a_series_of_impacts_ends_at_rest_until_the_platform_lets_go():
-    until = PRESSING_START[0] + PRESSING_DURATION
+    until, wall = PRESSING_START[0] + PRESSING_DURATION, PRESSING.platform.derivative
     course = follow(PRESSING, *PRESSING_START, until)
     result = simulated(scene_of(PRESSING), PRESSING_START, PRESSING_DURATION)
     assert int(result.outcome) == MotionOutcome.FINISHED
@@ -43,18 +43,12 @@ def test_a_series_of_impacts_ends_at_rest_until_the_platform_lets_go():
     assert released == pytest.approx(exact, abs=1e-11)
     assert min(PRESSING.push(t) for t in np.linspace(arrived, released - 1e-6, 2000)) > 0.0
     assert float(result.contacts.rebound_speed_nm_per_us[last]) == 0.0
-    assert float(result.contacts.departure_position_nm[last]) == pytest.approx(
-        PRESSING.platform.derivative(0, exact), abs=1e-10
-    )
+    assert float(result.contacts.departure_position_nm[last]) == pytest.approx(wall(0, exact), abs=1e-10)
     # after it, SciPy once more from the release
-    onward = follow(
-        PRESSING, exact, PRESSING.platform.derivative(0, exact), PRESSING.platform.derivative(1, exact), until
-    )
-    some = int(rests[1]) - last - 1
-    assert some > 2
-    for shift in range(some):
-        here = onward.rows[shift]
-        row = last + 1 + shift
+    onward = follow(PRESSING, exact, wall(0, exact), wall(1, exact), until)
+    rows = range(last + 1, int(rests[1]))
+    assert len(rows) > 2
+    for row, here in zip(rows, onward.rows[: len(rows)], strict=True):
         # a flight that begins with gap ~ t^3: SciPy's 1e-13 nm is not seen in its impact
         assert float(result.contacts.arrival_time_us[row]) == pytest.approx(here[0], abs=1e-8)
         assert float(result.contacts.departure_velocity_nm_per_us[row]) == pytest.approx(here[3], abs=1e-7)
@@ -84,24 +78,25 @@ def test_a_tip_captured_without_adhesion_is_let_go_too():
 
 
 @pytest.mark.parametrize(
-    ("system", "time"),
+    "system",
     [
         # at the top of a fast platform, which leaves the tip behind at once
-        (LawSystem(Cosines(0.0, 0.0, ((4.0, 181.8, 0.0),)), 0.9, quality_factor=40.0), 0.0),
+        LawSystem(Cosines(0.0, 0.0, ((4.0, 181.8, 0.0),)), 0.9, quality_factor=40.0),
         # pressed by a slow one, which lets it go near its lowest point
-        (PRESSING, 0.0),
+        PRESSING,
     ],
     ids=["let go at once", "rides"],
 )
-def test_a_start_at_rest_on_the_platform_rides_until_it_lets_go(system, time):
-    start = (time, system.platform.derivative(0, time), system.platform.derivative(1, time))
+def test_a_start_at_rest_on_the_platform_rides_until_it_lets_go(system):
+    time = 0.0
+    wall = system.platform.derivative
+    start = (time, wall(0, time), wall(1, time))
     result = simulated(scene_of(system), start, 60.0)
     release = system.release(time, time + 60.0)
     assert float(result.contacts.departure_time_us[0]) == pytest.approx(release, abs=1e-11)
     assert float(result.contacts.arrival_time_us[0]) == time
     assert float(result.contacts.energy_lost_aj[0]) == 0.0
-    let_go = (release, system.platform.derivative(0, release), system.platform.derivative(1, release))
-    course = follow(system, *let_go, time + 60.0)
+    course = follow(system, release, wall(0, release), wall(1, release), time + 60.0)
     assert len(course.rows) > 1
     for row, exact in enumerate(course.rows[:2], start=1):
         # SciPy's 1e-13 nm in a flight that begins with gap ~ t^2 or t^3

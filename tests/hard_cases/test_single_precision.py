@@ -26,53 +26,45 @@ EXAMPLES = ROOT / "fitting" / "examples"
 TABLE = EXAMPLES / "amplitudes_law.csv"
 
 
-def _scene() -> Any:
-    return bouncing()
-
-
 def _contact() -> Any:
     return afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 181.8), afm.Contact.paper())
-
-
-def _range() -> Any:
-    return ParameterRange("platform.amplitude_nm", 1.0, 2.0)
 
 
 REFUSED: dict[str, Callable[[], object]] = {
     "amplitude_gradients": lambda: fitting.amplitude_gradients(
         fitting.read_table(TABLE), "law", {"r": 0.9, "epsilon": 60.0}
     ),
-    "basins_of_attraction": lambda: afm.basins_of_attraction(_scene(), columns=2, rows=2),
-    "bifurcation_diagram": lambda: afm.bifurcation_diagram(_scene(), "platform.amplitude_nm", np.array([1.0, 2.0])),
+    "basins_of_attraction": lambda: afm.basins_of_attraction(bouncing(), columns=2, rows=2),
+    "bifurcation_diagram": lambda: afm.bifurcation_diagram(bouncing(), "platform.amplitude_nm", np.array([1.0, 2.0])),
     "bootstrap": lambda: fitting.bootstrap(fitting.fit(fitting.read_table(TABLE))),
     "calibrate": lambda: fitting.calibrate(fitting.read_sweep(EXAMPLES / "real" / "thermal_nanosurf.nid")),
     "compare": lambda: fitting.compare(fitting.read_table(TABLE)),
     "contact_orbits": lambda: afm.contact_orbits(_contact(), 1, 1),
-    "continue_orbits": lambda: afm.continue_orbits(_scene(), 1, _range()),
+    "continue_orbits": lambda: afm.continue_orbits(bouncing(), 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0)),
     "fit": lambda: fitting.fit(fitting.read_table(TABLE)),
     "fit_delay": lambda: fitting.fit_delay(afm.Contact.paper()),
     "fit_law": lambda: fitting.fit_law(afm.Contact.paper()),
     "invert": lambda: fitting.invert(fitting.read_table(TABLE)),
-    "iterate_batch": lambda: afm.iterate_batch(_scene(), np.array([4.0]), np.array([60.0]), 2),
-    "iterate_map": lambda: afm.iterate_map(_scene(), 4.0, 60.0, 2),
-    "lyapunov_spectrum": lambda: afm.lyapunov_spectrum(_scene()),
-    "many_impact_orbits": lambda: afm.many_impact_orbits(_scene(), 1, 2),
+    "iterate_batch": lambda: afm.iterate_batch(bouncing(), np.array([4.0]), np.array([60.0]), 2),
+    "iterate_map": lambda: afm.iterate_map(bouncing(), 4.0, 60.0, 2),
+    "lyapunov_spectrum": lambda: afm.lyapunov_spectrum(bouncing()),
+    "many_impact_orbits": lambda: afm.many_impact_orbits(bouncing(), 1, 2),
     "make_law": lambda: afm.make_law(afm.Contact.paper()),
-    "map_jacobian": lambda: afm.map_jacobian(_scene(), 4.0, 60.0),
-    "next_impact": lambda: afm.next_impact(_scene(), 4.0, 60.0),
+    "map_jacobian": lambda: afm.map_jacobian(bouncing(), 4.0, 60.0),
+    "next_impact": lambda: afm.next_impact(bouncing(), 4.0, 60.0),
     "simulate": lambda: afm.simulate(_contact(), state(0.0, 10.0, 0.0), 10.0),
     "simulate_experiment": lambda: fitting.simulate_experiment(
         afm.Contact.paper(), afm.Cantilever(90.0, 40.0), drives_of([(1, 180.0, 4.0, 0.0)])
     ),
-    "single_impact_orbits": lambda: afm.single_impact_orbits(_scene(), 1),
+    "single_impact_orbits": lambda: afm.single_impact_orbits(bouncing(), 1),
     "stability_chart": lambda: afm.stability_chart(
-        afm.scene_family(_scene(), "platform.reduced_frequency", "platform.amplitude_nm"),
+        afm.scene_family(bouncing(), "platform.reduced_frequency", "platform.amplitude_nm"),
         x_values=np.array([1.0, 1.1]),
         y_values=np.array([1.0, 2.0]),
         last_order=1,
     ),
-    "sweep": lambda: afm.sweep(_scene(), [{"parameter": "platform.amplitude_nm", "linear": [1, 2, 2]}], "orbits"),
-    "approach_curve": lambda: afm.approach_curve(_scene(), [10.0]),
+    "sweep": lambda: afm.sweep(bouncing(), [{"parameter": "platform.amplitude_nm", "linear": [1, 2, 2]}], "orbits"),
+    "approach_curve": lambda: afm.approach_curve(bouncing(), [10.0]),
     "tapping": lambda: fitting.tapping(fitting.read_table(EXAMPLES / "tapping_contact.csv")),
 }
 """What says that it needs 64 bits."""
@@ -89,17 +81,8 @@ NO_NUMBERS = {
     # read, write, remember; NumPy alone; or what one of the above hands to them
     *("load", "load_law", "load_scene", "save_law", "save_scene", "scene_family", "use_cache", "trajectory"),
     *("prior_of_values", "design", "drive_grid", "equipartition", "fit_each", "lockin", "posterior", "read_curve"),
-    *(
-        "read_curves",
-        "read_sweep",
-        "read_table",
-        "read_trace",
-        "sader",
-        "sensitivity",
-        "tapping_map",
-        "tapping_together",
-    ),
-    *("table_of_curve", "write_inference_data", "write_table"),
+    *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "sensitivity", "tapping_map"),
+    *("tapping_together", "table_of_curve", "write_inference_data", "write_table"),
 }
 
 
