@@ -118,9 +118,9 @@ def test_many_tips_begin_on_the_fastest_stable_orbit_of_the_full_search():
 @pytest.mark.slow
 def test_shares_of_basins_are_those_of_random_starts():
     scene = law_scene(1.57)
-    found = basins_of_attraction(scene, columns=60, rows=60, speeds_nm_per_us=(0.0, 15.0))
+    found = basins_of_attraction(scene, columns=100, rows=100, speeds_nm_per_us=(0.0, 15.0))
     assert {attractor.name for attractor in found.attractors} == {"(3,4)", "(2,4)"}
-    starts = 4_000
+    starts = 10_000
     phase, rebound = np.random.default_rng(7).uniform([[0.0], [0.0]], [[2.0 * np.pi], [15.0]], (2, starts))
     time = phase / float(scene.platform.angular_frequency)
     flown = afm.iterate_batch(scene, time, np.asarray(scene.platform.velocity(time)) + rebound, 300)
