@@ -3,6 +3,7 @@
 import collections.abc
 import dataclasses
 import enum
+import importlib
 import inspect
 import json
 import math
@@ -22,6 +23,10 @@ import pytest
 import afm_jax as afm
 import fitting
 from afm_jax import results, saved
+from afm_jax.contact.collide import Collisions
+from afm_jax.contact.law_of_contact import ContactLaws
+from afm_jax.dynamics.bifurcations import Ramps
+from afm_jax.effects.effect_table import EffectTable
 from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
 from afm_jax.scenefile.parameter_paths import ParameterRange
@@ -316,6 +321,13 @@ def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_pat
     np.testing.assert_array_equal(drawn["contact"], [[5.0, np.nan], [20.0, 3.0], [40.0, 1.0]])
     for axes in (middle, lower):
         np.testing.assert_array_equal(axes.lines[0].get_ydata(), [np.nan, 3.0, 1.0])
+
+
+@pytest.mark.parametrize("told", [Ramps, Collisions, ContactLaws, EffectTable])
+def test_what_a_command_tells_names_a_picture_that_there_is(told: type):
+    module, _, name = getattr(told, "_picture").partition(":")  # noqa: B009  # no field of a named tuple
+    assert callable(getattr(importlib.import_module(module), name))
+    assert getattr(told, "plot") is results.Result.plot  # noqa: B009
 
 
 def test_slots_without_an_orbit_are_in_no_table_and_no_picture(tmp_path: Path):
