@@ -177,3 +177,23 @@ def test_the_library_leaves_jax_as_it_is():
     assert len(excused) > 3
     own_programs = {"afm_jax/__main__.py", "afm_jax/bench/timing.py", "afm_jax/compilation_cache.py"}
     assert set(map(str, changing)) - set(map(str, excused)) == own_programs
+
+
+WITHOUT_EXTRAS = """
+import importlib, sys
+for package in ("arviz", "blackjax", "dask", "distributed", "h5py", "mpmath", "numcodecs", "pandas", "xarray", "zarr"):
+    sys.modules[package] = None  # imports fail
+import jax
+jax.config.update("jax_enable_x64", True)
+from afm_jax.cli.main import COMMANDS
+for row in COMMANDS.values():
+    try:
+        importlib.import_module(row.runs.partition(":")[0])
+    except ModuleNotFoundError as error:
+        print(row.name, error.name)
+"""
+
+
+def test_a_command_needs_the_packages_of_extras_only_for_what_they_are_for():
+    # most of them take a second to import, too
+    assert python(WITHOUT_EXTRAS).splitlines() == ["sweep xarray"]

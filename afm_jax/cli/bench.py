@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from afm_jax.bench import collisions, dynamics, scenes, sweeps, timing
+from afm_jax.bench import collisions, dynamics, scenes, timing
 from afm_jax.bench.study import StudyTable
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
@@ -175,6 +175,8 @@ def measure_sweeps(size: Size) -> Measured:
     """Measure sweeps over law scenes."""
     full = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 8_000_000, "processes": [1, 2, 4]}
     small = {"sizes": [2000], "points": 0, "processes": []}
+    from afm_jax.bench import sweeps  # noqa: PLC0415 (needs Zarr, which the other parts do not)
+
     rows = sweeps.sweep_rows(**(small if size.quick else full), cores=size.cores)
     return Measured(rows, sweeps.aims(rows))
 

@@ -4,8 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from afm_jax.cli.command import Output
-from afm_jax.cli.each import fit_each
+from afm_jax.cli.command import Output, later
 from afm_jax.cli.session import Session, prepare_folder
 from afm_jax.cli.values import example_path, tables_with
 from afm_jax.words import text_table
@@ -18,6 +17,8 @@ from fitting.sampling.bootstrap import bootstrap
 from fitting.sampling.inference_data import require_netcdf, write_inference_data
 from fitting.sampling.posterior import posterior, require_blackjax
 from fitting.tables.several import SeveralTables
+
+fit_each = later("afm_jax.cli.each:fit_each")
 
 
 def fit(

@@ -21,7 +21,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.impact_loop import (
@@ -408,6 +407,8 @@ def root_on(leg: CurveLeg, test: Callable[[CurvePoint], float], family: LoopFami
         return np.nan if point is None else test(point)
 
     try:
+        from scipy.optimize import brentq  # noqa: PLC0415 (half a second, seldom needed)
+
         fraction = float(np.asarray(brentq(tested_at, 0.0, 1.0, xtol=1e-15)))
     except ValueError:
         # the guesses on the way led elsewhere

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
@@ -224,6 +223,8 @@ def _ended(
         end, kind = _narrowed(at, points[last], fractions[beyond]), None
         if least(end[0]) < 0.0 <= least(fractions[beyond]):
             # shortly before, the flight is too short to be flown
+            from scipy.optimize import brentq  # noqa: PLC0415 (half a second, seldom needed)
+
             held = float(np.asarray(brentq(least, end[0], fractions[beyond], xtol=1e-14)))
             if abs(held - end[0]) < _SHORT_FLIGHT:
                 end, kind = (held, end[1]), "held"
