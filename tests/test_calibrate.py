@@ -230,7 +230,10 @@ def test_what_is_no_calibration_is_not_valid(sweep, said):
 
 def test_noise_or_nothing_is_no_resonance():
     random, khz = np.random.default_rng(3), np.linspace(89.0, 91.0, 80)
-    noise = {"amplitude": 1.0 + 0.02 * random.standard_normal(80), "phase_deg": random.uniform(-2.0, 2.0, 80)}
+    noise: dict[str, Any] = {
+        "amplitude": 1.0 + 0.02 * random.standard_normal(80),
+        "phase_deg": random.uniform(-2.0, 2.0, 80),
+    }
     result = calibrate(ResonanceSweep(frequency_khz=khz, **noise), compare=False)
     assert not result.valid
     assert any("No resonance stands out" in reason for reason in result.reasons)

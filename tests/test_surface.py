@@ -122,7 +122,8 @@ def test_amplitude_zero_has_a_derivative():
 
 def test_undamped_at_resonance_is_refused():
     base, force = BaseDrive(1.0, 90.0), ForceDrive(1.0, 50.0, 0.0, Tone(1.0, 90.0 + 1e-9))
-    for quality, drive in ((None, {"base": base}), (np.inf, {"force": force})):
+    cases: tuple[tuple[float | None, dict[str, Any]], ...] = ((None, {"base": base}), (np.inf, {"force": force}))
+    for quality, drive in cases:
         (name,) = drive
         with pytest.raises(ValueError, match=f"`{name}` drives an undamped cantilever at its free frequency"):
             surface_of(Scene(Cantilever(90.0, quality), PLATFORM, **drive))

@@ -40,7 +40,7 @@ def small_table(**changes: Any) -> AmplitudeTable:
     columns: dict[str, Any] = {"order": np.array([1, 2]), "drive_frequency_khz": np.array([180.0, 349.2])}
     columns |= {"drive_amplitude_nm": np.array([4.0, 2.0]), "offset_nm": np.array([0.0, -1.0])}
     columns |= {"peak_amplitude_nm": np.array([163.3, 106.67]), "peak_amplitude_error_nm": np.array([1.63, 1.06])}
-    return AmplitudeTable(**({"free_frequency_khz": 90.0} | columns | changes))
+    return AmplitudeTable(**{"free_frequency_khz": 90.0, **columns, **changes})
 
 
 def assert_same(left: AmplitudeTable, right: AmplitudeTable, *, but: tuple[str, ...] = ()) -> None:
