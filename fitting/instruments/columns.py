@@ -54,7 +54,7 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
         units = [unit_named(piece) for piece in rest if not NUMBER.fullmatch(piece)]
         factors = [float(piece) for piece in rest if NUMBER.fullmatch(piece)]
         if not sign or not channel or len(units) > 1 or len(factors) > 1 or 0.0 in factors:
-            raise ValueError(f"`{part.strip()}` is no COLUMN=CHANNEL[:UNIT][:FACTOR]; write offset_nm=Z:um:-1")
+            raise ValueError(f"'{part.strip()}' is no COLUMN=CHANNEL[:UNIT][:FACTOR]; write offset_nm=Z:um:-1")
         if column not in ROLES:
             raise ValueError(f"there is no column `{column}`; it is one of {', '.join(ROLES)}")
         if column in found:
