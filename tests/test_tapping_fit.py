@@ -113,6 +113,7 @@ def law_at(result: FitResult, speeds: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_contact_comes_out_of_a_noisy_curve():
     """What its taps hold, and to one side what they hold no better; nothing but the tip's radius is known."""
     truth = tapping_truth(0)
