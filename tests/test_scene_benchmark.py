@@ -97,8 +97,10 @@ def test_errors_are_shown_apart_for_contacts_that_turn(followed):
     left = alone.contacts.departure_time_us + jnp.linspace(0.0, 1e-5, 6)[:, None]
     wrong = changed(alone, rebound_speed_nm_per_us=speeds, departure_time_us=left)
     row = contact_errors(wrong, alone, single._replace(turning=turning))
-    wanted = {"turning_rebound_error_median": 1e-3, "straight_rebound_error_worst": 1e-6}
-    wanted |= {"straight_time_error_us_worst": 1e-5, "turning_time_error_us_worst": 2e-6, "turning_share": 1.0 / 3.0}
+    assert row["turning_share"] == pytest.approx(1.0 / 3.0, rel=1e-12)
+    assert row["turning_rebound_error_median"] == pytest.approx(1e-3, rel=1e-9)
+    wanted = {"straight_rebound_error_worst": 1e-6}
+    wanted |= {"straight_time_error_us_worst": 1e-5, "turning_time_error_us_worst": 2e-6}
     assert {name: row[name] for name in wanted} == pytest.approx(wanted, rel=1e-6)
     assert row["different"] == 0
     # a contact that does not end has no error: it is counted

@@ -42,6 +42,11 @@ _IMPACT_CELLS: dict[str, Cell] = {
 }
 
 
+def _picture_of_found(self: "OrbitTable | ManyOrbitTable", path: str | Path | None = None) -> "Figure":
+    """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
+    return self.found.plot(path)
+
+
 class OrbitTable(NamedTuple):
     """The single-impact orbits of one scene, of order N."""
 
@@ -49,11 +54,7 @@ class OrbitTable(NamedTuple):
     order: int
     found: SingleImpactOrbits
 
-    text = Result.text
-
-    def plot(self, path: str | Path | None = None) -> "Figure":
-        """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
-        return self.found.plot(path)
+    text, plot = Result.text, _picture_of_found
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -118,11 +119,7 @@ class ManyOrbitTable(NamedTuple):
     resting: StickingOrbit | str
     """The orbit with a rest, or a sentence on why there is none."""
 
-    text = Result.text
-
-    def plot(self, path: str | Path | None = None) -> "Figure":
-        """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
-        return self.found.plot(path)
+    text, plot = Result.text, _picture_of_found
 
     @property
     def rows(self) -> list[dict[str, Any]]:
