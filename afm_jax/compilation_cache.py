@@ -13,9 +13,10 @@ import sys
 import tempfile
 import warnings
 from contextlib import suppress
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Cache(NamedTuple):
@@ -60,6 +61,24 @@ def silence_xla() -> None:
         # what jax.config's jax_logging_level calls, which changes loggers of Python, too
         with suppress(ImportError, AttributeError):
             import_module("jaxlib.utils").absl_set_min_log_level(3)
+
+
+@lru_cache
+def quick_options() -> dict[str, Any] | None:
+    """Return options that leave the compiler's slowest passes on the CPU out, where it knows them by these names.
+
+    For programs that run less often than it takes to compile them (those kept by commands, derivatives outside of
+    compiled programs): they take half as long to compile, for a tenth of the time that they run.
+    """
+    import jax  # noqa: PLC0415  # packages are imported without it
+
+    options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+    try:
+        known = jax.default_backend() == "cpu"
+        jax.jit(lambda x: x, compiler_options=options)(0.0)
+    except jax.errors.JaxRuntimeError:
+        return None
+    return options if known else None
 
 
 def open_cache() -> Cache:

@@ -505,7 +505,8 @@ def _of_pairs_of_one_drive(pairs: _Pairs, program: Callable[..., _Block]) -> _Bl
         column = column.reshape(sets, rows, *column.shape[1:])
         return np.concatenate([column, np.repeat(column[:, -1:], filling, axis=1)], axis=1)
 
-    block = jax.tree.map(of_table, in_blocks(work, lanes, block=_lanes(problem), widths=()))
+    compiled = (program, problem, jax.tree.structure((impacts, pairs.measurement)))
+    block = jax.tree.map(of_table, in_blocks(work, lanes, block=_lanes(problem), widths=(), program=compiled))
     # rows that only fill a table up say nothing
     for unread in (block.misfit, block.slope, block.unseen):
         unread[:, rows:] = 0.0

@@ -3,7 +3,6 @@
 import re
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,20 +29,6 @@ def start_jax(tell: Callable[[str], None]) -> Cache:
         warnings.filterwarnings("ignore", message=_UNWRITTEN)
         _replace_damaged(cache.folder, tell)
     return cache
-
-
-@lru_cache
-def quick_options() -> dict[str, Any] | None:
-    """Return options that leave the compiler's slowest passes on the CPU out, where it knows them by these names.
-
-    Kept programs (`keep_programs`) take half as long to compile, for a tenth of the time that they run.
-    """
-    options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-    try:
-        jax.jit(lambda x: x, compiler_options=options)(0.0)
-    except jax.errors.JaxRuntimeError:
-        return None
-    return options
 
 
 def count_programs() -> dict[str, int]:

@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 from jax import core, export
 
-from afm_jax.cli.compilation import quick_options
+from afm_jax.compilation_cache import quick_options
 from afm_jax.whole_files import write_whole
 
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")

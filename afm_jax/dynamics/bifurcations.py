@@ -2,8 +2,8 @@
 
 A sweep carries the tip from value to value, which is what makes hysteresis show, and is a long sequence. It is done in
 many lanes at once, each a stretch of neighbouring values, like this: a first tip hurries along the first values of all
-stretches; from where it was, all stretches are ramped side by side; then the first value of every stretch is done again
-from the end of the stretch before it, and the stretches in which that makes a difference are ramped again from there,
+stretches; from where it was, all stretches are ramped side by side; then every stretch is ramped again from the end of
+the one before it, for as long as that makes a difference, and those behind the ones whose end became another are, too,
 until none is left. What remains is what one tip that is ramped along all values does, where its motion is regular; it
 carries drive phase and rebound speed from value to value. A tip that the platform holds, or that flies away, begins
 anew at the next value, where it is told to or where there is motion (`bouncing_tips`).
@@ -41,8 +41,8 @@ _HURRIED = 100
 """Impacts at each value of the first, hurried sweep."""
 _PASSES = 40
 """Times at most that stretches are ramped again."""
-_FEW = 128
-"""Lanes of a block of laws unless there are more than fill a whole one: fewer take as long."""
+_FEW = 16
+"""Lanes of a block of laws unless there are more than fill a whole one."""
 _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 _LISTED = 6
@@ -218,11 +218,12 @@ def bifurcation_diagram(  # noqa: PLR0913
     if impacts < RECORDED:
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
     begin = None if start is None else seen.start(start_of(scenes, start))
-    with _compiling_for(seen.scenes, accuracy):
+    with _compiling_for(seen.scenes, impacts, accuracy):
         _, fresh = batch_and_tips(seen.scenes, begin)
-    seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
-    sweeper = _Sweeper(seen.scenes, fresh, impacts, accuracy)
-    swept, complete = sweeper.run(report)
+        seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
+        sweeper = _Sweeper(seen.scenes, fresh, impacts, accuracy)
+        starts = sweeper.hurried()
+    swept, complete = sweeper.run(starts, report)
     restarted = np.append(False, swept.end.outcome[:-1] != Outcome.IMPACT)
     order = slice(None) if upward else slice(None, None, -1)
     seen, platform, swept, restarted = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept, restarted))
@@ -230,12 +231,13 @@ def bifurcation_diagram(  # noqa: PLR0913
     return _sweep_of(seen, platform, swept, restarted, ordered, upward=upward, complete=complete)
 
 
-def _compiling_for(scenes: Scene, accuracy: float) -> AbstractContextManager[None]:
-    """Compile on another core what will follow the tips of scenes with laws."""
+def _compiling_for(scenes: Scene, impacts: int, accuracy: float) -> AbstractContextManager[None]:
+    """Compile on another core what will follow the tips of scenes with laws, many and few."""
     if isinstance(scenes.interaction, Contact):
         return nullcontext()
-    scenes, anywhere = jax.tree.map(np.asarray, (scenes, leaving_tips(scenes)))
-    return compiling(_Sweeper(scenes, anywhere, RECORDED, accuracy).follow_the_firsts)
+    scenes, ended = jax.tree.map(np.asarray, (scenes, leaving_tips(scenes)))
+    ended = ended._replace(outcome=np.full_like(ended.outcome, Outcome.CAPTURED))
+    return compiling(_Sweeper(scenes, ended, impacts, accuracy).follow_some)
 
 
 class _SweptRows(NamedTuple):
@@ -257,30 +259,21 @@ class _Sweeper:
         self.stretch = max(shortest, min(longest, _LONG_STRETCH))
         self.lanes = -(-self.count // self.stretch)
 
-    def run(self, report: Report | None) -> tuple[_SweptRows, bool]:
-        """Return the sweep of all values, and whether nothing was left to be ramped again."""
+    def run(self, starts: Tips, report: Report | None) -> tuple[_SweptRows, bool]:
+        """Return the sweep of all values, and whether nothing was left to be ramped again.
+
+        Args:
+            starts: tips at the first values of all stretches.
+            report: told how many of how many values are done.
+        """
         every = np.arange(self.lanes)
-        starts = self._hurried()
         parts = self._sweep(every, starts, report)
         changed = every
         for _ in range(_PASSES):
-            behind = changed[changed + 1 < self.lanes] + 1
-            if not behind.size:
-                break
-            starts = self._carried(parts[-1], behind - 1, self._numbers(behind - 1)[:, -1], behind)
-            first = self._follow(self._numbers(behind)[:, 0], starts)
-            differs = ~_same(first, jax.tree.map(lambda part, rows=behind: part[rows], parts[0]))
-            changed = behind[differs]
+            changed = self._swept_again(parts, changed[changed + 1 < self.lanes] + 1)
             if not changed.size:
-                break
-            chosen = jax.tree.map(lambda part, rows=differs: part[rows], starts)
-            again = self._sweep(changed, chosen, None)
-            for old, new in zip(parts, again, strict=True):
-                for part, rows in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True):
-                    part[changed] = rows
-        else:
-            return self._joined(parts), False
-        return self._joined(parts), True
+                return self._joined(parts), True
+        return self._joined(parts), False
 
     def _numbers(self, lanes: np.ndarray) -> np.ndarray:
         """Return the numbers of the values of stretches; the last stretch ends with its last value again and again."""
@@ -307,9 +300,32 @@ class _Sweeper:
                 report(min((place + 1) * len(lanes), self.count), self.count)
         return parts
 
+    def _swept_again(self, parts: list[_SweptRows], lanes: np.ndarray) -> np.ndarray:
+        """Ramp stretches again from the ends of those before them, each for as long as that makes a difference.
+
+        Args:
+            parts: what came out at the first, second, ... value of all stretches; what differs is written over.
+            lanes: the stretches.
+
+        Returns:
+            The stretches whose end became another one.
+        """
+        for place in range(self.stretch):
+            if not lanes.size:
+                break
+            before, row = (parts[place - 1], lanes) if place else (parts[-1], lanes - 1)
+            old = self._numbers(row)[:, place - 1]
+            tips = self._carried(before, row, old, lanes, place)
+            now, then = self._follow(self._numbers(lanes)[:, place], tips), _rows_of(parts[place], lanes)
+            differs = ~_same(now, then)
+            lanes = lanes[differs]
+            for part, rows in zip(jax.tree.leaves(parts[place]), jax.tree.leaves(now), strict=True):
+                part[lanes] = rows[differs]
+        return lanes
+
     def _carried(self, before: _SweptRows, rows: Any, old: np.ndarray, lanes: np.ndarray, place: int = 0) -> Tips:
         """Return tips of one value at the next one."""
-        end = jax.tree.map(lambda part: part[rows], before.end)
+        end = _rows_of(before.end, rows)
         tips = carried(self._at(old)[0], *self._at(self._numbers(lanes)[:, place]), end)
         return jax.tree.map(np.asarray, tips)
 
@@ -324,16 +340,18 @@ class _Sweeper:
             end, record = in_blocks(work, (scenes, tips))
         else:
             width = LANES if len(numbers) > LANES else _FEW
-            end, record = in_blocks(work, (scenes, tips), block=width, widths=(width,))
+            program = (follow, self.impacts, self.accuracy)
+            end, record = in_blocks(work, (scenes, tips), block=width, widths=(width,), program=program)
         period = self.period_us[numbers]
         return _SweptRows(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
 
-    def follow_the_firsts(self) -> _SweptRows:
-        """Return what the tips that begin there come to at the first values of all stretches."""
+    def follow_some(self) -> None:
+        """Follow the tips that begin at the first values of all stretches, and those of few."""
         firsts = self._numbers(np.arange(self.lanes))[:, 0]
-        return self._follow(firsts, self._at(firsts)[1])
+        for some in (firsts, firsts[:_FEW]):
+            self._follow(some, self._at(some)[1])
 
-    def _hurried(self) -> Tips:
+    def hurried(self) -> Tips:
         """Return the tips that one gets at the first values of all stretches in a sweep of those alone."""
         firsts, fresh = self._at(self._numbers(np.arange(self.lanes))[:, 0])
         if not isinstance(self.scenes.interaction, Contact):
@@ -380,6 +398,10 @@ def carried(before: Scene, after: Scene, fresh: Tips, tips: Tips) -> Tips:
     )
     going = tips.outcome == Outcome.IMPACT
     return jax.tree.map(lambda old, new: jnp.where(going, old, new), tips_there, fresh)
+
+
+def _rows_of(tree: Any, rows: Any) -> Any:
+    return jax.tree.map(lambda part: part[rows], tree)
 
 
 def _same(one: _SweptRows, other: _SweptRows) -> Bool[np.ndarray, " lanes"]:

@@ -4,9 +4,9 @@
 last ones. A time is a number of whole drive periods plus a remainder in us within one period, so that the drive's phase
 stays accurate in long motions.
 
-Of laws, `advance` is one step of the impact map (`impact_after`) for a block of tips that fits the processor's cache.
-It is written for arrays, not as a `vmap` of one tip: what only a resting tip needs (chatter summed up, the ride, the
-release) and long searches for an impact are computed in the steps in which a tip of the block needs them.
+Of laws, `advance` is one step of the impact map for a block of tips that fits the processor's cache: `impact_after`,
+written for arrays, not as a `vmap` of one tip: what only a resting tip needs (chatter summed up, the ride, the release)
+and long searches for an impact are computed in the steps in which a tip of the block needs them.
 
 Contacts are simulated, a stretch of many at a time. A tip departs where the bridge breaks, at one gap always, so that
 its next contact depends on time and velocity alone: a map of two variables like that of impacts, whose Jacobian is the
@@ -26,8 +26,9 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase
+from afm_jax.impact.first_impact import Flight
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
+from afm_jax.impact.map import Departure, NextImpact, Search, end_of_flight, flight_from, impact_at_end
 from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, through_impact
 from afm_jax.motion.record import ContactKind, Contacts, Simulation, State
 from afm_jax.motion.settle import HELD_PERIODS
@@ -127,13 +128,18 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
         scenes: a batch of scenes with a law, every number of one lane a tip.
         tips: at the beginning of a flight each.
     """
-    longer = jax.vmap(partial(_one_impact, max_steps=MAX_STEPS))
+
+    def ends(max_steps: int):
+        return jax.vmap(partial(end_of_flight, search=Search(max_steps)))
+
+    flights = jax.vmap(_flight_of)(scenes, tips)
     if len(tips.time_us) <= _FEW:
-        return after_impacts(scenes, tips, longer(scenes, tips))
-    going = tips.outcome == Outcome.IMPACT
-    impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
-    slow = going & (impact.outcome == Outcome.STEP_LIMIT)
-    return after_impacts(scenes, tips, again_for(longer, slow, (scenes, tips), impact, block=_FEW))
+        found = ends(MAX_STEPS)(scenes, flights)
+    else:
+        found = ends(_QUICK_STEPS)(scenes, flights)
+        slow = found.outcome == Outcome.STEP_LIMIT
+        found = again_for(ends(MAX_STEPS), slow, (scenes, flights), found, block=_FEW)
+    return after_impacts(scenes, tips, jax.vmap(impact_at_end)(scenes, flights, found))
 
 
 def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
@@ -166,9 +172,9 @@ def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
     return MapStep(tips, impact, rested, end)
 
 
-def _one_impact(scene: Scene, tip: Tips, *, max_steps: int) -> NextImpact:
+def _flight_of(scene: Scene, tip: Tips) -> Flight:
     departure = Departure(tip.time_us, tip.gap_nm, tip.velocity_nm_per_us)
-    return impact_after(scene, departure, Search(max_steps), flies=tip.outcome == Outcome.IMPACT)
+    return flight_from(scene, departure, Search(MAX_STEPS), flies=tip.outcome == Outcome.IMPACT)
 
 
 def _slowest_chatter(scene: Scene) -> Float[Array, ""]:

@@ -21,7 +21,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, require_float64
-from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
+from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, FirstImpact, Flight, first_impact
 from afm_jax.impact.lasting_impact import crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import Law, axes_of_one, impact_law_of
 from afm_jax.outcomes import Outcome
@@ -297,20 +297,35 @@ def impact_after(
         search: for the impact.
         flies: whether there is a flight; where there is none the search ends at once with `Outcome.INVALID_START`.
     """
-    law, cantilever, surface = impact_law_of(scene), scene.cantilever, scene.platform
+    flight = flight_from(scene, departure, search, flies=flies)
+    return impact_at_end(scene, flight, end_of_flight(scene, flight, search))
+
+
+def flight_from(scene: Scene, departure: Departure, search: Search, *, flies: Bool[Array, ""] | None = None) -> Flight:
+    """Return the flight that begins with a departure; where there is none (`flies`), one that ends at once."""
     time, gap, velocity = departure
     if flies is not None:
         # a tip that sinks into the surface from the start is in no flight
-        velocity = jnp.where(flies, velocity, surface.velocity(time) - 1.0)
+        velocity = jnp.where(flies, velocity, scene.platform.velocity(time) - 1.0)
         gap = gap if gap is None else jnp.where(flies, gap, 0.0)
-    flight = Flight(cantilever, surface, time, velocity, gap, jnp.zeros_like(time) if search.from_above else None)
-    first = first_impact(
+    level = jnp.zeros_like(time) if search.from_above else None
+    return Flight(scene.cantilever, scene.platform, time, velocity, gap, level)
+
+
+def end_of_flight(scene: Scene, flight: Flight, search: Search) -> FirstImpact:
+    """Return when a flight ends; where a negative delay let it begin early, the search begins after the overlap."""
+    return first_impact(
         flight,
-        skip_us=_overlap(law, flight),
-        latest_us=None if search.until_us is None else search.until_us - time,
+        skip_us=_overlap(impact_law_of(scene), flight),
+        latest_us=None if search.until_us is None else search.until_us - flight.start_us,
         max_steps=search.max_steps,
         root_tolerance_us=search.root_tolerance_us,
     )
+
+
+def impact_at_end(scene: Scene, flight: Flight, first: FirstImpact) -> NextImpact:
+    """Return the impact of a law (eqs. 2 and 4) with which a flight ends."""
+    law, cantilever, surface = impact_law_of(scene), scene.cantilever, scene.platform
     arrival = flight.start_us + first.duration_us
     _, before = cantilever.propagator(first.duration_us)(flight.position, flight.velocity)
     hit = first.outcome == Outcome.IMPACT

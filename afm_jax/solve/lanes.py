@@ -7,7 +7,7 @@ A batch costs what its hardest lane costs where all lanes take the same steps. S
 need more are gathered into small blocks of their own, where no others wait for them.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -28,6 +28,8 @@ LANES = 512
 """Lanes of a block that stay in the processor's cache; from 300 to 1000 differ little."""
 WIDTHS = (1, 16, 128, LANES)
 """Sizes of blocks: few, so that few programs are compiled."""
+_COMPILED: set[Hashable] = set()
+"""Programs of `in_blocks` that have run, with the shapes of their lanes."""
 Report = Callable[[int, int], object]
 """Told how many of how many lanes are done."""
 
@@ -50,8 +52,11 @@ def in_blocks(
     block: int = LANES,
     widths: Sequence[int] = WIDTHS,
     report: Report | None = None,
+    program: Hashable = None,
 ) -> Any:
     """Return the results of work on lanes as NumPy arrays, done block by block on all cores.
+
+    The first block is done alone, so that programs are compiled once, unless that is known to have happened before.
 
     Args:
         work: takes a tree of JAX arrays with a leading axis of lanes, gives one of arrays with the same axis.
@@ -59,6 +64,7 @@ def in_blocks(
         block: lanes of a block; of fewer lanes there is one smaller block.
         widths: sizes that a smaller block may have, in ascending order.
         report: told how far it is, from the second block on.
+        program: names the work with all that shapes its programs but the lanes; None: it may be new every time.
     """
     count = len(jax.tree.leaves(lanes)[0])
     width = next((width for width in widths if width >= min(count, block)), block)
@@ -73,12 +79,16 @@ def in_blocks(
             return jax.tree.map(np.asarray, work(jax.tree.map(cut, whole)))
 
     firsts = range(0, count, width)
-    done = [part(0)]  # alone, so that programs are compiled once
-    if len(firsts) > 1:
+    leaves, structure = jax.tree.flatten(whole)
+    compiled = (program, width, structure, *((leaf.dtype, leaf.shape[1:]) for leaf in leaves))
+    alone = 0 if program is not None and compiled in _COMPILED else 1
+    done = [part(first) for first in firsts[:alone]]
+    _COMPILED.add(compiled)
+    if len(firsts) > alone:
         with ThreadPoolExecutor(available_cores()) as pool:
-            for result in pool.map(part, firsts[1:]):
+            for result in pool.map(part, firsts[alone:]):
                 done.append(result)
-                if report is not None:
+                if report is not None and len(done) > 1:
                     report(min(len(done) * width, count), count)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
 
