@@ -413,8 +413,8 @@ def _repetition(
     """Return whether a contact that a tip has left is to be computed again in finer steps, and what it ended with.
 
     The first repetition is made of contacts that magnify errors: the tip left with less than 1/`magnified` of its
-    kinetic energy, stayed long, or did not form the junction exactly once. More follow, up to five in all, until rate
-    (relative) and time (in us, times 10) of the departure change by less than 4 `agreement`.
+    kinetic energy, or stayed long. More follow, up to five in all, until rate (relative) and time (in us, times 10) of
+    the departure change by less than 4 `agreement`.
     """
     if setting.agreement is None:
         return jnp.zeros_like(has_left), repeats
@@ -428,8 +428,7 @@ def _repetition(
         jnp.abs(departed.gap_rate - previous.departure_rate),
         10.0 * jnp.abs(departed.time_us - previous.departure_us) * jnp.abs(departed.gap_rate),
     ) > _LESS * setting.agreement * jnp.abs(departed.gap_rate)
-    magnified = slowed | lasts | (tip.junctions != 1)
-    again = has_left & jnp.where(repeats.times == 0, magnified, differs & (repeats.times < _MOST_REPEATS))
+    again = has_left & jnp.where(repeats.times == 0, slowed | lasts, differs & (repeats.times < _MOST_REPEATS))
     over = repeats._replace(times=jnp.where(has_left, 0, repeats.times))
     return again, _where(again, Repeats(repeats.times + 1, departed.time_us, departed.gap_rate), over)
 
