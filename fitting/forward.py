@@ -9,7 +9,6 @@ Below, `linearise` and `predict` do that for all pairs of a set of parameters an
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,7 +27,7 @@ from afm_jax.impact.closure import OrbitPlace, OrbitProblem, follow_root, harmle
 from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
 from afm_jax.impact.orbits import amplitudes, near_fold, steady_orbits
-from afm_jax.solve.lanes import compiling, filled, in_blocks
+from afm_jax.solve.lanes import compiled_quickly, compiling, filled, in_blocks
 from fitting.models import Measurement, Problem, Rows
 
 
@@ -422,7 +421,7 @@ def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem
     return _Impacts(impact, jax.tree.map(lambda s: np.pad(s[:own], [(0, others), *[(0, 0)] * (s.ndim - 1)]), slopes))
 
 
-@partial(jax.jit, static_argnames="problem")
+@compiled_quickly(static_argnames="problem")
 def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> _Impacts:
     """Return the law, or the table of the contact, of several sets of values."""
     return _Impacts(*jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values))
@@ -532,7 +531,7 @@ def branch_near(coordinate: Any) -> Branch:
     return Branch(OrbitPlace(coordinate, numpy.zeros_like(coordinate)), there, there.astype(np.int32), nothing)
 
 
-@partial(jax.jit, static_argnames="problem")
+@compiled_quickly(static_argnames="problem")
 def located(
     points: Float[Array, "lanes p"],
     impacts: _Impacts,
@@ -549,7 +548,7 @@ def located(
     return jax.vmap(one)(points, impact, measurement.rows)
 
 
-@partial(jax.jit, static_argnames="problem")
+@compiled_quickly(static_argnames="problem")
 def linearise_pairs(
     points: Float[Array, "lanes p"],
     impacts: _Impacts,
@@ -598,7 +597,7 @@ def _block(prediction: Prediction, slope: Float[Array, "lanes k p"], rows: Rows)
     )
 
 
-@partial(jax.jit, static_argnames="problem")
+@compiled_quickly(static_argnames="problem")
 def predict_pairs(
     points: Float[Array, "lanes p"],
     impacts: _Impacts,

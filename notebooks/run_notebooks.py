@@ -8,6 +8,8 @@ from tempfile import TemporaryDirectory
 
 import nbformat
 
+from afm_jax.compilation_cache import processor_key
+
 ROOT = Path(__file__).parent.parent
 KEPT = ROOT / "build" / "notebooks" / "gallery"
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -16,6 +18,8 @@ _SECONDS_A_CELL = 600
 
 def run(path: Path) -> nbformat.NotebookNode:
     """Run a notebook from the first cell to the last, compiled as for users, and keep it with its outputs.
+
+    Notebooks share what they have compiled: many fit by the same programs.
 
     Args:
         path: the notebook, which itself stays without outputs.
@@ -28,6 +32,12 @@ def run(path: Path) -> nbformat.NotebookNode:
     """
     notebook = nbformat.read(path, as_version=4)
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    environment |= {
+        "PYTHONPATH": str(ROOT),
+        "TF_CPP_MIN_LOG_LEVEL": "3",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    environment["JAX_COMPILATION_CACHE_DIR"] = str(ROOT / "build" / f"programs-{processor_key()}")
     with warnings.catch_warnings(), TemporaryDirectory() as folder:
         # Jupyter's own: event loops and transports, nothing of the notebook's
         warnings.simplefilter("ignore")
@@ -39,7 +49,7 @@ def run(path: Path) -> nbformat.NotebookNode:
             resources={"metadata": {"path": folder}},
             extra_arguments=["--IPKernelApp.log_level=ERROR"],  # not that kernels talk over TCP, on this very machine
         )
-        client.execute(env={**environment, "PYTHONPATH": str(ROOT)})
+        client.execute(env=environment)
     notebook.metadata.pop("widgets", None)  # a page without a kernel shows pictures
     notebook.metadata["made_from"] = _made_from(path)
     KEPT.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ may drop the rule; the function itself is then differentiated.
 """
 
 from collections.abc import Callable, Hashable, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,8 +30,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
 from afm_jax.checks import is_traced
-from afm_jax.compilation_cache import quick_options
-from afm_jax.solve.lanes import again_for_the_open
+from afm_jax.solve.lanes import again_for_the_open, compiled_quickly
 
 _implicit_root = Primitive("implicit_root")
 
@@ -299,17 +298,8 @@ def _along(result: Array, slopes: Array, tangents: Sequence[Array]) -> Any:
     return total
 
 
-def _with_slopes(leaves: Sequence[Array], asked: _Slopes) -> tuple[Any, Any]:
-    """Return results and derivatives, compiled; outside of a compiled program quickly, for it hardly runs twice."""
-    return _compiled(quick=not any(map(is_traced, leaves)))(tuple(leaves), asked)
-
-
-@cache
-def _compiled(*, quick: bool) -> Callable[..., tuple[Any, Any]]:
-    return jax.jit(_results_and_slopes, static_argnums=1, compiler_options=quick_options() if quick else None)
-
-
-def _results_and_slopes(leaves: tuple[Array, ...], asked: _Slopes) -> tuple[Any, Any]:
+@compiled_quickly(static_argnames="asked")
+def _with_slopes(leaves: tuple[Array, ...], asked: _Slopes) -> tuple[Any, Any]:
     """Return results and derivatives: the derivatives by shifts, at 0, that all tips' numbers have in common."""
 
     def shifted(shifts):

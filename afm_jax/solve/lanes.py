@@ -10,6 +10,7 @@ need more are gathered into small blocks of their own, where no others wait for 
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache, wraps
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,7 +23,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool
 
 from afm_jax.checks import is_traced
-from afm_jax.compilation_cache import available_cores
+from afm_jax.compilation_cache import available_cores, quick_options
 
 LANES = 512
 """Lanes of a block that stay in the processor's cache; from 300 to 1000 differ little."""
@@ -108,6 +109,34 @@ def compiling(work: Callable[[], object]) -> Iterator[None]:
     with ThreadPoolExecutor(1) as pool:
         pool.submit(in_usual_precision)
         yield
+
+
+_Function = Callable[..., Any]
+
+
+def compiled_quickly(*, static_argnames: str | Sequence[str] = ()) -> Callable[[_Function], _Function]:
+    """Return a decorator like `jax.jit` for what takes longer to compile than to run: it has `quick_options`.
+
+    Inside of another program the function is compiled as that one is.
+
+    Args:
+        static_argnames: as of `jax.jit`.
+    """
+
+    def decorated(function: _Function) -> _Function:
+        @cache
+        def program(*, quick: bool) -> _Function:
+            options = quick_options() if quick else None
+            return jax.jit(function, static_argnames=static_argnames, compiler_options=options)
+
+        @wraps(function)
+        def called(*arguments: Any, **named: Any) -> Any:
+            inside = any(map(is_traced, jax.tree.leaves((arguments, named))))
+            return program(quick=not inside)(*arguments, **named)
+
+        return called
+
+    return decorated
 
 
 def map_in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int, recompute: bool = False) -> Any:
