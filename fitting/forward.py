@@ -504,8 +504,9 @@ def _of_pairs_of_one_drive(pairs: _Pairs, program: Callable[..., _Block]) -> _Bl
         column = column.reshape(sets, rows, *column.shape[1:])
         return np.concatenate([column, np.repeat(column[:, -1:], filling, axis=1)], axis=1)
 
-    compiled = (program, problem, jax.tree.structure((impacts, pairs.measurement)))
-    block = jax.tree.map(of_table, in_blocks(work, lanes, block=_lanes(problem), widths=(), program=compiled))
+    width = _lanes(problem)
+    known = (program, problem, jax.tree.structure((impacts, pairs.measurement))) if len(number) > width else None
+    block = jax.tree.map(of_table, in_blocks(work, lanes, block=width, widths=(), program=known))
     # rows that only fill a table up say nothing
     for unread in (block.misfit, block.slope, block.unseen):
         unread[:, rows:] = 0.0

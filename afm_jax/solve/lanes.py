@@ -80,11 +80,13 @@ def in_blocks(
             return jax.tree.map(np.asarray, work(jax.tree.map(cut, whole)))
 
     firsts = range(0, count, width)
-    leaves, structure = jax.tree.flatten(whole)
-    compiled = (program, width, structure, *((leaf.dtype, leaf.shape[1:]) for leaf in leaves))
-    alone = 0 if program is not None and compiled in _COMPILED else 1
+    alone = 1
+    if program is not None:
+        leaves, structure = jax.tree.flatten(whole)
+        compiled = (program, width, structure, *((leaf.dtype, leaf.shape[1:]) for leaf in leaves))
+        alone = 0 if compiled in _COMPILED else 1
+        _COMPILED.add(compiled)
     done = [part(first) for first in firsts[:alone]]
-    _COMPILED.add(compiled)
     if len(firsts) > alone:
         with ThreadPoolExecutor(available_cores()) as pool:
             for result in pool.map(part, firsts[alone:]):
