@@ -2,6 +2,7 @@
 
 import resource
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -51,6 +52,8 @@ def contact_one_core(*, batch: int, repetitions: int, many: int, scipy_speeds: S
         `rows` with what, batch, microseconds_per_impact, compile_s, rebound_error (relative), delay_error_us,
         ratio_to_plain, flops, instructions, memory_mib; `reference_error`.
     """
+    # of a process in which nothing has been traced yet
+    gradient = _first_gradient(min(batch, 100))
     contact, speeds = Contact.paper(), speeds_of(batch)
     reference, coarser = (batch_of(contact, 1.0, speeds, setting) for setting in (REFERENCE, COARSER_REFERENCE))
 
@@ -72,7 +75,7 @@ def contact_one_core(*, batch: int, repetitions: int, many: int, scipy_speeds: S
             for row in _variants(accuracy, speeds, repetitions)
         ]
     rows += _effects(speeds, repetitions)
-    rows.append(_many(many))
+    rows += [gradient, _many(many)]
     # the finest setting, of the speeds that SciPy follows
     finest = collide(contact, jnp.asarray(scipy_speeds), accuracy=1e-11)
     for method, tolerances in (("DOP853", [1e-6, 1e-9]), ("LSODA", [1e-9])):
@@ -185,6 +188,29 @@ def _effects(speeds: Float[Array, " batch"], repetitions: int) -> list[Row]:
         text = compiled.as_text() or ""
         rows.append(row | {"flops": cost.get("flops"), "instructions": text.count(" = ")})
     return rows
+
+
+def _first_gradient(batch: int) -> Row:
+    """Measure a gradient outside of compiled programs: what a session waits for, the first time and then."""
+    what = "gradient by all parameters and speeds, outside of compiled programs"
+    progress(f"bench: contact, {what}")
+
+    def total(contact: Contact, speeds: Array) -> Array:
+        result = collide(contact, speeds)
+        return jnp.sum(result.rebound_speed_nm_per_us) + jnp.sum(result.collision_delay_us)
+
+    seconds = []
+    for _ in range(3):
+        began = time.perf_counter()
+        jax.block_until_ready(jax.grad(total, argnums=(0, 1))(Contact.paper(), speeds_of(batch) + 1.0))
+        seconds.append(time.perf_counter() - began)
+    best = min(seconds)
+    return {
+        "what": what,
+        "batch": batch,
+        "microseconds_per_impact": 1e6 * best / batch,
+        "compile_s": seconds[0] - best,
+    }
 
 
 def _many(count: int) -> Row:
