@@ -124,6 +124,7 @@ def test_the_sensitivity_is_the_slope_of_the_rows_in_contact(tmp_path):
     told = run(FORCES, "--slope", "--json", "--out", tmp_path)
     assert told.exit_code == 0, told.stderr
     assert strictly(told.stdout)["deflection_nm_per_volt"]["value"] == found.value.value
+    assert strictly((tmp_path / "calibration.json").read_text()) == strictly(told.stdout)
     assert (tmp_path / "calibration.png").exists()
     assert run(THERMAL, "--slope").exit_code == 2
     assert "--slope reads the sensitivity" in run(FORCES).stderr

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from afm_jax.cli.command import Output
-from afm_jax.cli.session import Session
+from afm_jax.cli.session import Session, labelled
 from afm_jax.strict_json import plain
 from fitting.calibration.calibrate import calibrate
 from fitting.calibration.report import (
@@ -77,6 +77,6 @@ def _sensitivity(path: Path) -> Output:
     shows = "Deflection over the height of the sample; dashed, the sensitivity through the end of each curve."
 
     def write(folder: Path, _: Any) -> list[Path]:
-        return write_with_picture(report, slope_figure(curves, slope), shows, folder, plain(payload))
+        return write_with_picture(report, slope_figure(curves, slope), shows, folder, plain(labelled(payload)))
 
     return Output(payload=payload, text=[partial(text_of, report)], report=write)
