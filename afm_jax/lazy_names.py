@@ -53,7 +53,10 @@ class _Words(str):
     __repr__ = str.__str__
 
 
-_ARRAY_LIKE = re.compile(r"(?:typing\.)?Union\[[\w.]*\.Array, numpy\.ndarray, [^]]*complex(, NoneType)?\]")
+_ARRAY_LIKE = re.compile(
+    r"(?:typing\.)?Union\[[\w.]*\.Array, numpy\.ndarray, [^]]*complex(, NoneType)?\]"
+    r"|[\w.]*\.Array \| numpy\.ndarray \| (?:[\w.]+ \| )*complex( \| None)?"  # since JAX 0.12
+)
 _MODULES = re.compile(r"(?:\w+\.)+(?=\w)")
 _ARRAY = re.compile(r"(?:Float|Int|Bool)\[Array, '[^']*'\]")
 
@@ -99,5 +102,5 @@ def _short(annotation: Any) -> Any:
     if annotation is inspect.Parameter.empty:
         return annotation
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
-    text = _ARRAY_LIKE.sub(lambda union: "ArrayLike | None" if union[1] else "ArrayLike", text)
+    text = _ARRAY_LIKE.sub(lambda union: "ArrayLike | None" if union[1] or union[2] else "ArrayLike", text)
     return _Words(_MODULES.sub("", text))

@@ -644,7 +644,7 @@ class Free(NamedTuple):
     """Gap in nm at which the bridge breaks: the length over which a leaving tip loses its energy."""
 
 
-@jax.jit
+@compiled_quickly()
 def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
     """Return what an impact does to free tips; coordinates of taps are taken for those of free ones."""
     if isinstance(impact, PulledImpact):
@@ -655,7 +655,7 @@ def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
     return Free(speeds, hertz.time(speeds.approach), impact.lowest, just_above, hertz.length_nm)
 
 
-@jax.jit
+@compiled_quickly()
 def times_of_taps(
     impact: PulledImpact, approach_speed: Float[Array, " n"], pull: Float[Array, " n"]
 ) -> Float[Array, " n"]:

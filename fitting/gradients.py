@@ -7,7 +7,6 @@ orbit, the derivatives of amplitudes, forward or reverse, are NaN and a sentence
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,7 +22,7 @@ from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, orbit_state
 from afm_jax.results import Result, public_result
-from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.lanes import compiled_quickly, in_blocks
 from fitting.forward import branch_of, impact_of, orbit_problem, shown
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
@@ -135,7 +134,7 @@ def _problem(
     return Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in values), tuple(effects))
 
 
-@partial(jax.jit, static_argnames=("problem", "mode"))
+@compiled_quickly(static_argnames=("problem", "mode"))
 def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
     impact = impact_of(values, measurement, problem)
     differentiated = jax.jacfwd if mode == "forward" else jax.jacrev

@@ -15,7 +15,6 @@ step after the fit (`fitting.fits.step`). With the approach speed u and the rebo
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -25,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import PAPER
+from afm_jax.solve.lanes import compiled_quickly
 from fitting.fits.objective import Objective
 from fitting.models import Held, Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
@@ -153,7 +153,7 @@ def seen_in_taps(
     return tuple(seen)
 
 
-@partial(jax.jit, static_argnames="effects")
+@compiled_quickly(static_argnames="effects")
 def _varied(
     parameters: dict[str, Float[Array, " k"]], mass_ng: Float[Array, ""], speeds: Float[Array, " n"], effects: tuple
 ) -> tuple[Float[Array, "k n"], Float[Array, "k n"], Float[Array, " k"]]:

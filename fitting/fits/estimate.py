@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
+from afm_jax.solve.lanes import compiled_quickly
 from fitting.fits.discrepancy import ModelDiscrepancy, effects_of_held, seen_in_taps, with_runs
 from fitting.fits.intervals import Convergence, at_bound, check_minimum, covariance
 from fitting.fits.law_after import ClosestMember, ModelLaw, member_after, points_of_law, speed_range
@@ -503,7 +504,7 @@ def _slope_along(at: AtMinimum, along: Float[np.ndarray, " n"]) -> tuple[float, 
     return slope, slope * np.sqrt(length)
 
 
-@jax.jit
+@compiled_quickly()
 def coordinates(law: Law, speeds: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return the coordinates of orbits at approach speeds in nm/us."""
     return law.coordinate(speeds)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.impact.lasting_impact import PulledImpact
 from afm_jax.impact.law import Law
-from afm_jax.solve.lanes import filled
+from afm_jax.solve.lanes import compiled_quickly, filled
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.discrepancy import Columns, ModelDiscrepancy
 from fitting.fits.step import LinearStep, bounded
@@ -124,7 +124,7 @@ def law_before(
     return LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
 
 
-@jax.jit
+@compiled_quickly()
 def law_and_slope(
     impact: AnyImpact, slopes: AnyImpact, speeds: Float[Array, " n"]
 ) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Shaped
 
 from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.least_squares import Box, descended
+from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.intervals import Places
 from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, Polished, lowest, polish
@@ -576,7 +577,7 @@ def untabulated(
     return np.isfinite(approach) & ~held
 
 
-@jax.jit
+@compiled_quickly()
 def _errors(impact: TabulatedImpact, approach: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     return impact.errors(approach)
 

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -17,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
+from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
@@ -351,12 +351,12 @@ class FitResult(Result):
         )
 
 
-@jax.jit
+@compiled_quickly()
 def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, Array]:
     return law.rebound_speed(speeds), law.collision_delay(speeds)
 
 
-@jax.jit
+@compiled_quickly()
 def _tabulated(
     speeds: Float[Array, " rows"],
     rebound: Float[Array, " rows"],

@@ -20,6 +20,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.lasting_impact import gained_and_longer, indentation, middle_of_contact
 from afm_jax.impact.orbits import FlightEnds, lockin, peak_amplitude
 from afm_jax.least_squares import Box, Searches, descended
+from afm_jax.solve.lanes import compiled_quickly
 
 _HALF_SINE = 0.42441318157838753
 """4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
@@ -137,7 +138,7 @@ def _residual(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantil
     return jnp.where(jnp.isfinite(row.error), apart / row.error, 0.0)
 
 
-@jax.jit
+@compiled_quickly()
 @partial(jax.vmap, in_axes=(0, 0, None))
 def _look(
     unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever
@@ -193,7 +194,7 @@ def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
     return _best_ends(_searched(starts, each, cantilever).reshape(-1, len(beside), 2), rows, cantilever)
 
 
-@jax.jit
+@compiled_quickly()
 @partial(jax.vmap, in_axes=(0, 0, None))
 def _best_ends(places: Float[Array, "starts 2"], row: MeasuredRow, cantilever: Cantilever) -> Inverted:
     """Return what the best of a row's searches has found."""
