@@ -20,18 +20,21 @@ from typing import Annotated, Any, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import FlightEnds, peak_amplitude
 from afm_jax.motion.record import ContactKind, Contacts, Simulation, State, contacts_left, to_gap
 from afm_jax.motion.settle import Settled, Window, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly
+from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -417,7 +420,7 @@ class MotionWindow:
         if np.any(np.asarray(detail.junctions)[whole] > 0):
             solid = self.scene.interaction.solid
             depths = np.linspace(float(solid.depth_scale_nm * solid.depth(solid.fold)), 0.0, _LOADS)
-            loads.append(float(np.min(np.asarray(solid.force(depths)))))
+            loads.append(float(_least_force(solid, depths)))
         return min(loads), max(loads)
 
     @property
@@ -668,9 +671,7 @@ def peaks_of_flights(
     _, response = surface_of(scene)
     if response is None:
         start, z, v = (jnp.asarray(column, float) for column in (start_us, position_nm, velocity_nm_per_us))
-        duration = jnp.asarray(end_us, float) - start
-        flights = FlightEnds(start, duration, z, v, *scene.cantilever.propagator(duration)(z, v))
-        return np.asarray(jax.vmap(partial(peak_amplitude, scene.cantilever))(flights))
+        return np.asarray(_peaks(scene.cantilever, start, z, v, jnp.asarray(end_us, float)))
     start, end = (np.asarray(column, float)[:, None] for column in (start_us, end_us))
     position, velocity = (jnp.asarray(column)[:, None] for column in (position_nm, velocity_nm_per_us))
     steady, rate = response.position_and_velocity(start)
@@ -683,6 +684,26 @@ def peaks_of_flights(
         peak = np.take_along_axis(times, top, axis=1)
         low, high = np.maximum(peak - spacing, start), np.minimum(peak + spacing, end)
     return heights.max(axis=1)
+
+
+@compiled_quickly()
+def _least_force(solid: ElasticCurve, depths_nm: Float[np.ndarray | Array, " loads"]) -> Float[Array, ""]:
+    return jnp.min(solid.force(depths_nm))
+
+
+@compiled_quickly()
+def _peaks(
+    cantilever: Cantilever,
+    start_us: Float[Array, " flights"],
+    position_nm: Float[Array, " flights"],
+    velocity_nm_per_us: Float[Array, " flights"],
+    end_us: Float[Array, " flights"],
+) -> Float[Array, " flights"]:
+    """Return the largest heights of flights that only the sample drives."""
+    duration = end_us - start_us
+    ends = cantilever.propagator(duration)(position_nm, velocity_nm_per_us)
+    flights = FlightEnds(start_us, duration, position_nm, velocity_nm_per_us, *ends)
+    return jax.vmap(partial(peak_amplitude, cantilever))(flights)
 
 
 def peaks_between_contacts(scene: Scene, simulation: Simulation) -> Float[np.ndarray, " flights"]:

@@ -128,7 +128,7 @@ class DensePath(NamedTuple):
             found = _in_contact(prepared, inside, _filled_up(times[touching]))
             gap[touching], rate[touching] = (part[: int(touching.sum())] for part in found)
         phase = np.select([piece.kind == kind for kind in _PHASES], list(_PHASES.values()), piece.kind)
-        lab = _in_lab(prepared.surface, prepared.response, times, gap, rate)
+        lab = to_lab(prepared.surface, prepared.response, times, gap, rate)
         force = np.zeros(times.shape)
         if prepared.driven is not None:
             force = _force(self.scene.interaction, prepared.driven.junction, phase, gap, rate)
@@ -235,7 +235,7 @@ def fly(scene: Scene, flights: Pieces, times_us: np.ndarray) -> tuple[np.ndarray
     """Return heights in nm and velocities in nm/us in the lab along flights, at times of shape (times, flights)."""
     surface, response = surface_of(scene)
     origin, times = jnp.asarray(flights.origin_us), jnp.asarray(times_us)
-    gap, rate = _flight(scene.cantilever, surface, jnp.asarray(flights.x), jnp.asarray(flights.rate), origin, times)
+    gap, rate = _flown(scene.cantilever, surface, jnp.asarray(flights.x), jnp.asarray(flights.rate), origin, times)
     lab = to_lab(surface, response, times, gap, rate)
     return np.asarray(lab.position_nm), np.asarray(lab.velocity_nm_per_us)
 
@@ -266,7 +266,6 @@ def _flight(
 
 
 _flown = jax.jit(_flight)
-_in_lab = jax.jit(to_lab)
 _force = jax.jit(force_in_phase)
 
 
