@@ -195,7 +195,7 @@ def test_bias_of_the_reading_on_resonance_is_shown_against_the_truth(exact):
 
 
 def test_one_program_serves_tables_of_any_length():
-    programs: tuple[Any, ...] = (_look, _best_ends)
+    programs: tuple[Any, ...] = (_look.outside, _best_ends.outside)
     table, _ = law_table(ImpactLaw(0.95, 60.0), 40.0, LAW_ROWS)
     assert invert(table).valid
     before = [program._cache_size() for program in programs]

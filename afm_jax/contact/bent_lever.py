@@ -29,6 +29,7 @@ from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.lasting_impact import PulledImpact, Taps, polynomials, stretched
 from afm_jax.solve.derivatives import largest
+from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.solve.quadrature import gauss_nodes
 
 PULLS, SPEEDS = 7, 18
@@ -70,7 +71,7 @@ class _Stretch(NamedTuple):
     second: Float[Array, ""]
 
 
-@jax.jit
+@compiled_quickly()
 def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> PulledImpact:
     """Return the table of a contact's taps, differentiable in every parameter.
 

@@ -46,7 +46,7 @@ from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.derivatives import by_tangents, implicit_root
-from afm_jax.solve.lanes import LANES, again_for_the_open, filled, for_each_lane, rows_in_blocks
+from afm_jax.solve.lanes import LANES, again_for_the_open, compiled_quickly, filled, for_each_lane, rows_in_blocks
 
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
@@ -417,7 +417,7 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
     return speed
 
 
-@jax.jit
+@compiled_quickly()
 def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Array]:
     """Return the capture speed in nm/us (0: every tip leaves, infinite: none does), and whether a junction exists."""
     junction = find_junction(contact)
@@ -517,7 +517,7 @@ def _in_many_steps(
     return _careful((contact, _junctions(contact, speeds)), mass, speeds)
 
 
-@jax.jit
+@compiled_quickly()
 def _careful(contact: tuple[Contact, Junction], mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
     """Return the collisions of a batch in many steps, turning points in the bridge included."""
     return _in_blocks(contact, mass, speeds, CAREFUL)[0]

@@ -40,6 +40,7 @@ from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, HertzContact, ImpactL
 from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import Result, public_result
 from afm_jax.solve.derivatives import largest
+from afm_jax.solve.lanes import compiled_quickly
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
@@ -601,7 +602,7 @@ def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     return ImpactLaw(1.0, max(epsilon, 0.0), viscous, closest_delay(u, w, delay)[0])
 
 
-@jax.jit
+@compiled_quickly()
 def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
     """Return the table of a contact's free collisions, differentiable in every parameter.
 

@@ -19,6 +19,7 @@ from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_ph
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import halved
+from afm_jax.solve.lanes import compiled_quickly
 
 _NODES = 64
 _ITERATIONS = 12
@@ -81,7 +82,7 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
     )
 
 
-@jax.jit
+@compiled_quickly()
 def _course(
     contact: Contact, speed: Float[Array, ""], mass: Float[Array, ""]
 ) -> tuple[Junction, list[_Leg], Float[Array, "3"]]:

@@ -30,7 +30,7 @@ from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
-from afm_jax.solve.lanes import LANES, Report, compiling, in_blocks
+from afm_jax.solve.lanes import LANES, Report, compiled_quickly, compiling, in_blocks
 from afm_jax.units import within_turn
 
 _STRETCHES, _MORE_STRETCHES = 512, 1024
@@ -366,7 +366,7 @@ class _Sweeper:
         return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
 
 
-@jax.jit
+@compiled_quickly()
 def _hurried_law(firsts: Scene, fresh: Tips) -> Tips:
     def one(state, place: tuple[Scene, Tips]):
         scene, _ = place
@@ -480,7 +480,7 @@ def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.n
     return np.where(inside, height, np.nan).reshape(len(period), -1)
 
 
-@jax.jit
+@compiled_quickly()
 def _flight_height(
     scenes: Scene,
     gap_nm: Float[Array, " values"],

@@ -6,7 +6,6 @@ loop is closed to rounding and its multipliers are exact.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,7 +36,7 @@ from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.scenefile.parameter_paths import scene_family
 from afm_jax.solve.arclength import EquationsAt
-from afm_jax.solve.lanes import Report, in_blocks
+from afm_jax.solve.lanes import Report, compiled_quickly, in_blocks
 from afm_jax.solve.newton import LinearisedRows, Newton, Roots, newton_rows, shortened
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
@@ -341,7 +340,7 @@ class _Return(NamedTuple):
     peak_amplitude_nm: Any
 
 
-@partial(jax.jit, static_argnames=("accuracy",))
+@compiled_quickly(static_argnames=("accuracy",))
 def _returns(seen: SampleDriven, phase: Array, rebound: Array, turns: Array, *, accuracy: float) -> _Return:
     def one(seen: SampleDriven, phase: Array, rebound: Array, turn: Array) -> _Return:
         scene = seen.scenes
@@ -577,7 +576,7 @@ class ContactFlights:
         return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, [near, slowest])
 
 
-@jax.jit
+@compiled_quickly()
 def _lowest_gap(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array) -> tuple[Array, Array]:
     """Return the lowest point of flights between two contacts above the gap at which the bridge forms, in nm.
 

@@ -37,7 +37,7 @@ from afm_jax.dynamics.impact_loop import (
 from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import largest
-from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.lanes import compiled_quickly, in_blocks
 from afm_jax.solve.newton import Newton
 
 KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
@@ -150,7 +150,7 @@ class CurvePoint(NamedTuple):
     """Longest delay of an impact, in drive periods."""
 
 
-@jax.jit
+@compiled_quickly()
 def _linearised(family: LoopFamily, point: Array) -> tuple[Array, Array]:
     def twice(point):
         value = equations_at(point, family)
@@ -160,7 +160,7 @@ def _linearised(family: LoopFamily, point: Array) -> tuple[Array, Array]:
     return value, slopes
 
 
-@jax.jit
+@compiled_quickly()
 def _tests_and_delay(family: LoopFamily, point: Array) -> tuple[Array, Array]:
     unknowns, fractions = split_point(point, family)
     loop = loop_at(fractions, family)
@@ -190,7 +190,7 @@ def solved_point(guess: np.ndarray, normal: np.ndarray, family: LoopFamily) -> C
     return CurvePoint(point.x, point.tangent, tests, delay)
 
 
-@jax.jit
+@compiled_quickly()
 def _read(family: LoopFamily, points: Array) -> LoopReading:
     def reading_at(point):
         unknowns, fractions = split_point(point, family)

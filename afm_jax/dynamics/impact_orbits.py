@@ -30,7 +30,7 @@ from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import Departure, follow_impacts
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.lanes import power_of_two
+from afm_jax.solve.lanes import compiled_quickly, power_of_two
 from afm_jax.solve.newton import Newton, newton
 
 DEFAULT_STARTS = 512
@@ -175,7 +175,7 @@ def check_loop(order: int, impacts: int) -> None:
             raise ValueError(f"`{name}` must be a positive integer up to {most}, but is {value}")
 
 
-@partial(jax.jit, static_argnames=("driven", "samples"))
+@compiled_quickly(static_argnames=("driven", "samples"))
 def _read_loops(
     scene: Scene, order: Float[Array, ""], loops: Float[Array, "loops n"], *, driven: str, samples: int
 ) -> LoopReading:

@@ -25,7 +25,7 @@ from afm_jax.motion.law_motion import or_rest
 from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.lanes import compiled_quickly, in_blocks
 
 _TOUCHING = 1e-13
 """Gap over the heights it is the difference of, below which it is rounding."""
@@ -112,7 +112,7 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
     return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
 
 
-@jax.jit
+@compiled_quickly()
 def landed_tips(scenes: Scene, start: State) -> Tips:
     """Return tips just after the first impact of a flight from anywhere above the platform, or of a rest on it.
 
@@ -133,7 +133,7 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
     return after_impacts(scenes, tips, jax.vmap(first_impact_of)(scenes, starts)).end
 
 
-@jax.jit
+@compiled_quickly()
 def leaving_tips(scenes: Scene) -> Tips:
     """Return tips that leave the platform upward at its highest speed, at that speed again or twice the capture speed.
 
@@ -174,7 +174,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
     return jax.tree.map(lambda on_orbit, elsewhere: np.where(there & has_law, on_orbit, elsewhere), tips, usual)
 
 
-@jax.jit
+@compiled_quickly()
 def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Bool[Array, " lanes"], Tips]:
     """Return which scenes with laws have a stable orbit, and tips on them, about as high above the platform as told."""
 

@@ -19,6 +19,7 @@ from jax.stages import Compiled
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
+from afm_jax.compilation_cache import quick_options
 from afm_jax.effects.scene_effects import SceneEffect, effects_in
 from afm_jax.motion.follow import follow_in_pieces, joined, why_over
 from afm_jax.motion.observe import MotionWindow
@@ -374,7 +375,7 @@ class Programs:
         # equal where one compiled program serves both
         key = (jax.tree.structure(arguments), *(jnp.shape(leaf) for leaf in jax.tree.leaves(arguments)))
         if key not in self._compiled:
-            self._compiled[key] = jax.jit(_simulated).lower(*arguments).compile()
+            self._compiled[key] = jax.jit(_simulated).lower(*arguments).compile(quick_options())
         return self._compiled[key], arguments
 
 

@@ -39,6 +39,7 @@ from afm_jax.impact.law import Impact, ImpactLaw, Law, Speeds, TabulatedLaw, imp
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
 from afm_jax.solve.derivatives import absent, implicit_root, implicit_system
+from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import within_turn
 
 NEAR_DOUBLE = 1e-3
@@ -153,7 +154,7 @@ def _check_order(order: ArrayLike) -> None:
         raise ValueError(f"`order` must be a positive integer, but is {order}")
 
 
-@jax.jit
+@compiled_quickly()
 def _single_impact_orbits(scene: Scene, frame: FreeFrame, order: Float[Array, ""]) -> SingleImpactOrbits:
     law = impact_law_of(scene)
     problem = orbit_problem(scene.cantilever, frame.platform, law, order)

@@ -43,7 +43,7 @@ from afm_jax.motion.record import (
     to_lab,
 )
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.lanes import repeat_for
+from afm_jax.solve.lanes import compiled_quickly, repeat_for
 
 _ROUNDS = 8
 """Rounds between two checks whether all tips have arrived at the end."""
@@ -108,7 +108,7 @@ class ContactTip(NamedTuple):
     rounds: Int[Array, ""]
 
 
-@partial(jax.jit, static_argnames=("max_contacts", "setting", "max_rounds", "reverse"))
+@compiled_quickly(static_argnames=("max_contacts", "setting", "max_rounds", "reverse"))
 def follow_contacts(  # noqa: PLR0913
     scene: Scene,
     surface: Platform | Surface,

@@ -39,6 +39,7 @@ from afm_jax.motion.record import (
 )
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.derivatives import implicit_root
+from afm_jax.solve.lanes import compiled_quickly
 
 _FLIGHT_STEPS = 1_000_000
 """Steps of the search of one flight: as many as it takes, a flight that never lands needs some every period."""
@@ -76,7 +77,7 @@ class LawRecord(NamedTuple):
     """Flights that were followed."""
 
 
-@partial(jax.jit, static_argnames=("max_contacts", "reverse"))
+@compiled_quickly(static_argnames=("max_contacts", "reverse"))
 def follow_law(
     scene: Scene,
     surface: Platform | Surface,

@@ -27,7 +27,7 @@ from afm_jax.contact.junction import Phase, find_junction, force_in_phase
 from afm_jax.contact.step import TipInContact, advance, eighth_order_step
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.lanes import filled, power_of_two
+from afm_jax.solve.lanes import compiled_quickly, filled, power_of_two
 
 _BLOCK = 128
 """Trials computed in one call."""
@@ -334,7 +334,7 @@ def _integrated_contacts(prepared: PreparedScene, simulation: Simulation, rows: 
     return joined.where(joined.end_us - joined.begin_us > _SHORTEST_US * (1.0 + np.abs(joined.begin_us)))
 
 
-@jax.jit
+@compiled_quickly()
 def _some_trials(
     driven: Driven, tip: TipInContact, until: Float[Array, ""]
 ) -> tuple[TipInContact, tuple[tuple[Array, ...], Bool[Array, "trials contacts"]]]:
@@ -360,7 +360,7 @@ def _in_contact(prepared: PreparedScene, piece: Pieces, times: np.ndarray) -> tu
     return np.asarray(gap), np.asarray(rate)
 
 
-@jax.jit
+@compiled_quickly()
 def _states_at(
     driven: Driven, start: ContactState, phase: Int[Array, " times"], time_us: Float[Array, " times"]
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:

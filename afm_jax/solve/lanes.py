@@ -10,7 +10,8 @@ need more are gathered into small blocks of their own, where no others wait for 
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache, wraps
+from dataclasses import dataclass
+from functools import cached_property, update_wrapper
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -113,32 +114,45 @@ def compiling(work: Callable[[], object]) -> Iterator[None]:
         yield
 
 
-_Function = Callable[..., Any]
+@dataclass(eq=False)
+class QuicklyCompiled:
+    """A function that is compiled with `quick_options`; inside of another program it is compiled as that one is.
+
+    Attributes:
+        function: of trees of arrays.
+        static_argnames: as of `jax.jit`.
+    """
+
+    function: Callable[..., Any]
+    static_argnames: str | Sequence[str]
+
+    def __post_init__(self) -> None:
+        """Take the function's name and docstring."""
+        update_wrapper(self, self.function)
+
+    @cached_property
+    def inside(self) -> Callable[..., Any]:
+        """The function as a part of other programs."""
+        return jax.jit(self.function, static_argnames=self.static_argnames)
+
+    @cached_property
+    def outside(self) -> Callable[..., Any]:
+        """The function by itself; the options are known once JAX has started."""
+        return jax.jit(self.function, static_argnames=self.static_argnames, compiler_options=quick_options())
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        """Return the function's result."""
+        traced = any(map(is_traced, jax.tree.leaves((arguments, named))))
+        return (self.inside if traced else self.outside)(*arguments, **named)
 
 
-def compiled_quickly(*, static_argnames: str | Sequence[str] = ()) -> Callable[[_Function], _Function]:
-    """Return a decorator like `jax.jit` for what takes longer to compile than to run: it has `quick_options`.
-
-    Inside of another program the function is compiled as that one is.
+def compiled_quickly(*, static_argnames: str | Sequence[str] = ()) -> Callable[[Callable[..., Any]], QuicklyCompiled]:
+    """Return a decorator like `jax.jit` for what takes longer to compile than to run: see `QuicklyCompiled`.
 
     Args:
         static_argnames: as of `jax.jit`.
     """
-
-    def decorated(function: _Function) -> _Function:
-        @cache
-        def program(*, quick: bool) -> _Function:
-            options = quick_options() if quick else None
-            return jax.jit(function, static_argnames=static_argnames, compiler_options=options)
-
-        @wraps(function)
-        def called(*arguments: Any, **named: Any) -> Any:
-            inside = any(map(is_traced, jax.tree.leaves((arguments, named))))
-            return program(quick=not inside)(*arguments, **named)
-
-        return called
-
-    return decorated
+    return lambda function: QuicklyCompiled(function, static_argnames)
 
 
 def map_in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int, recompute: bool = False) -> Any:
