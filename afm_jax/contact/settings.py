@@ -108,8 +108,9 @@ class DrivenSetting(NamedTuple):
 
     `quick` is the way leg by leg, or None to go through every contact in time; `fineness` the steps per unit of the
     local time scale of the way in time; `trials` the trial steps that a tip in contact may take in one round. Contacts
-    that magnify errors (left at less than one in `magnified` of their energy, or after long) are computed again in
-    finer steps, until two in a row agree within `agreement`; None: never.
+    that magnify errors (left at less than one in `magnified` of their energy, after long or, with `turned`, without or
+    with more than one junction) are computed again in finer steps, until two in a row agree within `agreement`; None:
+    never.
     """
 
     quick: QuickSetting | None
@@ -117,10 +118,11 @@ class DrivenSetting(NamedTuple):
     trials: int
     agreement: float | None = None
     magnified: float = 1.0
+    turned: bool = True
 
 
 DRIVEN_SETTINGS = {
-    1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.4, 50, agreement=1e-6, magnified=16.0),
+    1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.8, 60, 1e-6, 8.0, turned=False),
     1e-9: DrivenSetting(QuickSetting(18, 13, 15, 16, 1e-9, 10, 7, 1e-4), 5.5, 120, agreement=1e-9, magnified=4.0),
     1e-11: DrivenSetting(QuickSetting(22, 16, 18, 20, 1e-11, 12, 9, 1e-5), 10.0, 250, agreement=1e-11, magnified=2.0),
 }

@@ -59,7 +59,7 @@ _LEGS_AT_ONCE, _TRIALS_AT_ONCE = 256, 64
 """Tips of a batch that go through legs together, and that try steps in time together."""
 _TRIALS = 4
 """Trial steps between two checks which tips of a batch need more."""
-_LASTS_LONG = 10.0
+_LASTS_LONG = 5.0
 """Duration from which a contact counts as long, in units of (gap at arrival + gap at departure)/(arrival speed)."""
 _FINER, _MOST_REPEATS = 1.5, 5
 """Factor by which steps are finer in each repetition of a contact, and the most repetitions."""
@@ -413,8 +413,8 @@ def _repetition(
     """Return whether a contact that a tip has left is to be computed again in finer steps, and what it ended with.
 
     The first repetition is made of contacts that magnify errors: the tip left with less than 1/`magnified` of its
-    kinetic energy, or stayed long. More follow, up to five in all, until rate (relative) and time (in us, times 10) of
-    the departure change by less than 4 `agreement`.
+    kinetic energy, stayed long or, with `turned`, did not form the junction exactly once. More follow, up to five in
+    all, until rate (relative) and time (in us, times 10) of the departure change by less than 4 `agreement`.
     """
     if setting.agreement is None:
         return jnp.zeros_like(has_left), repeats
@@ -428,7 +428,8 @@ def _repetition(
         jnp.abs(departed.gap_rate - previous.departure_rate),
         10.0 * jnp.abs(departed.time_us - previous.departure_us) * jnp.abs(departed.gap_rate),
     ) > _LESS * setting.agreement * jnp.abs(departed.gap_rate)
-    again = has_left & jnp.where(repeats.times == 0, slowed | lasts, differs & (repeats.times < _MOST_REPEATS))
+    magnified = slowed | lasts | (tip.junctions != 1) if setting.turned else slowed | lasts
+    again = has_left & jnp.where(repeats.times == 0, magnified, differs & (repeats.times < _MOST_REPEATS))
     over = repeats._replace(times=jnp.where(has_left, 0, repeats.times))
     return again, _where(again, Repeats(repeats.times + 1, departed.time_us, departed.gap_rate), over)
 
