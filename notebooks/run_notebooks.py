@@ -35,9 +35,9 @@ def run(path: Path) -> nbformat.NotebookNode:
     environment |= {
         "PYTHONPATH": str(ROOT),
         "TF_CPP_MIN_LOG_LEVEL": "3",
+        "JAX_COMPILATION_CACHE_DIR": str(ROOT / "build" / f"programs-{processor_key()}"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }
-    environment["JAX_COMPILATION_CACHE_DIR"] = str(ROOT / "build" / f"programs-{processor_key()}")
     with warnings.catch_warnings(), TemporaryDirectory() as folder:
         # Jupyter's own: event loops and transports, nothing of the notebook's
         warnings.simplefilter("ignore")

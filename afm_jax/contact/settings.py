@@ -122,7 +122,9 @@ class DrivenSetting(NamedTuple):
 
 
 DRIVEN_SETTINGS = {
-    1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.8, 60, 1e-6, 8.0, turned=False),
+    1e-6: DrivenSetting(
+        QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.8, 60, agreement=1e-6, magnified=8.0, turned=False
+    ),
     1e-9: DrivenSetting(QuickSetting(18, 13, 15, 16, 1e-9, 10, 7, 1e-4), 5.5, 120, agreement=1e-9, magnified=4.0),
     1e-11: DrivenSetting(QuickSetting(22, 16, 18, 20, 1e-11, 12, 9, 1e-5), 10.0, 250, agreement=1e-11, magnified=2.0),
 }

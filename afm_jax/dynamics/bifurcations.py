@@ -266,9 +266,7 @@ class _Sweeper:
             starts: tips at the first values of all stretches.
             report: told how many of how many values are done.
         """
-        every = np.arange(self.lanes)
-        parts = self._sweep(every, starts, report)
-        changed = every
+        parts, changed = self._sweep(starts, report), np.arange(self.lanes)
         for _ in range(_PASSES):
             changed = self._swept_again(parts, changed[changed + 1 < self.lanes] + 1)
             if not changed.size:
@@ -289,15 +287,15 @@ class _Sweeper:
         """Return the scenes of values, and the tips that begin there."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), (self.scenes, self.fresh))
 
-    def _sweep(self, lanes: np.ndarray, tips: Tips, report: Report | None) -> list[_SweptRows]:
-        """Return what comes out at the first, second, ... value of stretches."""
-        numbers, parts = self._numbers(lanes), []
+    def _sweep(self, tips: Tips, report: Report | None) -> list[_SweptRows]:
+        """Return what comes out at the first, second, ... value of all stretches."""
+        lanes, parts = np.arange(self.lanes), []
         for place in range(self.stretch):
             if place:
-                tips = self._carried(parts[-1], slice(None), numbers[:, place - 1], lanes, place)
-            parts.append(self._follow(numbers[:, place], tips))
+                tips = self._carried(parts, lanes, place)
+            parts.append(self._follow(self._numbers(lanes)[:, place], tips))
             if report is not None:
-                report(min((place + 1) * len(lanes), self.count), self.count)
+                report(min((place + 1) * self.lanes, self.count), self.count)
         return parts
 
     def _swept_again(self, parts: list[_SweptRows], lanes: np.ndarray) -> np.ndarray:
@@ -313,9 +311,7 @@ class _Sweeper:
         for place in range(self.stretch):
             if not lanes.size:
                 break
-            before, row = (parts[place - 1], lanes) if place else (parts[-1], lanes - 1)
-            old = self._numbers(row)[:, place - 1]
-            tips = self._carried(before, row, old, lanes, place)
+            tips = self._carried(parts, lanes, place)
             now, then = self._follow(self._numbers(lanes)[:, place], tips), _rows_of(parts[place], lanes)
             differs = ~_same(now, then)
             lanes = lanes[differs]
@@ -323,10 +319,11 @@ class _Sweeper:
                 part[lanes] = rows[differs]
         return lanes
 
-    def _carried(self, before: _SweptRows, rows: Any, old: np.ndarray, lanes: np.ndarray, place: int = 0) -> Tips:
-        """Return tips of one value at the next one."""
-        end = _rows_of(before.end, rows)
-        tips = carried(self._at(old)[0], *self._at(self._numbers(lanes)[:, place]), end)
+    def _carried(self, parts: list[_SweptRows], lanes: np.ndarray, place: int) -> Tips:
+        """Return the tips of the value before at a value of stretches; before the first one ends another stretch."""
+        before, rows = (parts[place - 1], lanes) if place else (parts[-1], lanes - 1)
+        old, new = self._numbers(rows)[:, place - 1], self._numbers(lanes)[:, place]
+        tips = carried(self._at(old)[0], *self._at(new), _rows_of(before.end, rows))
         return jax.tree.map(np.asarray, tips)
 
     def _follow(self, numbers: np.ndarray, tips: Tips) -> _SweptRows:

@@ -174,7 +174,7 @@ def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
 
 def _flight_of(scene: Scene, tip: Tips) -> Flight:
     departure = Departure(tip.time_us, tip.gap_nm, tip.velocity_nm_per_us)
-    return flight_from(scene, departure, Search(MAX_STEPS), flies=tip.outcome == Outcome.IMPACT)
+    return flight_from(scene, departure, flies=tip.outcome == Outcome.IMPACT)
 
 
 def _slowest_chatter(scene: Scene) -> Float[Array, ""]:

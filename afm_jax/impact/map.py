@@ -297,18 +297,20 @@ def impact_after(
         search: for the impact.
         flies: whether there is a flight; where there is none the search ends at once with `Outcome.INVALID_START`.
     """
-    flight = flight_from(scene, departure, search, flies=flies)
+    flight = flight_from(scene, departure, from_above=search.from_above, flies=flies)
     return impact_at_end(scene, flight, end_of_flight(scene, flight, search))
 
 
-def flight_from(scene: Scene, departure: Departure, search: Search, *, flies: Bool[Array, ""] | None = None) -> Flight:
+def flight_from(
+    scene: Scene, departure: Departure, *, from_above: bool = False, flies: Bool[Array, ""] | None = None
+) -> Flight:
     """Return the flight that begins with a departure; where there is none (`flies`), one that ends at once."""
     time, gap, velocity = departure
     if flies is not None:
         # a tip that sinks into the surface from the start is in no flight
         velocity = jnp.where(flies, velocity, scene.platform.velocity(time) - 1.0)
         gap = gap if gap is None else jnp.where(flies, gap, 0.0)
-    level = jnp.zeros_like(time) if search.from_above else None
+    level = jnp.zeros_like(time) if from_above else None
     return Flight(scene.cantilever, scene.platform, time, velocity, gap, level)
 
 

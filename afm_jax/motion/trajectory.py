@@ -118,7 +118,7 @@ class DensePath(NamedTuple):
             return Trajectory(wanted, *(np.zeros(wanted.shape, kind) for kind in (float,) * 4 + (int, float)))
         times, prepared = _filled_up(wanted.reshape(-1)), self.prepared
         piece = self.pieces.where(np.clip(np.searchsorted(self.pieces.begin_us, times, side="right") - 1, 0, None))
-        flown = _flown(self.scene.cantilever, prepared.surface, piece.x, piece.rate, piece.origin_us, times)
+        flown = _flight(self.scene.cantilever, prepared.surface, piece.x, piece.rate, piece.origin_us, times)
         gap, rate = (np.where(piece.kind == FLIGHT, np.asarray(part), 0.0) for part in flown)
         straight, touching = piece.kind == STRAIGHT, piece.kind >= 0
         gap = np.where(straight, piece.x + piece.rate * (times - piece.origin_us), gap)
@@ -235,7 +235,7 @@ def fly(scene: Scene, flights: Pieces, times_us: np.ndarray) -> tuple[np.ndarray
     """Return heights in nm and velocities in nm/us in the lab along flights, at times of shape (times, flights)."""
     surface, response = surface_of(scene)
     origin, times = jnp.asarray(flights.origin_us), jnp.asarray(times_us)
-    gap, rate = _flown(scene.cantilever, surface, jnp.asarray(flights.x), jnp.asarray(flights.rate), origin, times)
+    gap, rate = _flight(scene.cantilever, surface, jnp.asarray(flights.x), jnp.asarray(flights.rate), origin, times)
     lab = to_lab(surface, response, times, gap, rate)
     return np.asarray(lab.position_nm), np.asarray(lab.velocity_nm_per_us)
 
@@ -250,6 +250,7 @@ def state_at(scene: Scene, simulation: Simulation, time_us: float) -> State | No
     return State(*(jnp.asarray(part) for part in (time_us, position[0, 0], velocity[0, 0])))
 
 
+@compiled_quickly()
 def _flight(
     cantilever: Cantilever,
     surface: Platform | Surface,
@@ -265,7 +266,6 @@ def _flight(
     return position - height, velocity - speed
 
 
-_flown = jax.jit(_flight)
 _force = jax.jit(force_in_phase)
 
 

@@ -82,7 +82,7 @@ def in_blocks(
 
     firsts = range(0, count, width)
     alone = 1
-    if program is not None:
+    if program is not None and len(firsts) > 1:
         leaves, structure = jax.tree.flatten(whole)
         compiled = (program, width, structure, *((leaf.dtype, leaf.shape[1:]) for leaf in leaves))
         alone = 0 if compiled in _COMPILED else 1
