@@ -26,18 +26,22 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem, follow_root, harmless_coordinate
 from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
-from afm_jax.impact.orbits import amplitudes, near_fold, steady_orbits
+from afm_jax.impact.orbits import amplitudes, steady_orbits
 from afm_jax.solve.lanes import compiled_quickly, compiling, filled, in_blocks
 from fitting.models import Measurement, Problem, Rows
 
 
 class Branch(NamedTuple):
-    """The orbit that a row is taken to be on: where, whether there is one, and how many there are."""
+    """The orbit that a row is taken to be on: where, whether there is one, and how many there are.
+
+    ``slopes`` are those of `FollowedRoot`, None where the orbit was not followed.
+    """
 
     place: OrbitPlace
     exists: Bool[Array, ""]
     orbits: Int[Array, ""]
     near_fold: Bool[Array, ""]
+    slopes: Float[Array, "2 2"] | None = None
 
 
 AnyImpact = Law | TabulatedImpact | PulledImpact
@@ -137,13 +141,14 @@ def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
     """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
     harmless = harmless_coordinate(orbit)
     wanted = known.exists & ~row.free
-    root, found = follow_root(jnp.where(wanted, known.place.coordinate, harmless), orbit, wanted)
-    there = wanted & found
+    root = follow_root(jnp.where(wanted, known.place.coordinate, harmless), orbit, wanted)
+    there = wanted & root.closes
     return Branch(
-        place=OrbitPlace(jnp.where(there, root.coordinate, harmless), root.phase),
+        place=OrbitPlace(jnp.where(there, root.place.coordinate, harmless), root.place.phase),
         exists=there | row.free,
         orbits=jnp.where(row.free, 1, jnp.where(there, known.orbits, 0)),
-        near_fold=there & near_fold(root.coordinate, orbit),
+        near_fold=there & root.near_fold,
+        slopes=root.slopes,
     )
 
 
@@ -169,7 +174,7 @@ def prediction_of(
     branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem, row: Rows, problem: Problem
 ) -> Prediction:
     """Return what is predicted for a row at a set of values, on the orbit that it is taken to be on."""
-    read = shown(amplitudes(branch.place, orbit), orbit, row, values, problem)
+    read = shown(amplitudes(branch.place, orbit, branch.slopes), orbit, row, values, problem)
     speeds = lax.stop_gradient(orbit.impact.speeds(branch.place.coordinate))
     still = lax.stop_gradient(orbit)
     middle = middle_of_contact(

@@ -11,7 +11,7 @@ import pytest
 import afm_jax as afm
 from afm_jax.impact.closure import COARSE, OrbitProblem, find_roots, follow_root
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.impact.orbits import near_fold, orbit_state, steady_orbits
+from afm_jax.impact.orbits import orbit_state, steady_orbits
 from tests.package_scenes import scene_of
 from tests.reference_examples import DELAY, scene
 from tests.reference_flight import Parameters
@@ -106,14 +106,15 @@ def test_following_leads_to_the_root_that_a_search_finds(drive):
     begin = steady(problem_of(p, order))
     (slot,) = np.flatnonzero(begin.steady)
     moved = problem_of(dataclasses.replace(p, epsilon=118.0, quality_factor=39.0), order)
-    followed, found = follow(begin.place.coordinate[slot], moved, WANTED)
-    assert bool(found)
+    root = follow(begin.place.coordinate[slot], moved, WANTED)
+    followed = root.place
+    assert bool(root.closes)
     roots = find(moved)
     coordinates = np.asarray(roots.place.coordinate)[np.asarray(roots.found)]
     nearest = coordinates[np.argmin(np.abs(coordinates - float(followed.coordinate)))]
     assert float(followed.coordinate) == pytest.approx(nearest, rel=1e-10)
     assert float(followed.coordinate) != pytest.approx(float(begin.place.coordinate[slot]), rel=1e-4)
-    assert not bool(near_fold(followed.coordinate, moved))
+    assert not bool(root.near_fold)
     # a tenth of a nanometre of drive: nothing leaves the sample
     weak = problem_of(dataclasses.replace(p, amplitude_nm=0.1), order)
-    assert not bool(follow(begin.place.coordinate[slot], weak, WANTED)[1])
+    assert not bool(follow(begin.place.coordinate[slot], weak, WANTED).closes)

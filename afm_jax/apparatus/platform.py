@@ -1,5 +1,8 @@
 """The moving platform that carries the sample: offset + ramp + cosine, and a second cosine where there is one."""
 
+from collections.abc import Iterable
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -8,6 +11,58 @@ from afm_jax.apparatus.drives import Tone
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
+
+
+class Oscillation(NamedTuple):
+    """A harmonic part of a motion at one time: angular frequency in rad/us, position in nm and velocity in nm/us."""
+
+    angular_frequency: Float[Array, "..."]
+    position: Float[Array, "..."]
+    velocity: Float[Array, "..."]
+
+
+class Motion(NamedTuple):
+    """The motion of a surface at one time: a ramp and oscillations, whose derivatives all follow from the first two."""
+
+    ramped_nm: Float[Array, "..."]
+    """The offset at that time."""
+    rate_nm_per_us: Float[Array, "..."]
+    oscillations: tuple[Oscillation, ...]
+
+    @property
+    def position(self) -> Float[Array, "..."]:
+        """Height in nm."""
+        return sum((part.position for part in self.oscillations), start=self.ramped_nm)
+
+    @property
+    def velocity(self) -> Float[Array, "..."]:
+        """First derivative of the height by time, in nm/us."""
+        still = jnp.broadcast_to(self.rate_nm_per_us, self.ramped_nm.shape)
+        return sum((part.velocity for part in self.oscillations), start=still)
+
+    @property
+    def acceleration(self) -> Float[Array, "..."]:
+        """Second derivative of the height by time, in nm/us^2."""
+        return self._sum(-(part.angular_frequency**2) * part.position for part in self.oscillations)
+
+    @property
+    def jerk(self) -> Float[Array, "..."]:
+        """Third derivative of the height by time, in nm/us^3."""
+        return self._sum(-(part.angular_frequency**2) * part.velocity for part in self.oscillations)
+
+    @property
+    def snap(self) -> Float[Array, "..."]:
+        """Fourth derivative of the height by time, in nm/us^4."""
+        return self._sum(part.angular_frequency**4 * part.position for part in self.oscillations)
+
+    @property
+    def crackle(self) -> Float[Array, "..."]:
+        """Fifth derivative of the height by time, in nm/us^5."""
+        return self._sum(part.angular_frequency**4 * part.velocity for part in self.oscillations)
+
+    def _sum(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
+        first, *others = [*parts] or [jnp.zeros_like(self.ramped_nm)]
+        return sum(others, start=first)
 
 
 class Platform(eqx.Module):
@@ -71,16 +126,18 @@ class Platform(eqx.Module):
         first = self.angular_frequency
         return first if self.second is None else jnp.maximum(first, self.second.angular_frequency)
 
-    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return z_p in nm and its rate in nm/us at a time in us, from one sine-cosine pair a frequency."""
+    def motion(self, time_us: ArrayLike) -> Motion:
+        """Return z_p with its derivatives at a time in us, from one sine-cosine pair a frequency."""
         time = as_argument(time_us)
         sine, cosine = sine_cosine(self.angular_frequency * time)
-        position = self.offset_nm + self.offset_rate_nm_per_us * time + self.amplitude_nm * cosine
-        velocity = self.offset_rate_nm_per_us - self.top_speed_nm_per_us * sine
-        if self.second is None:
-            return position, velocity
-        value, rate = self.second.value_and_rate(time)
-        return position + value, velocity + rate
+        first = Oscillation(self.angular_frequency, self.amplitude_nm * cosine, -self.top_speed_nm_per_us * sine)
+        others = [] if self.second is None else [_of_tone(self.second, time)]
+        return Motion(self.offset_nm + self.offset_rate_nm_per_us * time, self.offset_rate_nm_per_us, (first, *others))
+
+    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return z_p in nm and its rate in nm/us at a time in us."""
+        motion = self.motion(time_us)
+        return motion.position, motion.velocity
 
     def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return z_p in nm at a time in us."""
@@ -92,20 +149,8 @@ class Platform(eqx.Module):
 
     def acceleration(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return d^2z_p/dt^2 in nm/us^2 at a time in us."""
-        time = as_argument(time_us)
-        _, cosine = sine_cosine(self.angular_frequency * time)
-        first = -self.top_speed_nm_per_us * self.angular_frequency * cosine
-        if self.second is None:
-            return first
-        value, _ = self.second.value_and_rate(time)
-        return first - self.second.angular_frequency**2 * value
+        return self.motion(time_us).acceleration
 
-    def jerk(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return d^3z_p/dt^3 in nm/us^3 at a time in us."""
-        time = as_argument(time_us)
-        sine, _ = sine_cosine(self.angular_frequency * time)
-        first = self.top_speed_nm_per_us * self.angular_frequency**2 * sine
-        if self.second is None:
-            return first
-        _, rate = self.second.value_and_rate(time)
-        return first - self.second.angular_frequency**2 * rate
+
+def _of_tone(tone: Tone, time_us: Float[Array, "..."]) -> Oscillation:
+    return Oscillation(tone.angular_frequency, *tone.value_and_rate(time_us))

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.platform import Motion, Oscillation, Platform
 from afm_jax.apparatus.scene import Scene, require_one_frequency
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.checks import as_argument, as_parameter, is_traced, readable
@@ -49,6 +49,14 @@ class Wave(eqx.Module):
         square = self.cosine**2 + self.sine**2
         moves = square > 0.0
         return jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0)
+
+    def at(self, time_us: Float[Array, "..."]) -> Oscillation:
+        """Return the wave at a time in us."""
+        sine, cosine = sine_cosine(self.angular_frequency * time_us)
+        position = self.cosine * cosine + self.sine * sine
+        return Oscillation(
+            self.angular_frequency, position, self.angular_frequency * (self.sine * cosine - self.cosine * sine)
+        )
 
 
 class Surface(eqx.Module):
@@ -89,16 +97,16 @@ class Surface(eqx.Module):
             fastest = jnp.maximum(fastest, wave.angular_frequency)
         return fastest
 
-    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return height in nm and velocity in nm/us at a time in us, from one sine-cosine pair a wave."""
+    def motion(self, time_us: ArrayLike) -> Motion:
+        """Return the height with its derivatives at a time in us, from one sine-cosine pair a wave."""
         time = as_argument(time_us)
-        position = self.offset_nm + self.offset_rate_nm_per_us * time
-        velocity = jnp.broadcast_to(self.offset_rate_nm_per_us, position.shape)
-        for wave in self.tones:
-            sine, cosine = sine_cosine(wave.angular_frequency * time)
-            position = position + wave.cosine * cosine + wave.sine * sine
-            velocity = velocity + wave.angular_frequency * (wave.sine * cosine - wave.cosine * sine)
-        return position, velocity
+        ramped = self.offset_nm + self.offset_rate_nm_per_us * time
+        return Motion(ramped, self.offset_rate_nm_per_us, tuple(wave.at(time) for wave in self.tones))
+
+    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return height in nm and velocity in nm/us at a time in us."""
+        motion = self.motion(time_us)
+        return motion.position, motion.velocity
 
     def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return the height in nm at a time in us."""
@@ -110,23 +118,7 @@ class Surface(eqx.Module):
 
     def acceleration(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return the acceleration in nm/us^2 at a time in us."""
-        time = as_argument(time_us)
-        acceleration = jnp.zeros_like(self.offset_nm * time)
-        for wave in self.tones:
-            sine, cosine = sine_cosine(wave.angular_frequency * time)
-            height = wave.cosine * cosine + wave.sine * sine
-            acceleration = acceleration - wave.angular_frequency**2 * height
-        return acceleration
-
-    def jerk(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return the rate of the acceleration in nm/us^3 at a time in us."""
-        time = as_argument(time_us)
-        jerk = jnp.zeros_like(self.offset_nm * time)
-        for wave in self.tones:
-            sine, cosine = sine_cosine(wave.angular_frequency * time)
-            rate = wave.angular_frequency * (wave.sine * cosine - wave.cosine * sine)
-            jerk = jerk - wave.angular_frequency**2 * rate
-        return jerk
+        return self.motion(time_us).acceleration
 
     def _total(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
         return sum(parts, start=jnp.zeros_like(self.offset_nm))

@@ -137,7 +137,9 @@ def highest_orbits(
     def of_order(order: Array) -> dict[str, Array]:
         def orbit_of(place: OrbitPlace, row: Array) -> tuple[Array, Array, Array]:
             scene, own_frame = jax.tree.map(lambda leaf: leaf[row], (scenes, frame))
-            orbit = orbit_at(place, jnp.ones((), bool), own_frame, problem_of(scene, own_frame, order))
+            orbit = orbit_at(
+                place, jnp.ones((), bool), jnp.zeros((), bool), own_frame, problem_of(scene, own_frame, order)
+            )
             half, determinant = 0.5 * jnp.abs(orbit.trace), orbit.determinant
             inside = half**2 - determinant
             # a pair on a circle has the root of the determinant for its size

@@ -28,6 +28,10 @@ from afm_jax.impact.law import Impact, ImpactLaw, Speeds
 from afm_jax.solve.newton import Newton, newton
 from afm_jax.solve.polynomial_roots import real_roots
 
+NEAR_DOUBLE = 1e-3
+"""Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
+_NEARBY = 1e-5
+"""Distance from a root at which its slope is taken, as a fraction of its distance from capture."""
 _REGULAR = 1e-12
 """Relative size below which a determinant is taken for the rounding of 0."""
 _PASSES = 3
@@ -163,11 +167,25 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
     return jnp.stack([(position - height) / platform.amplitude_nm, missing])
 
 
+class FollowedRoot(NamedTuple):
+    """Where Newton's method for the map of a lasting impact ended.
+
+    ``closes``: whether the map closes there; ``slopes``: derivatives of `map_gaps` by coordinate and phase, shape
+    (2, 2), right to the size of the last step; ``near_fold``: see `NEAR_DOUBLE`.
+    """
+
+    place: OrbitPlace
+    closes: Bool[Array, ""]
+    slopes: Float[Array, "2 2"]
+    near_fold: Bool[Array, ""]
+
+
 @jax.jit
-def follow_root(
-    near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Array, ""]
-) -> tuple[OrbitPlace, Bool[Array, ""]]:
+def follow_root(near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Array, ""]) -> FollowedRoot:
     """Return where the map of a lasting impact closes, and whether it does, without derivatives.
+
+    With x(Y) the solution (a, b) of the linear system, the gaps are its matrix times (cos, sin) - x, so that the slope
+    of the closing condition on an orbit, d|x|^2/dY/2, is the determinant of the gaps' slopes over that of the matrix.
 
     Args:
         near: coordinate of the impact, close to that of the orbit.
@@ -187,7 +205,22 @@ def follow_root(
     settings = Newton(_NEWTON, step_tolerance=_CLOSE, residual_tolerance=_CLOSE, unit=longest, damping=damped)
     place = jnp.stack(place_of(near, speeds, system, problem))
     root = newton(map_gaps, place, problem, settings, where=wanted)
-    return OrbitPlace(*root.x), system.regular & jnp.all(jnp.abs(root.residual) < _CLOSED)
+    (a, b), (c, d) = root.slopes
+    return FollowedRoot(
+        place=OrbitPlace(*root.x),
+        closes=system.regular & jnp.all(jnp.abs(root.residual) < _CLOSED),
+        slopes=root.slopes,
+        near_fold=jnp.abs((a * d - b * c) * root.x[0]) < NEAR_DOUBLE * jnp.abs(system.determinant),
+    )
+
+
+def near_fold(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
+    """Say whether a root of the scalar condition is near-double: see `NEAR_DOUBLE`."""
+    # a difference, right to nine digits: the derivative's program is twice as large; not beyond capture
+    step = _NEARBY * (coordinate - problem.impact.lowest)
+    ends = coordinate + step * jnp.array([-1.0, 1.0])
+    low, high = jax.vmap(closing_residual, in_axes=(0, None))(ends, problem)
+    return jnp.abs((high - low) * coordinate) < 2.0 * step * NEAR_DOUBLE
 
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
@@ -319,6 +352,10 @@ class OrbitRoots(NamedTuple):
     """Which slots hold a root."""
     complete: Bool[Array, ""]
     """Whether there were no more roots than slots."""
+    near_fold: Bool[Array, " slots"]
+    """Which roots are near-double."""
+    slopes: Float[Array, "slots 2 2"] | None
+    """Derivatives of `map_gaps` by coordinate and phase, right to ten digits; None unless the impact lasts."""
 
 
 def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
@@ -336,13 +373,15 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     coordinate, found, complete = _quartic_roots(problem) if _is_quartic(problem) else _scanned_roots(problem, scan)
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
     if problem.impact.lasts:
-        place, closes = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
+        place, closes, slopes, near_double = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
         found = found & driven & closes
         found = found & ~_seen_before(place.coordinate, found)
     else:
         place, regular = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
-        found = found & driven & regular
-    return OrbitRoots(OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
+        found, slopes = found & driven & regular, None
+        near_double = jax.vmap(near_fold, in_axes=(0, None))(safe, problem)
+    place = OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase)
+    return OrbitRoots(place, found, complete, found & near_double, slopes)
 
 
 def _is_quartic(problem: OrbitProblem) -> bool:
@@ -448,7 +487,8 @@ def _sampled_twice(grid: Float[Array, " points"], problem: OrbitProblem, scan: S
 def _changes(samples: _Samples) -> Bool[Array, " intervals"]:
     """Say in which intervals the residual changes its sign, between impacts that are over soon."""
     _, value, brief = samples
-    return (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
+    below, above = value < 0.0, value >= 0.0  # neither where it is not a number
+    return (below[:-1] & above[1:] | above[:-1] & below[1:]) & brief[:-1] & brief[1:]
 
 
 def _inside(crossing: Bool[Array, " intervals"], scan: Scan) -> tuple[Array, Array]:

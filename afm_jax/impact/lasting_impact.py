@@ -33,7 +33,6 @@ which orbits and predictions take in place of a law: collisions of a free tip (`
 lever, which contain their pull (`PulledImpact`), as Chebyshev series.
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -158,24 +157,15 @@ def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_
         surface: moves.
         time_us: mid contact, half a delay after the arrival.
     """
-    height, velocity = surface.position_and_velocity(time_us)
-    acceleration = surface.acceleration(time_us)
-    pull = cantilever.acceleration(height, velocity) - acceleration
-    jerk, (snap, crackle) = _thrice(surface.jerk, time_us)
-    pulled = cantilever.acceleration
+    motion, pulled = surface.motion(time_us), cantilever.acceleration
+    position, velocity, acceleration = motion.position, motion.velocity, motion.acceleration
+    jerk, snap, crackle = motion.jerk, motion.snap, motion.crackle
     return Middle(
-        pull, pulled(velocity, acceleration) - jerk, pulled(acceleration, jerk) - snap, pulled(jerk, snap) - crackle
+        pulled(position, velocity) - acceleration,
+        pulled(velocity, acceleration) - jerk,
+        pulled(acceleration, jerk) - snap,
+        pulled(jerk, snap) - crackle,
     )
-
-
-def _thrice(of: Callable[[Array], Array], at: Float[Array, "..."]) -> tuple[Array, tuple[Array, Array]]:
-    """Return a function's value and its first two derivatives."""
-
-    def twice(at):
-        return jax.jvp(of, (at,), (jnp.ones_like(at),))
-
-    (value, rate), (_, second) = jax.jvp(twice, (at,), (jnp.ones_like(at),))
-    return value, (rate, second)
 
 
 AIR = 10.0 / 9.0

@@ -38,14 +38,10 @@ from afm_jax.impact.lasting_impact import PulledImpact, crawls, depth_of_impact,
 from afm_jax.impact.law import Impact, ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
-from afm_jax.solve.derivatives import absent, implicit_root, implicit_system
+from afm_jax.solve.derivatives import absent, implicit_root, implicit_step, implicit_system
 from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import within_turn
 
-NEAR_DOUBLE = 1e-3
-"""Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
-_NEARBY = 1e-5
-"""Distance from a root at which its slope is taken, as a fraction of its distance from capture."""
 _ARRIVAL_TOLERANCE = 1e-7
 """Drive periods by which the first impact of a flight may lie before the orbit's own, by rounding."""
 
@@ -160,7 +156,7 @@ def _single_impact_orbits(scene: Scene, frame: FreeFrame, order: Float[Array, ""
     problem = orbit_problem(scene.cantilever, frame.platform, law, order)
     roots = find_roots(problem)
     found = roots.found & frame.periodic & law.leaves
-    orbits = jax.vmap(orbit_at, in_axes=(0, 0, None, None))(roots.place, found, frame, problem)
+    orbits = jax.vmap(orbit_at, in_axes=(0, 0, 0, None, None))(roots.place, found, roots.near_fold, frame, problem)
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
 
 
@@ -175,19 +171,23 @@ def orbit_problem(cantilever: Cantilever, platform: Platform, law: Law, order: F
     return OrbitProblem(cantilever, platform, law, order)
 
 
-def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem) -> SingleImpactOrbits:
+def orbit_at(
+    place: OrbitPlace, found: Bool[Array, ""], near_fold: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem
+) -> SingleImpactOrbits:
     """Return one slot of `SingleImpactOrbits`: motion, verdict and readings of one root; NaN where there is none.
 
     Args:
         place: the root.
         found: whether it is one.
+        near_fold: whether it is near-double.
         frame: of the scene.
         problem: of the frame's platform.
     """
     state = orbit_state(place, problem)
-    verdict = judge(place, found, state, problem)
+    trace, determinant = trace_and_determinant(problem.impact, problem.cantilever, problem.platform, state.flight)
+    admissible = is_admissible(found, state, problem)
     # an approach that is less than the rounding of the flight's end is none
-    found = found & ~jnp.isnan(verdict.trace)
+    found = found & ~jnp.isnan(trace)
     flight, speeds = state.flight, state.speeds
     velocities = jnp.stack([flight.start_velocity, flight.end_velocity])
     if frame.response is not None:
@@ -200,17 +200,17 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
 
     return SingleImpactOrbits(
         exists=found,
-        admissible=found & verdict.admissible,
-        stable=verdict.stable,
-        near_double=found & verdict.near_double,
+        admissible=found & admissible,
+        stable=found & contracts(trace, determinant),
+        near_double=found & near_fold,
         phase_rad=known(within_turn(state.phase + frame.phase_rad, 2.0 * jnp.pi)),
         velocity_after_nm_per_us=known(velocities[0]),
         velocity_before_nm_per_us=known(velocities[1]),
         approach_speed_nm_per_us=known(speeds.approach),
         rebound_speed_nm_per_us=known(speeds.rebound),
         delay_us=known(speeds.delay),
-        trace=known(verdict.trace),
-        determinant=known(verdict.determinant),
+        trace=known(trace),
+        determinant=known(determinant),
         complete=found,
         extrapolated=found & law.extrapolated(speeds.approach) if isinstance(law, TabulatedLaw) else None,
         **{name: known(value) for name, value in _lab_readings(state, frame, problem).items()},
@@ -237,16 +237,6 @@ class OrbitState(NamedTuple):
     phase: Float[Array, ""]
     speeds: Speeds
     flight: FlightEnds
-
-
-class Verdict(NamedTuple):
-    """What a root is good for: see `SingleImpactOrbits`."""
-
-    admissible: Bool[Array, ""]
-    stable: Bool[Array, ""]
-    near_double: Bool[Array, ""]
-    trace: Float[Array, ""]
-    determinant: Float[Array, ""]
 
 
 class SteadyOrbits(NamedTuple):
@@ -307,11 +297,21 @@ def _alone(wave: Wave) -> Surface:
 
 
 @jax.jit
-def orbit_state(place: OrbitPlace, problem: OrbitProblem) -> OrbitState:
-    """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
+def orbit_state(place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "2 2"] | None = None) -> OrbitState:
+    """Return the motion at a root, with the root's derivatives (implicit function theorem).
+
+    Args:
+        place: the root.
+        problem: what it is an orbit of.
+        slopes: of `FollowedRoot`, for first derivatives alone; None: computed.
+    """
     cantilever, platform, impact, order = problem
     if impact.lasts:
-        place = OrbitPlace(*implicit_system(map_gaps, jnp.stack(place), problem))
+        root = jnp.stack(place)
+        if slopes is None:
+            place = OrbitPlace(*implicit_system(map_gaps, root, problem))
+        else:
+            place = OrbitPlace(*implicit_step(map_gaps, root, problem, slopes))
         speeds = speeds_at_place(place, problem)
         phase = place.phase + platform.angular_frequency * speeds.delay
     else:
@@ -326,10 +326,15 @@ def orbit_state(place: OrbitPlace, problem: OrbitProblem) -> OrbitState:
     return OrbitState(phase, speeds, FlightEnds(start, duration, position, velocity, end_position, end_velocity))
 
 
-def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
-    """Return whether an orbit is admissible, stable (eq. 8 and its generalisation) and close to a fold."""
+def is_admissible(found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Bool[Array, ""]:
+    """Say whether an orbit's flight does not pass through the platform on its way, and the tip leaves the bridge.
+
+    Args:
+        found: whether there is an orbit; a slot without one is not admissible.
+        state: its motion.
+        problem: what it is an orbit of.
+    """
     cantilever, platform, impact, _ = problem
-    trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
     # the flight counts from max(t_in, t_out) on
     skip = jnp.maximum(-state.speeds.delay, 0.0) if impact.delayed else None
     # an empty slot does not leave the platform, so that its search ends at once
@@ -338,22 +343,7 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
     flies = found & ends_at_its_own_impact(flight, state.flight.duration_us, skip, platform.period_us)
     if isinstance(impact, Law) and impact.delayed:
         flies = flies & ~crawls(impact, impact.at_approach(state.speeds.approach), cantilever)
-    return Verdict(
-        admissible=flies,
-        stable=found & contracts(trace, determinant),
-        near_double=found & near_fold(place.coordinate, problem),
-        trace=trace,
-        determinant=determinant,
-    )
-
-
-def near_fold(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
-    """Say whether a root is near-double: |d f/d ln Y| < 1e-3, f the closing condition and Y its coordinate."""
-    # a difference, right to nine digits: the derivative's program is twice as large; not beyond capture
-    step = _NEARBY * (coordinate - problem.impact.lowest)
-    ends = coordinate + step * jnp.array([-1.0, 1.0])
-    low, high = jax.vmap(closing_residual, in_axes=(0, None))(ends, problem)
-    return jnp.abs((high - low) * coordinate) < 2.0 * step * NEAR_DOUBLE
+    return flies
 
 
 def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
@@ -364,12 +354,48 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     problem = lax.stop_gradient(problem)
     roots = find_roots(problem, TAPPED if isinstance(problem.impact, PulledImpact) else COARSE)
 
-    def orbit_of(place, found):
+    def orbit_of(place, found, slopes):
         state = orbit_state(place, problem)
-        verdict = judge(place, found, state, problem)
-        return verdict.admissible & verdict.stable, verdict.near_double, _readings(state, problem)
+        steady = is_admissible(found, state, problem) & is_stable(place, slopes, state, problem)
+        return steady, _readings(state, problem)
 
-    return SteadyOrbits(roots.place, *jax.vmap(orbit_of)(roots.place, roots.found))
+    steady, readings = jax.vmap(orbit_of)(roots.place, roots.found, roots.slopes)
+    return SteadyOrbits(roots.place, steady, roots.near_fold, readings)
+
+
+def is_stable(
+    place: OrbitPlace, slopes: Float[Array, "2 2"] | None, state: OrbitState, problem: OrbitProblem
+) -> Bool[Array, ""]:
+    """Say whether an orbit is stable, from the slopes that its search has found where the impact lasts.
+
+    With the gaps g and h of one turn in position and velocity relative to the surface, and the relative acceleration a,
+    the next impact is late by g/u and as fast as u - h - a g/u; T = 2 + t and D = 1 + t + d, t and d the trace and the
+    determinant of the changes of both.
+
+    Args:
+        place: the root.
+        slopes: of `OrbitRoots`.
+        state: the motion there.
+        problem: what it is an orbit of.
+    """
+    cantilever, platform, impact, _ = problem
+    flight = state.flight
+    if slopes is None:
+        return contracts(*trace_and_determinant(impact, cantilever, platform, flight))
+    omega, approach = platform.angular_frequency, state.speeds.approach
+    coordinate = place.coordinate
+    _, per_coordinate = jax.jvp(lambda y: impact.speeds(y).approach, (coordinate,), (jnp.ones_like(coordinate),))
+    by_speed, by_time = slopes[:, 0] / per_coordinate, slopes[:, 1] * omega
+    pull = cantilever.acceleration(flight.end_position, flight.end_velocity)
+    pull = pull - platform.acceleration(place.phase / omega)
+
+    def changes(gap, missing):
+        late = platform.amplitude_nm * gap / approach
+        return late, -platform.top_speed_nm_per_us * missing - pull * late
+
+    (later, slower), (late, slow) = changes(*by_time), changes(*by_speed)
+    trace, determinant = later + slow, later * slow - slower * late
+    return contracts(2.0 + trace, 1.0 + trace + determinant)
 
 
 def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
@@ -378,12 +404,8 @@ def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array,
     The roots are those of `steady_orbits`; of the stable ones flights are followed only until one is admissible.
     """
     problem = lax.stop_gradient(problem)
-    cantilever, platform, impact, _ = problem
     roots = find_roots(problem, COARSE)
     states = jax.vmap(orbit_state, in_axes=(0, None))(roots.place, problem)
-
-    def is_stable(state):
-        return contracts(*trace_and_determinant(impact, cantilever, platform, state.flight))
 
     def goes_on(search):
         untried, _, steady = search
@@ -392,19 +414,25 @@ def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array,
     def try_fastest(search):
         untried, _, _ = search
         slot = jnp.argmax(untried)
-        place, state = jax.tree.map(lambda leaf: leaf[slot], (roots.place, states))
+        state = jax.tree.map(lambda leaf: leaf[slot], states)
         # of a batch, a search that has ended follows no flight
-        verdict = judge(place, goes_on(search), state, problem)
-        return untried.at[slot].set(-jnp.inf), slot, verdict.admissible
+        admissible = is_admissible(goes_on(search), state, problem)
+        return untried.at[slot].set(-jnp.inf), slot, admissible
 
-    untried = jnp.where(roots.found & jax.vmap(is_stable)(states), states.speeds.approach, -jnp.inf)
+    stable = jax.vmap(is_stable, in_axes=(0, 0, 0, None))(roots.place, roots.slopes, states, problem)
+    untried = jnp.where(roots.found & stable, states.speeds.approach, -jnp.inf)
     _, slot, steady = lax.while_loop(goes_on, try_fastest, (untried, jnp.argmax(untried), jnp.zeros((), bool)))
     return jax.tree.map(lambda leaf: leaf[slot], states), steady
 
 
-def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
-    """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
-    return _readings(orbit_state(place, problem), problem)
+def amplitudes(
+    place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "2 2"] | None = None
+) -> Float[Array, " 3"]:
+    """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable.
+
+    Arguments as of `orbit_state`.
+    """
+    return _readings(orbit_state(place, problem, slopes), problem)
 
 
 @jax.jit

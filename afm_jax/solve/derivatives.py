@@ -71,6 +71,26 @@ def implicit_system(
     return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, system=True)
 
 
+def implicit_step(
+    residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]],
+    root: Float[Array, " n"],
+    parameters: Any,
+    slopes: Float[Array, "n n"],
+) -> Float[Array, " n"]:
+    """Attach the first implicit derivative to a root, as `implicit_system` does, with df/dx from the search itself.
+
+    Args:
+        residual: f(x, parameters).
+        root: the value of x that the search found; its own derivative is ignored.
+        parameters: pytree of arrays, of what the root depends on.
+        slopes: df/dx at the root, held constant: there are no second derivatives.
+    """
+    root = lax.stop_gradient(root)
+    miss = residual(root, parameters)
+    # a step of Newton's method for what changes
+    return root - solved_columns(list(slopes.T), miss - lax.stop_gradient(miss))
+
+
 class _Mapped(NamedTuple):
     """A residual for a batch: row by row the same function; ``axes``: 0 or None for each leaf of the parameters."""
 

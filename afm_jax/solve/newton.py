@@ -74,6 +74,8 @@ class Root(NamedTuple):
     """A `NewtonOutcome`."""
     residual: Float[Array, " n"]
     """The residual before the last step; infinite where no round was made."""
+    slopes: Float[Array, "n n"]
+    """Derivatives of the residual by the unknowns before the last step; 0 where no round was made."""
 
 
 def newton(
@@ -104,7 +106,7 @@ def newton(
         return value, value
 
     def improve(state: tuple[Array, Root]) -> tuple[Array, Root]:
-        count, (x, outcome, old) = state
+        count, (x, outcome, *before) = state
         slopes, value = jax.jacfwd(twice, has_aux=True)(x)
         full = -solved_columns(list(slopes.T), value)
         step, sizes = settings.limited(x, full)
@@ -116,16 +118,16 @@ def newton(
         going = outcome == NewtonOutcome.NOT_CONVERGED
         now = jnp.where(found, NewtonOutcome.CONVERGED, outcome)
         now = jnp.where(finite, now, NewtonOutcome.NO_STEP)
-        return count + 1, Root(
-            jnp.where(going & finite, x + step, x), jnp.where(going, now, outcome), jnp.where(going, value, old)
-        )
+        here = (jnp.where(going, new, old) for new, old in zip((value, slopes), before, strict=True))
+        return count + 1, Root(jnp.where(going & finite, x + step, x), jnp.where(going, now, outcome), *here)
 
     def unsettled(state: tuple[Array, Root]) -> Array:
         return (state[0] < settings.rounds) & (state[1].outcome == NewtonOutcome.NOT_CONVERGED)
 
     asked = jnp.ones((), bool) if where is None else where
     first = jnp.where(asked, NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NOT_ASKED).astype(jnp.int32)
-    start = Root(begin, first, jnp.full_like(begin, jnp.inf))
+    # the batch's own from the start: a loop whose state joins the batch later is traced once more
+    start = Root(begin, first, jnp.abs(begin) + jnp.inf, 0.0 * jnp.outer(begin, begin))
     root = lax.while_loop(unsettled, improve, (jnp.zeros((), jnp.int32), start))[1]
     return root._replace(x=implicit_system(residual, root.x, parameters))
 
