@@ -342,7 +342,9 @@ def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> st
     if flat.dtype.kind not in "biufc":
         return f"{shape}{flat.dtype}"
     if flat.size <= _SHOWN:
-        return shape + (", ".join(map(_one, flat.tolist())) or "nothing")
+        # of several numbers those that are not known are dashes, as in tables
+        unknown = "-" if flat.size > 1 else "not known"
+        return shape + (", ".join(_one(each, unknown) for each in flat.tolist()) or "nothing")
     if flat.dtype.kind == "b":
         return f"{shape}{flat.sum()} of {flat.size} yes"
     size = np.abs(flat) if flat.dtype.kind == "c" else flat
@@ -364,11 +366,11 @@ def _outcomes_in_words(flat: np.ndarray, words: type[enum.IntEnum]) -> str:
     return ", ".join(f"{count} {name}" for name, count in zip(names, counts.tolist(), strict=True)) or "nothing"
 
 
-def _one(value: Any) -> str:
+def _one(value: Any, unknown: str = "not known") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float) and math.isnan(value):
-        return "not known"
+        return unknown
     return f"{value:.6g}"
 
 

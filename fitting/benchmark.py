@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from afm_jax.accuracy.overview import overview_row
-from afm_jax.bench.timing import progress
+from afm_jax.bench.timing import progress, time_calls
 from afm_jax.least_squares import Box, Searches, descended
 from fitting.fits.objective import PLAIN, Objective, polish
 from fitting.models import Problem, measurement_of
@@ -132,13 +133,9 @@ def minimum_accuracy(
     for method, search, stops in searches:
         progress(f"accuracy: fits, {method}")
         for stop in stops:
-            found, seconds = problem.values(search(stop))[0], []
-            for _ in range(repetitions):
-                begin = time.perf_counter()
-                search(stop)
-                seconds.append(time.perf_counter() - begin)
-            error = float(np.max(np.abs(found / truth - 1.0)))
-            measured.append(overview_row("fits", method, f"tolerance {stop:g}", 1e6 * min(seconds), error))
+            calls = time_calls(partial(search, stop), repetitions=repetitions)
+            error = float(np.max(np.abs(problem.values(calls.result)[0] / truth - 1.0)))
+            measured.append(overview_row("fits", method, f"tolerance {stop:g}", 1e6 * calls.best_s, error))
     reference = {
         "error_of": "worst parameter, relative",
         "reference": "the law that made the table",

@@ -118,6 +118,24 @@ def test_another_shape_structure_or_static_argument_is_another_program(folder):
     assert len(TRACED) == 4
 
 
+def test_programs_that_are_kept_already_are_not_kept_again(folder):
+    # two functions of the same arguments, as of fits
+    module: Any = sys.modules["made_here"]
+
+    def doubled(x):
+        return 2.0 * x
+
+    def tripled(x):
+        return 3.0 * x
+
+    module.doubled, module.tripled = jax.jit(doubled), jax.jit(tripled)
+    for _ in range(2):
+        keep_programs(["made_here:doubled", "made_here:tripled"], folder, lambda _: None)
+    assert float(module.doubled(np.ones(()))) == 2.0
+    assert float(module.tripled(np.ones(()))) == 3.0
+    assert [path.name.partition("-")[0] for path in files(folder)] == ["doubled", "tripled"]
+
+
 @pytest.mark.parametrize("damage", [b"nonsense", b"", None])
 def test_a_damaged_file_is_replaced_and_said(folder, damage):
     anew(folder)(*arguments())

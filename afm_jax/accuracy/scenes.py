@@ -7,7 +7,6 @@ which is taken for true.
 """
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -23,7 +22,7 @@ from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.bench.problems import ROUNDS
 from afm_jax.bench.study import Row, named
-from afm_jax.bench.timing import Compiled, compiled_for, progress, time_compiled
+from afm_jax.bench.timing import Compiled, compiled_for, progress, time_calls, time_compiled
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting
 from afm_jax.impact.first_impact import Flight, first_impact
@@ -339,16 +338,11 @@ def _row(model: str, rung: Callable[[], tuple[float, float, int]], repetitions: 
     progress(f"accuracy: {model}")
     row: Row = {"model": model, "peak_nm": None, "lowest_peak_nm": None, "seconds": None, "contacts": None}
     try:
-        # the first run compiles
-        peak, lowest, contacts = rung()
+        calls = time_calls(rung, repetitions=repetitions)
     except (_NoAnswer, ValueError) as failure:
         return row | {"reason": str(failure)}
-    seconds = []
-    for _ in range(max(repetitions, 1)):
-        began = time.perf_counter()
-        _ = rung()
-        seconds.append(time.perf_counter() - began)
-    return row | {"peak_nm": peak, "lowest_peak_nm": lowest, "contacts": contacts, "seconds": min(seconds)}
+    peak, lowest, contacts = calls.result
+    return row | {"peak_nm": peak, "lowest_peak_nm": lowest, "contacts": contacts, "seconds": calls.best_s}
 
 
 def _orbit(scene: Scene) -> Callable[[], tuple[float, float, int]]:

@@ -2,7 +2,6 @@
 
 import resource
 import sys
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ from jaxtyping import Array, Float
 from afm_jax.bench.integrators import title
 from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.bench.study import Contestant, Row, measured, named, timed
-from afm_jax.bench.timing import compiled_for, progress
+from afm_jax.bench.timing import compiled_for, progress, time_calls
 from afm_jax.contact.collide import Collision, batch_of, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import EFFECTS
@@ -199,17 +198,13 @@ def _first_gradient(batch: int) -> Row:
         result = collide(contact, speeds)
         return jnp.sum(result.rebound_speed_nm_per_us) + jnp.sum(result.collision_delay_us)
 
-    seconds = []
-    for _ in range(3):
-        began = time.perf_counter()
-        jax.block_until_ready(jax.grad(total, argnums=(0, 1))(Contact.paper(), speeds_of(batch) + 1.0))
-        seconds.append(time.perf_counter() - began)
-    best = min(seconds)
+    gradient = jax.grad(total, argnums=(0, 1))
+    calls = time_calls(lambda: gradient(Contact.paper(), speeds_of(batch) + 1.0), repetitions=2)
     return {
         "what": what,
         "batch": batch,
-        "microseconds_per_impact": 1e6 * best / batch,
-        "compile_s": seconds[0] - best,
+        "microseconds_per_impact": 1e6 * calls.best_s / batch,
+        "compile_s": calls.compile_s,
     }
 
 

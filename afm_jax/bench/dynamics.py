@@ -3,18 +3,16 @@
 SciPy does a small part of the same work, each impact by `solve_ivp` with events, and is told for the whole of it.
 """
 
-import os
 import time
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.problems import chaotic_scene
 from afm_jax.bench.scipy_impacts import scipy_impacts
-from afm_jax.bench.timing import progress
+from afm_jax.bench.timing import progress, time_calls
 from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
@@ -96,23 +94,16 @@ def dynamics_rows(*, values: int, impacts: int, side: int, orders: int, grid: in
 
 def _row(what: str, work: str, run: Callable[[], Any], beside: str, beside_seconds: float) -> Row:
     progress(f"bench: {what}, {work}")
-    seconds, processor = [], []
-    for _ in range(3):
-        began, used = time.perf_counter(), os.times()
-        jax.block_until_ready(run())
-        now = os.times()
-        seconds.append(time.perf_counter() - began)
-        processor.append(now.user - used.user + now.system - used.system)
-    best = int(np.argmin(seconds[1:])) + 1
+    calls = time_calls(run, repetitions=2)
     return {
         "what": what,
         "work": work,
-        "seconds": seconds[best],
-        "processor_seconds": processor[best],
-        "first_s": seconds[0],
+        "seconds": calls.best_s,
+        "processor_seconds": calls.best_processor_s,
+        "first_s": calls.first_s,
         "beside": beside,
         "beside_seconds": beside_seconds,
-        "ratio": beside_seconds / seconds[best],
+        "ratio": beside_seconds / calls.best_s,
     }
 
 

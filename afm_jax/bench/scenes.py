@@ -4,11 +4,9 @@ The flights between the contacts are part of the time. Errors are those of one c
 that no chaos multiplies them; contacts that turn in the bridge are shown apart.
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -17,7 +15,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.problems import SingleContacts, batch_run, bouncing_starts, single_contacts, spread_starts
 from afm_jax.bench.scipy_contacts import contact_contestants
 from afm_jax.bench.study import Row, measured
-from afm_jax.bench.timing import Compiled, compiled_for, progress, time_compiled
+from afm_jax.bench.timing import Compiled, compiled_for, progress, time_calls, time_compiled
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
@@ -185,27 +183,20 @@ def _long(name: str, scene: Scene, periods: int, repetitions: int) -> Row:
     progress(f"bench: scenes, {name}, one tip for {periods} drive periods")
     starts = spread_starts(scene, 1)
     start, duration = State(*(part[0] for part in starts)), periods * float(scene.platform.period_us)
-
-    def timed() -> tuple[float, Simulation]:
-        began = time.perf_counter()
-        found = jax.block_until_ready(simulate(scene, start, duration))
-        return time.perf_counter() - began, found
-
-    first, found = timed()
-    best = min(timed()[0] for _ in range(max(repetitions, 1)))
-    contacts = int(found.count)
+    calls = time_calls(lambda: simulate(scene, start, duration), repetitions=repetitions)
+    motion: Simulation = calls.result
+    contacts = int(motion.count)
     return {
         "what": f"one tip, {periods} drive periods",
         "scene": name,
         "batch": 1,
         "periods": periods,
         "contacts": contacts,
-        "seconds": best,
-        "microseconds_per_contact": 1e6 * best / max(contacts, 1),
-        # of a program that is compiled already next to nothing
-        "compile_s": max(first - best, 0.0),
-        "held_share": float(found.held),
-        "failed": int(int(found.outcome) not in {MotionOutcome.FINISHED, MotionOutcome.HELD}),
+        "seconds": calls.best_s,
+        "microseconds_per_contact": 1e6 * calls.best_s / max(contacts, 1),
+        "compile_s": calls.compile_s,
+        "held_share": float(motion.held),
+        "failed": int(int(motion.outcome) not in {MotionOutcome.FINISHED, MotionOutcome.HELD}),
     }
 
 

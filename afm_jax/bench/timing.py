@@ -29,6 +29,22 @@ class Timing(NamedTuple):
     median_s: float
 
 
+class Calls(NamedTuple):
+    """Seconds that calls of a function take which compiles in its first, and what the last returns."""
+
+    first_s: float
+    best_s: float
+    """Of the calls after the first."""
+    best_processor_s: float
+    """Processor time of that best call."""
+    result: Any
+
+    @property
+    def compile_s(self) -> float:
+        """Seconds by which the first call took longer: next to nothing if the programs are compiled already."""
+        return max(self.first_s - self.best_s, 0.0)
+
+
 class Compiled(NamedTuple):
     """A function compiled for one kind of arguments, and the seconds that took."""
 
@@ -49,6 +65,19 @@ def time_compiled(compiled: Compiled, *arguments: Any, repetitions: int) -> tupl
     calls = 1 + int(_SHORTEST_REPETITION_S / _seconds(compiled, arguments, 1))
     seconds = [_seconds(compiled, arguments, calls) for _ in range(repetitions)]
     return Timing(compiled.seconds, min(seconds), statistics.median(seconds)), result
+
+
+def time_calls(run: Callable[[], Any], *, repetitions: int) -> Calls:
+    """Call a function once and then some times more, at least once, and return the times and what it computed."""
+    result, seconds, processor = None, [], []
+    for _ in range(1 + max(repetitions, 1)):
+        began, used = time.perf_counter(), os.times()
+        result = jax.block_until_ready(run())
+        now = os.times()
+        seconds.append(time.perf_counter() - began)
+        processor.append(now.user - used.user + now.system - used.system)
+    best = min(range(1, len(seconds)), key=seconds.__getitem__)
+    return Calls(seconds[0], seconds[best], processor[best], result)
 
 
 def _seconds(compiled: Compiled, arguments: tuple[Any, ...], calls: int) -> float:

@@ -97,17 +97,14 @@ def time_impacts() -> float:
     """Return microseconds that an impact of many tips takes, the best of three times."""
     import jax  # noqa: PLC0415
 
+    from afm_jax.bench.timing import time_calls  # noqa: PLC0415
     from afm_jax.impact.map import iterate_batch  # noqa: PLC0415
     from afm_jax.scenefile.presets import preset  # noqa: PLC0415
 
     scene = preset("figure2")
     times, speeds = jax.numpy.linspace(0.0, 5.0, _TIPS), jax.numpy.linspace(50.0, 100.0, _TIPS)
-    seconds = []
-    for _ in range(4):
-        begin = time.perf_counter()
-        jax.block_until_ready(iterate_batch(scene, times, speeds, _IMPACTS))
-        seconds.append(time.perf_counter() - begin)
-    return 1e6 * min(seconds[1:]) / (_IMPACTS * _TIPS)
+    calls = time_calls(lambda: iterate_batch(scene, times, speeds, _IMPACTS), repetitions=3)
+    return 1e6 * calls.best_s / (_IMPACTS * _TIPS)
 
 
 def _version(name: str) -> str | None:

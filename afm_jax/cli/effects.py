@@ -37,7 +37,7 @@ def effects(
     if write is not None and study.reduction is not None:
         save_scene(study.reduction.scene, write, start=start)
         session.note(f"wrote {write}")
-        told["reduced"]["file"] = write
+        told["reduced"] = {**told["reduced"], "file": write}
     return Output(
         payload=told,
         text=table.printed(),

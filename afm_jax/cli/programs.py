@@ -27,31 +27,39 @@ _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "line
 
 
 def keep_programs(names: Sequence[str], folder: Path, tell: Callable[[str], None]) -> None:
-    """Let traced programs of jitted functions, "module:function" each, outlive the process, as files in a folder."""
-    for module, function in (name.split(":") for name in names):
-        setattr(import_module(module), function, _keeping(getattr(sys.modules[module], function), folder, tell))
+    """Let traced programs of jitted functions, "module:function" each, outlive the process, as files in a folder.
+
+    A function whose programs are kept already stays as it is: a command may ask for each of several curves.
+    """
+    for module, name in (place.split(":") for place in names):
+        function = getattr(import_module(module), name)
+        if not isinstance(function, _Keeping):
+            setattr(sys.modules[module], name, _Keeping(function, folder, tell))
 
 
-def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable[..., Any]:
-    programs: dict[Any, tuple[Any, Any]] = {}
+class _Keeping:
+    """A jitted function that finds its traced programs in a folder."""
 
-    def kept(*arguments: Any, **named: Any) -> Any:
+    def __init__(self, jitted: Any, folder: Path, tell: Callable[[str], None]):
+        self.jitted, self.folder, self.tell = jitted, folder, tell
+        self.programs: dict[Any, tuple[Any, Any]] = {}
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
         leaves, tree = jax.tree.flatten((arguments, named))
         arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
         if any(isinstance(leaf, core.Tracer) for leaf in arrays):
-            return jitted(*arguments, **named)
+            return self.jitted(*arguments, **named)
 
         def of_arrays(arrays: list[Any]) -> Any:
             positional, by_name = jax.tree.unflatten(tree, eqx.combine(arrays, static))
-            return jitted(*positional, **by_name)
+            return self.jitted(*positional, **by_name)
 
         call = (tree, *static, *((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arrays)))
-        if call not in programs:
-            programs[call] = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", of_arrays, arrays, tell)
-        program, result = programs[call]
+        if call not in self.programs:
+            path = self.folder / f"{self.jitted.__name__}-{_digest(call)}.program"
+            self.programs[call] = _program(path, of_arrays, arrays, self.tell)
+        program, result = self.programs[call]
         return jax.tree.unflatten(result, program(arrays))
-
-    return kept
 
 
 def _digest(call: Any) -> str:

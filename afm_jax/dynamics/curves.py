@@ -36,6 +36,7 @@ from afm_jax.dynamics.impact_loop import (
 )
 from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
+from afm_jax.solve.bracketed_root import bracketed_root
 from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import compiled_quickly, in_blocks
 from afm_jax.solve.newton import Newton
@@ -407,9 +408,7 @@ def root_on(leg: CurveLeg, test: Callable[[CurvePoint], float], family: LoopFami
         return np.nan if point is None else test(point)
 
     try:
-        from scipy.optimize import brentq  # noqa: PLC0415 (half a second, seldom needed)
-
-        fraction = float(np.asarray(brentq(tested_at, 0.0, 1.0, xtol=1e-15)))
+        fraction = bracketed_root(tested_at, 0.0, 1.0, tolerance=1e-15)
     except ValueError:
         # the guesses on the way led elsewhere
         return None

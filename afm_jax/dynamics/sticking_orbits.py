@@ -25,6 +25,7 @@ from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
+from afm_jax.solve.bracketed_root import bracketed_root
 from afm_jax.solve.lanes import Report, filled
 from afm_jax.units import within_turn
 
@@ -223,9 +224,7 @@ def _ended(
         end, kind = _narrowed(at, points[last], fractions[beyond]), None
         if least(end[0]) < 0.0 <= least(fractions[beyond]):
             # shortly before, the flight is too short to be flown
-            from scipy.optimize import brentq  # noqa: PLC0415 (half a second, seldom needed)
-
-            held = float(np.asarray(brentq(least, end[0], fractions[beyond], xtol=1e-14)))
+            held = bracketed_root(least, end[0], fractions[beyond], tolerance=1e-14)
             if abs(held - end[0]) < _SHORT_FLIGHT:
                 end, kind = (held, end[1]), "held"
         if end[0] != points[last][0]:

@@ -2,7 +2,9 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 from rich.table import Table
 
@@ -16,7 +18,8 @@ from afm_jax.words import counted, known
 _COSTS = ("time_us_per_period", "operations", "transcendentals")
 
 
-class EffectTable(NamedTuple):
+@dataclass(frozen=True)
+class EffectTable:
     """The effects of a scene, one a row."""
 
     study: EffectStudy
@@ -26,6 +29,10 @@ class EffectTable(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax effects`."""
+        return self._told
+
+    @cached_property
+    def _told(self) -> dict[str, Any]:
         study = self.study
         reading, orbit, reduction = study.observed.reading, study.observed.orbit, study.reduction
         assert reading is not None  # a study has one  # noqa: S101

@@ -23,7 +23,7 @@ from fitting.inversion.result import (
     on_resonance,
     read_on_resonance,
 )
-from fitting.inversion.verdict import OUTLIER, InversionEvidence, judge_inversion
+from fitting.inversion.verdict import InversionEvidence, contradictory, judge_inversion
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table, check_quality_factor
 
@@ -161,7 +161,7 @@ def _inverted_rows(table: AmplitudeTable, shared: _Shared) -> InvertedRows:
             moved[good, :, k] = np.stack(other.impact, axis=1)[found.converged] - impact[good]
         for row in np.setdiff1d(chosen, good):
             note[row] = "no flight between two impacts has this amplitude and phase"
-        for row in chosen[np.nan_to_num(chi2[chosen]) > OUTLIER]:
+        for row in np.flatnonzero(contradictory(chi2)):
             note[row] = f"amplitudes and phase contradict each other (chi2 {chi2[row]:.3g} of one degree of freedom)"
     return InvertedRows(
         impact=impact,

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from afm_jax.impact.law import Law
 from afm_jax.outcomes import Rule, Rules, judge
@@ -11,7 +11,7 @@ from fitting.inversion.regression import Laws
 from fitting.inversion.result import LawDistance, RegressedLaw, described
 from fitting.tables.table import AmplitudeTable
 
-OUTLIER = 16.0
+_OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _IMPROBABLE = 1e-3
 """Probability of as much scatter by noise alone below which a law does not explain the rows."""
@@ -53,12 +53,17 @@ class InversionEvidence:
     @property
     def outliers(self) -> int:
         """How many rows contradict themselves."""
-        return int(np.sum(np.nan_to_num(self.laws.rows.chi2) > OUTLIER))
+        return int(contradictory(self.laws.rows.chi2).sum())
 
     @property
     def best_p_value(self) -> float:
         """Probability of the rows' scatter under the law that explains them better."""
         return max((law.p_value for law in self.laws.laws.values() if not np.isnan(law.p_value)), default=np.nan)
+
+
+def contradictory(chi2: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Return which rows contradict themselves, by chi2 of their three numbers; none of those with two, whose is NaN."""
+    return np.asarray(chi2 > _OUTLIER)
 
 
 def judge_inversion(evidence: InversionEvidence) -> tuple[list[str], list[str]]:
