@@ -352,28 +352,35 @@ def impact_slopes(
 
 
 def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
-    """Compile the two large programs of `linearise`, or read them from the cache, side by side.
+    """Compile the large programs of `linearise`, or read them from the cache, side by side.
 
     Args:
         values: some values of the parameters.
         measurement: what will be compared with.
         problem: the model.
     """
-    batch, impacts = batch_of(np.asarray(values)[None], measurement, problem)
+    sets = np.asarray(values)[None]
+    batch, calls = _calls_for_impacts(sets, measurement, problem)
+    # of the impacts only the shapes are needed here: any numbers do
+    impacts = jax.tree.map(lambda leaf: np.ones((BATCH, *leaf.shape[1:]), leaf.dtype), impacts_of.shapes(*calls[0]))
+    here, own = measurement, problem
     if measurement.joint is not None:
         # one of what is driven: the program of another is compiled when it comes to it
         drive = measurement.joint.drives[0]
-        batch, problem = batch[:, 0], replace(measurement.joint.problem, drive=drive)
-        measurement = measurement.of_drive(drive)
-    index = np.zeros(_lanes(problem), dtype=int)
-    rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
-    some, points = measurement._replace(rows=rows), batch[index]
+        batch, own = batch[:, 0], replace(measurement.joint.problem, drive=drive)
+        here = measurement.of_drive(drive)
+    index = np.zeros(_lanes(own), dtype=int)
+    rows = jax.tree.map(lambda column: np.asarray(column)[index], here.rows)
+    some, points = here._replace(rows=rows), batch[index]
     nowhere = branch_near(np.full(index.shape, np.nan))
 
     def run(program: Callable[..., Any], *more: Any) -> None:
-        jax.block_until_ready(program(points, impacts, index, some, problem, *more))
+        jax.block_until_ready(program(points, impacts, index, some, own, *more))
 
-    with compiling(lambda: run(linearise_pairs, nowhere)):
+    with (
+        compiling(lambda: batch_of(sets, measurement, problem)),
+        compiling(lambda: run(linearise_pairs, nowhere)),
+    ):
         run(located)
 
 
@@ -401,6 +408,15 @@ def batch_of(
     values: Float[np.ndarray, "sets p"], measurement: Measurement, problem: Problem
 ) -> tuple[Float[np.ndarray, "batch ..."], _Impacts]:
     """Return sets of values, filled up to `BATCH`, and their impacts; of several tables the values of each."""
+    batch, calls = _calls_for_impacts(values, measurement, problem)
+    impacts = [jax.tree.map(np.asarray, impacts_of(*call)) for call in calls]
+    return batch, jax.tree.map(lambda *leaves: filled(np.concatenate(leaves), BATCH), *impacts)
+
+
+def _calls_for_impacts(
+    values: Float[np.ndarray, "sets p"], measurement: Measurement, problem: Problem
+) -> tuple[Float[np.ndarray, "batch ..."], list[tuple[Any, ...]]]:
+    """Return the sets of values as of `batch_of`, and the arguments of `impacts_of` for their impacts."""
     batch = filled(values, BATCH)
     points = batch
     if measurement.joint is not None:
@@ -411,9 +427,7 @@ def batch_of(
     rowless = measurement._replace(rows=jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows))
     # a table of taps takes long, and a fit mostly asks for one: each by itself
     parts = [points[i : i + 1] for i in range(len(values))] if problem.pulled else [points]
-    impacts = [jax.tree.map(np.asarray, impacts_of(part, rowless, problem)) for part in parts]
-    whole = jax.tree.map(lambda *leaves: filled(np.concatenate(leaves), BATCH), *impacts)
-    return batch, whole
+    return batch, [(part, rowless, problem) for part in parts]
 
 
 def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:

@@ -2,14 +2,16 @@
 
 Commands name the few that gain (processor seconds of a warm call, with and without: fit by viscous+delay 5.3 and 11.9,
 collide 2.1 and 3.3; a simulation gains too little). `jax.export` writes them, its own serialisation; pickle would run
-any code that a file names. A file is found by all that a trace depends on: loaded sources, versions, configuration,
+any code that a file names. A file is found by all that a trace depends on: sources, versions, configuration,
 devices, shapes and structure. Results are modules and tuples of arrays; other arguments have a `repr` that says all.
 """
 
 import hashlib
 import json
 import sys
+import threading
 from collections.abc import Callable, Sequence
+from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -42,34 +44,64 @@ class _Keeping:
 
     def __init__(self, jitted: Any, folder: Path, tell: Callable[[str], None]):
         self.jitted, self.folder, self.tell = jitted, folder, tell
-        self.programs: dict[Any, tuple[Any, Any]] = {}
+        self.traced: dict[Any, tuple[export.Exported, Any]] = {}
+        self.programs: dict[Any, Callable[..., Any]] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         leaves, tree = jax.tree.flatten((arguments, named))
         arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
         if any(isinstance(leaf, core.Tracer) for leaf in arrays):
             return self.jitted(*arguments, **named)
+        call, (program, result) = self._trace(arrays, static, tree)
+        if call not in self.programs:
+            # at once: a jitted function would compile again where an argument comes from another program
+            like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
+            with _ONE_TRACE:
+                lowered = jax.jit(program.call).lower(*like)
+            self.programs[call] = lowered.compile(quick_options())
+        return jax.tree.unflatten(result, self.programs[call](arrays))
+
+    def shapes(self, *arguments: Any, **named: Any) -> Any:
+        """Return the result of a call with shapes and types in place of arrays; nothing is compiled."""
+        leaves, tree = jax.tree.flatten((arguments, named))
+        arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
+        _, (program, result) = self._trace(arrays, static, tree)
+        return jax.tree.unflatten(result, [jax.ShapeDtypeStruct(of.shape, of.dtype) for of in program.out_avals])
+
+    def _trace(self, arrays: list[Any], static: list[Any], tree: Any) -> tuple[Any, tuple[export.Exported, Any]]:
+        """Return what names a call, its traced program and the tree of the result."""
 
         def of_arrays(arrays: list[Any]) -> Any:
             positional, by_name = jax.tree.unflatten(tree, eqx.combine(arrays, static))
             return self.jitted(*positional, **by_name)
 
         call = (tree, *static, *((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arrays)))
-        if call not in self.programs:
-            path = self.folder / f"{self.jitted.__name__}-{_digest(call)}.program"
-            self.programs[call] = _program(path, of_arrays, arrays, self.tell)
-        program, result = self.programs[call]
-        return jax.tree.unflatten(result, program(arrays))
+        with _ONE_TRACE:
+            if call not in self.traced:
+                path = self.folder / f"{self.jitted.__name__}-{_digest(call)}.program"
+                self.traced[call] = _traced(path, of_arrays, arrays, self.tell)
+        return call, self.traced[call]
+
+
+_ONE_TRACE = threading.Lock()
+"""Traces need the interpreter: one after the other, so that the first is compiled while the next one is traced."""
 
 
 def _digest(call: Any) -> str:
     said = [call, *(getattr(jax.config, option) for option in _CONFIGURATION), jax.devices(), *map(version, _PACKAGES)]
-    files = (sys.modules[name].__file__ for name in sorted(sys.modules) if name.startswith(("afm_jax.", "fitting.")))
-    return hashlib.sha256(f"{said}".encode() + b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
+    return hashlib.sha256(f"{said}{_sources()}".encode()).hexdigest()
 
 
-def _program(path: Path, function: Any, arrays: list[Any], tell: Callable[[str], None]) -> tuple[Any, Any]:
-    """Return a function's program and the tree of its result, from a file if both are behind their digest there."""
+@cache
+def _sources() -> str:
+    """Return a digest of both packages' sources, wherever a program may come from."""
+    folders = (Path(str(import_module(name).__file__)).parent for name in ("afm_jax", "fitting"))
+    files = (path for folder in folders for path in sorted(folder.rglob("*.py")))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
+def _traced(path: Path, function: Any, arrays: list[Any], tell: Callable[[str], None]) -> tuple[export.Exported, Any]:
+    """Return a function's traced program and the tree of its result, from a file if both are behind their digest."""
     kept = path.read_bytes() if path.exists() else b""
     text = kept[32:]
     if kept[:32] != hashlib.sha256(text).digest():
@@ -82,10 +114,7 @@ def _program(path: Path, function: Any, arrays: list[Any], tell: Callable[[str],
         except OSError as error:
             tell(f"{path.name} cannot be written: {error.strerror}")
     structure, _, text = text.partition(b"\n")
-    program = export.deserialize(bytearray(text))
-    # at once: a jitted function would compile again where an argument comes from another program
-    like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
-    return jax.jit(program.call).lower(*like).compile(quick_options()), jax.tree.structure(_made(json.loads(structure)))
+    return export.deserialize(bytearray(text)), jax.tree.structure(_made(json.loads(structure)))
 
 
 def _structure(value: Any) -> Any:

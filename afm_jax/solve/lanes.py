@@ -145,6 +145,10 @@ class QuicklyCompiled:
         traced = any(map(is_traced, jax.tree.leaves((arguments, named))))
         return (self.inside if traced else self.outside)(*arguments, **named)
 
+    def shapes(self, *arguments: Any, **named: Any) -> Any:
+        """Return the result of a call with shapes and types in place of arrays; nothing is compiled."""
+        return self.outside.eval_shape(*arguments, **named)
+
 
 def compiled_quickly(*, static_argnames: str | Sequence[str] = ()) -> Callable[[Callable[..., Any]], QuicklyCompiled]:
     """Return a decorator like `jax.jit` for what takes longer to compile than to run: see `QuicklyCompiled`.

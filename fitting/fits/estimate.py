@@ -17,12 +17,13 @@ from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.fits.discrepancy import ModelDiscrepancy, effects_of_held, seen_in_taps, with_runs
 from fitting.fits.intervals import Convergence, at_bound, check_minimum, covariance
-from fitting.fits.law_after import ClosestMember, ModelLaw, member_after, points_of_law, speed_range
+from fitting.fits.law_after import LAW_POINTS, ClosestMember, ModelLaw, member_after, points_of_law, speed_range
 from fitting.fits.minimum import ATTRACTED, Minimum, ModelErrors
 from fitting.fits.objective import ROBUST, Objective, soft_square
 from fitting.fits.result import FittedRows, table_of_law
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.step import (
+    PARTS_AT_ONCE,
     Descended,
     LinearStep,
     StepRows,
@@ -34,7 +35,7 @@ from fitting.fits.step import (
     system_of,
 )
 from fitting.forward import Linearised, Predicted, predict
-from fitting.models import Held, Problem, readings_of
+from fitting.models import Held, Measurement, Problem, readings_of
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
@@ -418,6 +419,24 @@ def _predicted_after(at: AtMinimum, parts: list[LinearStep], discrepancy: ModelD
     near = [np.where(exists, np.asarray(coordinates(law, safe)), np.nan) for law in laws]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
     return predict(values, stacked, measurement, problem, np.array(near))
+
+
+def warm_up_predictions(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
+    """Compile what `_predicted_after` will run, or read it from the cache, for any law of the usual shape.
+
+    Args:
+        values: some values of the parameters.
+        measurement: what the laws will be compared with.
+        problem: the model.
+    """
+    if problem.pulled or not problem.lasting:
+        return
+    speeds = np.geomspace(20.0, 200.0, LAW_POINTS)
+    delay = None if problem.model == "contact" else problem.law(jnp.asarray(values), measurement.fixed).delay
+    law = table_of_law(speeds, 0.9 * speeds, -1.0 / speeds, capture_speed_nm_per_us=10.0, delay=delay)
+    laws = jax.tree.map(lambda leaf: np.stack([leaf] * PARTS_AT_ONCE), law)
+    nowhere = np.full((PARTS_AT_ONCE, len(measurement.rows.order)), np.nan)
+    predict(np.tile(values, (PARTS_AT_ONCE, 1)), laws, measurement, problem, nowhere)
 
 
 def _tabulated_after(at: AtMinimum, step: LinearStep, discrepancy: ModelDiscrepancy) -> TabulatedLaw:

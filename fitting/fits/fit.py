@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.least_squares import chi2_tail
+from afm_jax.solve.lanes import compiling
 from afm_jax.version import version_of
 from fitting.fits.estimate import (
     FitEstimate,
@@ -21,6 +22,7 @@ from fitting.fits.estimate import (
     courses_along_rows,
     estimate_of,
     hanging_on_held,
+    warm_up_predictions,
 )
 from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED, Interval, profile_intervals, within_range
 from fitting.fits.law_after import holding, speed_range
@@ -158,9 +160,11 @@ def find_fit(  # noqa: PLR0913
             f"{table.source}: {amplitudes} measured amplitude{'s' if amplitudes != 1 else ''} cannot determine the "
             f"{len(problem.own)} parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
-    warm_up(starts(problem, measurement)[0], measurement, problem)
+    begin = starts(problem, measurement)[0]
+    warm_up(begin, measurement, problem)
     stated = Objective(measurement, problem, robust=robust)
-    objective, minimum, model_errors, refused = minimum_with_model_errors(stated)
+    with compiling(lambda: warm_up_predictions(begin, measurement, problem)):
+        objective, minimum, model_errors, refused = minimum_with_model_errors(stated)
     scale = None
     if scale_errors:
         objective, minimum, scale = rescale_errors(objective, minimum, len(problem.own))

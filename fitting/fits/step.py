@@ -407,7 +407,8 @@ def longest_run(rows: StepRows, system: StepSystem) -> float:
 
 
 _STEP_PARTS = (1.0, 0.0), (0.5, 0.25), (0.125, 0.0625)
-"""Parts of a step that are looked at, two at a time."""
+PARTS_AT_ONCE = 2
+"""Parts of a step that are looked at, and how many of them at a time."""
 _NOTHING = 1e-3
 """What a step takes off chi2 at least, to first order, for it to count."""
 Predictor = Callable[[list[LinearStep]], Predicted]
