@@ -106,4 +106,5 @@ def test_a_quantity_of_the_instrument_is_in_every_list_of_them():
         (CALIBRATION, _Instrument._fields, "_Instrument of fitting/inversion/invert.py"),
         (set(NUISANCE_NAMES) - set(DRIFT_NAMES), SETTINGS, "SETTINGS of fitting/tables/table.py"),
     ):
-        assert not set(names) - set(known), f"{where} lacks it: see notebooks/adding_a_force.md"
+        lacking = [name for name in names if name not in known]
+        assert lacking == [], f"{where} lacks {lacking}: see notebooks/adding_a_force.md"
