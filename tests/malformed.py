@@ -2,8 +2,9 @@
 
 `{"base": NAME, "file": ..., "text": ...}` is a sound file of a format. `{"of": NAME, "call": ..., "old": ..., "new":
 ..., "says": ...}` is one with the first `old` replaced (all of them where it is a separator; the whole file without
-`old`; `new` as bytes of Latin-1 where `"bytes": true`), the command, and what it says after `afm-jax: `. Without `new`
-the file stays sound and the call is wrong. All sound files lie in the folder where commands run.
+`old`; `new` as bytes of Latin-1 where `"bytes": true`), the command, and what it says after `afm-jax: `, where
+COMMANDS stands for the list of all commands. Without `new` the file stays sound and the call is wrong. All sound files
+lie in the folder where commands run.
 
 `python -m tests.malformed` writes the messages anew; read the difference before you keep it.
 """
@@ -17,6 +18,7 @@ from typing import Any
 
 from click.testing import CliRunner, Result
 
+from afm_jax.cli.main import COMMANDS
 from afm_jax.cli.main import main as afm_jax
 
 CORPUS = Path(__file__).with_suffix(".jsonl")
@@ -57,8 +59,9 @@ def run(base: dict[str, Any], case: dict[str, Any]) -> Result:
 
 
 def line_of(result: Result) -> str:
-    """Return what a command said on standard error, whatever the folders are called."""
-    return result.stderr.replace(str(TABLE), "TABLE").replace(str(Path.cwd()), "HERE")
+    """Return what a command said on standard error, folders and the list of commands by one word each."""
+    said = result.stderr.replace(", ".join(sorted(COMMANDS)), "COMMANDS")
+    return said.replace(str(TABLE), "TABLE").replace(str(Path.cwd()), "HERE")
 
 
 def main() -> None:

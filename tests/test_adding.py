@@ -1,10 +1,16 @@
-"""A force and a parameter of the delay are added to a copy as `notebooks/adding_a_force.md` says: few files each."""
+"""A force and a parameter of the delay are added to a copy as `notebooks/adding_a_force.md` says: few files each.
+
+What one of its steps leaves to another file is looked for there.
+"""
 
 import shutil
 from pathlib import Path
 
 import pytest
 
+from fitting.inversion.invert import _Instrument
+from fitting.parameters import DRIFT_NAMES, NUISANCE_NAMES
+from fitting.tables.table import CALIBRATION, SETTINGS
 from tests.fresh_python import python
 from tests.mutations import before_and_after
 from tests.test_scenefile import CANTILEVER, LAW, PLATFORM
@@ -92,3 +98,13 @@ def test_a_force_is_added_in_three_files_and_a_parameter_of_the_delay_in_five(tm
     assert float(later) == pytest.approx(3.0 / 50.0**2, rel=1e-9)
     assert all(f"'{name}'" in fitted for name in ("attraction_constant_aj", "delay_late_nm2_per_us"))
     assert "--attraction-constant-aj X" in " ".join(helped)
+
+
+def test_a_quantity_of_the_instrument_is_in_every_list_of_them():
+    for names, known, where in (
+        (CALIBRATION, NUISANCE_NAMES, "NUISANCES of fitting/parameters.py"),
+        (CALIBRATION, _Instrument._fields, "_Instrument of fitting/inversion/invert.py"),
+        (set(NUISANCE_NAMES) - set(DRIFT_NAMES), SETTINGS, "SETTINGS of fitting/tables/table.py"),
+    ):
+        lacking = [name for name in names if name not in known]
+        assert lacking == [], f"{where} lacks {lacking}: see notebooks/adding_a_force.md"

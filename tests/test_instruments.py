@@ -18,6 +18,7 @@ from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIO
 from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
+from fitting.tapping_curves.measured import is_table
 from tests.instrument_files import asylum_ramp, gwyddion_bytes, nanonis_ramp, tapping_rows
 from tests.strict_reading import strictly
 
@@ -228,6 +229,12 @@ def test_wrong_column_maps_are_named(tmp_path: Path):
     for options, said in cases:
         with pytest.raises(TableError, match=said):
             read_curves(path, **options)
+
+
+def test_a_file_that_begins_like_an_instruments_is_no_table(tmp_path: Path):
+    comments = b"# free_frequency_khz = 90\r\n"
+    for start, table in ((b"", True), (b"WSxM file copyright\r\n", False), (b"Z (m),Amp (m)\r\n", True)):
+        assert is_table(saved(tmp_path, start + comments)) == table
 
 
 # ---- what the numbers say themselves

@@ -76,6 +76,31 @@ class Finite(ValueKind):
         return number
 
 
+class PositiveInteger(ValueKind):
+    """An integer from 1 to a million."""
+
+    name = "integer"
+
+    def read(self, text: str) -> int:
+        """Return the integer that a text says."""
+        if not re.fullmatch(r"\s*[0-9]{1,7}\s*", text) or not 1 <= int(text) <= 1_000_000:
+            raise ValueError(f"must be a positive integer up to 1000000, but is {text}")
+        return int(text)
+
+
+class Multiples(ValueKind):
+    """Positive integers in a comma list."""
+
+    name = "list"
+
+    def read(self, text: str) -> tuple[int, ...]:
+        """Return the integers, without repetitions."""
+        parts = text.split(",")
+        if not all(re.fullmatch(r"\s*[0-9]{1,4}\s*", part) and 1 <= int(part) <= 1000 for part in parts):
+            raise ValueError(f"must be integers from 1 to 1000 as in 1,2,3, but is {text}")
+        return tuple(dict.fromkeys(map(int, parts)))
+
+
 class Numbers(ValueKind):
     """A comma list of numbers; each part a number or a range start:stop:step that holds the stop if it fits.
 

@@ -77,8 +77,7 @@ def _parser_of(data: bytes, path: str) -> Callable[[bytes, str], Recording]:
     head = data[:4096]
     if head[:2] in {b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"} or path.lower().endswith(".ibw"):
         return parse_igor
-    starts = {b"WSxM file": parse_wsxm, b"GWYP": parse_gwyddion, b"[DataSet]": parse_nanosurf}
-    found = next((parse for start, parse in starts.items() if head.startswith(start)), None)
+    found = next((parse for mark, parse in MARKS.items() if head.startswith(mark)), None)
     if found is not None:
         return found
     if head.startswith(b"\x93NUMPY") or (head.startswith(b"PK") and b".npy" in head):
@@ -94,7 +93,7 @@ def _refuse_arrays(_: bytes, name: str) -> Recording:
 
 def holds_curves(head: bytes, path: str) -> bool:
     """Say whether a file that begins so is of a format that holds nothing but curves against height."""
-    return _parser_of(head, path) in {parse_igor, parse_wsxm, parse_gwyddion, parse_neasnom}
+    return _parser_of(head, path) not in {parse_nanosurf, parse_nanonis_text, parse_separated, _refuse_arrays}
 
 
 def text_of(data: bytes, name: str) -> str:
@@ -572,3 +571,7 @@ def parse_gwyddion(data: bytes, name: str) -> Recording:
             part[label] = numbers
     segments = tuple(Segment(k + 1, "", part) for k, part in enumerate(parts))
     return Recording("Gwyddion graphs", name, segments, units)
+
+
+MARKS = {b"WSxM file": parse_wsxm, b"GWYP": parse_gwyddion, b"[DataSet]": parse_nanosurf}
+"""Formats by what their files begin with."""

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from afm_jax.whole_files import first_bytes
 from fitting.instruments.curve import MeasuredCurve, read_curves, table_text
+from fitting.instruments.formats import MARKS
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, parse_table
 
@@ -45,7 +46,7 @@ def is_table(path: str | Path) -> bool:
         head = first_bytes(path, 1 << 16)
     except OSError:
         return True
-    return any(word in head for word in _IS_TABLE)
+    return not head.startswith(tuple(MARKS)) and any(word in head for word in _IS_TABLE)
 
 
 def read_measured(path: str | Path, *, curve: int | None = None, **options: Any) -> MeasuredFile:

@@ -1,7 +1,6 @@
 """Commands about the motions of a scene."""
 
 import math
-import re
 from importlib import import_module
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import click
 from afm_jax.cli.command import Command, Options, use_all_cores
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Course, Ends, Finite, Grid, Share, ValueKind
+from afm_jax.cli.values import Course, Ends, Finite, Grid, Multiples, PositiveInteger, Share
 
 BASINS = Command(
     name="basins",
@@ -125,31 +124,6 @@ LYAPUNOV = Command(
         PICTURE,
     ),
 )
-
-
-class PositiveInteger(ValueKind):
-    """An integer from 1 to a million."""
-
-    name = "integer"
-
-    def read(self, text: str) -> int:
-        """Return the integer that a text says."""
-        if not re.fullmatch(r"\s*[0-9]{1,7}\s*", text) or not 1 <= int(text) <= 1_000_000:
-            raise ValueError(f"must be a positive integer up to 1000000, but is {text}")
-        return int(text)
-
-
-class Multiples(ValueKind):
-    """Positive integers in a comma list."""
-
-    name = "list"
-
-    def read(self, text: str) -> tuple[int, ...]:
-        """Return the integers, without repetitions."""
-        parts = text.split(",")
-        if not all(re.fullmatch(r"\s*[0-9]{1,4}\s*", part) and 1 <= int(part) <= 1000 for part in parts):
-            raise ValueError(f"must be integers from 1 to 1000 as in 1,2,3, but is {text}")
-        return tuple(dict.fromkeys(map(int, parts)))
 
 
 def _check_sticking(_: Session, options: Options) -> None:
