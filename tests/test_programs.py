@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
+from afm_jax.cli import programs
 from afm_jax.cli.programs import keep_programs
 from afm_jax.impact.law import ImpactLaw
 from tests.fresh_python import outputs
@@ -159,17 +160,19 @@ def test_a_file_that_cannot_be_written_costs_nothing_but_time(folder, monkeypatc
 
 
 def test_other_sources_have_other_programs(folder, monkeypatch):
-    anew(folder)(*arguments())
-    source = folder.parent / "changed.py"
-    module = ModuleType("fitting.made_here")
-    module.__file__ = str(source)
-    monkeypatch.setitem(sys.modules, "fitting.made_here", module)
-    for text in ("1", "2"):
+    source = folder.parent / "made_package" / "rooms" / "changed.py"
+    source.parent.mkdir(parents=True)
+    module = ModuleType("made_package")
+    module.__file__ = str(source.parent.parent / "__init__.py")
+    monkeypatch.setitem(sys.modules, "made_package", module)
+    monkeypatch.setattr(programs, "_OURS", ("made_package",))
+    for text, traced in (("1", 1), ("2", 2), ("2", 2), ("1", 2), ("3", 3)):
         source.write_text(text)
+        # as the next process does
+        programs._sources.cache_clear()
         anew(folder)(*arguments())
-    assert len(TRACED) == 3
-    anew(folder)(*arguments())
-    assert len(TRACED) == 3
+        assert len(TRACED) == traced
+    programs._sources.cache_clear()
 
 
 def test_inside_other_functions_it_is_the_function(folder):

@@ -21,7 +21,7 @@ class Oscillation(NamedTuple):
     velocity: Float[Array, "..."]
 
 
-class Motion(NamedTuple):
+class SurfaceMotion(NamedTuple):
     """The motion of a surface at one time: a ramp and oscillations, whose derivatives all follow from the first two."""
 
     ramped_nm: Float[Array, "..."]
@@ -126,13 +126,15 @@ class Platform(eqx.Module):
         first = self.angular_frequency
         return first if self.second is None else jnp.maximum(first, self.second.angular_frequency)
 
-    def motion(self, time_us: ArrayLike) -> Motion:
+    def motion(self, time_us: ArrayLike) -> SurfaceMotion:
         """Return z_p with its derivatives at a time in us, from one sine-cosine pair a frequency."""
         time = as_argument(time_us)
         sine, cosine = sine_cosine(self.angular_frequency * time)
         first = Oscillation(self.angular_frequency, self.amplitude_nm * cosine, -self.top_speed_nm_per_us * sine)
         others = [] if self.second is None else [_of_tone(self.second, time)]
-        return Motion(self.offset_nm + self.offset_rate_nm_per_us * time, self.offset_rate_nm_per_us, (first, *others))
+        return SurfaceMotion(
+            self.offset_nm + self.offset_rate_nm_per_us * time, self.offset_rate_nm_per_us, (first, *others)
+        )
 
     def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return z_p in nm and its rate in nm/us at a time in us."""

@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.apparatus.platform import Motion, Oscillation, Platform
+from afm_jax.apparatus.platform import Oscillation, Platform, SurfaceMotion
 from afm_jax.apparatus.scene import Scene, require_one_frequency
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.checks import as_argument, as_parameter, is_traced, readable
@@ -97,11 +97,11 @@ class Surface(eqx.Module):
             fastest = jnp.maximum(fastest, wave.angular_frequency)
         return fastest
 
-    def motion(self, time_us: ArrayLike) -> Motion:
+    def motion(self, time_us: ArrayLike) -> SurfaceMotion:
         """Return the height with its derivatives at a time in us, from one sine-cosine pair a wave."""
         time = as_argument(time_us)
         ramped = self.offset_nm + self.offset_rate_nm_per_us * time
-        return Motion(ramped, self.offset_rate_nm_per_us, tuple(wave.at(time) for wave in self.tones))
+        return SurfaceMotion(ramped, self.offset_rate_nm_per_us, tuple(wave.at(time) for wave in self.tones))
 
     def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return height in nm and velocity in nm/us at a time in us."""

@@ -25,6 +25,7 @@ from afm_jax.compilation_cache import quick_options
 from afm_jax.whole_files import write_whole
 
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
+_OURS = ("afm_jax", "fitting")
 _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax")
 
 
@@ -94,8 +95,8 @@ def _digest(call: Any) -> str:
 
 @cache
 def _sources() -> str:
-    """Return a digest of both packages' sources, wherever a program may come from."""
-    folders = (Path(str(import_module(name).__file__)).parent for name in ("afm_jax", "fitting"))
+    """Return a digest of all sources that a program may come from."""
+    folders = (Path(str(import_module(name).__file__)).parent for name in _OURS)
     files = (path for folder in folders for path in sorted(folder.rglob("*.py")))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
 
