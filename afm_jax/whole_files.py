@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from afm_jax.words import in_callers_words
+
 LARGEST_BYTES = 1 << 30
 """Of what is read: a device or a pipe without end would fill the memory."""
 MOST_VALUES = LARGEST_BYTES // 8
@@ -152,7 +154,8 @@ def write_whole(
 
     Args:
         path: of the file.
-        content: bytes, or a text to be encoded as UTF-8; what no encoding has, as in names of files, is escaped.
+        content: bytes, or a text, in the caller's words (`in_callers_words`), to be encoded as UTF-8; what no encoding
+            has, as in names of files, is escaped.
         within: folder below which no part of the path may be a link; None: the file itself must be none.
         named_by_user: whether the user gave this very path: a link there is followed, a device or a pipe written to.
 
@@ -160,19 +163,20 @@ def write_whole(
         OSError: naming the file, if it cannot be written; what was there before is still there.
     """
     place = Path(path)
-    data = content if isinstance(content, bytes) else content.encode("utf-8", errors="backslashreplace")
+    if isinstance(content, str):
+        content = in_callers_words(content).encode("utf-8", errors="backslashreplace")
     # through links of the user: the file that is meant is replaced, not the link to it
     target = Path(os.path.realpath(place)) if named_by_user else place
     try:
         if not named_by_user:
             check_plain(place, within=within)
         elif target.exists() and not target.is_file():
-            target.write_bytes(data)
+            target.write_bytes(content)
             return
         fresh = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
         try:
             with fresh.open("xb") as file:
-                file.write(data)
+                file.write(content)
                 # it must outlast a power cut, too
                 file.flush()
                 os.fsync(file.fileno())
