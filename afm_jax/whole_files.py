@@ -1,5 +1,7 @@
 """Files that appear whole or not at all, as every command writes them, and files read whole, up to a size.
 
+Texts are written in the caller's words: a command names its options where the library names arguments.
+
 A folder of results may come from somebody else: what lies in it is never followed where it is a link, so that nothing
 outside the folder is overwritten. Only a path that the user named as the one to write may be the user's own link.
 """
@@ -12,11 +14,10 @@ import select
 import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-
-from afm_jax.words import in_callers_words
 
 LARGEST_BYTES = 1 << 30
 """Of what is read: a device or a pipe without end would fill the memory."""
@@ -141,6 +142,30 @@ def whole_folder(path: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(fresh, ignore_errors=True)
         raise
+
+
+@contextmanager
+def arguments_named(words: Callable[[str], str]) -> Iterator[None]:
+    """Within this block all that is printed or written is passed through a function, which names arguments otherwise.
+
+    >>> with arguments_named(lambda text: text.replace("`order=1`", "--order 1")):
+    ...     in_callers_words("try `order=1`")
+    'try --order 1'
+    """
+    before = _named.set(words)
+    try:
+        yield
+    finally:
+        _named.reset(before)
+
+
+def in_callers_words(text: str) -> str:
+    """Return a text as the caller reads it: a command names its options where the library names arguments."""
+    words = _named.get()
+    return text if words is None else words(text)
+
+
+_named: ContextVar[Callable[[str], str] | None] = ContextVar("_named", default=None)
 
 
 def write_whole(

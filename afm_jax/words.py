@@ -3,7 +3,7 @@
 import contextlib
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from itertools import zip_longest
 from typing import Any, SupportsFloat
@@ -218,30 +218,6 @@ def bullets(title: str, items: Sequence[str]) -> list[str]:
     ['', 'Notes:', '  - one']
     """
     return ["", title, *(f"  - {item}" for item in items)] if items else []
-
-
-@contextlib.contextmanager
-def arguments_named(words: Callable[[str], str]) -> Iterator[None]:
-    """Within this block all that is printed or written is passed through a function, which names arguments otherwise.
-
-    >>> with arguments_named(lambda text: text.replace("`order=1`", "--order 1")):
-    ...     in_callers_words("try `order=1`")
-    'try --order 1'
-    """
-    before = _named.set(words)
-    try:
-        yield
-    finally:
-        _named.reset(before)
-
-
-def in_callers_words(text: str) -> str:
-    """Return a text as the caller reads it: a command names its options where the library names arguments."""
-    words = _named.get()
-    return text if words is None else words(text)
-
-
-_named: ContextVar[Callable[[str], str] | None] = ContextVar("_named", default=None)
 
 
 def shown(text: str) -> str:

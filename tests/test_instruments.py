@@ -18,7 +18,7 @@ from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIO
 from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
-from tests.instrument_files import asylum_ramp, gwyddion_bytes, nanonis_ramp, tapping_rows
+from tests.instrument_files import asylum_ramp, gwyddion_bytes, nanonis_ramp, separated, tapping_rows
 from tests.strict_reading import strictly
 
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
@@ -30,13 +30,6 @@ def saved(folder: Path, data: bytes | str, name: str = "curve.dat") -> Path:
     path = folder / name
     path.write_bytes(data.encode() if isinstance(data, str) else data)
     return path
-
-
-def separated(columns: dict[str, np.ndarray], sign: str = ",", decimal: str = ".") -> str:
-    rows = [
-        sign.join(f"{cell:.6f}".replace(".", decimal) for cell in row) for row in zip(*columns.values(), strict=True)
-    ]
-    return "\n".join([sign.join(columns), *rows]) + "\n"
 
 
 def given(column: np.ndarray | None) -> np.ndarray:

@@ -31,7 +31,7 @@ from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session, session_options, write_json
 from afm_jax.cli.values import Share, scene_and_start
 from afm_jax.compilation_cache import available_cores, silence_xla
-from afm_jax.words import arguments_named, in_callers_words
+from afm_jax.whole_files import arguments_named, in_callers_words
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene

@@ -9,7 +9,7 @@ import click
 
 from afm_jax.cli.fit_options import Fixed, checked_model, named_parameter
 from afm_jax.cli.values import Finite, ValueAndError, example_path, option_of
-from afm_jax.words import in_callers_words
+from afm_jax.whole_files import in_callers_words
 from fitting.parameters import DELAY, DRIFT_NAMES, LAW, MODELS, NUISANCES, PARAMETERS
 
 if TYPE_CHECKING:

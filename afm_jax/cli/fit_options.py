@@ -8,7 +8,7 @@ import click
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ValueKind, parse_around_plus_minus
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
-from afm_jax.words import in_callers_words
+from afm_jax.whole_files import in_callers_words
 from fitting.parameters import CONTACT_DEFAULT, model_parameters
 
 

@@ -22,8 +22,8 @@ import click
 from afm_jax.columns import columns_of, csv_cells
 from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
-from afm_jax.whole_files import check_plain, write_whole
-from afm_jax.words import broken, in_callers_words, lines_at_most, shown, text_table
+from afm_jax.whole_files import check_plain, in_callers_words, write_whole
+from afm_jax.words import broken, lines_at_most, shown, text_table
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
