@@ -1,5 +1,7 @@
 """Files that appear whole or not at all, as every command writes them, and files read whole, up to a size.
 
+Texts are written in the caller's words: a command names its options where the library names arguments.
+
 A folder of results may come from somebody else: what lies in it is never followed where it is a link, so that nothing
 outside the folder is overwritten. Only a path that the user named as the one to write may be the user's own link.
 """
@@ -12,8 +14,9 @@ import select
 import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 LARGEST_BYTES = 1 << 30
@@ -141,6 +144,30 @@ def whole_folder(path: Path) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def arguments_named(words: Callable[[str], str]) -> Iterator[None]:
+    """Within this block all that is printed or written is passed through a function, which names arguments otherwise.
+
+    >>> with arguments_named(lambda text: text.replace("`order=1`", "--order 1")):
+    ...     in_callers_words("try `order=1`")
+    'try --order 1'
+    """
+    before = _named.set(words)
+    try:
+        yield
+    finally:
+        _named.reset(before)
+
+
+def in_callers_words(text: str) -> str:
+    """Return a text as the caller reads it: a command names its options where the library names arguments."""
+    words = _named.get()
+    return text if words is None else words(text)
+
+
+_named: ContextVar[Callable[[str], str] | None] = ContextVar("_named", default=None)
+
+
 def write_whole(
     path: str | os.PathLike[str],
     content: str | bytes,
@@ -152,7 +179,8 @@ def write_whole(
 
     Args:
         path: of the file.
-        content: bytes, or a text to be encoded as UTF-8; what no encoding has, as in names of files, is escaped.
+        content: bytes, or a text, in the caller's words (`in_callers_words`), to be encoded as UTF-8; what no encoding
+            has, as in names of files, is escaped.
         within: folder below which no part of the path may be a link; None: the file itself must be none.
         named_by_user: whether the user gave this very path: a link there is followed, a device or a pipe written to.
 
@@ -160,19 +188,20 @@ def write_whole(
         OSError: naming the file, if it cannot be written; what was there before is still there.
     """
     place = Path(path)
-    data = content if isinstance(content, bytes) else content.encode("utf-8", errors="backslashreplace")
+    if isinstance(content, str):
+        content = in_callers_words(content).encode("utf-8", errors="backslashreplace")
     # through links of the user: the file that is meant is replaced, not the link to it
     target = Path(os.path.realpath(place)) if named_by_user else place
     try:
         if not named_by_user:
             check_plain(place, within=within)
         elif target.exists() and not target.is_file():
-            target.write_bytes(data)
+            target.write_bytes(content)
             return
         fresh = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
         try:
             with fresh.open("xb") as file:
-                file.write(data)
+                file.write(content)
                 # it must outlast a power cut, too
                 file.flush()
                 os.fsync(file.fileno())

@@ -529,7 +529,7 @@ def _check_shared(tables: SeveralTables, each: Sequence[dict[str, tuple[float, f
                     for where, pair in ((tables.labels[0], each[0].get(name)), (label, known.get(name)))
                 ]
                 raise ValueError(
-                    f"{name} is shared, but {', and '.join(said)}; say it once (`constraints`), or do not share it"
+                    f"{name} is shared, but {', and '.join(said)}; say it once (`constraints=...`), or do not share it"
                 )
 
 
@@ -780,7 +780,9 @@ def split_held(
             continue
         check_constraints({name: (value, error)}, "contact", (name,))
         if values.get(name, value) != value:
-            raise ValueError(f"{name} is held at {values[name]:g} (`fixed`) and known as {value:g}: say one of the two")
+            raise ValueError(
+                f"{name} is held at {values[name]:g} (`fixed=...`) and known as {value:g}: say one of the two"
+            )
         values[name], errors[name] = value, error
     return values, others, errors
 

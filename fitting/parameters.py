@@ -344,14 +344,14 @@ def model_parameters(
         if name not in names:
             raise ValueError(f"`free` must be chosen from {', '.join(names)}, but one is {name!r}")
         if name in held:
-            raise ValueError(f"{name} is both fitted (`free`) and held (`fixed`); remove it from one")
+            raise ValueError(f"{name} is both fitted (`free=...`) and held (`fixed=...`); remove it from one")
     if len(set(chosen)) < len(chosen) or not chosen:
         raise ValueError("`free` must name at least one parameter that is not fixed, and none twice")
     if model == "contact":
         return chosen
     loose = [name for name in names if name not in (*chosen, *held)]
     if loose:
-        raise ValueError(f"{' and '.join(loose)} must be fitted (`free`) or held at a value (`fixed`)")
+        raise ValueError(f"{' and '.join(loose)} must be fitted (`free=...`) or held at a value (`fixed=...`)")
     return tuple(name for name in names if name in chosen)
 
 

@@ -18,6 +18,14 @@ def tapping_rows(points: int = 120, *, retract: bool = False) -> tuple[np.ndarra
     return offset, amplitude, LAG_DEG - 0.8 * np.maximum(offset - TOUCHES_NM, 0.0) + 0.1 * noise
 
 
+def separated(columns: dict[str, np.ndarray], sign: str = ",", decimal: str = ".") -> str:
+    """Return columns as text with a head, six decimals a number."""
+    rows = [
+        sign.join(f"{cell:.6f}".replace(".", decimal) for cell in row) for row in zip(*columns.values(), strict=True)
+    ]
+    return "\n".join([sign.join(columns), *rows]) + "\n"
+
+
 def igor_wave(columns: dict[str, np.ndarray], note: str, *, order: str = "<") -> bytes:
     """Return a binary wave of version 5 (WaveMetrics' Technical Note 003): a column or an image a channel, labelled."""
     pytest.importorskip("igor2")

@@ -109,7 +109,7 @@ def test_nothing_to_measure_is_not_valid():
 
 
 def test_what_is_held_is_not_forecast():
-    options = {"model": "full", "uncertainty": 0.1, "free_frequency_khz": (90.0, None), "fix": (("r", 0.9),)}
+    options = {"model": "full", "uncertainty": 0.1, "free_frequency_khz": (90.0, None), "fixed": (("r", 0.9),)}
     prior = prior_of_options(options, 0.01)
     assert prior.problem.names == ("epsilon", "viscous_loss")
     assert prior.fixed == {"r": 0.9}

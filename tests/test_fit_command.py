@@ -195,8 +195,8 @@ def test_packages_are_asked_for_before_the_fit(monkeypatch):
 
 
 def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():
-    options = {"scale_errors": False, "robust": False, "constrain": (), "free": None}
-    settings = fit_settings("contact", options | {"left_out": ("viscous",), "fix": (("modulus_gpa", 90.0),)})
+    options = {"scale_errors": False, "robust": False, "constraints": (), "free": None}
+    settings = fit_settings("contact", options | {"left_out": ("viscous",), "fixed": (("modulus_gpa", 90.0),)})
     assert settings["free"] == ("relative_humidity", "adhesion_energy_j_per_m2")
     assert settings["effects"] == ("capillary", "structural", "core", "jkr")
 

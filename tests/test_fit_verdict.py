@@ -119,7 +119,7 @@ def test_what_does_not_explain_the_data_says_what_to_try_and_which_rows_are_far(
     ):
         (reason,) = reasons_of(model, residual=residual, p_value=0.0, chi2=9e4)
         assert said in reason
-        assert "farthest off: line 2 (if only a few are wrong: --robust)." in reason
+        assert "farthest off: line 2 (if only a few are wrong: `robust=True`)." in reason
 
 
 def test_robust_loss_is_advised_only_where_the_rest_is_explained():
@@ -127,7 +127,7 @@ def test_robust_loss_is_advised_only_where_the_rest_is_explained():
         generator = np.random.default_rng(1)
         residual = np.where(generator.random((40, 1)) < share, 30.0, 0.5) * generator.choice([-1.0, 1.0], size=(40, 2))
         (reason,) = reasons_of(rows=40, residual=residual, p_value=0.0, chi2=9e4)
-        assert ("if only a few are wrong: --robust" in reason) is advised
+        assert ("if only a few are wrong: `robust=True`" in reason) is advised
 
 
 def test_a_robust_fit_whose_other_rows_are_not_explained_is_not_valid():
@@ -168,7 +168,7 @@ def test_correlated_residuals_invalidate_though_chi2_is_as_it_should_be():
     wave = np.sqrt(2.0) * np.sin(np.linspace(0.0, 12.0, 80))
     residual = np.stack([wave, wave], axis=1)
     (reason,) = reasons_of(rows=80, residual=residual)
-    assert "--robust" not in reason
+    assert "`robust=True`" not in reason
     # the same far within the errors is of no consequence
     assert not reasons_of(rows=80, residual=0.1 * residual)
     assert not reasons_of(rows=80, residual=np.random.default_rng(3).permutation(residual))

@@ -19,7 +19,7 @@ from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
 from fitting.tapping_curves.measured import is_table
-from tests.instrument_files import asylum_ramp, gwyddion_bytes, nanonis_ramp, tapping_rows
+from tests.instrument_files import asylum_ramp, gwyddion_bytes, nanonis_ramp, separated, tapping_rows
 from tests.strict_reading import strictly
 
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
@@ -31,13 +31,6 @@ def saved(folder: Path, data: bytes | str, name: str = "curve.dat") -> Path:
     path = folder / name
     path.write_bytes(data.encode() if isinstance(data, str) else data)
     return path
-
-
-def separated(columns: dict[str, np.ndarray], sign: str = ",", decimal: str = ".") -> str:
-    rows = [
-        sign.join(f"{cell:.6f}".replace(".", decimal) for cell in row) for row in zip(*columns.values(), strict=True)
-    ]
-    return "\n".join([sign.join(columns), *rows]) + "\n"
 
 
 def given(column: np.ndarray | None) -> np.ndarray:
@@ -98,7 +91,7 @@ def test_wsxm_curves_whose_free_amplitude_jumps_are_refused_by_name():
     assert all(-1.13 < curve.slope[0] < -1.08 for curve in curves if curve.slope is not None)
     assert "nm_per_volt" in curves[0].missing
     assert any("inverted channel" in note for note in curves[0].notes)
-    with pytest.raises(TableError, match=r"--nm-per-volt NM_PER_V\|slope"):
+    with pytest.raises(TableError, match=r'give `nm_per_volt=NM_PER_V\|"slope"`'):
         table_text(curves[0])
 
 
@@ -194,7 +187,7 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
     lever = ("spring_constant_n_per_m", "quality_factor", "drive_frequency_khz")
     others = (*lever, "deflection_nm_per_volt", "nm_per_volt")
     assert [curve.number(key) for key in others] == pytest.approx([5.4, 200.0, 90.0, 110.0, 120.0], rel=1e-12)
-    assert (curve.known["drive"].origin, curve.missing) == ("option --drive", ())
+    assert (curve.known["drive"].origin, curve.missing) == ("option `drive=...`", ())
     nanonis = read_curve(saved(tmp_path, nanonis_ramp()))
     assert nanonis.number("free_frequency_khz") == 90.0
     assert any("grows away from the sample" in note for note in nanonis.notes)
@@ -203,7 +196,7 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
 def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     offset, amplitude, lag = tapping_rows()
     path = saved(tmp_path, separated({"a": -1e-3 * offset, "b": 0.01 * amplitude, "c": -lag}, ";"))
-    with pytest.raises(TableError, match="no height among the channels a, b, c; say --columns offset_nm=CHANNEL:UNIT"):
+    with pytest.raises(TableError, match='among the channels a, b, c; say `columns="offset_nm=CHANNEL:UNIT"`'):
         read_curve(path)
     wanted = "offset_nm=a:um:-1,lockin_amplitude_nm=b:V,phase_lag_deg=c:-1"
     curve = read_curve(path, columns=wanted)
@@ -224,7 +217,7 @@ def test_wrong_column_maps_are_named(tmp_path: Path):
             "=5 has one channel where other columns have OUT/BACK",
         ),
         ({"columns": "offset_nm=1/9:nm"}, "there is no channel `9`; it has 1, 2"),
-        ({}, re.escape("say --columns offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V")),
+        ({}, re.escape('say `columns="offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V')),
     )
     for options, said in cases:
         with pytest.raises(TableError, match=said):
@@ -242,7 +235,7 @@ def test_a_file_that_begins_like_an_instruments_is_no_table(tmp_path: Path):
 
 def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
     curve = read_curve(saved(tmp_path, "Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n"))
-    asked = "if one of the channels A, P is: --columns lockin_amplitude_nm=CHANNEL:UNIT"
+    asked = 'if one of the channels A, P is: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`'
     assert any(asked in note for note in curve.notes)
     with pytest.raises(TableError, match=re.escape(asked)):
         table_text(curve)
@@ -304,7 +297,7 @@ def test_the_zero_of_the_phase_is_that_of_the_free_rows(curve_of):
 def test_signs_and_units_of_the_phase_that_the_caller_gives_stay(curve_of):
     kept = curve_of(phase=-LAG, columns="phase_lag_deg=Phase:1", **KNOWN)
     assert np.polyfit(LAG, given(kept.phase_lag_deg), 1)[0] == pytest.approx(-1.0, abs=1e-3)
-    with pytest.raises(TableError, match=r"it is in radians; say --columns phase_lag_deg=CHANNEL:rad"):
+    with pytest.raises(TableError, match='it is in radians; say `columns="phase_lag_deg=CHANNEL:rad"`'):
         curve_of(phase=-np.deg2rad(LAG), **KNOWN)
     curve = curve_of(phase=np.deg2rad(LAG), columns="phase_lag_deg=Phase:rad", **KNOWN)
     assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(LAG), rel=1e-4)

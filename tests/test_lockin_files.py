@@ -90,7 +90,7 @@ def test_faults_of_hdf5_files(tmp_path: Path):
     for place, group, said in (
         (path, "scam", "there is no group 'scam'; those with deflection_nm are scan"),
         (path, "scan", "column deflection_nm: the data set has shape (2, 3)"),
-        (nested, None, "--group scan/backward (there are scan/backward, scan/forward)"),
+        (nested, None, '`group="scan/backward"` (there are scan/backward, scan/forward)'),
         (cut, None, "cannot be read as HDF5"),
     ):
         with pytest.raises(TableError, match=re.escape(said)):

@@ -127,7 +127,7 @@ def test_the_sensitivity_is_the_slope_of_the_rows_in_contact(tmp_path):
     assert strictly((tmp_path / "calibration.json").read_text()) == strictly(told.stdout)
     assert (tmp_path / "calibration.png").exists()
     assert run(THERMAL, "--slope").exit_code == 2
-    assert "--slope reads the sensitivity" in run(FORCES).stderr
+    assert "`afm-jax calibrate --slope` reads the sensitivity" in run(FORCES).stderr
     with pytest.raises(TableError, match="no deflection in V"):
         sensitivity(read_curves(REAL / "tapping_amplitude_wsxm.f.curves"))
 

@@ -12,7 +12,7 @@ def basins(
     scene: NamedScene,
     *,
     grid: tuple[int, int],
-    speeds: tuple[float, float] | None,
+    speeds_nm_per_us: tuple[float, float] | None,
     draws: int,
     picture: str,
 ) -> Output:
@@ -20,7 +20,7 @@ def basins(
     columns, rows = grid
     with session.working("following starts (the first run compiles for some seconds)", "starts") as report:
         result = basins_of_attraction(
-            as_drawn(scene.scene), columns=columns, rows=rows, speeds_nm_per_us=speeds, report=report
+            as_drawn(scene.scene), columns=columns, rows=rows, speeds_nm_per_us=speeds_nm_per_us, report=report
         )
         if scene.unknowns is not None:
             band = drawn_shares(scene.scene, result, scene.unknowns, draws=draws)

@@ -15,6 +15,7 @@ columns of CSV files by the files' names, `reason` is why it is not valid.
 """
 
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -25,11 +26,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.ending import NotValid, in_options, is_inner
+from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session, session_options, write_json
-from afm_jax.cli.values import scene_and_start
+from afm_jax.cli.values import Share, scene_and_start
 from afm_jax.compilation_cache import available_cores, silence_xla
+from afm_jax.whole_files import arguments_named, in_callers_words
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
@@ -91,13 +93,12 @@ class Output:
                 its impacts may be extrapolated, `impact_speeds_nm_per_us`.
             **more: pictures, and what else the output has.
         """
-        reason = None if result.reason is None else in_options(result.reason)
         told = {
-            "payload": {**result.to_dict(), "reason": reason},
+            "payload": {**result.to_dict(), "reason": result.reason},
             "text": result.printed(),
             "tables": result.tables(),
             "impact_speeds": getattr(result, "impact_speeds_nm_per_us", None),
-            "not_valid": reason,
+            "not_valid": result.reason,
         }
         return cls(**told | more)
 
@@ -157,7 +158,7 @@ class Command:
 
     def click_command(self) -> click.Command:
         """Return the command for click."""
-        function = partial(run_command, self)
+        function = partial(run_in_options, self)
         # click lists options in the order of decorators, of which the last is applied first
         for option in reversed((*self.options, *session_options(self.out_file))):
             function = option(function)
@@ -169,6 +170,52 @@ def use_all_cores() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if "host_platform_device_count" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
+
+
+_ARGUMENT = re.compile(r"`(\w+)=([^`]*?)(?:, \1_error=([^`]*))?`")
+_NAME = re.compile(r"`(\w+)`")
+_QUOTES = re.compile(r'\\?"|&#34;')
+"""Of a Python text, also within JSON and HTML."""
+_ENTRY = re.compile(r"\{(\w+): (?:\((\S+), (\S+)\)|(\S+))\}")
+
+
+def in_options(text: str, options: Mapping[str, click.Option]) -> str:
+    """Return a text of the library in a command's words: it names arguments, the command line has options.
+
+    Args:
+        text: names arguments as `name=value`, as `name=...` where the value does not matter, or, if it begins so, as
+            `name`; what the command has no option for stays.
+        options: of the command, by the arguments that they set.
+
+    >>> order = click.Option(["--order"])
+    >>> in_options("there is no orbit of order 2; try `order=1`", {"order": order})
+    'there is no orbit of order 2; try --order 1'
+    """
+
+    def option(found: re.Match[str]) -> str:
+        name, value, error = found.groups()
+        if name not in options:
+            return found[0]
+        kind = options[name]
+        value = "" if value in {"...", "True"} else _QUOTES.sub("", value)
+        value = _ENTRY.sub(lambda entry: f"{entry[1]}={entry[4] or f'{entry[2]}+-{entry[3]}'}", value)
+        if isinstance(kind.type, Share) and value:
+            value = f"{100.0 * float(value):g}%"
+        value = value if error is None else f"'{value} +- {error}'"
+        return f"{kind.opts[0]} {value}".rstrip()
+
+    first = _NAME.match(text)
+    if first is not None and first[1] in options:
+        text = _NAME.sub(lambda found: options[found[1]].opts[0] if found[1] in options else found[0], text)
+    return _ARGUMENT.sub(option, text)
+
+
+def run_in_options(row: Command, **options: Any) -> None:
+    """Run a command, and let all that it prints, writes and refuses name its options, not the library's arguments."""
+    parameters = click.get_current_context().command.params
+    named = {str(each.name): each for each in parameters if isinstance(each, click.Option)}
+    with arguments_named(partial(in_options, options=named)), _naming(None):
+        run_command(row, **options)
 
 
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
@@ -226,7 +273,7 @@ def hand_out(session: Session, output: Output) -> None:
     if output.failure is not None:
         raise output.failure
     if output.not_valid is not None:
-        raise NotValid(output.not_valid)
+        raise NotValid(in_callers_words(output.not_valid))
 
 
 def _with_scene(output: Output, scene: NamedScene, options: Options) -> Output:
@@ -254,10 +301,13 @@ def _loaded(options: Options) -> NamedScene:
 
 @contextmanager
 def _naming(scene: NamedScene | None) -> Iterator[None]:
-    """Let messages about wrong values begin with the scene's name."""
+    """Let messages about wrong values speak in the caller's words, and begin with the scene's name if there is one."""
     try:
         yield
     except ValueError as error:
-        if scene is None or is_inner(error) or str(error).startswith(scene.name):
+        said = in_callers_words(str(error))
+        if scene is not None and not said.startswith(scene.name):
+            said = f"{scene.name}: {said}"
+        if is_inner(error) or said == str(error):
             raise
-        raise ValueError(f"{scene.name}: {error}") from error
+        raise ValueError(said) from error

@@ -9,6 +9,7 @@ import click
 
 from afm_jax.cli.fit_options import Fixed, checked_model, named_parameter
 from afm_jax.cli.values import Finite, ValueAndError, example_path, option_of
+from afm_jax.whole_files import in_callers_words
 from fitting.parameters import DELAY, DRIFT_NAMES, LAW, MODELS, NUISANCES, PARAMETERS
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
 _REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; not with a delay"}
 _NUISANCES = tuple(nuisance for nuisance in NUISANCES if nuisance.name not in DRIFT_NAMES)
 _NUISANCE_NAMES = tuple(nuisance.name for nuisance in _NUISANCES)
-_BELONG = ("mass_ng", "spring_constant_n_per_m", "free", "fix", "value", *_LAW, *_NUISANCE_NAMES)
+_BELONG = ("mass_ng", "spring_constant_n_per_m", "free", "fixed", "value", *_LAW, *_NUISANCE_NAMES)
 """What says the law and the cantilever, where no file does."""
 
 
@@ -47,7 +48,9 @@ PRIOR_OPTIONS = (
         type=click.Choice(("sample", "force", "base")),
         help="What is driven: the sample, or the cantilever itself; else the sample, or as measured.",
     ),
-    click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=X", help="A parameter that is not fitted."),
+    click.option(
+        "--fix", "fixed", type=Fixed(), multiple=True, metavar="NAME=X", help="A parameter that is not fitted."
+    ),
     click.option("--free", metavar="NAMES", help="Parameters that a fit would determine, if not all not fixed."),
     click.option("--value", type=Fixed(), multiple=True, metavar="NAME=X", help="A contact's parameter; repeatable."),
     *(
@@ -111,8 +114,9 @@ def prior_of_options(options: Mapping[str, Any], noise: float) -> "Prior":
             return _from_values(options, given, law)
         path = path / "fit.json" if path.is_dir() else path
     for name in (*given, *(["drive"] if options.get("drive") is not None else [])):
-        if source != "measured" or name not in {"free", "fix"}:
-            raise click.UsageError(f"{option_of(name)} is what --{source} says already; leave one of them out")
+        if source != "measured" or name not in {"free", "fixed"}:
+            said = f"`{name}` is what `{source}=...` says already; leave one of them out"
+            raise click.UsageError(in_callers_words(said))
     from fitting.experiments.prior import prior_of_fit, read_prior  # noqa: PLC0415
 
     uncertainty, model = options["uncertainty"], options.get("model")
@@ -125,7 +129,7 @@ def prior_of_options(options: Mapping[str, Any], noise: float) -> "Prior":
     from fitting.tables.table import read_table  # noqa: PLC0415
 
     table = read_table(path, noise=noise)
-    free, fixed = _names(given), dict(given.get("fix", ()))
+    free, fixed = _names(given), dict(given.get("fixed", ()))
     return prior_of_fit(fit(table, model or "law+delay", free=free, fixed=fixed), uncertainty)
 
 
@@ -137,7 +141,7 @@ def _from_values(options: Mapping[str, Any], given: Mapping[str, Any], law: "Tab
     if "free_frequency_khz" not in given:
         raise click.UsageError("give --free-frequency-khz (and --quality-factor), or --fit or --measured")
     quality_factor, _ = given.get("quality_factor", (None, None))
-    fixed, contact = dict(given.get("fix", ())), dict(given.get("value", ()))
+    fixed, contact = dict(given.get("fixed", ())), dict(given.get("value", ()))
     own = checked_model(model, free, fixed)
     for name in _NUISANCE_NAMES:
         if name not in {"quality_factor", "free_frequency_khz"} and name in given and given[name][1] is None:

@@ -6,7 +6,6 @@
 
 import errno
 import os
-import re
 from collections.abc import Callable
 
 import click
@@ -88,18 +87,6 @@ def _verdict(error: Exception) -> tuple[str, int]:
             return _wrong_values(error)
 
 
-_KEYWORD = re.compile(r"`(\w+)=([^`]*)`")
-
-
-def in_options(text: str) -> str:
-    """Return a sentence of the library in a command's words: it names parameters, the command line has options.
-
-    >>> in_options("there is no orbit of order 2; try `order=1`")
-    'there is no orbit of order 2; try --order 1'
-    """
-    return _KEYWORD.sub(lambda found: f"--{found[1].replace('_', '-')} {found[2]}", text)
-
-
 def _refused_by_the_system(error: OSError) -> str:
     if error.filename is None and error.errno in _FULL:
         # what writes files names them
@@ -113,7 +100,7 @@ def _wrong_values(error: Exception) -> tuple[str, int]:
     name = type(error).__name__
     if isinstance(error, ValueError) and not is_inner(error):
         # thus also TableError, SceneError and the checks of the objects: the data are wrong
-        return in_options(str(error)) or name, 2
+        return str(error) or name, 2
     what = f"{name}: {error}" if str(error) else name
     return f"the program failed, which is not the input's fault ({what}); {_TRACEBACK}=1 shows where", 1
 

@@ -8,6 +8,7 @@ import click
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ValueKind, parse_around_plus_minus
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
+from afm_jax.whole_files import in_callers_words
 from fitting.parameters import CONTACT_DEFAULT, model_parameters
 
 
@@ -113,12 +114,12 @@ def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
     """
     if options["left_out"] and model != "contact":
         raise click.UsageError("--no is about the contact's effects; add --model contact")
-    fixed, free = dict(options["fix"]), options["free"]
+    fixed, free = dict(options["fixed"]), options["free"]
     settings: dict[str, Any] = {
         "scale_errors": options["scale_errors"],
         "robust": options["robust"],
         **{name: options[name] for name in ("share", "hierarchical") if options.get(name)},
-        "constraints": dict(options["constrain"]),
+        "constraints": dict(options["constraints"]),
         "free": free,
         "fixed": fixed,
     }
@@ -142,7 +143,7 @@ def checked_model(model: str, free: tuple[str, ...] | None, fixed: dict[str, flo
     try:
         return model_parameters(model, free, fixed)
     except ValueError as error:
-        raise click.UsageError(str(error).replace("`free`", "--free").replace("`fixed`", "--fix")) from error
+        raise click.UsageError(in_callers_words(str(error))) from error
 
 
 def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ import click
 from afm_jax.columns import columns_of, csv_cells
 from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
-from afm_jax.whole_files import check_plain, write_whole
+from afm_jax.whole_files import check_plain, in_callers_words, write_whole
 from afm_jax.words import broken, lines_at_most, shown, text_table
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class Session:
 
     def note(self, message: str) -> None:
         """Write a message to standard error."""
-        _console(stderr=True).print(shown(message), markup=False, highlight=False, soft_wrap=True)
+        _console(stderr=True).print(shown(in_callers_words(message)), markup=False, highlight=False, soft_wrap=True)
 
     @contextmanager
     def working(self, what: str, parts: str = "") -> Iterator[Callable[[int, int], None]]:
@@ -185,7 +185,7 @@ class Session:
                 terminal lines break between words, and tables that are too wide for it are turned.
         """
         if self.json:
-            click.echo(strict_json(labelled(payload)))
+            click.echo(in_callers_words(strict_json(labelled(payload))))
             return
         console = _console(stderr=False)
         with lines_at_most(console.width):
@@ -194,7 +194,7 @@ class Session:
                     continue
                 words = part if isinstance(part, str) else part() if callable(part) else _table_text(console, part)
                 if isinstance(words, str):
-                    words = _broken(shown(words), console.width)
+                    words = _broken(shown(in_callers_words(words)), console.width)
                     console.print(words, markup=False, highlight=False, soft_wrap=True)
                 else:
                     console.print(words)

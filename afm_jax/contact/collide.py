@@ -589,7 +589,8 @@ class Collisions(NamedTuple):
         title = "Collisions of a free tip with the sample at rest"
         parts: list[str | Table] = [printed_table(title, cells, self.rows[:_MOST_PRINTED])]
         if len(self.rows) > _MOST_PRINTED:
-            parts.append(f"The first {_MOST_PRINTED} of {len(self.rows)} collisions; --json and --out give all.")
+            which = f"The first {_MOST_PRINTED} of {len(self.rows)} collisions"
+            parts.append(f"{which}; the JSON object and collide.csv have all.")
         parts += sorted({row["outcome"] for row in self.rows})
         capture, junction = self.capture_speed_nm_per_us, self.junction
         if all(row["captured"] for row in self.rows):

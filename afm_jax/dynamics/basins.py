@@ -144,7 +144,7 @@ class Basins(ResultTuple):
         """Return what `afm-jax basins` prints, a line an attractor."""
         speeds = self.rebound_speed_nm_per_us
         box = f"{len(self.phase_rad)} drive phases of a period x {len(speeds)} rebound speeds"
-        starts = f"Starts: {box} from {speeds[0]:.4g} to {speeds[-1]:.4g} nm/us (--speeds chooses others)"
+        starts = f"Starts: {box} from {speeds[0]:.4g} to {speeds[-1]:.4g} nm/us (`speeds_nm_per_us=...` chooses others)"
         lines = [
             f"{attractor.name}: {100.0 * share:.4g} +- {100.0 * error:.2g} % of the starts"
             for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)

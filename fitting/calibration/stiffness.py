@@ -32,7 +32,7 @@ AIR_K = (296.0, 3.0)
 """Temperature of lever and air where none is given."""
 SCALE_ERROR = 0.05
 """Relative standard error of the deflection's scale where none is given: force curves repeat it to some per cent."""
-_SIZES = "; --length-um and --width-um give k by Sader's method, which needs no such scale"
+_SIZES = "; `length_um=...` and `width_um=...` give k by Sader's method, which needs no such scale"
 _REAL = (
     (0.91324, -0.48274, 0.46842, -0.12886, 0.044055, -0.0035117, 0.00069085),
     (1.0, -0.56964, 0.48690, -0.13444, 0.045155, -0.0035862, 0.00069085),
@@ -118,7 +118,7 @@ def equipartition(
     value = factor * BOLTZMANN * temperature / (1e-18 * mean.value)
     share = float(np.sqrt((mean.standard_error / mean.value) ** 2 + (error / temperature) ** 2 + 4.0 * scale_error**2))
     how = "by the slope of a force curve (static InvOLS)" if static else "for the mode itself"
-    good = f"good to {100.0 * scale_error:g} % (--scale-error, 5 % unless given)"
+    good = f"good to {100.0 * scale_error:g} % (`scale_error=...`, 5 % unless given)"
     assumed = (
         f"The scale of the deflection is {good} and was calibrated {how}: factor {factor:.3f}.",
         "First flexural mode of a rectangular lever, the laser on its end.",

@@ -247,8 +247,8 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
             return _spectrum_of(read_recording(path))
         if holds_curves(head, str(path)):
             raise TableError(
-                f"{path}: holds curves against height, no resonance sweep; --slope reads the sensitivity off force "
-                "curves, `afm-jax tapping` the energy of a tap off amplitude and phase"
+                f"{path}: holds curves against height, no resonance sweep; `afm-jax calibrate --slope` reads the "
+                "sensitivity off force curves, `afm-jax tapping` the energy of a tap off amplitude and phase"
             )
     text = read_text(path)
     parse = _parse_nanonis if any(line.strip() == _MARK for line in text.split("\n")) else _parse_csv

@@ -291,8 +291,8 @@ WARNINGS: Rules[SweepEvidence] = [
     Rule(
         lambda e: e.better,
         "The background '{case[0].background}' describes the sweep better (AIC lower by {case[1]:.0f}) and gives "
-        "{case[0].frequency_khz:.7g} kHz and Q = {case[0].quality_factor:.5g}: choose it with --background "
-        "{case[0].background}.",
+        "{case[0].frequency_khz:.7g} kHz and Q = {case[0].quality_factor:.5g}: choose it with "
+        '`background="{case[0].background}"`.',
     ),
 ]
 """What a reader should know besides."""

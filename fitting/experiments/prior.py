@@ -162,7 +162,7 @@ def prior_of_values(  # noqa: PLR0913
     given = dict(values or {})
     for name in given:
         if name not in own:
-            raise ValueError(f"`values` names {name!r}, but the model {model!r} has {', '.join(own)}")
+            raise ValueError(f"the model {model!r} has no parameter {name!r}; it has {', '.join(own)}")
     if not 0.0 < uncertainty < 1.0:
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
@@ -403,7 +403,7 @@ def _information(found: Mapping[str, Any], correlations: Sequence[Sequence[float
 
 def _check_payload(payload: Mapping[str, Any]) -> None:
     if payload.get("format") != "afm-jax fit":
-        raise ValueError("this is no saved fit; give the JSON that `afm-jax fit TABLE.csv --json` or --out writes")
+        raise ValueError("this is no saved fit; give the JSON of `afm-jax fit TABLE.csv --json`")
     for key in ("model", "parameters", "correlations", "input", "valid"):
         if key not in payload:
             raise ValueError(f"the saved fit lacks {key!r}; write it again with `afm-jax fit TABLE.csv --json`")

@@ -49,11 +49,11 @@ _LONG_CONTACT = 0.2
 _REFUSED = (
     "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
     "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude, or fit the contact's own "
-    "parameters (--model contact), which needs no law."
+    'parameters (`model="contact"`), which needs no law.'
 )
 _NO_TAPS = (
-    "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what "
-    "is known of it (--fix tip_radius_nm=20, for example), or leave out rows that are not one impact a period."
+    "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what is known of "
+    'it (`fixed={"tip_radius_nm": 20}`, for example), or leave out rows that are not one impact a period.'
 )
 _AT_BOUND = 0.005
 _PULLED, _TORN = 2.0, 3.0
@@ -267,7 +267,7 @@ def _why_not_explained(evidence: Evidence) -> str:
     scaled = (evidence.error_scale or 1.0) * np.abs(np.nan_to_num(evidence.rows.residual))
     few = 2 * np.any(scaled > OUTLIER, axis=1).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
-        tail += " (if only a few are wrong: --robust)"
+        tail += " (if only a few are wrong: `robust=True`)"
     if evidence.contact_share > _LONG_CONTACT:
         return (
             f"Impacts last up to {100.0 * evidence.contact_share:.0f} % of a drive period: too long to be impacts of a "
@@ -446,9 +446,9 @@ def _assumed(evidence: Evidence) -> list[str]:
     held = [held for held in evidence.held if held.assumed]
     if not held:
         return []
-    better = f"{held[0].name}={held[0].value:.4g}+-{0.1 * held[0].error:.2g}"
+    better = f'`constraints={{"{held[0].name}": ({held[0].value:.4g}, {0.1 * held[0].error:.2g})}}`'
     said = f"{', '.join(map(_held_in_words, held))}; law, band and intervals hang on them"
-    return [f"{said}: say what is known better, like --constrain {better}"]
+    return [f"{said}: say what is known better, like {better}"]
 
 
 def _hanging(evidence: Evidence) -> list[str]:
@@ -607,7 +607,7 @@ REASONS: Rules[Evidence] = (
     Rule(
         lambda e: [] if e.scattering else _disagreeing(e),
         "The tables do not have one law: {case}; look at what is different there, leave it out, or let laws differ "
-        "from table to table (--hierarchical).",
+        "from table to table (`hierarchical=True`).",
     ),
     Rule(lambda e: e.freedom <= 0, "As many parameters as amplitudes: the goodness of fit cannot be judged."),
     Rule(_open_ones, "{case}."),
@@ -690,7 +690,7 @@ WARNINGS: Rules[Evidence] = (
     Rule(
         _untold_drifts,
         "The rows, which stand in order of time, hardly determine what is assumed here: {case}. Rows of the free tip "
-        "before and after the others determine drifts; `--constrain` takes what is known of them.",
+        "before and after the others determine drifts; `constraints=...` takes what is known of them.",
     ),
 )
 """What a reader should know besides."""

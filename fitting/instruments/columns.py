@@ -117,8 +117,8 @@ def example_of_columns(recording: Recording) -> str:
     """Return what to write for channels without names: an example of eight columns where that may be meant."""
     unnamed = recording.channels == [str(k + 1) for k in range(len(recording.channels))]
     if unnamed and len(recording.channels) % _EIGHT == 0:
-        return f"say --columns {_EXAMPLE} (approach/retract)"
-    return "say --columns offset_nm=CHANNEL:UNIT"
+        return f'say `columns="{_EXAMPLE}"` (approach/retract)'
+    return 'say `columns="offset_nm=CHANNEL:UNIT"`'
 
 
 def _pair(recording: Recording, channel: str) -> tuple[str, str] | None:

@@ -45,7 +45,7 @@ _NEEDED = {
     "drive_frequency_khz": "KHZ",
     "free_frequency_khz": "KHZ",
     "free_amplitude_nm": "NM",
-    "nm_per_volt": "NM_PER_V|slope",
+    "nm_per_volt": 'NM_PER_V|"slope"',
 }
 _NO_AMPLITUDE = "There is no lock-in amplitude"
 _WANTED = {"quality_factor": "Q", "spring_constant_n_per_m": "N_PER_M"}
@@ -170,7 +170,7 @@ def read_curves(
     stated = any(segment.branch for segment in recording.segments)
     recording, wanted = laid_out(recording, wanted)
     known = dict(recording.known)
-    known["drive"] = Known(drive, "", "option --drive") if drive else Known("base", "", _ASSUMED_BASE)
+    known["drive"] = Known(drive, "", "option `drive=...`") if drive else Known("base", "", _ASSUMED_BASE)
     known |= given
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
         # lock-ins are tuned to the resonance before a curve is taken
@@ -189,7 +189,7 @@ def read_curves(
     return curves
 
 
-_ASSUMED_BASE = "assumed: shaken at its base by a piezo; --drive force for a photothermal or magnetic drive"
+_ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
 
 
 def _refuse_others(recording: Recording) -> None:
@@ -218,10 +218,11 @@ def _joined(
     taken = {source.channel for source in sources.values() if source is not None}
     others = ", ".join(name for name in segments[0].channels if name not in taken)
     if sources["lockin_amplitude_nm"] is None:
-        told = f"; if one of the channels {others} is: --columns lockin_amplitude_nm=CHANNEL:UNIT" if others else ""
+        is_one = f"; if one of the channels {others} is"
+        told = f'{is_one}: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`' if others else ""
         notes.append(f"{_NO_AMPLITUDE}{told}. The slope of a force curve is what `afm-jax calibrate` reads.")
     elif sources["phase_lag_deg"] is None and others:
-        notes.append(f"Phase: none known; if one of the channels {others} is: --columns phase_lag_deg=CHANNEL:UNIT.")
+        notes.append(f'Phase: none known; if one of the channels {others} is: `columns="phase_lag_deg=CHANNEL:UNIT"`.')
     parts: dict[str, list[Any]] = {role: [] for role in ROLES}
     branches: list[str] = []
     for segment in segments:
@@ -297,9 +298,9 @@ def _source(
         if unit:
             raise TableError(
                 f"{recording.source}: the channel {source.channel} has the unit {unit!r}, which is none of {role}; say "
-                f"--columns {role}={source.channel}:{unit_of}"
+                f'`columns="{role}={source.channel}:{unit_of}"`'
             )
-        notes.append(f"Unit: {source.channel} has none and is taken in {unit_of}; else --columns {role}=NAME:UNIT.")
+        notes.append(f'Unit: {source.channel} has none and is taken in {unit_of}; else `columns="{role}=NAME:UNIT"`.')
         unit = unit_of
     return replace(source, unit=unit)
 
@@ -317,7 +318,7 @@ def _converted(recording: Recording, segment: Segment, source: ColumnSource, rol
     if not np.all(np.abs(scaled) < 1e9):
         raise TableError(
             f"{recording.source}, curve {segment.curve}, channel {source.channel}: numbers beyond 1e9; the file is "
-            f"damaged, or its unit is another one: --columns {role}={source.channel}:UNIT"
+            f'damaged, or its unit is another one: `columns="{role}={source.channel}:UNIT"`'
         )
     return np.rad2deg(np.unwrap(np.deg2rad(scaled))) if role == "phase_lag_deg" else scaled
 
@@ -397,7 +398,7 @@ def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
     why = f"{repeated} rows repeat a height and {back} step back" if repeated or back else "asked for"
     how = f"of {width:.3g} nm" if width else "of equal height"
     error = ", with their scatter for an error" if width else ""
-    notes = [f"Bins: {why}; the table has the means of bins {how}{error} (--bin-nm)."]
+    notes = [f"Bins: {why}; the table has the means of bins {how}{error} (`bin_nm=...`)."]
     binned_curve = replace(curve, bin_nm=width)
     if width and curve.amplitude is not None and curve.amplitude_unit == "nm" and curve.free.any():
         rows = _rows(binned_curve)
@@ -407,7 +408,7 @@ def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
         if times > _MIXED:
             notes.append(
                 f"Scatter: in contact readings at one height scatter {times:.0f} times as much as far away, as where "
-                "approach and retract are mixed; give them as a column branch, or as OUT/BACK in --columns."
+                "approach and retract are mixed; give them as a column branch, or as OUT/BACK in `columns=...`."
             )
     return replace(binned_curve, notes=(*curve.notes, *notes))
 
@@ -509,13 +510,13 @@ def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]
     if _runs_away(curve):
         reasons.append(
             f"The amplitude is smaller far from the sample ({far:.4g} {unit}) than near it ({near:.4g} {unit}): the "
-            "heights run the other way; turn them round with --columns offset_nm=CHANNEL:-1 (or drop that -1)."
+            'heights run the other way; turn them round with `columns="offset_nm=CHANNEL:-1"` (or drop that -1).'
         )
     for branch, look in looks.items():
         if look.change is not None and "free_amplitude_nm" not in curve.known:
             reasons.append(
                 f"There is no flat free part in the {branch}: the amplitude still changes by {look.change:.1%} over "
-                "the farthest quarter of the rows; record farther away, or give --free-amplitude-nm."
+                "the farthest quarter of the rows; record farther away, or give `free_amplitude_nm=...`."
             )
     return reasons
 
@@ -592,7 +593,7 @@ def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCu
     if np.nanmax(np.abs(phase)) < 2.0 * np.pi and abs(np.rad2deg(abs(level)) - lag) < _RADIANS_DEG:
         raise TableError(
             f"{printable(curve.source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "
-            "degrees: it is in radians; say --columns phase_lag_deg=CHANNEL:rad"
+            'degrees: it is in radians; say `columns="phase_lag_deg=CHANNEL:rad"`'
         )
     error = float(np.hypot(max(scatter, 0.01), _error_of_lag(curve)))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
@@ -644,17 +645,16 @@ def _scale_notes(curve: MeasuredCurve) -> list[str]:
     slope, error = abs(curve.slope[0]), curve.slope[1]
     shown = f"{slope:.3g} +- {error:.1g}"
     if curve.amplitude_unit == "V":
-        hard = f"on a hard sample that is {1.0 / slope:.3g} nm/V (--nm-per-volt slope)"
+        hard = f'on a hard sample that is {1.0 / slope:.3g} nm/V (`nm_per_volt="slope"`)'
         return [f"Gain: in contact the amplitude falls by {shown} V per nm; {hard}."]
     for factor, what in ((np.sqrt(0.5), "an rms amplitude"), (2.0, "a peak-to-peak amplitude")):
         if abs(slope / factor - 1.0) < 0.05:
-            mend = f"if it is one, --columns lockin_amplitude_nm=CHANNEL:{1.0 / factor:.4g}"
+            mend = f'if it is one, `columns="lockin_amplitude_nm=CHANNEL:{1.0 / factor:.4g}"`'
             return [f"Gain: in contact the amplitude falls by {shown} nm per nm, as {what} would: {mend}."]
     if abs(slope - 1.0) > max(0.1, 3.0 * error):
         why = "the scale of the amplitude is off by that" + (", or the sample is soft" if slope < 1.0 else "")
-        return [
-            f"Gain: in contact the amplitude falls by {shown} nm per nm, not by 1: {why}; --nm-per-volt slope sets it."
-        ]
+        mend = '`nm_per_volt="slope"` sets it'
+        return [f"Gain: in contact the amplitude falls by {shown} nm per nm, not by 1: {why}; {mend}."]
     return []
 
 
@@ -664,7 +664,7 @@ def _phase_notes(curve: MeasuredCurve) -> list[str]:
     if phase is None or amplitude is None:
         return ["There is no phase: the energy of a tap has an upper bound only."] if amplitude is not None else []
     turned = any(note.startswith("Sign: the free tip") for note in curve.notes)
-    taken = "Sign: a larger phase is taken as a larger lag; if it leads, --columns phase_lag_deg=CHANNEL:-1."
+    taken = 'Sign: a larger phase is taken as a larger lag; if it leads, `columns="phase_lag_deg=CHANNEL:-1"`.'
     notes = [] if turned else [taken]
     zero = curve.known.get("phase_zero_deg")
     if zero is None:
@@ -703,7 +703,7 @@ def table_text(curve: MeasuredCurve) -> str:
         raise TableError(f"{curve.source}, curve {curve.curve}: {curve.reasons[0]}")
     needed = [key for key in curve.missing if key in _NEEDED]
     if needed:
-        options = " ".join(f"--{key.replace('_', '-')} {_NEEDED[key]}" for key in needed)
+        options = " ".join(f"`{key}={_NEEDED[key]}`" for key in needed)
         raise TableError(f"{curve.source}: the file does not say {', '.join(needed)}; give {options}")
     rows = _rows(curve)
     columns: dict[str, Any] = {

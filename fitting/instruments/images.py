@@ -158,15 +158,15 @@ def _channel(images: Images, role: str, wanted: Mapping[str, ColumnSource]) -> t
         name = next((name for name in names if re.fullmatch(_NAMES[role], name, re.IGNORECASE)), None)
         if name is None:
             raise TableError(
-                f"{images.source}: none of the images {listed} is called {role.split('_')[-2]}; say --columns "
-                f"{role}=CHANNEL:{_UNITS[role]}, or give amplitude and phase as two files"
+                f"{images.source}: none of the images {listed} is called {role.split('_')[-2]}; say "
+                f'`columns="{role}=CHANNEL:{_UNITS[role]}"`, or give amplitude and phase as two files'
             )
         source = ColumnSource(name)
     unit = source.unit or images.units.get(source.channel, "") or _UNITS[role]
     if UNITS.get(unit, ("",))[0] not in ROLES[role][0]:
         raise TableError(
             f"{images.source}: the channel {source.channel} has the unit {unit!r}, which is none of {role}; say "
-            f"--columns {role}={source.channel}:{_UNITS[role]}"
+            f'`columns="{role}={source.channel}:{_UNITS[role]}"`'
         )
     return source.channel, unit, 1.0 if source.factor is None else source.factor
 
@@ -294,10 +294,10 @@ def _of_file_of_curves(
     rows, columns = grid
     if len(curves) != rows * columns:
         raise TableError(
-            f"{path}: holds {len(curves)} curves, not {rows} x {columns} = {rows * columns}; say --grid ROWSxCOLUMNS"
+            f"{path}: holds {len(curves)} curves, not {rows} x {columns} = {rows * columns}; correct `grid=...`"
         )
     if any(curve.amplitude is None or curve.phase_lag_deg is None for curve in curves):
-        raise TableError(f"{path}: the curves have no amplitude or no phase; say --columns")
+        raise TableError(f"{path}: the curves have no amplitude or no phase; say `columns=...`")
     values = []
     for curve in curves:
         approach = curve.branch == ("approach" if "approach" in curve.branch else "retract")
@@ -348,7 +348,7 @@ def _note_of_curves(ratio: float, amplitude: Float[np.ndarray, "rows columns"]) 
     of = f"; {missing} curves do not come there" if missing else ""
     return (
         f"Curves: each pixel is its curve at {ratio:g} of its own free amplitude, zero of the phase from its own free "
-        f"rows{of} (--at)."
+        f"rows{of} (`ratio=...`)."
     )
 
 

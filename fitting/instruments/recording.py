@@ -191,11 +191,11 @@ def given_numbers(
         sound = np.isfinite(number) and (number > 0.0 or key in any_sign) and (error is None or error > 0.0)
         if not sound:
             raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
-        found[key] = Known(float(number), units[key], f"option --{key.replace('_', '-')}", error)
+        found[key] = Known(float(number), units[key], f"option `{key}=...`", error)
     return found
 
 
-ASSUMED_RESONANCE = "assumed: on resonance, at the free frequency; else --drive-frequency-khz"
+ASSUMED_RESONANCE = "assumed: on resonance, at the free frequency; else `drive_frequency_khz=...`"
 """Origin of a drive's frequency that nobody gave."""
 
 

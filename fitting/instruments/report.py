@@ -31,9 +31,7 @@ def curves_summary(curves: list[MeasuredCurve]) -> str:
         "",
         *text_table(["known", "value", "unit", "from"], known, words=(0, 2, 3)),
     ]
-    asked = [
-        f"{key}: --{key.replace('_', '-')}" for key in dict.fromkeys(k for c in curves if c.valid for k in c.missing)
-    ]
+    asked = [f"{key}: `{key}=...`" for key in dict.fromkeys(k for c in curves if c.valid for k in c.missing)]
     lines += bullets("The file does not say:", asked)
     lines += bullets("Notes:", list(dict.fromkeys(note for curve in curves for note in curve.notes)))
     lines += bullets("Refused:", [f"curve {curve.curve}: {reason}" for curve in curves for reason in curve.reasons])

@@ -147,7 +147,9 @@ def _rows(result: Inversion) -> list[Part]:
     parts: list[Part] = [table, Text("  Speeds in nm/us, tau in ns; loss: u_in - u_out.")]
     if rows.shared_names:
         names = " and ".join(rows.shared_names)
-        said = f"  Errors are those of each row; the systematic ones, of {names}, stand in invert.csv and --json."
+        said = (
+            f"  Errors are those of each row; the systematic ones, of {names}, stand in invert.csv and the JSON object."
+        )
         parts.append(Text(said))
     return parts
 

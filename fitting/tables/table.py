@@ -240,7 +240,7 @@ def check_errors(head: Head, present: Collection[str], faults: Faults) -> None:
     for column in MEASURED:
         if column.name in present and column.error not in present:
             hint = f"add the column {column.error}"
-            hint += " or give the relative noise (--noise 1%)" if column.amplitude else ""
+            hint += " or give the relative noise (`noise=0.01`)" if column.amplitude else ""
             hint += f", or repeat readings: {LEAST_REPEATS} repeats tell them"
             faults.add(f"has no errors; {hint}", line=head.line, column=column.name)
 
@@ -385,7 +385,7 @@ def _check_measured(
     for column in MEASURED:
         if column.name not in blank or column.error not in blank:
             continue
-        mend = f"fill {column.error} in" + (" or give the relative noise (--noise 1%)" if column.amplitude else "")
+        mend = f"fill {column.error} in" + (" or give the relative noise (`noise=0.01`)" if column.amplitude else "")
         for row in np.flatnonzero(blank[column.error] & ~blank[column.name]):
             faults.add(f"the value has no error; {mend}", line=int(lines[row]), column=column.name)
         for row in np.flatnonzero(blank[column.name] & ~blank[column.error]):
@@ -637,8 +637,9 @@ def check_quality_factor(table: AmplitudeTable) -> None:
     if table.quality_factor is not None and np.isnan(table.quality_factor):
         raise TableError(
             f"{printable(table.source)}: the quality factor is missing, and the loss of the impacts depends on it; add "
-            "a line such as '# quality_factor = 40 +- 2' above the column names or give --quality-factor '40 +- 2' "
-            "(`afm-jax calibrate` measures it); '# quality_factor = none' says that there is no air damping"
+            "a line such as '# quality_factor = 40 +- 2' above the column names or give `quality_factor=40, "
+            "quality_factor_error=2` (`afm-jax calibrate` measures it); '# quality_factor = none' says that there is "
+            "no air damping"
         )
 
 

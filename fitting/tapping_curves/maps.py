@@ -196,7 +196,7 @@ def tapping_map(
     if amplitude_error_nm is None or phase_error_deg is None:
         notes.append(
             f"Noise: {errors[0]:.3g} nm and {errors[1]:.3g} degrees a pixel, from the roughness along the lines "
-            "(--amplitude-error-nm, --phase-error-deg)."
+            "(`amplitude_error_nm=...`, `phase_error_deg=...`)."
         )
     return _mapped(images, drive, known, _ImageReadings(amplitude, free, behind, *errors), notes)
 
@@ -227,7 +227,7 @@ def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -
         needed["free_amplitude_nm"] = "NM"
     if images.amplitude_unit == "V":
         needed["nm_per_volt"] = "NM"
-    missing = [f"--{key.replace('_', '-')} {unit}" for key, unit in needed.items() if key not in known]
+    missing = [f"`{key}={unit}`" for key, unit in needed.items() if key not in known]
     if missing:
         raise TableError(f"{images.source}: the file does not say all that an energy needs; give {' '.join(missing)}")
     if "spring_constant_n_per_m" not in known:
@@ -268,7 +268,8 @@ def _behind_free(
         middle = np.nanmedian(images.phase_deg)
         reading = -free_lag if -180.0 < middle < 0.0 else free_lag
         notes.append(
-            f"Phase: the free tip is taken to read {reading:.1f} +- {_USUAL_ZERO_DEG[1]:g} deg; else --free-phase-deg."
+            f"Phase: the free tip is taken to read {reading:.1f} +- {_USUAL_ZERO_DEG[1]:g} deg; else "
+            "`free_phase_deg=...`."
         )
         origin = f"assumed: the free tip reads {'the opposite of ' if reading < 0.0 else ''}its lag"
         known["free_phase_deg"] = Known(reading, "deg", origin, _USUAL_ZERO_DEG[1])

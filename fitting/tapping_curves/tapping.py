@@ -89,8 +89,8 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     quality = np.nan_to_num(table.quality_factor or 0.0)
     if not quality:
         raise TableError(
-            f"{name}: the quality factor is missing; give --quality-factor '200 +- 2', or the comment line "
-            "'# quality_factor = 200 +- 2'"
+            f"{name}: the quality factor is missing; give `quality_factor=200, quality_factor_error=2`, or the comment "
+            "line '# quality_factor = 200 +- 2'"
         )
     if table.lockin_amplitude_nm is None or table.lockin_amplitude_error_nm is None:
         raise TableError(f"{name}: there is no lockin_amplitude_nm; the energy needs the lock-in's amplitude and phase")

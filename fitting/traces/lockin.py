@@ -272,7 +272,7 @@ def _warnings(
 ) -> list[str]:
     found = []
     if reference.origin == "time zero":
-        found.append("The phase takes time 0 as when the platform is highest: give --drive-phase-deg or a column.")
+        found.append("The phase takes time 0 as when the platform is highest: give `drive_phase_deg=...` or a column.")
     share = sampling_error_nm(folded) / max(abs(folded.lockin), 1e-300)
     if share > 1e-3:
         advice = "sample faster, or not in step with the drive"
@@ -286,7 +286,7 @@ def _warnings(
         and impacts
     ):
         what = f"The flight bends at its top like one of {seen:.4g} kHz, not {given:g} kHz"
-        found.append(f"{what}: wrong rest position (--rest-nm), other free frequency, or a filtered trace.")
+        found.append(f"{what}: wrong rest position (`rest_nm=...`), other free frequency, or a filtered trace.")
     if 2 * search.order > len(search.misfit_nm):
         what = f"The trace spans {trace.drive_periods:.3g} drive periods"
         found.append(f"{what}: too few to see a doubled period of order {2 * search.order}.")
@@ -435,7 +435,7 @@ def _check_known(result: LockinResult) -> None:
     values = {"drive_amplitude_nm": result.drive_amplitude_nm, "offset_nm": result.offset_nm}
     for name, value in values.items():
         if value is None:
-            mend = f"give --{name.replace('_', '-')} or a comment '# {name} = 1'"
+            mend = f"give `{name}=...` or a comment '# {name} = 1'"
             raise TableError(
                 f"{result.trace.source}: {name} is not known, so that it cannot enter the amplitude table; {mend}"
             )
@@ -456,6 +456,6 @@ def _cantilever(steady: Sequence[LockinResult]) -> dict[str, float | None]:
     if shared["free_frequency_khz"] is None:
         raise TableError(
             f"{first.source}: free_frequency_khz is not known, so that there is no amplitude table; give "
-            "--free-frequency-khz or a comment '# free_frequency_khz = 90' (afm-jax calibrate measures it)"
+            "`free_frequency_khz=...` or a comment '# free_frequency_khz = 90' (afm-jax calibrate measures it)"
         )
     return shared

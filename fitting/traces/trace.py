@@ -257,7 +257,7 @@ def _read(h5py: Any, file: Any, group: str | None, faults: Faults, size: int) ->
     inner = [] if has_deflection else _groups_with_deflection(h5py, place)
     if inner:
         choice = f" (there are {', '.join(inner)})" if inner[1:] else ""
-        faults.fail(f"there is no data set deflection_nm here; name its group: --group {inner[0]}{choice}")
+        faults.fail(f'there is no data set deflection_nm here; name its group: `group="{inner[0]}"`{choice}')
     check_names(names, TRACE, faults=faults)
     wanted = [name for name in names if name in ATTRIBUTES]
     faults.raise_any()
@@ -372,7 +372,7 @@ class Trace(Result):
         if not 0.0 < self.step_us < np.inf or not np.isfinite(self.start_us):
             faults.add(f"`step_us` must be finite and above 0, but is {self.step_us!r}")
         if self.settings.drive_frequency_khz is None:
-            advice = "give --drive-frequency-khz or a comment '# drive_frequency_khz = 180'"
+            advice = "give `drive_frequency_khz=...` or a comment '# drive_frequency_khz = 180'"
             faults.add(f"the drive frequency is missing; {advice}")
         faults.raise_any()
         _check_length(self, faults)
@@ -477,7 +477,8 @@ def _clock(parsed: ParsedTrace, settings: TraceSettings, faults: Faults) -> tupl
     if times is None:
         if rate is None:
             faults.add(
-                "the sampling rate is missing; give a column time_us, --sampling-rate-mhz or '# sampling_rate_mhz = 50'"
+                "the sampling rate is missing; give a column time_us, `sampling_rate_mhz=...` or "
+                "'# sampling_rate_mhz = 50'"
             )
             return 0.0, 1.0
         return 0.0, 1.0 / rate

@@ -256,7 +256,7 @@ FINDINGS = (
         TraceKind.UPSIDE_DOWN,
         lambda e: e.ends_nm[0] < 0.0 and abs(e.ends_nm[1]) <= _BELOW * abs(e.ends_nm[0]),
         "the deflection lies between {e.ends_nm[0]:.4g} and {e.ends_nm[1]:.4g} nm, but a bouncing tip flies above "
-        "its rest position: multiply it by -1, or give what it reads at rest (--rest-nm)",
+        "its rest position: multiply it by -1, or give what it reads at rest (`rest_nm=...`)",
     ),
     Finding(
         TraceKind.DRIFTING,

@@ -218,9 +218,12 @@ FIT = Command(
             help="The parameters that are fitted, if not all that are not fixed; of a contact, if left out, "
             f"{','.join(CONTACT_DEFAULT)}.",
         ),
-        click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="Hold a parameter at a value."),
+        click.option(
+            "--fix", "fixed", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="Hold a parameter at a value."
+        ),
         click.option(
             "--constrain",
+            "constraints",
             type=Constraint(),
             multiple=True,
             metavar="NAME=VALUE+-ERROR",

@@ -28,7 +28,13 @@ BASINS = Command(
     options=(
         SCENE,
         click.option("--grid", type=Grid(), default="300x300", help="Drive phases x rebound speeds."),
-        click.option("--speeds", type=Ends(), metavar="LOW:HIGH", help="Range of the rebound speed, in nm/us."),
+        click.option(
+            "--speeds",
+            "speeds_nm_per_us",
+            type=Ends(),
+            metavar="LOW:HIGH",
+            help="Range of the rebound speed, in nm/us.",
+        ),
         LAW,
         DRAWS,
         PICTURE,
