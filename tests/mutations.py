@@ -56,7 +56,7 @@ MUTATIONS = {
     "damped frequency with 1/2Q^2": Mutation("1.0 - {0.25 => 0.5} / self", FLIGHT),
     "platform velocity turned round": Mutation("{- => +}self.top_speed_nm_per_us * sine", PLATFORM),
     "platform acceleration without an omega": Mutation(
-        "-self.top_speed_nm_per_us * {self.angular_frequency *  => }cosine", PLATFORM
+        "{-(part.angular_frequency**2) => -part.angular_frequency} * part.position", PLATFORM
     ),
     "cosine's sign in the wrong quadrants": Mutation(
         "(turn == {1.0 => 2.0}) | (turn == {2.0 => 3.0})",

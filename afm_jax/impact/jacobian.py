@@ -169,11 +169,13 @@ def impact_jacobian(
         velocity_before: V in nm/us.
     """
     arrival = as_argument(arrival_us)
-    approach = platform.velocity(arrival) - velocity_before
+    motion = platform.motion(arrival)
+    approach = motion.velocity - velocity_before
     slope = law.rebound_slope(approach)
     delay_slope = law.delay_slope(approach)
-    leaving = arrival + law.collision_delay(approach)
-    acceleration_in, acceleration_out = platform.acceleration(arrival), platform.acceleration(leaving)
+    acceleration_in = acceleration_out = motion.acceleration
+    if law.delayed:
+        acceleration_out = platform.acceleration(arrival + law.collision_delay(approach))
     time_by_time = 1.0 + delay_slope * acceleration_in
     return jnp.array(
         [
