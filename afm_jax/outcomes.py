@@ -26,7 +26,7 @@ class OutcomeInWords(enum.IntEnum):
 
 
 class Outcome(OutcomeInWords):
-    """How one step of the impact map ended."""
+    """How one step of the impact map ended; the `sentence` of a member says what happened."""
 
     IMPACT = 0, "The tip hit the platform and left it again."
     CAPTURED = 1, "The tip came too slowly to leave again: the platform captured it."
@@ -41,7 +41,7 @@ class Outcome(OutcomeInWords):
 
 
 class CollisionOutcome(OutcomeInWords):
-    """How the collision of a free tip with a contact ended."""
+    """How the collision of a free tip with a contact ended; the `sentence` of a member says what happened."""
 
     REBOUND = 0, "The tip formed the junction, broke it and left."
     TURNED_IN_BRIDGE = 1, "The bridge turned the tip round before the junction formed; it left."

@@ -108,7 +108,7 @@ def save(result: Any, path: str | Path) -> None:
 
 @checked
 def load(path: str | Path) -> Any:
-    """Return what `save` wrote.
+    """Return a result from the JSON file into which its method `save` wrote it.
 
     Arrays that were JAX's are JAX's again where it computes in 64 bits, else NumPy's, so that no digit is lost.
 

@@ -15,10 +15,10 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 
 
 class Tone(eqx.Module):
-    """A cosine amplitude cos(omega t + phase); what it is the amplitude of, its use says.
+    """One cosine of a drive, amplitude cos(omega t + phase): a motion in nm or a force in nN.
 
     Args:
-        amplitude: in nm of a motion, in nN of a force.
+        amplitude: not negative; of a motion in nm, of a force in nN.
         frequency_khz: omega / 2 pi.
         phase_deg: phase at time 0.
 

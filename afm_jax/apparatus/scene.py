@@ -20,7 +20,9 @@ def _for_scene(interaction: Any) -> Any:
 
 
 class Scene(eqx.Module):
-    """A container, nothing more: its parts are traced parameters, its structure says what is simulated.
+    """A scene to simulate: a cantilever over a sample, what happens when they meet, and what drives them.
+
+    Numbers are traced parameters; which parts there are decides what is compiled.
 
     Args:
         cantilever: the tip and its spring.

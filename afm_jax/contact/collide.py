@@ -68,7 +68,7 @@ ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj
 
 @public_result(outcome=CollisionOutcome, picture="afm_jax.plots.collisions:collisions_figure")
 class Collision(ResultTuple):
-    """What collisions end with; arrays of one shape.
+    """What becomes of free tips that collide with a sample at rest: speeds, times and energies, arrays of one shape.
 
     Where the tip is captured, rebound speed, delay, time in contact and time in the junction are 0, and the hystereses
     and the viscous loss are not what it has lost, since it stops on the way: see `outcome`. Energies are in aJ.
@@ -80,9 +80,9 @@ class Collision(ResultTuple):
     """Time between the crossings of gap 0 by the straight paths in and out."""
     captured: Bool[Array, "..."]
     outcome: Int[Array, "..."]
-    """A `CollisionOutcome`."""
+    """How the collision ended, the number of a `CollisionOutcome`."""
     time_in_contact_us: Float[Array, "..."]
-    """From the formation of the bridge to its breaking."""
+    """Time from the formation of the bridge to its breaking."""
     time_in_junction_us: Float[Array, "..."]
     deepest_gap_nm: Float[Array, "..."]
     """Smallest gap, negative where the tip indents the sample."""

@@ -70,11 +70,17 @@ class Junction(ResultTuple):
 @checked
 @compiled_quickly()
 def find_junction(contact: Contact) -> Junction:
-    """Return the junction of a contact; differentiable in every parameter, for one set of them.
+    """Return the gaps at which a contact's solid junction forms and breaks, and the energies that its hysteresis takes.
 
     A dry contact forms and breaks where its solids meet. Of several tangencies the one that an approaching tip meets
     with the bridge stiffening beyond the JKR contact is taken, at the largest gap; the spurious ones near the JKR
     pull-off cross the other way.
+
+    Args:
+        contact: the contact, of numbers; `vmap` serves several.
+
+    Returns:
+        The junction, differentiable in every parameter of the contact.
 
     Raises:
         TypeError: if it is no contact.
@@ -233,7 +239,7 @@ def explain_missing_junction(contact: Contact) -> str:
 
 
 class Phase(enum.IntEnum):
-    """What is between tip and sample."""
+    """What is between tip and sample: nothing (DRY), a liquid bridge, or the solid junction."""
 
     DRY = 0
     BRIDGE = 1

@@ -232,7 +232,7 @@ def fit_law(
 
 @checked
 def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS) -> TabulatedLaw:
-    """Return the law that a contact amounts to, as a table of free collisions: what a scene takes in its place.
+    """Return the impact law of a contact as a table of free tips' collisions; a scene takes it in the contact's place.
 
     Args:
         contact: the contact, of numbers.

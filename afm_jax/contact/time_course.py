@@ -29,20 +29,20 @@ _FLIGHT = 0.5
 
 @public_result(phase=Phase)
 class TimeCourse(ResultTuple):
-    """An impact in time; arrays of one length, times increasing.
+    """Gap, velocity and force of a free tip during one impact on a sample at rest; arrays of one length by rising time.
 
     A captured tip's course ends where it first stops on its way out.
     """
 
     time_us: Float[np.ndarray, " points"]
-    """0 where the bridge forms."""
+    """Time since the bridge formed."""
     gap_nm: Float[np.ndarray, " points"]
     velocity_nm_per_us: Float[np.ndarray, " points"]
-    """dD/dt: negative on the way in."""
+    """Rate dD/dt of the gap: negative on the way in."""
     phase: Int[np.ndarray, " points"]
-    """A `Phase`."""
+    """What is between tip and sample, the number of a `Phase`."""
     force_nn: Float[np.ndarray, " points"]
-    """On the tip; attraction is negative."""
+    """Force of the sample on the tip; attraction is negative."""
     captured: bool
 
 

@@ -68,18 +68,18 @@ class Attractor(NamedTuple):
 
 @public_result(picture="afm_jax.plots.dynamics:basins_figure", rows="table")
 class Basins(ResultTuple):
-    """Which start ends where.
+    """The motions (attractors) on which the starts of a grid of drive phases and rebound speeds end.
 
     Attributes:
         phase_rad: drive phase of the columns' starts.
         rebound_speed_nm_per_us: speed off the platform of the rows' starts; at the gap where the bridge breaks, if the
             scene has a contact.
-        attractors: by falling share.
+        attractors: the motions, by falling share of the starts.
         attractor: the number of each start's attractor, (rows, columns).
-        share: of each attractor.
-        share_error: its standard error, as of random starts.
-        boundary_dimension: by the uncertainty exponent; NaN with one attractor.
-        boundary_dimension_error: its standard error.
+        share: fraction of the starts that ends on each attractor.
+        share_error: standard errors of the shares, as of random starts.
+        boundary_dimension: dimension of the basins' boundary, by the uncertainty exponent; NaN with one attractor.
+        boundary_dimension_error: standard error of that dimension.
         share_interval95: of each attractor the interval that holds 95 % of its shares for drawn laws; None: none drawn.
     """
 
@@ -195,7 +195,7 @@ def basins_of_attraction(
     speeds_nm_per_us: tuple[float, float] | None = None,
     report: Report | None = None,
 ) -> Basins:
-    """Return which start, in drive phase and rebound speed, ends where.
+    """Return the motion on which each start of a grid of drive phases and rebound speeds ends.
 
     Args:
         scene: one scene with a law or a contact, driven with one frequency.

@@ -58,14 +58,14 @@ class Sweep(ResultTuple):
 
     Attributes:
         values: of the parameter, ascending.
-        upward: the sweep's direction.
+        upward: whether the parameter rises from value to value.
         verdicts: what the motion has come to at each value.
         restarted: the tip began anew there: it was held, or had flown away, at the value before.
         phase_rad: drive phase, in [0, 2 pi), at the end of each of the last impacts, (values, impacts); NaN where there
             was none. Of an orbit of m impacts the last m.
-        approach_nm_per_us: their approach speeds.
-        velocity_after_nm_per_us: the tip's velocity in the lab after them.
-        height_nm: the platform's height when the tip arrives.
+        approach_nm_per_us: approach speeds of these impacts.
+        velocity_after_nm_per_us: velocities of the tip in the lab after these impacts.
+        height_nm: heights of the platform when the tip arrives.
         strobe_height_nm: the tip's height whenever the drive's phase is 0 (the platform, if it moves, is highest),
             (values, drive periods), of the last ones.
         complete: False where stretches were still being ramped again when there were enough.
@@ -192,7 +192,7 @@ def bifurcation_diagram(  # noqa: PLR0913
     accuracy: float = 1e-6,
     report: Report | None = None,
 ) -> Sweep:
-    """Return what a tip comes to at each value of a parameter, ramped up or down.
+    """Return the last impacts of the motion at each value of a parameter, which is ramped up or down.
 
     Args:
         scene: a scene with a law or a contact, driven with one frequency.

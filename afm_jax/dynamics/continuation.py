@@ -98,7 +98,7 @@ class Continuation(ResultTuple):
     sticking: bool = False
     """The orbits rest on the surface (`follow_sticking`)."""
     law_parameters: tuple[str, ...] | None = None
-    """What is uncertain of the law, and gives the errors below; None: nothing."""
+    """Names of the law's uncertain parameters, which give the errors that follow; None: the law is known exactly."""
     amplitude_errors: tuple[Float[np.ndarray, " points"], ...] | None = None
     """Standard errors of the peak amplitude, in nm, of each branch."""
     special_errors: Float[np.ndarray, " special"] | None = None

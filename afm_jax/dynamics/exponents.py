@@ -51,14 +51,14 @@ _ARRIVED = 1e-8
 
 @public_result(picture="afm_jax.plots.dynamics:exponents_figure")
 class Lyapunov(ResultTuple):
-    """Exponents of motions, arrays of one lane a motion; larger exponent first.
+    """The two Lyapunov exponents of each of several motions, the larger one first; arrays of one lane a motion.
 
     Attributes:
         exponents_per_impact: minus infinity where the tip rests on the platform; NaN where the motion ended, without
             an impact to the end, before a tenth of the impacts were made.
-        exponents_per_us: the same in time.
+        exponents_per_us: exponents per time, in 1/us; minus infinity and NaN where those per impact are.
         exponents_per_impact_error: standard errors from the means of twenty parts; of an orbit how far it may be off.
-        exponents_per_us_error: the same in time.
+        exponents_per_us_error: standard errors of the exponents in 1/us, likewise.
         mean_log_determinant: mean of ln |det| of the map's Jacobian.
         impacts: how many the means are over.
         near_grazing: how many of them are near grazing.
@@ -218,7 +218,7 @@ def lyapunov_spectrum(
     accuracy: float = DEFAULT_ACCURACY,
     report: Report | None = None,
 ) -> Lyapunov:
-    """Return the Lyapunov exponents of a motion, or of many.
+    """Return the two Lyapunov exponents of a motion, or of many, in 1/us and per impact.
 
     Args:
         scene: a scene with a law or a contact, driven with one frequency; or a batch of scenes.

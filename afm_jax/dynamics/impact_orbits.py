@@ -68,9 +68,9 @@ class ManyImpactOrbits(ResultTuple):
 
     Attributes:
         loops: drive phases at the arrivals in rad, ascending, then coordinates in nm/us (`Law.speeds`).
-        reading: what there is to know of each, a `LoopReading`; all are admissible.
+        reading: impacts, peak amplitude, trace and determinant of each orbit, a `LoopReading`; all are admissible.
         multipliers: eigenvalues of the linearised map, the larger first.
-        stable: both lie inside the unit circle.
+        stable: whether both multipliers of an orbit lie inside the unit circle.
     """
 
     loops: Float[np.ndarray, "orbits n"]

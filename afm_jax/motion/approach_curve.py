@@ -85,23 +85,23 @@ class ApproachCurve(ResultTuple):
     """
 
     height_nm: Float[np.ndarray, " points"]
-    """Of the sample over the tip's rest position: negative below it."""
+    """Height of the sample over the tip's rest position: negative below it."""
     retract: Bool[np.ndarray, " points"]
     """Whether the sample moved away to get here."""
     amplitude_nm: Float[np.ndarray, " points"]
-    """At the drive's frequency; NaN where nothing could be read."""
+    """Lock-in amplitude at the drive's frequency; NaN where nothing could be read."""
     phase_lag_deg: Float[np.ndarray, " points"]
-    """From 0 to 360."""
+    """Lag behind the drive, from 0 to 360; NaN where nothing could be read."""
     dissipated_in_contact_aj: Float[np.ndarray, " points"]
     """Energy lost to the sample in a drive period."""
     virial_aj: Float[np.ndarray, " points"]
-    """Mean of force times height; positive where attraction prevails."""
+    """Mean of force times height over a drive period; positive where attraction prevails."""
     contacts: Int[np.ndarray, " points"]
     """Contacts until the motion repeats; 0 also where it does not."""
     periods: Int[np.ndarray, " points"]
     """Drive periods until the motion repeats; 0 where it does not."""
     outcome: Int[np.ndarray, " points"]
-    """A `CurveOutcome` each."""
+    """What came of the motion at each point, numbers of `CurveOutcome`."""
     reasons: tuple[str, ...]
     """The outcome of each point in words, with its numbers."""
     scene: Scene
@@ -110,8 +110,9 @@ class ApproachCurve(ResultTuple):
     """What is driven: "force" (on the tip) or "base"."""
     drive_frequency_khz: float
     free_amplitude_nm: float
-    """Of the free tip, in closed form."""
+    """Amplitude of the free tip, in closed form."""
     free_phase_lag_deg: float
+    """Lag of the free tip behind the drive, in closed form."""
 
 
 @checked

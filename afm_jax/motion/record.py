@@ -20,7 +20,7 @@ from afm_jax.solve.lanes import compiled_quickly
 
 
 class MotionOutcome(OutcomeInWords):
-    """How a simulation ended."""
+    """How a simulation ended; the `sentence` of a member says what happened and what to do."""
 
     FINISHED = 0, "The motion was followed to the end of its duration."
     HELD = 1, "The motion was followed to the end of its duration; the sample holds the tip there."
@@ -52,7 +52,7 @@ class ContactKind(enum.IntEnum):
 
 @public_result()
 class State(ResultTuple):
-    """Where the tip is: lab frame, scalars of one scene."""
+    """The tip's time in us, height above its rest position in nm and velocity upward in nm/us, all in the lab frame."""
 
     time_us: Float[Array, "..."]
     position_nm: Float[Array, "..."]
@@ -110,7 +110,10 @@ class Contacts(NamedTuple):
 
 @public_result(outcome=MotionOutcome)
 class Simulation(Result, eqx.Module):
-    """A scene followed in time; under `vmap` every array has the batch as first axis."""
+    """A scene followed in time by `simulate`: where it started, its contacts in order, its last state and its outcome.
+
+    Under `vmap` every array has the batch as first axis.
+    """
 
     start: State
     contacts: Contacts
@@ -118,11 +121,11 @@ class Simulation(Result, eqx.Module):
     """Number of contacts, the unfinished one of a held tip included."""
     final: State
     phase: Int[Array, "..."]
-    """`Phase` at the end (laws: JUNCTION where the platform holds the tip)."""
+    """What is between tip and sample at the end, a `Phase` (laws: JUNCTION where the platform holds the tip)."""
     held: Bool[Array, "..."]
     """Whether the tip is held at the end."""
     outcome: Int[Array, "..."]
-    """A `MotionOutcome`."""
+    """How the simulation ended, the number of a `MotionOutcome`."""
 
     def _known_rows(self) -> np.ndarray:
         """Return which rows are contacts."""

@@ -44,16 +44,19 @@ _PHASES = {FLIGHT: int(Phase.DRY), REST: int(Phase.JUNCTION), STRAIGHT: int(Phas
 
 @public_result(phase=Phase)
 class Trajectory(ResultTuple):
-    """The tip at given times; NumPy arrays of the times' shape."""
+    """Height, velocity, gap and force of the tip at given times; NumPy arrays of the times' shape."""
 
     time_us: np.ndarray
     position_nm: np.ndarray
-    """Height in the lab."""
+    """Height of the tip above its rest position, in the lab frame."""
     velocity_nm_per_us: np.ndarray
     gap_nm: np.ndarray
     gap_rate_nm_per_us: np.ndarray
     phase: np.ndarray
-    """`Phase` as integers; with a law JUNCTION while the platform holds the tip, or the collision delay lasts."""
+    """What is between tip and sample, numbers of `Phase`.
+
+    With a law JUNCTION while the platform holds the tip, or the collision delay lasts.
+    """
     force_nn: np.ndarray
     """Force of the sample on the tip; 0 with a law, whose impacts take no time."""
 
@@ -159,7 +162,7 @@ class DensePath(NamedTuple):
 
 @checked
 def trajectory(scene: SceneLike, simulation: Simulation, times_us: ArrayLike) -> Trajectory:
-    """Return the tip at given times.
+    """Return height, velocity, gap and force of the tip at given times of a simulation.
 
     Args:
         scene: the scene that was simulated.

@@ -134,7 +134,7 @@ Built = TypeVar("Built")
 
 
 class SceneError(ValueError):
-    """A scene file that cannot be used; the message is one line: what, where, how to mend it."""
+    """Raised where a scene file cannot be used; the message is one line: what, where, how to mend it."""
 
 
 def read_text(source: str | os.PathLike[str]) -> str:

@@ -81,7 +81,7 @@ class Curves:
 @public_result(picture="fitting.calibration.report:calibration_figure")
 @dataclass(frozen=True)
 class Calibration(Result):
-    """The outcome of `calibrate`; attributes are named like the keys of its JSON.
+    """Frequency and quality factor of a free cantilever: what `calibrate` returns, named like the keys of its JSON.
 
     Attributes:
         frequency_khz: undamped natural frequency Omega/2 pi.

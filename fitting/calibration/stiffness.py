@@ -46,11 +46,11 @@ _IMAGINARY = (
 @public_result()
 @dataclass(frozen=True)
 class Stiffness(Result):
-    """A spring constant or a sensitivity, with what it rests on.
+    """A spring constant in N/m or a sensitivity in nm/V, its errors and the assumptions that it rests on.
 
     Attributes:
         method: "equipartition", "Sader" or "slope".
-        value: in N/m, of a slope in nm/V; its errors with it.
+        value: the spring constant in N/m, for "slope" the sensitivity in nm/V, with its errors.
         assumed: the assumptions, a sentence each.
 
     It is a calibration only if it has a standard error.
@@ -142,9 +142,9 @@ def sader(
 
     Args:
         calibration: frequency and quality factor, in air.
-        length_um: of the lever, with its standard error.
-        width_um: its width, likewise; thickness must be small beside it.
-        temperature_k: of the air, dry and at 1013 hPa.
+        length_um: length of the lever and its standard error, in um.
+        width_um: width of the lever and its standard error, in um; the thickness must be small beside it.
+        temperature_k: temperature of the air, dry and at 1013 hPa, and its standard error, in K.
     """
     frequency, quality_factor = calibration.frequency_khz, calibration.quality_factor
 

@@ -40,7 +40,7 @@ class Forecast:
 @public_result(picture="fitting.experiments.report:design_figure", rows="points")
 @dataclass(frozen=True, eq=False)
 class Design(Result):
-    """The outcome of `design`; attributes are named like the keys of its JSON.
+    """The drives to measure next and the errors to expect: what `design` returns, named like the keys of its JSON.
 
     Attributes:
         prior: what the design rests on.

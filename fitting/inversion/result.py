@@ -227,11 +227,11 @@ def described(law: Law) -> str:
 @public_result(picture="fitting.inversion.report:inversion_figure", rows="records")
 @dataclass(frozen=True, kw_only=True)
 class Inversion(Result):
-    """The outcome of `invert`.
+    """Speeds and delay of the impact of each row, and the laws regressed on them: what `invert` returns.
 
     Attributes:
         table: what was inverted.
-        rows: point by point.
+        rows: speeds, delay and errors of each row.
         approach_speed_nm_per_us: speeds at which the laws' curves are given, shape (points,).
         laws: the regressions of the loss, by model; empty where rows do not determine one.
         delay: the delay law, or None.
@@ -239,7 +239,7 @@ class Inversion(Result):
         verdict: which law the rows prefer, in words.
         resonance: the paper's own reading of the rows on resonance.
         beside: a law that is known otherwise, if one was given.
-        distance: how far the rows are from it; None without one.
+        distance: how far the rows are from `beside`; None without that.
         valid: whether rows determine what is asked; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.

@@ -226,7 +226,7 @@ FEWEST = 40
 @public_result(picture="fitting.report.pair_plots:bootstrap_figure")
 @dataclass(frozen=True, eq=False)
 class Bootstrap(Result):
-    """Fitted values of synthetic data sets.
+    """Parameters fitted to synthetic data sets of the law that a fit has found; what `bootstrap` returns.
 
     Attributes:
         names: of the parameters.

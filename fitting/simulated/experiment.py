@@ -49,13 +49,13 @@ _TOLERANCE = 1e-6
 
 @public_result()
 class Drives(ResultTuple):
-    """What is driven in an experiment, one entry a row."""
+    """Orders, frequencies, amplitudes and offsets of the drives of an experiment, one entry a row."""
 
     order: Int[np.ndarray, " rows"]
     """N, drive periods per impact."""
     frequency_khz: Float[np.ndarray, " rows"]
     amplitude_nm: Float[np.ndarray, " rows"]
-    """Of the sample; of the free tip (of its deflection, if the base is driven) where that is driven."""
+    """Amplitude of the sample; of the free tip (of its deflection, if the base is driven) where that is driven."""
     offset_nm: Float[np.ndarray, " rows"]
 
 

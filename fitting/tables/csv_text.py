@@ -45,7 +45,7 @@ Masks = dict[str, Bool[np.ndarray, " rows"]]
 
 
 class TableError(ValueError):
-    """A file or table that cannot be used; the message is one line: what, where, how to mend it."""
+    """Raised where a file or table cannot be used; the message is one line: what, where, how to mend it."""
 
 
 @dataclass

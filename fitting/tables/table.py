@@ -546,32 +546,32 @@ class AmplitudeTable(Result):
 
     @property
     def tables(self) -> tuple["AmplitudeTable", ...]:
-        """The table itself: what several fitted together have more of."""
+        """A tuple of this table alone; several tables that are fitted together have more than one."""
         return (self,)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Where it is from."""
+        """A tuple of the path that the table was read from, a name for each of `tables`."""
         return (self.source,)
 
     @property
     def row_names(self) -> Shaped[np.ndarray, " rows"]:
-        """The line of the file that each row stands in."""
+        """Names of the rows: the line of the file that each stands in."""
         return self.lines.astype(str)
 
     @property
     def form(self) -> Form:
-        """The columns that it may have."""
+        """The columns and settings that a table of what is driven here may have."""
         return FORMS[self.drive]
 
     @property
     def tapping(self) -> bool:
-        """Whether the cantilever is driven itself."""
+        """Whether the cantilever is driven, by a force or its base, and not the sample."""
         return self.drive != "sample"
 
     @property
     def excitation_nm(self) -> Float[np.ndarray, " rows"]:
-        """Amplitude of the platform, or of the free tip."""
+        """Amplitude in nm of the sample, or of the free tip where the cantilever is driven."""
         found = self.free_amplitude_nm if self.tapping else self.drive_amplitude_nm
         assert found is not None  # checked when it was made  # noqa: S101
         return found

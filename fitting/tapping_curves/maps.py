@@ -50,16 +50,16 @@ class TappingMap(Result):
     """Energy and virial of a tap in every pixel, NaN where a pixel is out of range or nothing was measured.
 
     Attributes:
-        source: of the image.
+        source: path of the image's file, or where else it is from.
         drive: "force" on the tip, or its "base".
-        unit: "aJ", or "nm^2" where the spring constant is not known: energies over it.
-        energy: of a tap.
-        energy_error: its standard error, the pixel's own.
+        unit: of energies and virials, "aJ", or "nm^2" where the spring constant is not known: energies over it.
+        energy: energy that a tap takes, in `unit`.
+        energy_error: standard errors of the energies from each pixel's own noise.
         virial: mean of force times height, positive where attraction prevails.
-        virial_error: its standard error, the pixel's own.
+        virial_error: standard errors of the virials from each pixel's own noise.
         state: a `PixelState` for each pixel.
-        energy_common_error: standard error that all pixels have in common, at the median energy.
-        virial_common_error: the same for the virial, at the median pixel.
+        energy_common_error: standard error of the energy that all pixels have in common, at the median energy.
+        virial_common_error: standard error of the virial that all pixels have in common, at the median pixel.
         common: parts of `energy_common_error` by what they come from, with their signs.
         size_m: height and width of the image in m, or None.
         known: what was taken for the instrument, with where it comes from.

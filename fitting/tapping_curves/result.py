@@ -125,21 +125,21 @@ class MeasuredSpeeds:
 @public_result(picture="fitting.tapping_curves.pictures:curve_figure")
 @dataclass(frozen=True, kw_only=True)
 class Tapping(Result):
-    """The outcome of `tapping`.
+    """Energy and virial of a tap along the branches of a tapping curve, and the impact law: what `tapping` returns.
 
     Attributes:
         table: what was read.
-        curve: its rows with an amplitude, and what is known of the instrument.
-        rows: point by point.
+        curve: the table's rows with an amplitude, and what is known of the instrument.
+        rows: state, energy and virial of each row of the table.
         groups: the kinds of rows that may share an energy.
         fit: one energy for each group, the instrument free within its errors; None without a phase or rows.
-        functions: the energy as a smooth function along each branch, likewise.
+        functions: the energy as a smooth function along each branch, the instrument free within its errors; or None.
         branches: each with its energy and virial over the amplitude.
         scale_errors: whether errors are multiplied where the rows scatter more.
         followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
-        bound_aj: what a tap takes at most, where only the amplitude was recorded; else None.
-        hysteresis: thresholds on approach and retract.
-        speeds: of the impacts; None where there is no energy.
+        bound_aj: energy that a tap takes at most, where only the amplitude was recorded; else None.
+        hysteresis: changes of the motion that come at different heights on approach and retract.
+        speeds: speeds of the impacts; None where there is no energy.
         law: the fit of the impact law, or None.
         versions: of the packages that computed it.
     """
@@ -201,7 +201,7 @@ class Tapping(Result):
 
     @property
     def drift(self) -> list[str]:
-        """What says that the free tip drifted along rows whose order in time the table does not state, if it did."""
+        """Sentences on drifts of the free tip along rows whose order in time the table does not state; empty: none."""
         return drift_of_free_rows(self.curve, self.rows.free)
 
     @property
@@ -267,7 +267,7 @@ class Tapping(Result):
 
     @property
     def plain_energy(self) -> dict[str, Any]:
-        """Mean and scatter of the energies row by row, of the rows used, the instrument as given, in aJ."""
+        """Mean and scatter in aJ of the energies of single rows, with the instrument as given."""
         chosen = self.rows.used & np.isin(self.group_of_rows, self.chief)
         if not chosen.any():
             return {"mean": None, "standard_deviation": None, "systematic_error": None}
@@ -292,7 +292,7 @@ class Tapping(Result):
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:
-        """Energy at some amplitudes of each branch that has them."""
+        """Energy of a tap at some amplitudes of each branch that has them, in aJ."""
         return [
             {
                 "branch": i,
@@ -366,7 +366,7 @@ class Tapping(Result):
 
     @property
     def laws_of_energies(self) -> list[LawOfEnergies]:
-        """What impact laws make of the energies against speed; none where too few speeds are known."""
+        """Fits of impact laws to the energies against the approach speed; empty where too few speeds are known."""
         rows = self.rows_of_known_speed
         if self.speeds is None or len(rows) < FEWEST_SPEEDS:
             return []

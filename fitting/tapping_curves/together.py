@@ -56,12 +56,12 @@ class CurveScatter(CurveBranch):
 @public_result(picture="fitting.tapping_curves.pictures:together_figure")
 @dataclass(frozen=True, kw_only=True)
 class TappingTogether(Result):
-    """The outcome of `tapping_together`.
+    """Energies of a tap from several curves of one lever: what `tapping_together` returns.
 
     Attributes:
-        curves: each with the common nuisances of all.
-        common: what they have in common; None where fewer than two have an energy.
-        scatter: of each branch.
+        curves: the result of each curve, with the nuisances fitted to all.
+        common: the nuisances that all curves have in common; None where fewer than two have an energy.
+        scatter: how the energies of each branch scatter from curve to curve.
     """
 
     curves: tuple[Tapping, ...]

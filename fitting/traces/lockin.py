@@ -37,12 +37,14 @@ FORMAT_VERSION = 1
 @public_result(picture="fitting.traces.report:lockin_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LockinResult(Result):
-    """The reading of one trace; attributes are named like the keys of its JSON. Errors are standard errors.
+    """Order, amplitudes and phase that `lockin` reads of one trace; attributes are named like the keys of its JSON.
+
+    All errors are standard errors.
 
     Attributes:
         steady: whether it is a steady orbit with one impact in a response period.
-        kind: what it is.
-        verdict: the same in words.
+        kind: what kind of motion the trace shows, a `TraceKind`.
+        verdict: the kind of motion in a sentence.
         order: N, drive periods in a response period; None where nothing repeats.
         impacts_per_period: m; None where it is not known.
         peak_amplitude_nm: largest height above the rest position; None where nothing repeats.
@@ -60,15 +62,15 @@ class LockinResult(Result):
         noise_nm: standard deviation of one sample.
         sampling_error_nm: part of the lock-in amplitude's error that more samples per period would remove.
         scatter: how much response periods differ beyond noise, of the deflection's standard deviation.
-        response_periods: that were evaluated.
+        response_periods: how many response periods were evaluated.
         free_frequency_khz: given, or read off the bending at the top.
         free_frequency_origin: "given" or "trace".
         drive_amplitude_nm: given, or the platform column's; None where not known.
         offset_nm: given, or the platform column's; None where not known.
         warnings: what a reader should know besides.
         trace: what was read.
-        folded: the last whole response periods.
-        search: of the order.
+        folded: the last whole response periods, folded onto one.
+        search: what the search for the order found.
     """
 
     steady: bool
