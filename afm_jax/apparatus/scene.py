@@ -20,7 +20,7 @@ def _for_scene(interaction: Any) -> Any:
 
 
 class Scene(eqx.Module):
-    """A cantilever over a sample, what happens when they meet, and what drives them: all that a simulation is of.
+    """A scene to simulate: a cantilever over a sample, what happens when they meet, and what drives them.
 
     Numbers are traced parameters; which parts there are decides what is compiled.
 

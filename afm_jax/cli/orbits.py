@@ -21,20 +21,20 @@ def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | No
         refuse_other_than_law(scene.scene, scene.name)
     if impacts is None and not resolved:
         with session.working("searching for orbits"):
-            found = single_impact_orbits(scene.scene, order)
-        if not bool(found.complete):
+            of_scene = single_impact_orbits(scene.scene, order)
+        if not bool(of_scene.complete):
             session.note("there are more orbits than could be listed; the slowest are shown")
-        told = OrbitTable(scene.scene, order, found)
+        told = OrbitTable(scene.scene, order, of_scene)
     else:
         impacts = impacts or 1
         with session.working("searching for orbits (the first run compiles for some seconds)"):
             if resolved:
-                found = contact_orbits(scene.scene, order, impacts)
+                of_scene = contact_orbits(scene.scene, order, impacts)
                 resting = "a tip that the liquid bridge holds stays"
             else:
-                found, resting = many_impact_orbits(scene.scene, order, impacts), sticking_orbit(scene.scene)
-        told = ManyOrbitTable(scene.scene, order, impacts, found, resting)
-    return Output.of(told, files={"orbits.png": lambda path: save(found.plot(), path)})
+                of_scene, resting = many_impact_orbits(scene.scene, order, impacts), sticking_orbit(scene.scene)
+        told = ManyOrbitTable(scene.scene, order, impacts, of_scene, resting)
+    return Output.of(told, files={"orbits.png": lambda path: save(told.plot(), path)})
 
 
 def refuse_other_than_law(scene: Scene, path: str) -> None:

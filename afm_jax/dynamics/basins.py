@@ -214,9 +214,9 @@ def basins_of_attraction(
     if scene.platform.frequency_khz.ndim or columns < 2 or rows < 2:
         raise ValueError("basins are those of one scene, on a grid of 2 x 2 starts or more")
     if speeds_nm_per_us is None:
-        one = jax.tree.map(lambda leaf: leaf[None], scene)
-        usual = leaving_tips(one)
-        speeds_nm_per_us = (0.0, 4.0 * float((usual.velocity_nm_per_us - _velocity(one.platform, usual.time_us))[0]))
+        batch = jax.tree.map(lambda leaf: leaf[None], scene)
+        usual = leaving_tips(batch)
+        speeds_nm_per_us = (0.0, 4.0 * float((usual.velocity_nm_per_us - _velocity(batch.platform, usual.time_us))[0]))
     low, high = speeds_nm_per_us
     if not 0.0 <= low < high:
         raise ValueError(f"`speeds_nm_per_us` must rise from 0 or more, but is {speeds_nm_per_us}")
@@ -363,8 +363,8 @@ class _Finder:
                 some = jax.tree.map(lambda part, chosen=chosen: part[chosen], tips)
                 exponents = exponents_of_law(self.scenes(len(chosen)), some, impacts=1000, transient=_LONG)
                 larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
-                known = np.isfinite(larger)
-                if known.any() and np.median(larger[known]) > CHAOTIC_ERRORS * np.median(error[known]):
+                finite = np.isfinite(larger)
+                if finite.any() and np.median(larger[finite]) > CHAOTIC_ERRORS * np.median(error[finite]):
                     self.attractors[number] = attractor._replace(name="chaotic")
 
     def _find_radii(self, numbers: list[int]) -> None:

@@ -365,14 +365,14 @@ class _Sweeper:
 
 @compiled_quickly()
 def _hurried_law(firsts: Scene, fresh: Tips) -> Tips:
-    def one(state, place: tuple[Scene, Tips]):
+    def carry_on(state, place: tuple[Scene, Tips]):
         scene, _ = place
         tips = carried(state[0], *place, state[1])
         return (scene, skipped(scene, tips, impacts=_HURRIED)), tips
 
     each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], (firsts, fresh))
     first = jax.tree.map(lambda leaf: leaf[0], each)
-    return jax.tree.map(lambda part: part[:, 0], jax.lax.scan(one, first, each)[1])
+    return jax.tree.map(lambda part: part[:, 0], jax.lax.scan(carry_on, first, each)[1])
 
 
 @jax.jit
@@ -407,7 +407,7 @@ def _same(one: _SweptRows, other: _SweptRows) -> Bool[np.ndarray, " lanes"]:
     same = (a.kind == b.kind) & (a.impacts == b.impacts) & (a.periods == b.periods)
     for lane in np.flatnonzero(same & (a.kind == MotionKind.ORBIT)):
         m = a.impacts[lane]
-        points = [np.sort(part.record.approach_nm_per_us[lane, -m:]) for part in (one, other)]
+        points = [np.sort(swept.record.approach_nm_per_us[lane, -m:]) for swept in (one, other)]
         same[lane] = np.max(np.abs(points[0] - points[1])) <= _SAME * max(np.max(points[1]), 1e-12)
     return same
 

@@ -155,8 +155,8 @@ def highest_orbits(
         nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(names) + 1), jnp.nan),)
         there = frame.periodic & impact_law_of(scenes).leaves
         few = max(count // _ORBITS_AT_ONCE, 1)
-        found = roots.found.ravel() & jnp.repeat(there, slots)
-        columns = again_for(jax.vmap(orbit_of), found, (places, rows), nothing, block=few)
+        is_orbit = roots.found.ravel() & jnp.repeat(there, slots)
+        columns = again_for(jax.vmap(orbit_of), is_orbit, (places, rows), nothing, block=few)
         admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in columns)
         highest = jnp.argmax(jnp.where(steady, numbers[..., 0], -jnp.inf), axis=1)
         chosen = jnp.take_along_axis(numbers, highest[:, None, None], axis=1)[:, 0]

@@ -342,7 +342,7 @@ class _Return(NamedTuple):
 
 @compiled_quickly(static_argnames=("accuracy",))
 def _returns(seen: SampleDriven, phase: Array, rebound: Array, turns: Array, *, accuracy: float) -> _Return:
-    def one(seen: SampleDriven, phase: Array, rebound: Array, turn: Array) -> _Return:
+    def return_of(seen: SampleDriven, phase: Array, rebound: Array, turn: Array) -> _Return:
         scene = seen.scenes
         omega, until = scene.platform.angular_frequency, phase + (1.0 + _LONGEST_CONTACT) * turn
 
@@ -357,7 +357,7 @@ def _returns(seen: SampleDriven, phase: Array, rebound: Array, turns: Array, *, 
         determinant = slopes[0, 0] * slopes[1, 1] - slopes[0, 1] * slopes[1, 0]
         return _Return(gaps, slopes - jnp.eye(2), slopes[0, 0] + slopes[1, 1], determinant, peak)
 
-    return jax.vmap(one)(seen, phase, rebound, turns)
+    return jax.vmap(return_of)(seen, phase, rebound, turns)
 
 
 def _peak_of_flight(seen: SampleDriven, begin_us: Array, rebound: Array, arrival_us: Array) -> Array:
@@ -424,11 +424,11 @@ class FlownLoop(NamedTuple):
     @property
     def trace_and_determinant(self) -> tuple[float, float]:
         """T and D of the linearised map."""
-        whole = np.eye(2)
-        for one in self.maps:
-            whole = one @ whole
+        product = np.eye(2)
+        for slopes in self.maps:
+            product = slopes @ product
         # the determinant of the product cancels
-        return float(np.trace(whole)), float(np.prod(np.linalg.det(self.maps)))
+        return float(np.trace(product)), float(np.prod(np.linalg.det(self.maps)))
 
 
 def _closing_slopes(slopes: Float[np.ndarray, "m 2 unknowns"]) -> Float[np.ndarray, "n all"]:
@@ -460,7 +460,7 @@ class ContactFlights:
         self.order, self._driven = order, driven_part(scene)
         self.scene_at = scene_family(scene, *paths) if paths else lambda: scene
 
-        def one(phase: Array, rebound: Array, until: Array, values: Array) -> tuple[Array, Contacts, Array]:
+        def next_departure(phase: Array, rebound: Array, until: Array, values: Array) -> tuple[Array, Contacts, Array]:
             def departs(unknowns: Array) -> tuple[Array, Contacts]:
                 there = self.scene_at(*unknowns[2:])
                 omega = RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz
@@ -469,7 +469,7 @@ class ContactFlights:
             (following, contact), slopes = _with_slopes(departs, jnp.concatenate([jnp.stack([phase, rebound]), values]))
             return following, contact, slopes
 
-        self._fly = jax.jit(jax.vmap(one))
+        self._fly = jax.jit(jax.vmap(next_departure))
 
     def flown(
         self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
@@ -504,7 +504,7 @@ class ContactFlights:
         self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
     ) -> list[LoopReading | None]:
         """Return what there is to know of closed loops, NumPy arrays; arguments as for `flown`."""
-        return [None if one is None else self._reading(one) for one in self.flown(loops, values)]
+        return [None if loop is None else self._reading(loop) for loop in self.flown(loops, values)]
 
     def _reading(self, flown: FlownLoop) -> LoopReading:
         there, time, rebound = self._departures(flown)
@@ -553,14 +553,14 @@ class ContactFlights:
         size = len(point)
         around = [np.eye(size), -np.eye(size)] if family.test is not None else []
         aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
-        flown = [one for one in self.flown(*family.loops_and_values(point + aside)) if one is not None]
+        flown = [loop for loop in self.flown(*family.loops_and_values(point + aside)) if loop is not None]
         if len(flown) < len(aside):
             return None
         here = flown[0]
         units = family.units(len(here.loop) // 2)
         value, slopes = here.gaps / units, here.slopes * np.concatenate([units, family.width]) / units[:, None]
         if family.test is not None:
-            tests = np.array([self.tests(one, family, grazing=family.test == _GRAZING)[family.test] for one in flown])
+            tests = np.array([self.tests(loop, family, grazing=family.test == _GRAZING)[family.test] for loop in flown])
             value = np.append(value, tests[0])
             slopes = np.vstack([slopes, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
         return EquationsAt(value, slopes, here)

@@ -351,12 +351,12 @@ def _measured(scenes: Scene, tips: Tips, *, each: int) -> tuple[Tips, _Sums]:
         )
         return end, vector, jax.tree.map(jnp.add, sums, more)
 
-    def part(state, _):
+    def part_of_run(state, _):
         tips, vector, sums = lax.fori_loop(0, each, impact, (*state, begin))
         return (tips, vector), sums
 
     one = jnp.ones_like(none)
-    (tips, _), sums = lax.scan(part, (tips, (0.8 * one, 0.6 * one)), length=_PARTS + 1)
+    (tips, _), sums = lax.scan(part_of_run, (tips, (0.8 * one, 0.6 * one)), length=_PARTS + 1)
     return tips, jax.tree.map(lambda rows: rows[1:], sums)
 
 
@@ -364,12 +364,12 @@ def _measured(scenes: Scene, tips: Tips, *, each: int) -> tuple[Tips, _Sums]:
 def _recorded(scenes: Scene, tips: Tips) -> tuple[Tips, tuple[Record, Array, Array]]:
     """Return tips later, their impacts, Jacobians and determinants, with the axis of impacts first."""
 
-    def one(now: Tips, _: Any):
+    def next_impacts(now: Tips, _: Any):
         step = advance(scenes, now)
         jacobian, determinant, _ = _jacobian(scenes, step)
         return step.end, (record_of(scenes, step), jnp.stack(jacobian), determinant)
 
-    return lax.scan(one, tips, length=RECORDED)
+    return lax.scan(next_impacts, tips, length=RECORDED)
 
 
 def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
@@ -382,7 +382,7 @@ def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, 
     arrival = jnp.where(landed, impact.arrival_time_us, start.time_us + scenes.platform.period_us)
     before = jnp.where(landed, impact.velocity_before_nm_per_us, scenes.platform.velocity(arrival) - 1.0)
 
-    def one(scene: Scene, time: Array, velocity: Array, arrival: Array, before: Array):
+    def jacobian_of(scene: Scene, time: Array, velocity: Array, arrival: Array, before: Array):
         cantilever, platform = scene.cantilever, scene.platform
         law = impact_law_of(scene)
         flight = flight_jacobian(cantilever, platform, time, velocity, arrival)
@@ -395,7 +395,7 @@ def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, 
         unit = platform.angular_frequency * platform.top_speed_nm_per_us
         return (a * e + b * g, (a * f + b * h) * unit, (c * e + d * g) / unit, c * f + d * h), determinant
 
-    jacobian, determinant = jax.vmap(one)(scenes, start.time_us, start.velocity_nm_per_us, arrival, before)
+    jacobian, determinant = jax.vmap(jacobian_of)(scenes, start.time_us, start.velocity_nm_per_us, arrival, before)
     return jacobian, determinant, landed
 
 

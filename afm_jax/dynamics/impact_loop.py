@@ -147,13 +147,13 @@ def trace_and_determinant_of(
         return p.position_per_position + p.velocity_per_velocity, jnp.exp(-2.0 * cantilever.decay_rate * loop.period_us)
     impacts = impacts_at(unknowns, loop)
 
-    def one(leaving, velocity, duration, before):
+    def step_of_map(leaving, velocity, duration, before):
         arrival = leaving + duration
         contact = contact_jacobian(loop.impact, cantilever, surface, arrival, before)
         return contact @ flight_jacobian(cantilever, surface, leaving, velocity, arrival)
 
     before = surface.velocity(impacts.arrival_us) - impacts.speeds.approach
-    parts = jax.vmap(one)(impacts.leaving_us, impacts.velocity, impacts.duration_us, jnp.roll(before, -1))
+    parts = jax.vmap(step_of_map)(impacts.leaving_us, impacts.velocity, impacts.duration_us, jnp.roll(before, -1))
     whole = reduce(lambda product, part: part @ product, list(parts))
     # the determinant as a product of those of the parts: that of the whole cancels
     each = parts[:, 0, 0] * parts[:, 1, 1] - parts[:, 0, 1] * parts[:, 1, 0]
@@ -243,13 +243,15 @@ def flies(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Bool[Array, ""]:
     impacts = impacts_at(unknowns, loop)
     drive_us = 2.0 * jnp.pi / loop.angular_frequency
 
-    def one(leaving, velocity, duration, rebound, delay):
+    def flies_freely(leaving, velocity, duration, rebound, delay):
         flight = Flight(loop.cantilever, loop.surface, leaving, velocity)
         skip = jnp.maximum(-delay, 0.0) if loop.impact.delayed else None
         return (rebound > 0.0) & ends_at_its_own_impact(flight, duration, skip, drive_us)
 
     speeds = impacts.speeds
-    free = jax.vmap(one)(impacts.leaving_us, impacts.velocity, impacts.duration_us, speeds.rebound, speeds.delay)
+    free = jax.vmap(flies_freely)(
+        impacts.leaving_us, impacts.velocity, impacts.duration_us, speeds.rebound, speeds.delay
+    )
     return jnp.all(free) & jnp.all(speeds.approach > 0.0)
 
 

@@ -219,7 +219,7 @@ def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[A
     surface = loop.surface
     tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US)
 
-    def one(start):
+    def walk(start):
         time = start[0] * 2.0 * jnp.pi / loop.angular_frequency
         velocity = surface.velocity(time) + surface.top_speed_nm_per_us * 0.03 * (_FASTEST / 0.03) ** start[1]
         rows = follow_impacts(seen, Departure(time, None, velocity), tolerance, impacts=length, max_steps=_STEPS)
@@ -228,7 +228,7 @@ def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[A
         approach = surface.velocity(arrival) - rows.velocity_before_nm_per_us
         return jnp.where(hit, arrival * loop.angular_frequency, jnp.nan), jnp.where(hit, approach, jnp.nan)
 
-    return jax.vmap(one)(starts)
+    return jax.vmap(walk)(starts)
 
 
 def _closed_loop(guess: Float[Array, " n"], loop: ImpactLoop) -> Float[Array, " n"]:

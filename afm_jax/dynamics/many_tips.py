@@ -134,12 +134,12 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
 
     flights = jax.vmap(_flight_of)(scenes, tips)
     if len(tips.time_us) <= _FEW:
-        found = ends(MAX_STEPS)(scenes, flights)
+        ends_of_flights = ends(MAX_STEPS)(scenes, flights)
     else:
-        found = ends(_QUICK_STEPS)(scenes, flights)
-        slow = found.outcome == Outcome.STEP_LIMIT
-        found = again_for(ends(MAX_STEPS), slow, (scenes, flights), found, block=_FEW)
-    return after_impacts(scenes, tips, jax.vmap(impact_at_end)(scenes, flights, found))
+        ends_of_flights = ends(_QUICK_STEPS)(scenes, flights)
+        slow = ends_of_flights.outcome == Outcome.STEP_LIMIT
+        ends_of_flights = again_for(ends(MAX_STEPS), slow, (scenes, flights), ends_of_flights, block=_FEW)
+    return after_impacts(scenes, tips, jax.vmap(impact_at_end)(scenes, flights, ends_of_flights))
 
 
 def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
@@ -332,14 +332,14 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
 
 @eqx.filter_jit
 def _followed(scenes: Scene, tips: Tips, duration_us: Float[Any, " lanes"], *, accuracy: float) -> Simulation:
-    def one(scene: Scene, tip: Tips, duration: Array) -> Simulation:
+    def followed(scene: Scene, tip: Tips, duration: Array) -> Simulation:
         position = scene.platform.position(tip.time_us) + tip.gap_nm
         # one whose motion has ended flies for next to no time
         duration = jnp.where(tip.outcome == Outcome.IMPACT, duration, 1e-9)
         start = State(tip.time_us, position, tip.velocity_nm_per_us)
         return simulate(scene, start, duration, max_contacts=_ROWS, accuracy=accuracy)
 
-    return jax.vmap(one)(scenes, tips, duration_us)
+    return jax.vmap(followed)(scenes, tips, duration_us)
 
 
 def next_contact(
@@ -371,7 +371,7 @@ def departure_jacobians(
         accuracy: of `simulate`.
     """
 
-    def one(scene: Scene, time: Array, velocity: Array, later: Array) -> Array:
+    def jacobian(scene: Scene, time: Array, velocity: Array, later: Array) -> Array:
         until = later + _BEYOND / scene.cantilever.frequency_khz * 1e3
 
         def next_departure(state: Array) -> Array:
@@ -380,7 +380,7 @@ def departure_jacobians(
 
         return jax.jacfwd(next_departure)(jnp.stack([time, velocity]))
 
-    return jax.vmap(one)(scenes, departure_us, velocity_nm_per_us, next_departure_us)
+    return jax.vmap(jacobian)(scenes, departure_us, velocity_nm_per_us, next_departure_us)
 
 
 def _slower_period_us(scenes: Scene) -> Float[np.ndarray, " lanes"]:

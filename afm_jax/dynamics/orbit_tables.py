@@ -42,9 +42,9 @@ _IMPACT_CELLS: dict[str, Cell] = {
 }
 
 
-def _picture_of_found(self: "OrbitTable | ManyOrbitTable", path: str | Path | None = None) -> "Figure":
+def _picture_of_orbits(self: "OrbitTable | ManyOrbitTable", path: str | Path | None = None) -> "Figure":
     """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
-    return self.found.plot(path)
+    return self.orbits.plot(path)
 
 
 class OrbitTable(NamedTuple):
@@ -52,21 +52,21 @@ class OrbitTable(NamedTuple):
 
     scene: Scene
     order: int
-    found: SingleImpactOrbits
+    orbits: SingleImpactOrbits
 
-    text, plot = Result.text, _picture_of_found
+    text, plot = Result.text, _picture_of_orbits
 
     @property
     def columns(self) -> tuple[str, ...]:
         """What is told of an orbit: attributes that orbits of such a scene have."""
-        there = (name for name in (*_OF_A_DRIVEN_TIP, "extrapolated") if getattr(self.found, name) is not None)
+        there = (name for name in (*_OF_A_DRIVEN_TIP, "extrapolated") if getattr(self.orbits, name) is not None)
         return (*IMPACT_COLUMNS, *_OF_AN_ORBIT, *there)
 
     @property
     def rows(self) -> list[dict[str, Any]]:
         """The orbits that exist as plain numbers, by rising approach speed."""
-        columns = {name: getattr(self.found, name).tolist() for name in self.columns}
-        slots = [slot for slot, exists in enumerate(self.found.exists.tolist()) if exists]
+        columns = {name: getattr(self.orbits, name).tolist() for name in self.columns}
+        slots = [slot for slot, exists in enumerate(self.orbits.exists.tolist()) if exists]
         return [{name: values[slot] for name, values in columns.items()} for slot in slots]
 
     @property
@@ -84,7 +84,7 @@ class OrbitTable(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
-        return {"order": self.order, "orbits": self.rows, "complete": self.found.complete}
+        return {"order": self.order, "orbits": self.rows, "complete": self.orbits.complete}
 
     def printed(self) -> list[str | Table]:
         """Return the orbits as a table; where base or force drive with what is read at the drive's frequency."""
@@ -115,22 +115,22 @@ class ManyOrbitTable(NamedTuple):
     scene: Scene
     order: int
     impacts: int
-    found: ManyImpactOrbits
+    orbits: ManyImpactOrbits
     resting: StickingOrbit | str
     """The orbit with a rest, or a sentence on why there is none."""
 
-    text, plot = Result.text, _picture_of_found
+    text, plot = Result.text, _picture_of_orbits
 
     @property
     def rows(self) -> list[dict[str, Any]]:
         """The orbits as plain numbers, each with all its impacts."""
-        return [orbit_facts(self.found.reading, index) for index in range(len(self.found.stable))]
+        return [orbit_facts(self.orbits.reading, index) for index in range(len(self.orbits.stable))]
 
     @property
     def reason(self) -> str | None:
         """Why there is no orbit of this order, with a rest or without; None where there is one."""
         rests = isinstance(self.resting, StickingOrbit) and self.resting.order == self.order
-        if len(self.found.stable) or rests:
+        if len(self.orbits.stable) or rests:
             return None
         return why_none(self.scene, self.order, rejected=0, impacts=self.impacts)
 

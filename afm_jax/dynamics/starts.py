@@ -178,7 +178,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
 def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Bool[Array, " lanes"], Tips]:
     """Return which scenes with laws have a stable orbit, and tips on them, about as high above the platform as told."""
 
-    def one(scene: Scene, clearance: Array) -> tuple[Array, ...]:
+    def on_orbit_of(scene: Scene, clearance: Array) -> tuple[Array, ...]:
         platform = scene.platform
         order = jnp.round(platform.angular_frequency / (2.0 * scene.cantilever.angular_frequency))
         law = impact_law_of(scene)
@@ -190,7 +190,7 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
         risen = (clearance == 0.0) | (gap > _RISEN * clearance)
         return steady & risen & law.leaves, (start + rise) % platform.period_us, gap, speed
 
-    there, time, gap, velocity = jax.vmap(one)(scenes, clearance_nm)
+    there, time, gap, velocity = jax.vmap(on_orbit_of)(scenes, clearance_nm)
     return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
 
 

@@ -163,7 +163,7 @@ def follow_sticking(
     branches, special = [], []
     for number, (points, ends) in enumerate(stretches):
         places = given.low + width * np.array([fraction for fraction, _ in points])
-        readings = _readings([one for _, one in points], [family(value) for value in places])
+        readings = _readings([orbit for _, orbit in points], [family(value) for value in places])
         branches.append(OrbitBranch(places, np.zeros((len(points), 0)), readings, ends))
         for place, kind in ((0, ends[0]), (len(points) - 1, ends[1])):
             if kind != "range":
@@ -184,7 +184,7 @@ def follow_sticking(
 
 
 _At = Callable[[float], StickingOrbit | None]
-_Found = tuple[float, StickingOrbit]
+_OrbitThere = tuple[float, StickingOrbit]
 
 
 def _rests(orbit: StickingOrbit | None) -> int:
@@ -213,9 +213,9 @@ def _ended(
     orbits: list[StickingOrbit | None],
     stretch: range,
     short_us: float,
-) -> tuple[list[_Found], tuple[str, str]]:
+) -> tuple[list[_OrbitThere], tuple[str, str]]:
     """Return the points of a stretch with its narrowed ends, and why it ends there."""
-    points = [(fractions[k], one) for k in stretch if (one := orbits[k]) is not None]
+    points = [(fractions[k], orbit) for k in stretch if (orbit := orbits[k]) is not None]
     ends = []
     for last, beyond in ((0, stretch[0] - 1), (-1, stretch[-1] + 1)):
         if not 0 <= beyond < len(fractions):
@@ -233,7 +233,7 @@ def _ended(
     return points, (ends[0], ends[1])
 
 
-def _narrowed(at: _At, inside: _Found, outside: float) -> _Found:
+def _narrowed(at: _At, inside: _OrbitThere, outside: float) -> _OrbitThere:
     """Return the last point on the inner side of an end of the orbit."""
     while abs(outside - inside[0]) > _NARROWED:
         middle = 0.5 * (inside[0] + outside)

@@ -314,8 +314,8 @@ def _top_of_swing(dense: DensePath, from_us: float, to_us: float, period_us: flo
 def _reading_of(seen: Observables, *, deflection: bool) -> HeightReading:
     """Return what is kept of the observables of a motion: of the deflection or of the height."""
     verdict = seen.settled
-    known: dict[tuple[int | None, int | None], CurveOutcome] = {(1, 1): CurveOutcome.TAPS, (0, 1): CurveOutcome.FREE}
-    repeats = known.get((verdict.contacts, verdict.periods), CurveOutcome.OTHER_ORBIT)
+    outcomes: dict[tuple[int | None, int | None], CurveOutcome] = {(1, 1): CurveOutcome.TAPS, (0, 1): CurveOutcome.FREE}
+    repeats = outcomes.get((verdict.contacts, verdict.periods), CurveOutcome.OTHER_ORBIT)
     amplitude = seen.deflection_drive_lockin_amplitude_nm if deflection else seen.drive_lockin_amplitude_nm
     assert amplitude is not None and seen.phase_lag_deg is not None  # the cantilever is driven  # noqa: S101, PT018
     return HeightReading(

@@ -207,14 +207,14 @@ def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array
     away = Departure(*take_off(bed, release.time_us, until))
     leaving = jnp.where(arrived, impact.time_us, until)
     next_flight = Departure(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))
-    left = jnp.where(rests, release.happens, leaving < until)
+    leaves = jnp.where(rests, release.happens, leaving < until)
     kind = jnp.where(chatters, float(ContactKind.CHATTER), float(ContactKind.IMPACT))
     row = LawRow(
-        kind=jnp.where(left, kind, float(ContactKind.HELD)),
+        kind=jnp.where(leaves, kind, float(ContactKind.HELD)),
         arrival_us=arrival,
         approach=approach,
-        departure_us=jnp.where(left, jnp.where(rests, release.time_us, leaving), jnp.inf),
-        rebound=jnp.where(left & ~rests, rebound, 0.0),
+        departure_us=jnp.where(leaves, jnp.where(rests, release.time_us, leaving), jnp.inf),
+        rebound=jnp.where(leaves & ~rests, rebound, 0.0),
     )
     return row, jax.tree.map(lambda new, old: jnp.where(rests, new, old), away, next_flight), arrived & release.lost
 

@@ -128,8 +128,8 @@ class DensePath(NamedTuple):
         rate = np.where(straight, piece.rate, rate)
         if touching.any():
             inside = Pieces(*(_filled_up(column[touching]) for column in piece))
-            found = _in_contact(prepared, inside, _filled_up(times[touching]))
-            gap[touching], rate[touching] = (part[: int(touching.sum())] for part in found)
+            in_contact = _in_contact(prepared, inside, _filled_up(times[touching]))
+            gap[touching], rate[touching] = (part[: int(touching.sum())] for part in in_contact)
         phase = np.select([piece.kind == kind for kind in _PHASES], list(_PHASES.values()), piece.kind)
         lab = to_lab(prepared.surface, prepared.response, times, gap, rate)
         force = np.zeros(times.shape)
@@ -348,8 +348,8 @@ def _some_trials(
         after = advance(driven, tip, until, _FINENESS)
         place, begin = tip.state, tip.state.time_us
         step = (begin, after.state.time_us, tip.phase, begin, place.x, place.gap_rate)
-        kept = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, tip)
-        return kept, (step, going & (after.trial_length == 0.0))
+        moved = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, tip)
+        return moved, (step, going & (after.trial_length == 0.0))
 
     return lax.scan(once, tip, None, length=_BLOCK)
 
