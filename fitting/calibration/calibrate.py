@@ -10,13 +10,12 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.least_squares import chi2_tail
+from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from afm_jax.version import version_of
 from fitting.calibration.model import TERMS, SweepFit, fit_sweep, kind_of, model_at, refit, sum_without_resonance
 from fitting.calibration.result import Alternative, CalibratedValue, Calibration, Curves
 from fitting.calibration.sweep import ResonanceSweep, read_sweep
 from fitting.calibration.verdict import (
-    IMPROBABLE,
     SweepEvidence,
     autocorrelation,
     inflation_of,

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.least_squares import IMPROBABLE
 from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.words import counted
 from fitting.calibration.model import SweepFit
 from fitting.calibration.result import Alternative, CalibratedValue
 from fitting.calibration.sweep import ResonanceSweep
 
-IMPROBABLE = 1e-3
-"""Probability of the chi2 below which the model does not explain the sweep."""
 _PEAK = 30.0
 """Fall of chi2 per unit of chi2/dof that four more parameters practically never bring about by chance."""
 _CLEARLY = 10.0

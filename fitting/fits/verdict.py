@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import IMPROBABLE, chi2_tail
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN, chi2_tail
 from afm_jax.outcomes import Rule, Rules, judge
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
@@ -35,9 +35,6 @@ by chance in one fit of three thousand."""
 _RUN, _LONGEST_RUN = 3.0, 3.5
 """Standard deviations by which residuals run together over the speed from which that is said, and what is left of that
 beside a wider model discrepancy from which the model does not explain the table."""
-LARGEST_SCALE = 3.0
-"""Scale of the errors that is believed: a spread given for that of a mean, a 3 sigma limit for 1 sigma. Errors that
-would have to be larger are wrong by more than a scale, and have to be stated nearer to the truth."""
 _CORRELATED = 4.0
 """Correlation of neighbouring residuals, in standard deviations of those of independent ones, from which they are
 taken to be correlated: by chance in one fit of ten thousand."""
@@ -56,8 +53,6 @@ _NO_TAPS = (
     "is known of it (--fix tip_radius_nm=20, for example), or leave out rows that are not one impact a period."
 )
 _AT_BOUND = 0.005
-_PULLED, _TORN = 2.0, 3.0
-"""Distance from what is known of a quantity, in its standard errors, from which it is named, and not believed."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +232,7 @@ def _contradicted(evidence: Evidence) -> list[str]:
 
 def _torn(evidence: Evidence) -> list[str]:
     """Return what the amplitudes contradict of what was measured otherwise, in words."""
-    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.pulled.items() if abs(pull) > _TORN]
+    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.pulled.items() if abs(pull) > TORN]
     return ["; ".join(torn)] if torn else []
 
 
@@ -632,7 +627,7 @@ WARNINGS: Rules[Evidence] = (
     Rule(lambda e: _disagreeing(e) if e.scattering else [], "Far from the mean law even for this scatter: {case}."),
     Rule(_may_be_anything, "Not determined by these taps: {case}."),
     Rule(
-        lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if _PULLED < abs(by) <= _TORN],
+        lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if PULLED < abs(by) <= TORN],
         "{case}: check it, the loss depends on it.",
     ),
     Rule(_limits, "{case}."),

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
 
-from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, descended
+from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, descended
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, lag_of_free_tip
 from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of, virial_noise_of
@@ -28,8 +28,6 @@ _MOST_OUTLIERS = 0.2
 _HARMONICS_THAT_TELL = 4
 """With as many measured, what is left of the others does not matter."""
 Z95 = 1.959964
-TORN = 3.0
-"""Distance of a nuisance from what is given, in its standard errors, from which neither is believed."""
 _DRIFT_DEG, _DRIFT = 3.0, 0.02
 """Usual drift of phase and of free amplitude over a table, where free rows do not determine it."""
 _WIDE_DRIFT_DEG, _WIDE_DRIFT = 30.0, 0.3

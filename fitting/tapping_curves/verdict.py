@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from afm_jax.least_squares import IMPROBABLE
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED
 from afm_jax.outcomes import Rule, Rules
 from fitting.tapping_curves.branches import free_ends
 from fitting.tapping_curves.curve import USUAL_ERRORS, TappingCurve
@@ -18,11 +18,9 @@ from fitting.tapping_curves.energy_fit import EnergyFit, Nuisance
 
 BRACKET = 0.5
 """Relative standard error from which a number is only a bracket."""
-_LARGEST_SCALE, _MOST_SCALE = 2.0, 3.0
-"""Scatter of rows in contact, of their errors, that is believed without being asked for (measured curves have up to 1.8
-times that of the free tip), and where it is asked for (`scale_errors`)."""
-_PULLED = 2.0
-"""Distance of a nuisance from what is given, in its errors, from which it is named."""
+_LARGEST_UNASKED_SCALE = 2.0
+"""Scatter of rows in contact, of their errors, that is believed without `scale_errors`: measured curves have up to 1.8
+times that of the free tip."""
 _DRIFTING = 5.0
 """Errors of a drift of the free rows from which it is one."""
 _FOLLOWING = 3.0
@@ -74,7 +72,7 @@ NO_CONSTANT: tuple[Rule[Any], ...] = (
         "of freedom, probability {e.fit.p_value:.1g})",
     ),
     Rule(
-        lambda e: e.fit.scale > _MOST_SCALE,
+        lambda e: e.fit.scale > LARGEST_SCALE,
         "one energy a branch describes the rows only with errors {e.fit.scale:.1f} times as large",
     ),
     Rule(lambda e: _torn(e.fit), "for one energy a branch {case}"),
@@ -130,7 +128,7 @@ NO_FUNCTIONS: tuple[Rule[Any], ...] = (
     ),
     Rule(lambda e: _torn(e.functions), "the energy along the branches has no instrument as given: {case}"),
     Rule(
-        lambda e: e.functions.scale > (_MOST_SCALE if e.scale_errors else _LARGEST_SCALE),
+        lambda e: e.functions.scale > (LARGEST_SCALE if e.scale_errors else _LARGEST_UNASKED_SCALE),
         "the rows scatter {e.functions.scale:.1f} times as much about a smooth energy as their errors say",
     ),
     Rule(lambda e: e.drift, "{case}"),
@@ -198,7 +196,7 @@ WARNINGS: Rules[Any] = [
         "that",
     ),
     Rule(
-        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > _PULLED] if _given(e) and e.described else [],
+        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > PULLED] if _given(e) and e.described else [],
         lambda _, n: (
             f"{ORIGINS[n.kind]} ends {n.pull:+.1f} standard errors from what was given ({n.given} to {n.value:.6g})"
         ),
