@@ -20,8 +20,8 @@ from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
 from fitting.fits.result import NO_MASS, FittedParameter, FittedRows
-from fitting.models import ASSUMED_ERROR_OF_Q, Held
-from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, is_nuisance, name_of_table, parameter_called
+from fitting.models import Held
+from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import ERRORS_OF_REPEATS, AmplitudeTable
 
@@ -336,12 +336,13 @@ def _damping_warnings(evidence: Evidence) -> list[str]:
 def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:
     """Return what there is to say of a table's quality factor, which was fitted along or not; "" for nothing."""
     if along is not None:
-        assumed = (table.quality_factor or 0.0, ASSUMED_ERROR_OF_Q * (table.quality_factor or 0.0))
+        usual = USUAL_ERRORS["quality_factor"]
+        assumed = (table.quality_factor or 0.0, usual * (table.quality_factor or 0.0))
         if table.quality_factor_error is not None or along.constraint != assumed:
             return ""
         given, error = assumed
         return (
-            f"quality_factor = {given:g} is given without an error: {100.0 * ASSUMED_ERROR_OF_Q:g} % was assumed "
+            f"quality_factor = {given:g} is given without an error: {100.0 * usual:g} % was assumed "
             f"({given:g} +- {error:.3g}). The loss depends on it: state it, like `# quality_factor = {given:g} +- 1`."
         )
     if table.quality_factor is None or table.quality_factor_error is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from fitting.instruments.lag import free_lag_deg
+from fitting.parameters import USUAL_ERRORS
 
 Rows = Float[np.ndarray, " rows"]
 Phasors = Complex[np.ndarray, " rows"]
@@ -31,13 +32,6 @@ class Given(NamedTuple):
 
 
 EXACTLY_ONE = Given(1.0)
-USUAL_ERRORS = {
-    "free_frequency_khz": 2e-4,
-    "quality_factor": 0.05,
-    "spring_constant_n_per_m": 0.05,
-    "tip_calibration": 0.01,
-}
-"""Relative standard errors of what is given without one."""
 
 
 def given_or_usual(name: str, value: float, error: float | None) -> Given:
@@ -112,6 +106,15 @@ class TappingCurve:
     def has_phase(self) -> bool:
         """Whether any row has a phase."""
         return bool(np.isfinite(self.lag_deg).any())
+
+    @property
+    def relative_errors(self) -> dict[str, float]:
+        """Relative standard errors of every energy and virial, which go with k and the square of lengths, by name."""
+        calibration, spring = self.tip_calibration, self.spring_constant_n_per_m
+        return {
+            "tip_calibration": 2.0 * calibration.error / calibration.value,
+            "spring_constant_n_per_m": spring.error / spring.value,
+        }
 
     def part(self, chosen: Bool[np.ndarray, " rows"]) -> "TappingCurve":
         """Return the rows chosen, as a curve."""

@@ -763,10 +763,7 @@ class _EnergySearch:
             rows_chi2=rows_chi2,
             rows_freedom=float(used.sum() - taken),
             scale=scale,
-            relative_error={
-                "spring_constant_n_per_m": curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
-                "tip_calibration": 2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
-            },
+            relative_error=curve.relative_errors,
             search=self,
             at=x,
         )

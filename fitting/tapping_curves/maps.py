@@ -23,8 +23,9 @@ from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of
 from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
+from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
-from fitting.tapping_curves.curve import HARMONICS_FACTOR, USUAL_ERRORS, Given, Instrument, TappingCurve
+from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies
 
 _BEYOND = 3.0

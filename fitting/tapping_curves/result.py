@@ -11,9 +11,10 @@ from afm_jax.outcomes import judge
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import effective_mass_ng
+from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
-from fitting.tapping_curves.curve import USUAL_ERRORS, Rows, TappingCurve
+from fitting.tapping_curves.curve import Rows, TappingCurve
 from fitting.tapping_curves.energy_by_speed import FEWEST_SPEEDS, LawOfEnergies, laws_of_energies
 from fitting.tapping_curves.energy_curve import HEADLINE, TappingBranch, WayDifference, differences_of_ways
 from fitting.tapping_curves.energy_fit import Z95, EnergyFit, Nuisance

@@ -374,13 +374,9 @@ def _errors(
         moved["free_amplitude_drift"] = given._replace(free_amplitude_factor=factor)
     start = energies(curve, given)
     ends = {name: energies(curve, at) for name, at in moved.items()}
-    relative = {
-        "tip_calibration": 2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
-        "spring_constant_n_per_m": curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
-    }
     found = [
         {name: np.abs(getattr(end, column) - getattr(start, column)) for name, end in ends.items()}
-        | {name: share * np.abs(getattr(start, column)) for name, share in relative.items()}
+        | {name: share * np.abs(getattr(start, column)) for name, share in curve.relative_errors.items()}
         for column in ("energy_aj", "virial_aj")
     ]
     return found[0], found[1]
@@ -392,13 +388,8 @@ def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows
     if not touching.any():
         return None
     largest = largest_energies(curve, given)[touching]
-    share = np.hypot(
-        np.hypot(
-            2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
-            curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
-        ),
-        curve.quality_factor.error / curve.quality_factor.value,
-    )
+    quality = curve.quality_factor
+    share = np.linalg.norm([*curve.relative_errors.values(), quality.error / quality.value])
     return float(np.max(largest) * np.exp(1.645 * share))
 
 

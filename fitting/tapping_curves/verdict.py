@@ -11,8 +11,9 @@ from jaxtyping import Bool
 
 from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED
 from afm_jax.outcomes import Rule, Rules
+from fitting.parameters import USUAL_ERRORS
 from fitting.tapping_curves.branches import free_ends
-from fitting.tapping_curves.curve import USUAL_ERRORS, TappingCurve
+from fitting.tapping_curves.curve import TappingCurve
 from fitting.tapping_curves.energy_curve import FEWEST_ROWS
 from fitting.tapping_curves.energy_fit import EnergyFit, Nuisance
 
