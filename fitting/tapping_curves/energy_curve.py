@@ -48,6 +48,18 @@ class EnergyCurve:
         energy, error = (float(np.interp(ratio, self.amplitude_ratio, column)) for column in columns)
         return energy, error
 
+    @property
+    def largest(self) -> tuple[float, float, float]:
+        """The largest energy, its standard error and the amplitude, of the free one, that it is at."""
+        top = int(np.argmax(self.energy_aj))
+        return float(self.energy_aj[top]), float(self.energy_error_aj[top]), float(self.amplitude_ratio[top])
+
+    @property
+    def by_height(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Height, energy and its standard error in the order of the heights."""
+        order = np.argsort(self.height_nm)
+        return self.height_nm[order], self.energy_aj[order], self.energy_error_aj[order]
+
     def to_dict(self) -> dict[str, np.ndarray]:
         """Return amplitude ratio, height, energy and virial with their bands."""
         return {

@@ -119,15 +119,15 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     several = len({branch.drive for branch in result.branches}) > 1
     cells = []
     for branch in result.branches:
-        curve, top = branch.curve, int(np.argmax(branch.curve.energy_aj))
+        curve = branch.curve
+        *largest, place = curve.largest
         drive = f", {branch.drive_frequency_khz:g} kHz, {branch.free_amplitude_nm:.4g} nm" if several else ""
-        largest = with_error(float(curve.energy_aj[top]), float(curve.energy_error_aj[top]))
         cells.append(
             [
                 branch.name + drive,
                 f"{curve.amplitude_ratio[0]:.2f} to {curve.amplitude_ratio[-1]:.2f}",
                 *("-" if (at := curve.at(ratio)) is None else with_error(*at) for ratio in HEADLINE),
-                f"{largest} at {curve.amplitude_ratio[top]:.2f}",
+                f"{with_error(*largest)} at {place:.2f}",
             ]
         )
     lines = [

@@ -282,14 +282,19 @@ class Tapping(Result):
     @property
     def largest(self) -> dict[str, float] | None:
         """The largest energy of a tap along the branches: `value`, `standard_error`, `amplitude_ratio`."""
-        tops = []
-        for branch in self.branches:
-            curve = branch.curve
-            top = int(np.argmax(curve.energy_aj))
-            tops.append((curve.energy_aj[top], curve.energy_error_aj[top], curve.amplitude_ratio[top]))
-        if not tops:
+        if not self.branches:
             return None
-        return dict(zip(("value", "standard_error", "amplitude_ratio"), map(float, max(tops)), strict=True))
+        top = max(branch.curve.largest for branch in self.branches)
+        return dict(zip(("value", "standard_error", "amplitude_ratio"), top, strict=True))
+
+    @property
+    def energy_along_branches_aj(self) -> Rows:
+        """Energy of each row's tap by the function of its branch; NaN for rows of none."""
+        found = np.full(self.curve.rows, np.nan)
+        for branch in self.branches:
+            height, energy, _ = branch.curve.by_height
+            found[branch.rows] = np.interp(self.curve.offset_nm[branch.rows], height, energy)
+        return found
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:

@@ -293,15 +293,10 @@ def _followed(curve: TappingCurve, alike: list[np.ndarray], free: Bool[np.ndarra
 
 def _energies_along(result: Tapping) -> np.ndarray:
     """Return the energy of each row's tap: the one of its kind, or where none explains the rows that of its branch."""
-    found = np.full(result.curve.rows, np.nan)
-    if result.described:
-        constants = np.array([result.constant(i)[0] for i in range(len(result.groups))])
-        return np.where(result.group_of_rows >= 0, constants[np.maximum(result.group_of_rows, 0)], found)
-    for branch in result.branches:
-        order = np.argsort(branch.curve.height_nm)
-        height, energy = branch.curve.height_nm[order], branch.curve.energy_aj[order]
-        found[branch.rows] = np.interp(result.curve.offset_nm[branch.rows], height, energy)
-    return found
+    if not result.described:
+        return result.energy_along_branches_aj
+    constants = np.array([result.constant(i)[0] for i in range(len(result.groups))])
+    return np.where(result.group_of_rows >= 0, constants[np.maximum(result.group_of_rows, 0)], np.nan)
 
 
 def _kinds(
