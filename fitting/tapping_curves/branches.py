@@ -6,7 +6,7 @@ on the way back. Each such pair of heights, and the energy between the two branc
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -70,6 +70,12 @@ class Hysteresis:
             return None
         error = float(np.hypot(self.approach.standard_error, self.retract.standard_error))
         return self.approach.offset_nm - self.retract.offset_nm, error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the change with its heights as mappings, and its width."""
+        ends = {"approach": self.approach, "retract": self.retract}
+        mapped = {name: None if end is None else end._asdict() for name, end in ends.items()}
+        return {**vars(self), **mapped, "width_nm": self.width_nm}
 
 
 def way_of(retract: bool | np.bool_) -> str:  # noqa: FBT001

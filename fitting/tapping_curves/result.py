@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from fitting.fits.result import FitResult
 
 
+_STATISTICS = ("chi2", "degrees_of_freedom", "p_value", "scale")
+"""Of a fit of energies, as the JSON has them."""
+
+
 @dataclass(frozen=True)
 class EnergyGroup:
     """Rows that share an energy: of one drive and one branch."""
@@ -426,6 +430,44 @@ class Tapping(Result):
             if note.startswith("excluded")
         ]
 
+    def _named(self, *names: str) -> dict[str, Any]:
+        """Return attributes of the result by their names."""
+        return {name: getattr(self, name) for name in names}
+
+    def _branches(self) -> list[dict[str, Any]]:
+        """Return what is known of each branch: its rows, its one energy if it has one, and its curve."""
+        group = self.group_of_rows
+        return [
+            {
+                "drive_frequency_khz": branch.drive_frequency_khz,
+                "free_amplitude_nm": branch.free_amplitude_nm,
+                "branch": branch.way,
+                "repulsive": branch.repulsive,
+                "rows": len(branch.rows),
+                **self._constant_of(int(group[branch.rows[0]])),
+                "curve": branch.curve.to_dict(),
+            }
+            for branch in self.branches
+        ]
+
+    def _fits(self) -> dict[str, Any]:
+        """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
+        fit, functions, smooth = self.fit, self.functions, None
+        if functions is not None:
+            smooth = {
+                "valid": not self.why_not_functions,
+                "reason": self.why_not_functions or None,
+                **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
+                "nuisances": nuisances_as_dict(functions.nuisances),
+            }
+        # of one energy that does not describe the rows the instrument tells nothing
+        believed = fit if self.described or functions is None else functions
+        return {
+            "functions": smooth,
+            **{name: None if fit is None else getattr(fit, name) for name in _STATISTICS},
+            "nuisances": {} if believed is None else nuisances_as_dict(believed.nuisances),
+        }
+
     def _constant_of(self, number: int) -> dict[str, Any]:
         """Return whether one energy explains the rows of a group, and which."""
         blank: dict[str, Any] = {"energy_aj": None, "standard_error_aj": None, "interval95_aj": None}
@@ -468,72 +510,30 @@ class Tapping(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        fit, functions, energy = self.fit, self.functions, self.energy
-        # of one energy that does not describe the rows the instrument tells nothing
-        believed = fit if self.described or functions is None else functions
-        group = self.group_of_rows
-        branches = [
-            {
-                "drive_frequency_khz": branch.drive_frequency_khz,
-                "free_amplitude_nm": branch.free_amplitude_nm,
-                "branch": branch.way,
-                "repulsive": branch.repulsive,
-                "rows": len(branch.rows),
-                **self._constant_of(int(group[branch.rows[0]])),
-                "curve": branch.curve.to_dict(),
-            }
-            for branch in self.branches
-        ]
+        energy, law = self.energy, None if self.law is None else self.law.to_dict()
         payload = plain(
             {
-                "valid": self.valid,
-                "reasons": self.reasons,
-                "warnings": self.warnings,
+                **self._named("valid", "reasons", "warnings"),
                 "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
                 "energy_per_tap_reason": energy["reason"] or None,
                 "largest_energy_aj": self.largest,
-                "energies_at": self.energies_at,
-                "turning_points": self.turning_points,
+                **self._named("energies_at", "turning_points"),
                 "way_differences": [
                     {"approach": i, "retract": j, **vars(one)} for (i, j), one in self.way_differences.items()
                 ],
                 "plain_energy_aj": self.plain_energy,
                 "epsilon_nm2_per_us2": self.epsilon,
-                "energy_by_speed": self.energy_by_speed,
-                "assumptions": self.assumptions,
+                **self._named("energy_by_speed", "assumptions"),
                 "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
-                "branches": branches,
-                "functions": None
-                if functions is None
-                else {
-                    "valid": not self.why_not_functions,
-                    "reason": self.why_not_functions or None,
-                    "rows_chi2": functions.rows_chi2,
-                    "rows_freedom": functions.rows_freedom,
-                    "scale": functions.scale,
-                    "nuisances": nuisances_as_dict(functions.nuisances),
-                },
-                "chi2": None if fit is None else fit.chi2,
-                "degrees_of_freedom": None if fit is None else fit.degrees_of_freedom,
-                "p_value": None if fit is None else fit.p_value,
-                "scale": None if fit is None else fit.scale,
-                "nuisances": {} if believed is None else nuisances_as_dict(believed.nuisances),
-                "hysteresis": [
-                    {
-                        **vars(one),
-                        "approach": _height(one.approach),
-                        "retract": _height(one.retract),
-                        "width_nm": one.width_nm,
-                    }
-                    for one in self.hysteresis
-                ],
-                "law": None if self.law is None else self.law.to_dict()["law"],
+                "branches": self._branches(),
+                **self._fits(),
+                "hysteresis": [one.to_dict() for one in self.hysteresis],
+                "law": None if law is None else law["law"],
                 "reason": self.reason,
-                "fit": None if self.law is None else self.law.to_dict(),
+                "fit": law,
                 "rows": self.records(),
-                "set_aside": self.set_aside,
+                **self._named("set_aside", "versions"),
                 "input": {name: value for name, value in vars(self.table).items() if value is not None},
-                "versions": self.versions,
             }
         )
         if not self.curve.over_spring_constant:
@@ -564,7 +564,3 @@ def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
     if low <= 0.0:
         return low, float(energy * np.exp(above))
     return float(energy * np.exp(-np.hypot(np.log(energy / low), Z95 * share))), float(energy * np.exp(above))
-
-
-def _height(found: Any) -> dict[str, float] | None:
-    return None if found is None else found._asdict()
