@@ -97,14 +97,6 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     rows = np.isfinite(table.lockin_amplitude_nm)
     blank = np.full(table.rows, np.nan)
     lag, lag_error = (blank if part is None else part for part in (table.phase_lag_deg, table.phase_lag_error_deg))
-    unknown = table.spring_constant_n_per_m is None and table.mass_ng is None
-    spring = 1.0 if unknown else table.spring_constant_n_per_m or _stiffness(table)
-    given = {
-        "free_frequency_khz": (table.free_frequency_khz, table.free_frequency_error_khz),
-        "quality_factor": (quality, table.quality_factor_error),
-        "spring_constant_n_per_m": (spring, table.spring_constant_error_n_per_m),
-        "tip_calibration": table.calibration.get("tip_calibration", (1.0, None)),
-    }
     noise = table.lockin_amplitude_error_nm / table.lockin_amplitude_nm
     zero = table.calibration.get("phase_zero_deg")
     whole = TappingCurve(
@@ -120,16 +112,7 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         drive_frequency_khz=table.drive_frequency_khz,
         retract=np.zeros(table.rows, bool) if table.retract is None else table.retract == 1.0,
         both_ways=table.retract is not None,
-        free_frequency_khz=given_or_usual("free_frequency_khz", *given["free_frequency_khz"]),
-        quality_factor=given_or_usual("quality_factor", *given["quality_factor"]),
-        spring_constant_n_per_m=Given(spring)
-        if unknown
-        else given_or_usual("spring_constant_n_per_m", *given["spring_constant_n_per_m"]),
-        over_spring_constant=unknown,
-        tip_calibration=given_or_usual("tip_calibration", *given["tip_calibration"]),
-        assumed=tuple(
-            name for name, (_, error) in given.items() if not error and not (unknown and name.startswith("spring"))
-        ),
+        **_lever_of(table, quality),
         phase_zero_deg=None if zero is None else Given(*zero),
         origin_error_nm=table.calibration.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1],
         lines=np.asarray(table.lines),
@@ -138,9 +121,22 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     return whole.part(rows)
 
 
-def _stiffness(table: AmplitudeTable) -> float:
-    assert table.mass_ng is not None  # checked before  # noqa: S101
-    return table.mass_ng * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
+def _lever_of(table: AmplitudeTable, quality_factor: float) -> dict[str, Any]:
+    """Return what a table says of lever and calibration, with usual errors where it says none, as a curve's fields."""
+    spring, mass = table.spring_constant_n_per_m, table.mass_ng
+    if spring is None and mass is not None:
+        spring = mass * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
+    given = {
+        "free_frequency_khz": (table.free_frequency_khz, table.free_frequency_error_khz),
+        "quality_factor": (quality_factor, table.quality_factor_error),
+        "spring_constant_n_per_m": (spring, table.spring_constant_error_n_per_m),
+        "tip_calibration": table.calibration.get("tip_calibration", (1.0, None)),
+    }
+    return {
+        **{name: Given(1.0) if pair[0] is None else given_or_usual(name, *pair) for name, pair in given.items()},
+        "over_spring_constant": spring is None,
+        "assumed": tuple(name for name, (value, error) in given.items() if value is not None and not error),
+    }
 
 
 _BEYOND_DEG = 20.0
