@@ -9,16 +9,18 @@ first harmonic of the sample's force. Free, Z = -A0: that sets the time. Measure
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from fitting.instruments.lag import free_lag_deg
 from fitting.parameters import USUAL_ERRORS
+from fitting.tables.table import AmplitudeTable
 
 Rows = Float[np.ndarray, " rows"]
 Phasors = Complex[np.ndarray, " rows"]
+R = TypeVar("R", "TappingCurve", AmplitudeTable)
 
 
 class Given(NamedTuple):
@@ -118,13 +120,18 @@ class TappingCurve:
 
     def part(self, chosen: Bool[np.ndarray, " rows"]) -> "TappingCurve":
         """Return the rows chosen, as a curve."""
-        own = {
-            name: value[chosen]
-            for name, value in vars(self).items()
-            if isinstance(value, np.ndarray) and value.shape == chosen.shape
-        }
         harmonics = {n: column[chosen] for n, column in self.harmonic_amplitudes_nm.items()}
-        return replace(self, **own, harmonic_amplitudes_nm=harmonics)
+        return replace(part_of(self, chosen), harmonic_amplitudes_nm=harmonics)
+
+
+def part_of(rows: R, chosen: Bool[np.ndarray, " rows"]) -> R:
+    """Return the rows chosen of a curve or a table, of every array that has a number for each row."""
+    own: dict[str, Any] = {
+        name: value[chosen]
+        for name, value in vars(rows).items()
+        if isinstance(value, np.ndarray) and value.shape == chosen.shape
+    }
+    return replace(rows, **own)
 
 
 HARMONICS_FACTOR = Given(0.9, 0.1)

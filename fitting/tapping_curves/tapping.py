@@ -32,6 +32,7 @@ from fitting.tapping_curves.curve import (
     given_or_usual,
     lag_of_free_tip,
     motion_of,
+    part_of,
 )
 from fitting.tapping_curves.energy import Energies, energies, largest_energies, noise_of, virial_noise_of
 from fitting.tapping_curves.energy_curve import FEWEST_ROWS, branches_of
@@ -483,7 +484,7 @@ def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
     if result.speeds is None:
         return result
     chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
-    return replace(result, law=fit(_with_zero_of_phase(result, rows_of(result.table, chosen)), model))
+    return replace(result, law=fit(_with_zero_of_phase(result, part_of(result.table, chosen)), model))
 
 
 def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTable:
@@ -497,13 +498,3 @@ def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTabl
         return table
     calibration = table.calibration | {"phase_zero_deg": (float(found[0].value), float(found[0].standard_error))}
     return replace(table, calibration=calibration)
-
-
-def rows_of(table: AmplitudeTable, chosen: Bool[np.ndarray, " rows"]) -> AmplitudeTable:
-    """Return the rows chosen of a table."""
-    own: dict[str, Any] = {
-        name: value[chosen]
-        for name, value in vars(table).items()
-        if isinstance(value, np.ndarray) and value.shape == chosen.shape
-    }
-    return replace(table, **own)
