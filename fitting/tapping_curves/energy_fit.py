@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
 
-from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, descended
+from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, covariance_of, descended
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, lag_of_free_tip
 from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of, virial_noise_of
@@ -585,15 +585,12 @@ class _EnergySearch:
     def _start(self) -> np.ndarray:
         """Return the unknowns of the instrument as it is given."""
         plain = plain_instrument(self.curve, self.free)
-        at = np.zeros(len(self.unknowns))
-        time = self.curve.time
+        drifting = {"phase_drift_deg": plain.phase_zero_deg, "free_amplitude_drift": plain.free_amplitude_factor}
+        at, time = np.zeros(len(self.unknowns)), self.curve.time
         for i, one in enumerate(self.unknowns):
-            if one.kind == "phase_drift_deg" and time is not None and np.ptp(time) > 0.0:
-                zero = np.broadcast_to(plain.phase_zero_deg, (self.curve.rows,))
-                at[i] = np.polyfit(time, zero, 1)[0] / one.unit
-            if one.kind == "free_amplitude_drift" and time is not None and np.ptp(time) > 0.0:
-                factor = np.broadcast_to(plain.free_amplitude_factor, (self.curve.rows,))
-                at[i] = np.polyfit(time, factor, 1)[0] / one.unit
+            if one.kind in drifting and time is not None and np.ptp(time) > 0.0:
+                along = np.broadcast_to(drifting[one.kind], (self.curve.rows,))
+                at[i] = np.polyfit(time, along, 1)[0] / one.unit
         return at
 
     def _of_free(self, at: Instrument) -> np.ndarray:
@@ -725,27 +722,21 @@ class _EnergySearch:
     ) -> EnergyFit:
         """Return the fit at some unknowns; their covariance is that of its readings where none is given."""
         curve, state = self.curve, self._state(x, groups, scale)
-        found, of_free = state.found, state.of_free
         smoothers = [Smoother.of(*pair) for pair in zip(state.bins, processes, strict=True)]
         slopes = self._slopes(state, groups, smoothers)
         if covariance is None:
             _, jacobian = self._residuals(state, slopes, groups, smoothers)
-            covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True))
+            covariance = covariance_of(jacobian.T @ jacobian)
         units = self.values(x) - self.values(x - 1e-6) if len(x) else x
         errors = np.sqrt(np.diag(covariance)) * units / 1e-6
-        noise = scale * noise_of(self.smoothed, state.smooth)
-        residual, taken = np.full(curve.rows, np.nan), 0.0
-        for rows, smoother, values in zip(groups, smoothers, state.energies, strict=True):
-            residual[rows] = (found.energy_aj[rows] - smoother.mean(self.place[rows], values)) / noise[rows]
-            taken += float(smoother.leverage(self.place[rows]).sum())
-        used = np.zeros(curve.rows, bool)
-        used[np.concatenate(groups)] = True
-        rows_chi2 = float(np.nansum(residual**2))
-        # what the instrument takes of the rows' freedom: at most one each
+        residual = self._of_rows(state, groups, smoothers, scale)
+        taken = sum(float(one.leverage(self.place[rows]).sum()) for rows, one in zip(groups, smoothers, strict=True))
+        used = np.isin(np.arange(curve.rows), np.concatenate(groups))
+        rows_chi2, of_free = float(np.nansum(residual**2)), state.of_free
         return EnergyFit(
             rows=tuple(groups),
             smoothers=tuple(smoothers),
-            energies_at=found,
+            energies_at=state.found,
             slopes=slopes.energy,
             virial_slopes=slopes.virial,
             covariance=covariance,
@@ -759,6 +750,7 @@ class _EnergySearch:
             outliers=np.zeros(curve.rows, bool),
             residual=residual,
             chi2=rows_chi2 + float(of_free @ of_free + np.sum((self.known * x) ** 2)),
+            # what the instrument takes of the rows' freedom: at most one each
             degrees_of_freedom=round(used.sum() + len(of_free) + self.known.sum() - len(x) - taken),
             rows_chi2=rows_chi2,
             rows_freedom=float(used.sum() - taken),
@@ -767,6 +759,14 @@ class _EnergySearch:
             search=self,
             at=x,
         )
+
+    def _of_rows(self, state: _State, groups: list, smoothers: list[Smoother], scale: float) -> Rows:
+        """Return how far the rows' energies are from their functions, in errors; NaN for rows of none."""
+        noise = scale * noise_of(self.smoothed, state.smooth)
+        residual = np.full(self.curve.rows, np.nan)
+        for rows, one, values in zip(groups, smoothers, state.energies, strict=True):
+            residual[rows] = (state.found.energy_aj[rows] - one.mean(self.place[rows], values)) / noise[rows]
+        return residual
 
 
 COMMON = ("free_frequency_khz", "quality_factor", "harmonics_factor")
