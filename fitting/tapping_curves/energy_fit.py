@@ -19,7 +19,7 @@ from scipy.optimize import isotonic_regression
 from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, covariance_of, descended
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, lag_of_free_tip
-from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of, virial_noise_of
+from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of
 
 _inverse_triangle, _solve_triangle = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
 _FAR = 4.0
@@ -81,9 +81,13 @@ class _Unknown(NamedTuple):
     """A nuisance: which rows it moves, what is known of it, and the unit it is counted in."""
 
     name: str
-    kind: str
     rows: Bool[np.ndarray, " rows"]
     given: Given
+
+    @property
+    def kind(self) -> str:
+        """The name without the number of its drive."""
+        return self.name.rstrip("_0123456789")
 
     @property
     def unit(self) -> float:
@@ -404,31 +408,23 @@ def _scale(found: EnergyFit) -> float:
 
 def _unknowns(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> list[_Unknown]:
     every = np.ones(curve.rows, bool)
-    found = [
-        _Unknown(name, name, every, given)
-        for name, given in (
-            ("free_frequency_khz", curve.free_frequency_khz),
-            ("quality_factor", curve.quality_factor),
-        )
-        if given.error > 0.0
-    ]
+    lever = {"free_frequency_khz": curve.free_frequency_khz, "quality_factor": curve.quality_factor}
+    found = [_Unknown(name, every, given) for name, given in lever.items() if given.error > 0.0]
     start = np.broadcast_to(plain_instrument(curve, free).phase_zero_deg, (curve.rows,))
     for i, frequency in enumerate(np.unique(curve.drive_frequency_khz).tolist()):
         here = curve.drive_frequency_khz == frequency
         known = curve.phase_zero_deg or Given(float(np.mean(start[here])), np.inf)
         if known.error > 0.0:
-            found.append(_Unknown(f"phase_zero_deg_{i}", "phase_zero_deg", here, known))
+            found.append(_Unknown(f"phase_zero_deg_{i}", here, known))
     if len(curve.harmonic_amplitudes_nm) < _HARMONICS_THAT_TELL:
-        found.append(_Unknown("harmonics_factor", "harmonics_factor", every, HARMONICS_FACTOR))
+        found.append(_Unknown("harmonics_factor", every, HARMONICS_FACTOR))
     if curve.free_amplitude_error > 0.0:
-        for i, here in enumerate(_levels(curve)):
-            found.append(
-                _Unknown(f"free_amplitude_{i}", "free_amplitude", here, Given(1.0, curve.free_amplitude_error))
-            )
+        known = Given(1.0, curve.free_amplitude_error)
+        found += [_Unknown(f"free_amplitude_{i}", here, known) for i, here in enumerate(_levels(curve))]
     if curve.time is not None:
         phase, amplitude = (_WIDE_DRIFT_DEG, _WIDE_DRIFT) if free_ends(curve, free) else (_DRIFT_DEG, _DRIFT)
-        found.append(_Unknown("phase_drift_deg", "phase_drift_deg", every, Given(0.0, phase)))
-        found.append(_Unknown("free_amplitude_drift", "free_amplitude_drift", every, Given(0.0, amplitude)))
+        found.append(_Unknown("phase_drift_deg", every, Given(0.0, phase)))
+        found.append(_Unknown("free_amplitude_drift", every, Given(0.0, amplitude)))
     return found
 
 
@@ -555,17 +551,15 @@ class _EnergySearch:
         time = np.zeros(curve.rows) if curve.time is None else curve.time
         fields = {"phase_drift_deg": "phase_zero_deg", "free_amplitude_drift": "free_amplitude_factor"}
         fields |= {"free_amplitude": "free_amplitude_factor"}
-        columns: list[list[np.ndarray]] = [[], [], [], []]
+        slopes = np.zeros((len(_EnergySlopes._fields), curve.rows, len(self.unknowns)))
         for i, one in enumerate(self.unknowns):
             field = fields.get(one.kind, one.kind)
             # the logarithm of Q is what moves
             unit = one.unit * (self.values(x)[i] / one.given.value if one.kind == "quality_factor" else 1.0)
             here = unit * one.rows * (time if one.kind.endswith(("drift", "drift_deg")) else 1.0)
-            for column, part in zip(columns, by[field], strict=False):
-                column.append(part * here)
-            columns[3].append(here if field == "free_amplitude_factor" else np.zeros(curve.rows))
-        shape = (curve.rows, 0)
-        return _EnergySlopes(*(np.stack(c, axis=1) if c else np.zeros(shape) for c in columns))
+            slopes[:-1, :, i] = np.stack(by[field]) * here
+            slopes[-1, :, i] = here if field == "free_amplitude_factor" else 0.0
+        return _EnergySlopes(*slopes)
 
     def fitted(self, groups: list[np.ndarray], scale: float) -> EnergyFit:
         """Return the fit of some groups, the rows' own errors multiplied by a scale."""
@@ -928,8 +922,3 @@ def smoother_along(place: np.ndarray, values: np.ndarray, noise: np.ndarray, sca
     return max(
         Smoother.trials(bins, trials), key=lambda one: -float(np.sum(one.whitened(y) ** 2)) - one.log_determinant
     )
-
-
-def virial_noise(curve: TappingCurve, fit: EnergyFit) -> Rows:
-    """Return the standard error of each virial from its own row's noise, as the fit takes it, in aJ."""
-    return fit.scale * virial_noise_of(curve, fit.energies_at)

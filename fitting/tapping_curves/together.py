@@ -14,7 +14,7 @@ from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TableLike, as_table
 from fitting.tapping_curves.branches import CurveBranch
-from fitting.tapping_curves.energy_curve import TappingBranch, branches_of
+from fitting.tapping_curves.energy_curve import TappingBranch, branches_of, within
 from fitting.tapping_curves.energy_fit import Common, fitted_together
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import tapping
@@ -44,13 +44,10 @@ class CurveScatter(CurveBranch):
     energy_own_error_aj: Float[np.ndarray, " points"]
     energy_common_error_aj: Float[np.ndarray, " points"]
 
-    def at(self, ratio: float) -> tuple[float, float, float, float] | None:
+    def at(self, ratio: float) -> tuple[float, ...] | None:
         """Return mean, scatter, own and common error at an amplitude, of the free one; None where not measured."""
-        if not self.amplitude_ratio[0] <= ratio <= self.amplitude_ratio[-1]:
-            return None
         columns = (self.energy_aj, self.energy_scatter_aj, self.energy_own_error_aj, self.energy_common_error_aj)
-        mean, scatter, own, common = (float(np.interp(ratio, self.amplitude_ratio, column)) for column in columns)
-        return mean, scatter, own, common
+        return within(ratio, self.amplitude_ratio, *columns)
 
 
 @public_result(picture="fitting.tapping_curves.pictures:together_figure")
