@@ -103,12 +103,10 @@ def drift_of_free_rows(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> 
         here = free & np.isfinite(values)
         if here.sum() < 2 * FEWEST_ROWS:
             continue
-        x, y, w = np.flatnonzero(here) / (curve.rows - 1.0), values[here], errors[here] ** -2.0
-        x = x - np.average(x, weights=w)
-        slope = float(np.sum(w * x * y) / np.sum(w * x * x))
-        left = y - np.average(y, weights=w) - slope * x
-        scatter = max(1.0, float(np.sum(w * left**2)) / max(len(x) - 2, 1))
-        error = float(np.sqrt(scatter / np.sum(w * x * x)))
+        x, y, weights = np.flatnonzero(here) / (curve.rows - 1.0), values[here], 1.0 / errors[here]
+        (slope, start), covariance = np.polyfit(x, y, 1, w=weights, cov="unscaled")
+        chi2 = float(np.sum((weights * (y - slope * x - start)) ** 2))
+        error = float(np.sqrt(max(1.0, chi2 / (len(x) - 2)) * covariance[0, 0]))
         if abs(slope) > _DRIFTING * error:
             drift = f"{slope:+.2g} +- {error:.1g} {unit}"
             found.append(
