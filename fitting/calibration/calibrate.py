@@ -255,26 +255,17 @@ def _calibrated(fit: SweepFit, *, explained: bool) -> list[CalibratedValue]:
     """Return frequency and quality factor with errors, or without where there is nothing to base them on."""
     wider = inflation_of(fit)
     errors = np.sqrt(np.diag(fit.covariance)[:2]) * wider
-    if not explained:
-        reason = "the model does not explain the sweep"
-        return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
-    if not np.all(np.isfinite(errors)):
-        reason = "the sweep does not determine the parameters"
+    if not explained or not np.all(np.isfinite(errors)):
+        reason = "the sweep does not determine the parameters" if explained else "the model does not explain the sweep"
         return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
     # The linear parameters need no interval of their own: an infinite variance leaves them out.
     profiled = fit.covariance.copy()
     nuisances = np.arange(2, len(profiled))
     profiled[nuisances, nuisances] = np.inf
     intervals: list[Interval] = profile_intervals(fit.objective, fit.values, profiled, fit.chi2)
-    return [
-        CalibratedValue(
-            float(value),
-            float(error),
-            (_farther(interval.low, value, factor), _farther(interval.high, value, factor)),
-            interval.reason,
-        )
-        for value, error, interval, factor in zip(fit.values[:2], errors, intervals[:2], wider, strict=True)
-    ]
+    found = zip(fit.values[:2].tolist(), errors.tolist(), intervals[:2], wider.tolist(), strict=True)
+    stated = [(value, error, interval.moved(value, value, factor)) for value, error, interval, factor in found]
+    return [CalibratedValue(value, error, (ends.low, ends.high), ends.reason) for value, error, ends in stated]
 
 
 def _mean_square(fit: SweepFit, largest: float) -> CalibratedValue:
@@ -290,10 +281,6 @@ def _mean_square(fit: SweepFit, largest: float) -> CalibratedValue:
     value = float(0.5 * np.pi * 1e3 * frequency / quality_factor * power * largest**2)
     ends = (value * float(np.exp(-1.96 * share)), value * float(np.exp(1.96 * share)))
     return CalibratedValue(value, value * share, ends, None)
-
-
-def _farther(end: float | None, value: float, factor: float) -> float | None:
-    return None if end is None else float(value + factor * (end - value))
 
 
 def _curves(sweep: ResonanceSweep, fit: SweepFit) -> Curves:
