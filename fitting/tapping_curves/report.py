@@ -277,7 +277,7 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     """
     # a call without --out needs neither matplotlib nor JAX
     from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.report import write_report, write_report_files  # noqa: PLC0415
+    from fitting.report.files import write_report_files  # noqa: PLC0415
     from fitting.tapping_curves.pictures import tapping_figures  # noqa: PLC0415
 
     figures = tapping_figures(result)
@@ -294,8 +294,12 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     write_whole(folder / "tapping_frames.png", frames)
     records = result.keyed(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
-    law = [] if result.law is None else write_report(result.law, folder, write_table)
-    return [*written, folder / "tapping_frames.png", *law]
+    written.append(folder / "tapping_frames.png")
+    if result.law is None:
+        return written
+    from fitting.report.report import write_report  # noqa: PLC0415
+
+    return [*written, *write_report(result.law, folder, write_table)]
 
 
 def tapping_page(result: Tapping, pictures: Sequence[bytes], shows: Sequence[str]) -> str:
@@ -386,7 +390,7 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
         OSError: if a file cannot be written.
     """
     from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.report import write_report_files  # noqa: PLC0415
+    from fitting.report.files import write_report_files  # noqa: PLC0415
     from fitting.tapping_curves.pictures import together_figure  # noqa: PLC0415
 
     figure, report = together_figure(result), together_report(result)
