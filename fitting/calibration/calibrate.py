@@ -191,20 +191,19 @@ def _alternative(fit: SweepFit, background: str) -> Alternative:
         quality_factor_error=float(np.sqrt(variance)) if np.isfinite(variance) else None,
         chi2=fit.chi2,
         degrees_of_freedom=fit.freedom,
-        aic=fit.chi2 + 2.0 * len(fit.values),
+        aic=fit.aic,
         residual_autocorrelation=autocorrelation(fit, 1),
     )
 
 
-def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives: list[Alternative]) -> Calibration:
+def _evidence(sweep: ResonanceSweep, fit: SweepFit, curves: Curves, alternatives: list[Alternative]) -> SweepEvidence:
+    """Return all that the verdict looks at."""
     judged = fit.errors.origin != "estimated" and fit.errors.scale is None
     # the mean of a term of the gamma deviance is a little above 1
     size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages)) if sweep.averages else 1.0
     p_value = chi2_tail(fit.chi2 / size, fit.freedom) if judged else float("nan")
-    explained = not p_value < IMPROBABLE
-    frequency, quality_factor = _calibrated(fit, explained=explained)
-    kind, curves = fit.objective.kind, _curves(sweep, fit)
-    evidence = SweepEvidence(
+    frequency, quality_factor = _calibrated(fit, explained=not p_value < IMPROBABLE)
+    return SweepEvidence(
         sweep=sweep,
         fit=fit,
         frequency=frequency,
@@ -213,19 +212,24 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
         autocorrelation=autocorrelation(fit, 1),
         repeat=repeat_of(fit),
         runs_excess=runs_excess(fit, curves.amplitude_misfit),
-        chi2_without=sum_without_resonance(fit.objective.points, sweep.points, kind),
+        chi2_without=sum_without_resonance(fit.objective.points, sweep.points, fit.objective.kind),
         alternatives=alternatives,
     )
+
+
+def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives: list[Alternative]) -> Calibration:
+    kind, curves = fit.objective.kind, _curves(sweep, fit)
+    evidence = _evidence(sweep, fit, curves, alternatives)
     reasons, warnings = judge_calibration(evidence)
     errors = np.sqrt(np.diag(fit.covariance)[:2])
-    known = explained and bool(np.all(np.isfinite(errors)))
+    known = evidence.frequency.standard_error is not None
     linear = fit.values[2:]
     height = np.hypot(linear[0], linear[1]) if kind == "phase" else np.sqrt(max(linear[0], 0.0))
-    below_peak = 1.0 - 0.5 / quality_factor.value**2
+    below_peak = 1.0 - 0.5 / evidence.quality_factor.value**2
     return Calibration(
-        frequency_khz=frequency,
-        quality_factor=quality_factor,
-        peak_frequency_khz=frequency.value * float(np.sqrt(below_peak)) if below_peak > 0.0 else None,
+        frequency_khz=evidence.frequency,
+        quality_factor=evidence.quality_factor,
+        peak_frequency_khz=evidence.frequency.value * float(np.sqrt(below_peak)) if below_peak > 0.0 else None,
         peak_amplitude=float(height * sweep.amplitude.max()),
         mean_square=_mean_square(fit, float(sweep.amplitude.max())) if kind == "power" and known else None,
         correlation=float(fit.covariance[0, 1] / errors[0] / errors[1]) if known else None,
@@ -235,7 +239,7 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
         phase_reversed=fit.reverse,
         chi2=fit.chi2,
         degrees_of_freedom=fit.freedom,
-        p_value=p_value,
+        p_value=evidence.p_value,
         errors=fit.errors,
         residual_autocorrelation=evidence.autocorrelation,
         residual_repeat=evidence.repeat,

@@ -87,7 +87,7 @@ class SweepEvidence:
     def better(self) -> list[tuple[Alternative, float]]:
         """The background that describes the scan clearly better, if there is one, and by how much its AIC is lower."""
         best = _better(self.fit, self.alternatives)
-        return [] if best is None else [(best, self.fit.chi2 + 2.0 * len(self.fit.values) - best.aic)]
+        return [] if best is None else [(best, self.fit.aic - best.aic)]
 
 
 def judge_calibration(evidence: SweepEvidence) -> tuple[list[str], list[str]]:
@@ -104,7 +104,7 @@ def preferred(fit: SweepFit, background: str, alternatives: list[Alternative]) -
 
 def _better(fit: SweepFit, alternatives: list[Alternative]) -> Alternative | None:
     best = min(alternatives, key=lambda other: other.aic, default=None)
-    return best if best is not None and best.aic < fit.chi2 + 2.0 * len(fit.values) - _CLEARLY else None
+    return best if best is not None and best.aic < fit.aic - _CLEARLY else None
 
 
 def inflation_of(fit: SweepFit) -> Float[np.ndarray, "2"]:

@@ -311,6 +311,12 @@ class EnergyFit:
         """Return the variance that the instrument leaves in what changes by it with some slopes."""
         return np.einsum("nu,uv,nv->n", slopes, self.covariance, slopes)
 
+    def covariance_with(self, known: tuple[str, ...]) -> np.ndarray:
+        """Return the covariance of the unknowns if some of the nuisances, by name, were known."""
+        places = [i for i, one in enumerate(self.nuisances) if one.name in known]
+        gain = np.linalg.solve(self.covariance[np.ix_(places, places)], self.covariance[places])
+        return self.covariance - gain.T @ self.covariance[places]
+
     def budget(self, number: int) -> dict[str, float]:
         """Return what the variance of a constant comes from, in aJ^2."""
         energy, variance, slopes = self.function(number, np.zeros(1))
