@@ -142,7 +142,11 @@ _NO_MISFIT = 1e-6
 
 
 def autocorrelation(fit: SweepFit, lag: int) -> float:
-    """Return the correlation of residuals that lie `lag` points apart, of both components together."""
+    """Return the correlation of residuals that lie `lag` points apart, of both components together.
+
+    It is a size, of a scan's evenly spaced points. `fitting.fits.verdict.correlation_excess` is a test of neighbouring
+    rows of a table, whose readings may go together.
+    """
     blocks = fit.residual.reshape(2 if fit.objective.kind == "phase" else 1, -1)[:, : fit.points]
     total = float(np.sum(blocks**2))
     if total < _NO_MISFIT * fit.data or fit.points <= lag:

@@ -148,7 +148,8 @@ def free_ends(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> bool:
 def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
     """Return the rows of the free tip: those farther away than the first that departs in amplitude or phase.
 
-    A single row that departs is none; the zero of the phase is that of the rows farther away.
+    A single row that departs is none; the zero of the phase is that of the rows farther away. Each row is tested by its
+    own error. `fitting.instruments.branch.look_at` looks for the free part of a recording of unknown noise, in blocks.
     """
     free = np.zeros(curve.rows, bool)
     for part in ways(curve):
@@ -452,7 +453,11 @@ def rough_rows(curve: TappingCurve, chosen: Bool[np.ndarray, " rows"]) -> Bool[n
 
 
 def _off_parabola(place: Rows, amplitude: Rows, allowed: Rows, chosen: Bool[np.ndarray, " rows"]) -> Rows:
-    """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow."""
+    """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow.
+
+    Rows far off have hardly a pull by Cauchy's loss; by that of robust fits (`fitting.fits.objective`) they would keep
+    that of a row a few errors off.
+    """
 
     def off(factors: np.ndarray) -> np.ndarray:
         return (amplitude - np.polyval(factors, place)) / allowed

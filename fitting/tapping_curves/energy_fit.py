@@ -6,6 +6,10 @@ plus a Gaussian process (Matern 5/2) over the logarithm of the amplitude lost, f
 contact, and readings are energies(instrument) = function + noise of the row. Linear in small changes of the instrument,
 that is generalised least squares: function and instrument are determined together, and the band of the function holds
 what the instrument leaves open. A process of no size leaves the constant, one energy for all rows.
+
+Fits of laws compare readings with those that a law predicts (`fitting.fits.objective`). Here no law predicts a reading:
+what is compared is the energy that a reading gives with the function that is fitted along, so that residuals and
+weights are others. Steps, covariance and thresholds are those of fits (`afm_jax.least_squares`).
 """
 
 from dataclasses import dataclass, field, replace
@@ -790,7 +794,7 @@ def fitted_together(fits: list[EnergyFit]) -> tuple[list[EnergyFit], Common]:
 
     Each curve alone tells them by a Gaussian, mostly by how smooth it makes the energy; energies of curves of one
     sample are alike, so that this is counted as that of one curve: the weighted mean with the error of one. Each
-    curve's own unknowns and functions follow.
+    curve's own unknowns and functions follow. Tables fitted together (`fitting.fits.several`) are independent instead.
 
     Args:
         fits: of curves for which the same is given of the lever.

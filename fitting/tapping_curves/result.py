@@ -556,7 +556,11 @@ def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
 
 
 def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
-    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive."""
+    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive.
+
+    Within its errors an energy is linear in what is fitted, so that no chi2 needs to be profiled as for laws
+    (`fitting.fits.intervals`).
+    """
     low, high = energy - Z95 * error, energy + Z95 * error
     if share == 0.0 or energy <= 0.0:
         return low, high
