@@ -236,18 +236,15 @@ class Tapping(Result):
         Where one energy does not explain the rows `value` is None and `reason` says why.
         """
         blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None}
-        if self.fit is None:
-            bound = None if self.bound_aj is None else (0.0, self.bound_aj)
-            kind = "none" if bound is None else "upper bound"
-            return blank | {"interval95": bound, "kind": kind, "reason": self.why_not_constant if bound is None else ""}
-        if self.why_not_constant:
+        if self.fit is None and self.bound_aj is not None:
+            return blank | {"interval95": (0.0, self.bound_aj), "kind": "upper bound", "reason": ""}
+        if self.fit is None or self.why_not_constant:
             return blank | {"kind": "none", "reason": self.why_not_constant}
         chosen = self.chief
         if len(chosen) > 1:
             each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
             return blank | {"kind": "several", "reason": f"each drive has its own: {each}"}
         value, error, interval = self.constant(chosen[0])
-        interval = np.maximum(interval, 0.0) if value > 0.0 else np.array(interval)
         if not value > 0.0:
             return blank | {
                 "kind": "none",
@@ -258,7 +255,7 @@ class Tapping(Result):
         return {
             "value": value,
             "standard_error": error,
-            "interval95": interval,
+            "interval95": np.maximum(interval, 0.0),
             "kind": "bracket" if not error < BRACKET * value else "fit",
             "reason": "",
             "assumption": "each tap of the branch takes the same energy",
