@@ -136,6 +136,12 @@ def whole_covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarra
 
 IMPROBABLE = 1e-3
 """Probability of the chi2 below which a model does not explain its readings."""
+PULLED, TORN = 2.0, 3.0
+"""Distance of a fitted quantity from what is known of it otherwise, in the standard errors of that: from the first on
+it is named, from the second on neither is believed."""
+LARGEST_SCALE = 3.0
+"""Scale of the errors that is believed: a spread given for that of a mean, a 3 sigma limit for 1 sigma. Errors that
+would have to be larger are wrong by more than a scale, and have to be stated nearer to the truth."""
 
 
 def chi2_tail(chi2: float, freedom: int) -> float:

@@ -22,6 +22,7 @@ from fitting.parameters import (
     DELAY,
     LAW,
     NUISANCE_NAMES,
+    USUAL_ERRORS,
     Parameter,
     is_nuisance,
     model_parameters,
@@ -313,10 +314,6 @@ def _known_of_drifts(table: AmplitudeTable, given: Mapping[str, tuple[float, flo
     return known
 
 
-ASSUMED_ERROR_OF_Q = 0.05
-"""Relative standard error of a quality factor that is given without one."""
-
-
 class Task(NamedTuple):
     """A fit to do: what is known beforehand (value and error by parameter), what is fitted, and to what."""
 
@@ -350,7 +347,8 @@ def _known_of(
     """Return everything that is known beforehand of a table's fit, the quality factor's assumed error included."""
     known = constraints_of(table, constraints)
     if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
-        known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
+        usual = USUAL_ERRORS["quality_factor"] * table.quality_factor
+        known = {"quality_factor": (table.quality_factor, usual)} | known
     return known
 
 

@@ -265,6 +265,15 @@ def is_nuisance(name: str) -> bool:
     return name.partition(_OF)[0] in NUISANCE_NAMES
 
 
+USUAL_ERRORS = {
+    "free_frequency_khz": 2e-4,
+    "quality_factor": 0.05,
+    "spring_constant_n_per_m": 0.05,
+    "tip_calibration": 0.01,
+}
+"""Relative standard errors of what is given of an instrument without one."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class LawFormula:
     """A law that can be fitted, of the loss or of the delay.

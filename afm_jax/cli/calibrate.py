@@ -9,13 +9,7 @@ from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session, labelled
 from afm_jax.strict_json import plain
 from fitting.calibration.calibrate import calibrate
-from fitting.calibration.report import (
-    calibration_report,
-    slope_figure,
-    slope_report,
-    write_calibration,
-    write_with_picture,
-)
+from fitting.calibration.report import calibration_report, slope_figure, slope_report, write_calibration
 from fitting.calibration.result import Calibration
 from fitting.calibration.stiffness import (
     AIR_K,
@@ -28,6 +22,7 @@ from fitting.calibration.stiffness import (
 )
 from fitting.calibration.sweep import read_sweep, without_phase
 from fitting.instruments.curve import read_curves
+from fitting.report.files import write_with_picture
 from fitting.report.sections import text_of
 
 
@@ -77,6 +72,7 @@ def _sensitivity(path: Path) -> Output:
     shows = "Deflection over the height of the sample; dashed, the sensitivity through the end of each curve."
 
     def write(folder: Path, _: Any) -> list[Path]:
-        return write_with_picture(report, slope_figure(curves, slope), shows, folder, plain(labelled(payload)))
+        figure, data = slope_figure(curves, slope), plain(labelled(payload))
+        return write_with_picture(folder, "calibration", report, figure, shows, data, link="Picture")
 
     return Output(payload=payload, text=[partial(text_of, report)], report=write)

@@ -10,13 +10,12 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.least_squares import chi2_tail
+from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from afm_jax.version import version_of
 from fitting.calibration.model import TERMS, SweepFit, fit_sweep, kind_of, model_at, refit, sum_without_resonance
 from fitting.calibration.result import Alternative, CalibratedValue, Calibration, Curves
 from fitting.calibration.sweep import ResonanceSweep, read_sweep
 from fitting.calibration.verdict import (
-    IMPROBABLE,
     SweepEvidence,
     autocorrelation,
     inflation_of,
@@ -192,20 +191,19 @@ def _alternative(fit: SweepFit, background: str) -> Alternative:
         quality_factor_error=float(np.sqrt(variance)) if np.isfinite(variance) else None,
         chi2=fit.chi2,
         degrees_of_freedom=fit.freedom,
-        aic=fit.chi2 + 2.0 * len(fit.values),
+        aic=fit.aic,
         residual_autocorrelation=autocorrelation(fit, 1),
     )
 
 
-def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives: list[Alternative]) -> Calibration:
+def _evidence(sweep: ResonanceSweep, fit: SweepFit, curves: Curves, alternatives: list[Alternative]) -> SweepEvidence:
+    """Return all that the verdict looks at."""
     judged = fit.errors.origin != "estimated" and fit.errors.scale is None
     # the mean of a term of the gamma deviance is a little above 1
     size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages)) if sweep.averages else 1.0
     p_value = chi2_tail(fit.chi2 / size, fit.freedom) if judged else float("nan")
-    explained = not p_value < IMPROBABLE
-    frequency, quality_factor = _calibrated(fit, explained=explained)
-    kind, curves = fit.objective.kind, _curves(sweep, fit)
-    evidence = SweepEvidence(
+    frequency, quality_factor = _calibrated(fit, explained=not p_value < IMPROBABLE)
+    return SweepEvidence(
         sweep=sweep,
         fit=fit,
         frequency=frequency,
@@ -214,19 +212,24 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
         autocorrelation=autocorrelation(fit, 1),
         repeat=repeat_of(fit),
         runs_excess=runs_excess(fit, curves.amplitude_misfit),
-        chi2_without=sum_without_resonance(fit.objective.points, sweep.points, kind),
+        chi2_without=sum_without_resonance(fit.objective.points, sweep.points, fit.objective.kind),
         alternatives=alternatives,
     )
+
+
+def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives: list[Alternative]) -> Calibration:
+    kind, curves = fit.objective.kind, _curves(sweep, fit)
+    evidence = _evidence(sweep, fit, curves, alternatives)
     reasons, warnings = judge_calibration(evidence)
     errors = np.sqrt(np.diag(fit.covariance)[:2])
-    known = explained and bool(np.all(np.isfinite(errors)))
+    known = evidence.frequency.standard_error is not None
     linear = fit.values[2:]
     height = np.hypot(linear[0], linear[1]) if kind == "phase" else np.sqrt(max(linear[0], 0.0))
-    below_peak = 1.0 - 0.5 / quality_factor.value**2
+    below_peak = 1.0 - 0.5 / evidence.quality_factor.value**2
     return Calibration(
-        frequency_khz=frequency,
-        quality_factor=quality_factor,
-        peak_frequency_khz=frequency.value * float(np.sqrt(below_peak)) if below_peak > 0.0 else None,
+        frequency_khz=evidence.frequency,
+        quality_factor=evidence.quality_factor,
+        peak_frequency_khz=evidence.frequency.value * float(np.sqrt(below_peak)) if below_peak > 0.0 else None,
         peak_amplitude=float(height * sweep.amplitude.max()),
         mean_square=_mean_square(fit, float(sweep.amplitude.max())) if kind == "power" and known else None,
         correlation=float(fit.covariance[0, 1] / errors[0] / errors[1]) if known else None,
@@ -236,7 +239,7 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
         phase_reversed=fit.reverse,
         chi2=fit.chi2,
         degrees_of_freedom=fit.freedom,
-        p_value=p_value,
+        p_value=evidence.p_value,
         errors=fit.errors,
         residual_autocorrelation=evidence.autocorrelation,
         residual_repeat=evidence.repeat,
@@ -256,26 +259,17 @@ def _calibrated(fit: SweepFit, *, explained: bool) -> list[CalibratedValue]:
     """Return frequency and quality factor with errors, or without where there is nothing to base them on."""
     wider = inflation_of(fit)
     errors = np.sqrt(np.diag(fit.covariance)[:2]) * wider
-    if not explained:
-        reason = "the model does not explain the sweep"
-        return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
-    if not np.all(np.isfinite(errors)):
-        reason = "the sweep does not determine the parameters"
+    if not explained or not np.all(np.isfinite(errors)):
+        reason = "the sweep does not determine the parameters" if explained else "the model does not explain the sweep"
         return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
     # The linear parameters need no interval of their own: an infinite variance leaves them out.
     profiled = fit.covariance.copy()
     nuisances = np.arange(2, len(profiled))
     profiled[nuisances, nuisances] = np.inf
     intervals: list[Interval] = profile_intervals(fit.objective, fit.values, profiled, fit.chi2)
-    return [
-        CalibratedValue(
-            float(value),
-            float(error),
-            (_farther(interval.low, value, factor), _farther(interval.high, value, factor)),
-            interval.reason,
-        )
-        for value, error, interval, factor in zip(fit.values[:2], errors, intervals[:2], wider, strict=True)
-    ]
+    found = zip(fit.values[:2].tolist(), errors.tolist(), intervals[:2], wider.tolist(), strict=True)
+    stated = [(value, error, interval.moved(value, value, factor)) for value, error, interval, factor in found]
+    return [CalibratedValue(value, error, (ends.low, ends.high), ends.reason) for value, error, ends in stated]
 
 
 def _mean_square(fit: SweepFit, largest: float) -> CalibratedValue:
@@ -291,10 +285,6 @@ def _mean_square(fit: SweepFit, largest: float) -> CalibratedValue:
     value = float(0.5 * np.pi * 1e3 * frequency / quality_factor * power * largest**2)
     ends = (value * float(np.exp(-1.96 * share)), value * float(np.exp(1.96 * share)))
     return CalibratedValue(value, value * share, ends, None)
-
-
-def _farther(end: float | None, value: float, factor: float) -> float | None:
-    return None if end is None else float(value + factor * (end - value))
 
 
 def _curves(sweep: ResonanceSweep, fit: SweepFit) -> Curves:

@@ -405,6 +405,11 @@ class SweepFit:
         return float(np.sum(self.residual**2))
 
     @property
+    def aic(self) -> float:
+        """Akaike's criterion."""
+        return self.chi2 + 2.0 * len(self.values)
+
+    @property
     def freedom(self) -> int:
         """Numbers measured less parameters."""
         return self.data - len(self.values)

@@ -1,7 +1,6 @@
 """A calibration as a person reads it: sections, the files of --out, and the picture of the scan with the fit."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,24 +9,14 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, DARK, GRID, label_axes, new_figure, png_of, svg_of
+from afm_jax.plots.picture_style import ACCENT, DARK, GRID, label_axes, new_figure
 from afm_jax.words import interval, known, value_alone, with_error
 from fitting.calibration.result import CalibratedValue, Calibration
 from fitting.calibration.stiffness import WORTH, Stiffness, budget, doubts, uncalibrated
 from fitting.instruments.curve import MeasuredCurve
-from fitting.report.report import write_report_files
-from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
+from fitting.report.files import write_with_picture
+from fitting.report.sections import Bullets, Report, ReportSection, Table, Text
 
-POINT_COLUMNS = (
-    "line",
-    "frequency_khz",
-    "measured_amplitude",
-    "fitted_amplitude",
-    "amplitude_misfit",
-    "measured_phase_deg",
-    "fitted_phase_deg",
-    "phase_misfit_deg",
-)
 _BACKGROUNDS = {
     ("phase", "none"): "z = A L",
     ("phase", "constant"): "z = A L + B",
@@ -136,10 +125,10 @@ def value_in_words(value: CalibratedValue) -> str:
     return f"{value.value:.6g}" if error is None else with_error(value.value, error)
 
 
-def point_records(result: Calibration) -> list[dict[str, Any]]:
-    """Return a mapping per point, with the columns `POINT_COLUMNS`; what was not measured is missing."""
+def _point_columns(result: Calibration) -> dict[str, np.ndarray | None]:
+    """Return the points with the fit, by column; None for what was not measured."""
     sweep, curves = result.sweep, result.curves
-    columns = {
+    return {
         "line": sweep.lines,
         "frequency_khz": sweep.frequency_khz,
         "measured_amplitude": sweep.amplitude,
@@ -149,8 +138,6 @@ def point_records(result: Calibration) -> list[dict[str, Any]]:
         "fitted_phase_deg": curves.phase_deg,
         "phase_misfit_deg": curves.phase_misfit_deg,
     }
-    known = {name: column.tolist() for name, column in columns.items() if column is not None}
-    return [{name: column[i] for name, column in known.items()} for i in range(sweep.points)]
 
 
 def write_calibration(
@@ -176,18 +163,13 @@ def write_calibration(
         OSError: if a file cannot be written.
     """
     shows = "Amplitude (and phase) with the fit; below, the misfit, fit less measured."
-    written = write_with_picture(calibration_report(result, found), calibration_figure(result), shows, folder, data)
-    write_table("calibration_points.csv", point_records(result), POINT_COLUMNS)
+    report, figure = calibration_report(result, found), calibration_figure(result)
+    written = write_with_picture(folder, "calibration", report, figure, shows, data, link="Picture")
+    columns = _point_columns(result)
+    known = {name: column.tolist() for name, column in columns.items() if column is not None}
+    records = [{name: column[i] for name, column in known.items()} for i in range(result.sweep.points)]
+    write_table("calibration_points.csv", records, tuple(columns))
     return written
-
-
-def write_with_picture(report: Report, figure: Figure, shows: str, folder: Path, data: dict[str, Any]) -> list[Path]:
-    """Write calibration.html, .txt, .json and .png: a report with one picture, and its numbers."""
-    # the SVG file has the layout of the PNG drawn before
-    picture = png_of(figure)
-    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
-    page = page_of(replace(report, sections=[seen, *report.sections]))
-    return write_report_files(folder, "calibration", text=text_of(report), data=data, picture=picture, page=page)
 
 
 def _value_cells(name: str, value: CalibratedValue, unit: str) -> list[str]:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.least_squares import IMPROBABLE
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import decimals, with_error
@@ -141,7 +142,7 @@ class Calibration(Result):
     @property
     def explained(self) -> bool:
         """Whether the model explains the points, as far as their errors are known."""
-        return not self.p_value < 1e-3
+        return not self.p_value < IMPROBABLE
 
     @property
     def table_comments(self) -> list[str]:

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.least_squares import IMPROBABLE
 from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.words import counted
 from fitting.calibration.model import SweepFit
 from fitting.calibration.result import Alternative, CalibratedValue
 from fitting.calibration.sweep import ResonanceSweep
 
-IMPROBABLE = 1e-3
-"""Probability of the chi2 below which the model does not explain the sweep."""
 _PEAK = 30.0
 """Fall of chi2 per unit of chi2/dof that four more parameters practically never bring about by chance."""
 _CLEARLY = 10.0
@@ -88,7 +87,7 @@ class SweepEvidence:
     def better(self) -> list[tuple[Alternative, float]]:
         """The background that describes the scan clearly better, if there is one, and by how much its AIC is lower."""
         best = _better(self.fit, self.alternatives)
-        return [] if best is None else [(best, self.fit.chi2 + 2.0 * len(self.fit.values) - best.aic)]
+        return [] if best is None else [(best, self.fit.aic - best.aic)]
 
 
 def judge_calibration(evidence: SweepEvidence) -> tuple[list[str], list[str]]:
@@ -105,7 +104,7 @@ def preferred(fit: SweepFit, background: str, alternatives: list[Alternative]) -
 
 def _better(fit: SweepFit, alternatives: list[Alternative]) -> Alternative | None:
     best = min(alternatives, key=lambda other: other.aic, default=None)
-    return best if best is not None and best.aic < fit.chi2 + 2.0 * len(fit.values) - _CLEARLY else None
+    return best if best is not None and best.aic < fit.aic - _CLEARLY else None
 
 
 def inflation_of(fit: SweepFit) -> Float[np.ndarray, "2"]:
@@ -143,7 +142,11 @@ _NO_MISFIT = 1e-6
 
 
 def autocorrelation(fit: SweepFit, lag: int) -> float:
-    """Return the correlation of residuals that lie `lag` points apart, of both components together."""
+    """Return the correlation of residuals that lie `lag` points apart, of both components together.
+
+    It is a size, of a scan's evenly spaced points. `fitting.fits.verdict.correlation_excess` is a test of neighbouring
+    rows of a table, whose readings may go together.
+    """
     blocks = fit.residual.reshape(2 if fit.objective.kind == "phase" else 1, -1)[:, : fit.points]
     total = float(np.sum(blocks**2))
     if total < _NO_MISFIT * fit.data or fit.points <= lag:

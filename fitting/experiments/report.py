@@ -23,7 +23,7 @@ from fitting.experiments.candidates import LEFT_OUT
 from fitting.experiments.prior import size_of
 from fitting.experiments.result import Design, Forecast
 from fitting.parameters import NUISANCE_NAMES
-from fitting.report.sections import Bullets, Part, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
+from fitting.report.sections import Bullets, Part, Report, ReportSection, Table, Text, text_of
 
 _CANDIDATE_COLUMNS = ("chosen", "gain", "left_out")
 _CRITERIA = {"D": "D-optimal: smallest joint confidence region of", "A": "A-optimal: smallest sum of variances of"}
@@ -92,22 +92,14 @@ def write_design(
     Raises:
         OSError: if a file cannot be written.
     """
-    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.report import write_report_files  # noqa: PLC0415
+    from fitting.report.files import write_with_picture  # noqa: PLC0415
 
     blank = folder / "to_fill_in.csv"
     report, figure = design_report(result), design_figure(result)
     shows = (
         "Expected errors over the number of points; what one more measurement at each drive adds, chosen ones circled."
     )
-    written = write_report_files(
-        folder,
-        "design",
-        text=text_of(report),
-        data=result.to_dict(),
-        picture=png_of(figure),
-        page=page_of(report, pictures_of([svg_of(figure)], [shows])),
-    )
+    written = write_with_picture(folder, "design", report, figure, shows, result.to_dict())
     write_whole(blank, table_to_fill_in(result))
     write_table("design.csv", result.points(), point_columns(result))
     write_table("candidates.csv", result.all_candidates(), (*point_columns(result), *_CANDIDATE_COLUMNS))

@@ -295,11 +295,8 @@ def parameters_with_intervals(estimate: FitEstimate) -> dict[str, FittedParamete
         for i, profile in enumerate(intervals):
             # at a bound the closest formula has no error of its own
             growth = errors[i] / before[i] if at.free[i] and before[i] > 0.0 else 1.0
-            low, high = (
-                None if end is None else estimate.values[i] + growth * (end - at.values[i])
-                for end in (profile.low, profile.high)
-            )
-            intervals[i] = within_range(at.problem.parameters[i], Interval(low, high, profile.reason))
+            moved = profile.moved(at.values[i], estimate.values[i], growth)
+            intervals[i] = within_range(at.problem.parameters[i], moved)
     return _parameters(estimate, errors, intervals)
 
 

@@ -42,6 +42,11 @@ class Interval:
     high: float | None
     reason: str | None = None
 
+    def moved(self, value: float, to: float, growth: float) -> "Interval":
+        """Return the interval of a value that has moved, its ends at so many times their distance from it."""
+        low, high = (None if end is None else float(to + growth * (end - value)) for end in (self.low, self.high))
+        return Interval(low, high, self.reason)
+
 
 @dataclass
 class _Side:

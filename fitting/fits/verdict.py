@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import IMPROBABLE, chi2_tail
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN, chi2_tail
 from afm_jax.outcomes import Rule, Rules, judge
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
 from fitting.fits.result import NO_MASS, FittedParameter, FittedRows
-from fitting.models import ASSUMED_ERROR_OF_Q, Held
-from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, is_nuisance, name_of_table, parameter_called
+from fitting.models import Held
+from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import ERRORS_OF_REPEATS, AmplitudeTable
 
@@ -35,9 +35,6 @@ by chance in one fit of three thousand."""
 _RUN, _LONGEST_RUN = 3.0, 3.5
 """Standard deviations by which residuals run together over the speed from which that is said, and what is left of that
 beside a wider model discrepancy from which the model does not explain the table."""
-LARGEST_SCALE = 3.0
-"""Scale of the errors that is believed: a spread given for that of a mean, a 3 sigma limit for 1 sigma. Errors that
-would have to be larger are wrong by more than a scale, and have to be stated nearer to the truth."""
 _CORRELATED = 4.0
 """Correlation of neighbouring residuals, in standard deviations of those of independent ones, from which they are
 taken to be correlated: by chance in one fit of ten thousand."""
@@ -56,8 +53,6 @@ _NO_TAPS = (
     'it (`fixed={"tip_radius_nm": 20}`, for example), or leave out rows that are not one impact a period.'
 )
 _AT_BOUND = 0.005
-_PULLED, _TORN = 2.0, 3.0
-"""Distance from what is known of a quantity, in its standard errors, from which it is named, and not believed."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +232,7 @@ def _contradicted(evidence: Evidence) -> list[str]:
 
 def _torn(evidence: Evidence) -> list[str]:
     """Return what the amplitudes contradict of what was measured otherwise, in words."""
-    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.pulled.items() if abs(pull) > _TORN]
+    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.pulled.items() if abs(pull) > TORN]
     return ["; ".join(torn)] if torn else []
 
 
@@ -341,12 +336,13 @@ def _damping_warnings(evidence: Evidence) -> list[str]:
 def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:
     """Return what there is to say of a table's quality factor, which was fitted along or not; "" for nothing."""
     if along is not None:
-        assumed = (table.quality_factor or 0.0, ASSUMED_ERROR_OF_Q * (table.quality_factor or 0.0))
+        usual = USUAL_ERRORS["quality_factor"]
+        assumed = (table.quality_factor or 0.0, usual * (table.quality_factor or 0.0))
         if table.quality_factor_error is not None or along.constraint != assumed:
             return ""
         given, error = assumed
         return (
-            f"quality_factor = {given:g} is given without an error: {100.0 * ASSUMED_ERROR_OF_Q:g} % was assumed "
+            f"quality_factor = {given:g} is given without an error: {100.0 * usual:g} % was assumed "
             f"({given:g} +- {error:.3g}). The loss depends on it: state it, like `# quality_factor = {given:g} +- 1`."
         )
     if table.quality_factor is None or table.quality_factor_error is not None:
@@ -632,7 +628,7 @@ WARNINGS: Rules[Evidence] = (
     Rule(lambda e: _disagreeing(e) if e.scattering else [], "Far from the mean law even for this scatter: {case}."),
     Rule(_may_be_anything, "Not determined by these taps: {case}."),
     Rule(
-        lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if _PULLED < abs(by) <= _TORN],
+        lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if PULLED < abs(by) <= TORN],
         "{case}: check it, the loss depends on it.",
     ),
     Rule(_limits, "{case}."),

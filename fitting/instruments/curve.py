@@ -26,6 +26,7 @@ from fitting.instruments.columns import ROLES, ColumnSource, example_of_columns,
 from fitting.instruments.formats import read_recording
 from fitting.instruments.lag import free_lag_deg, sense_of
 from fitting.instruments.recording import ASSUMED_RESONANCE, UNITS, Known, Recording, Segment, given_numbers
+from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 
 FORMAT_VERSION = 1
@@ -603,19 +604,16 @@ def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCu
     return replace(curve, phase_lag_deg=sense.lag_deg(phase), known=known, notes=notes)
 
 
-_USUAL = {"free_frequency_khz": 2e-4, "quality_factor": 0.05}
-"""Relative errors of what is given without one."""
-
-
 def _error_of_lag(curve: MeasuredCurve) -> float:
     """Return the standard error of the free tip's lag in degrees, from those of its frequency and quality factor."""
-    at = {key: float(curve.known[key].value) for key in ("drive_frequency_khz", *_USUAL)}
+    decisive = ("free_frequency_khz", "quality_factor")
+    at = {key: float(curve.known[key].value) for key in ("drive_frequency_khz", *decisive)}
 
     def lag(**changed: float) -> float:
         drive, free, quality_factor = (at | changed).values()
         return float(free_lag_deg(str(curve.known["drive"].value), drive / free, quality_factor))
 
-    errors = {key: curve.known[key].error or share * at[key] for key, share in _USUAL.items()}
+    errors = {key: curve.known[key].error or USUAL_ERRORS[key] * at[key] for key in decisive}
     parts = [0.5 * (lag(**{key: at[key] + error}) - lag(**{key: at[key] - error})) for key, error in errors.items()]
     return float(np.linalg.norm(parts))
 

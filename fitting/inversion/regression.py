@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.impact.law import Law, errors_of, extrapolation_of
-from afm_jax.least_squares import chi2_tail
+from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from fitting.fits import law_after
 from fitting.fits.law_after import root_of
 from fitting.inversion.result import (
@@ -41,7 +41,6 @@ _SLOW = 2.5
 _POINTS = 120
 _DECIDED = 6.0
 """Difference of chi2 from which a law with as many coefficients is called better."""
-_IMPROBABLE = 1e-3
 _PLAIN = {"viscous": "a viscous loss, linear in the speed", "restitution": "a coefficient of restitution"}
 
 
@@ -343,6 +342,6 @@ def _verdict(laws: dict[str, RegressedLaw]) -> tuple[str | None, str]:
     if other.chi2 - best.chi2 < _DECIDED:
         return None, f"the rows do not tell restitution from viscous loss ({numbers})"
     verdict = f"the rows support {_PLAIN[best.model]}, rather than {_PLAIN[other.model]} ({numbers})"
-    if best.p_value < _IMPROBABLE:
+    if best.p_value < IMPROBABLE:
         verdict += "; but neither law explains them"
     return best.model, verdict

@@ -20,7 +20,7 @@ from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import decimals, known, with_error
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
 from fitting.parameters import LAWS
-from fitting.report.sections import Bullets, Part, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
+from fitting.report.sections import Bullets, Part, Report, ReportSection, Table, Text, text_of
 
 _FORMULAS = {
     "viscous": LAWS["viscous"].formula,
@@ -82,19 +82,11 @@ def write_inversion(
     Raises:
         OSError: if a file cannot be written.
     """
-    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.report import write_report_files  # noqa: PLC0415
+    from fitting.report.files import write_with_picture  # noqa: PLC0415
 
     report, figure = inversion_report(result), inversion_figure(result)
     shows = "Loss and delay of every row over the approach speed, with the laws that were regressed on them."
-    written = write_report_files(
-        folder,
-        "invert",
-        text=text_of(report),
-        data=result.to_dict(),
-        picture=png_of(figure),
-        page=page_of(report, pictures_of([svg_of(figure)], [shows])),
-    )
+    written = write_with_picture(folder, "invert", report, figure, shows, result.to_dict())
     records = result.records()
     write_table("invert.csv", records, tuple(records[0]))
     if result.law is None:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.impact.law import Law
+from afm_jax.least_squares import IMPROBABLE
 from afm_jax.outcomes import Rule, Rules, judge
 from fitting.inversion.regression import Laws
 from fitting.inversion.result import LawDistance, RegressedLaw, described
@@ -13,8 +14,6 @@ from fitting.tables.table import AmplitudeTable
 
 _OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
-_IMPROBABLE = 1e-3
-"""Probability of as much scatter by noise alone below which a law does not explain the rows."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ REASONS: Rules[InversionEvidence] = [
             "{e.regressed} rows do not determine a law of two coefficients: measure at more drives",
         ),
         Rule(
-            lambda e: e.best_p_value < _IMPROBABLE,
+            lambda e: e.best_p_value < IMPROBABLE,
             "neither law explains the rows: check the errors, Q, and the calibration of tip and drive",
         ),
         Rule(

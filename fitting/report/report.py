@@ -1,6 +1,5 @@
 """A fit as a person reads it: text for the terminal, files for the drawer (HTML, JSON, CSV, PNG)."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import numpy as np
 
 from afm_jax.saved import saved
 from afm_jax.scenefile.law_files import save_law_csv
-from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 from fitting.fits.comparison import Comparison
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
@@ -185,6 +183,7 @@ def write_report(
     Raises:
         OSError: if a file cannot be written.
     """
+    from fitting.report.files import write_report_files  # noqa: PLC0415
     from fitting.report.html import fit_page  # noqa: PLC0415
     from fitting.report.plots import fit_pictures  # noqa: PLC0415
 
@@ -196,29 +195,3 @@ def write_report(
     law = folder / "law.csv"
     save_law_csv(result.law, law)
     return [*written, law]
-
-
-def write_report_files(
-    folder: Path, name: str, *, text: str, data: dict[str, Any], picture: bytes, page: str | None = None
-) -> list[Path]:
-    """Write name.txt, name.json, name.png and, if there is a page, name.html into a folder and return their paths.
-
-    Args:
-        folder: an existing folder; files of these names are replaced.
-        name: of the files.
-        text: the summary.
-        data: everything, as JSON has it.
-        picture: a PNG file.
-        page: an HTML file.
-
-    Raises:
-        OSError: if a file cannot be written.
-    """
-    paths = [folder / f"{name}.{ending}" for ending in ("txt", "json", "png")]
-    write_whole(paths[0], text + "\n")
-    write_whole(paths[1], json.dumps(data, indent=1, allow_nan=False) + "\n")
-    write_whole(paths[2], picture)
-    if page is None:
-        return paths
-    write_whole(folder / f"{name}.html", page)
-    return [folder / f"{name}.html", *paths]

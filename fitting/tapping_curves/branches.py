@@ -6,7 +6,7 @@ on the way back. Each such pair of heights, and the energy between the two branc
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -70,6 +70,12 @@ class Hysteresis:
             return None
         error = float(np.hypot(self.approach.standard_error, self.retract.standard_error))
         return self.approach.offset_nm - self.retract.offset_nm, error
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the change with its heights as mappings, and its width."""
+        ends = {"approach": self.approach, "retract": self.retract}
+        mapped = {name: None if end is None else end._asdict() for name, end in ends.items()}
+        return {**vars(self), **mapped, "width_nm": self.width_nm}
 
 
 def way_of(retract: bool | np.bool_) -> str:  # noqa: FBT001
@@ -142,7 +148,8 @@ def free_ends(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> bool:
 def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
     """Return the rows of the free tip: those farther away than the first that departs in amplitude or phase.
 
-    A single row that departs is none; the zero of the phase is that of the rows farther away.
+    A single row that departs is none; the zero of the phase is that of the rows farther away. Each row is tested by its
+    own error. `fitting.instruments.branch.look_at` looks for the free part of a recording of unknown noise, in blocks.
     """
     free = np.zeros(curve.rows, bool)
     for part in ways(curve):
@@ -291,16 +298,22 @@ def _height(
 
 def _half(curve: TappingCurve, part: np.ndarray) -> Height | None:
     """Return where the amplitude crosses half of the free one for good, by the straight line between two rows."""
-    above = np.flatnonzero(curve.amplitude_nm[part] >= 0.5 * curve.free_amplitude_nm[part])
-    if not above.size or above[-1] + 1 == len(part):
+    last = last_above(curve.amplitude_nm[part], 0.5 * curve.free_amplitude_nm[part])
+    if last is None:
         return None
-    rows = part[above[-1] : above[-1] + 2]
+    rows = part[last : last + 2]
     (far, near), (before, after) = curve.offset_nm[rows].tolist(), curve.amplitude_nm[rows].tolist()
     level, slope = curve.free_amplitude_nm[rows[0]], (after - before) / (near - far)
     if before - after > _STEEP * level:
         return _between(far, near)
     at = far + (0.5 * level - before) / slope
     return Height(float(at), float(curve.amplitude_error_nm[rows].max() / abs(slope)))
+
+
+def last_above(values: np.ndarray, level: np.ndarray | float) -> int | None:
+    """Return the place of the last value that is not below a level; None where none is, or all to the end are."""
+    above = np.flatnonzero(values >= level)
+    return int(above[-1]) if above.size and above[-1] + 1 < len(values) else None
 
 
 def _between(low: float, high: float) -> Height:
@@ -440,7 +453,11 @@ def rough_rows(curve: TappingCurve, chosen: Bool[np.ndarray, " rows"]) -> Bool[n
 
 
 def _off_parabola(place: Rows, amplitude: Rows, allowed: Rows, chosen: Bool[np.ndarray, " rows"]) -> Rows:
-    """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow."""
+    """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow.
+
+    Rows far off have hardly a pull by Cauchy's loss; by that of robust fits (`fitting.fits.objective`) they would keep
+    that of a row a few errors off.
+    """
 
     def off(factors: np.ndarray) -> np.ndarray:
         return (amplitude - np.polyval(factors, place)) / allowed

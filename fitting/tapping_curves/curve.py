@@ -9,15 +9,18 @@ first harmonic of the sample's force. Free, Z = -A0: that sets the time. Measure
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from fitting.instruments.lag import free_lag_deg
+from fitting.parameters import USUAL_ERRORS
+from fitting.tables.table import AmplitudeTable
 
 Rows = Float[np.ndarray, " rows"]
 Phasors = Complex[np.ndarray, " rows"]
+R = TypeVar("R", "TappingCurve", AmplitudeTable)
 
 
 class Given(NamedTuple):
@@ -31,13 +34,6 @@ class Given(NamedTuple):
 
 
 EXACTLY_ONE = Given(1.0)
-USUAL_ERRORS = {
-    "free_frequency_khz": 2e-4,
-    "quality_factor": 0.05,
-    "spring_constant_n_per_m": 0.05,
-    "tip_calibration": 0.01,
-}
-"""Relative standard errors of what is given without one."""
 
 
 def given_or_usual(name: str, value: float, error: float | None) -> Given:
@@ -113,15 +109,29 @@ class TappingCurve:
         """Whether any row has a phase."""
         return bool(np.isfinite(self.lag_deg).any())
 
+    @property
+    def relative_errors(self) -> dict[str, float]:
+        """Relative standard errors of every energy and virial, which go with k and the square of lengths, by name."""
+        calibration, spring = self.tip_calibration, self.spring_constant_n_per_m
+        return {
+            "tip_calibration": 2.0 * calibration.error / calibration.value,
+            "spring_constant_n_per_m": spring.error / spring.value,
+        }
+
     def part(self, chosen: Bool[np.ndarray, " rows"]) -> "TappingCurve":
         """Return the rows chosen, as a curve."""
-        own = {
-            name: value[chosen]
-            for name, value in vars(self).items()
-            if isinstance(value, np.ndarray) and value.shape == chosen.shape
-        }
         harmonics = {n: column[chosen] for n, column in self.harmonic_amplitudes_nm.items()}
-        return replace(self, **own, harmonic_amplitudes_nm=harmonics)
+        return replace(part_of(self, chosen), harmonic_amplitudes_nm=harmonics)
+
+
+def part_of(rows: R, chosen: Bool[np.ndarray, " rows"]) -> R:
+    """Return the rows chosen of a curve or a table, of every array that has a number for each row."""
+    own: dict[str, Any] = {
+        name: value[chosen]
+        for name, value in vars(rows).items()
+        if isinstance(value, np.ndarray) and value.shape == chosen.shape
+    }
+    return replace(rows, **own)
 
 
 HARMONICS_FACTOR = Given(0.9, 0.1)

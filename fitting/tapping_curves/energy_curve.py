@@ -7,13 +7,21 @@ from jaxtyping import Bool, Float, Int
 
 from fitting.tapping_curves.branches import CurveBranch
 from fitting.tapping_curves.curve import Rows, TappingCurve
-from fitting.tapping_curves.energy_fit import Z95, EnergyFit, losses, smoother_along, virial_noise
+from fitting.tapping_curves.energy import virial_noise_of
+from fitting.tapping_curves.energy_fit import Z95, EnergyFit, losses, smoother_along
 
 FEWEST_ROWS = 3
 """Of a group of rows that gets an energy of its own."""
 _MOST_POINTS = 81
 HEADLINE = (0.95, 0.9, 0.8, 0.7, 0.5)
 """Amplitudes, of the free one, at which a reader is told the energy."""
+
+
+def within(ratio: float, measured: np.ndarray, *columns: np.ndarray) -> tuple[float, ...] | None:
+    """Return columns at an amplitude, of the free one, by straight lines between those measured; None beyond them."""
+    if not measured[0] <= ratio <= measured[-1]:
+        return None
+    return tuple(float(np.interp(ratio, measured, column)) for column in columns)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,13 +48,21 @@ class EnergyCurve:
     energy_by_instrument: Float[np.ndarray, "points unknowns"]
     energy_noise_aj: Float[np.ndarray, " points"]
 
-    def at(self, ratio: float) -> tuple[float, float] | None:
+    def at(self, ratio: float) -> tuple[float, ...] | None:
         """Return energy and standard error at an amplitude, of the free one; None beyond the branch."""
-        if not self.amplitude_ratio[0] <= ratio <= self.amplitude_ratio[-1]:
-            return None
-        columns = (self.energy_aj, self.energy_error_aj)
-        energy, error = (float(np.interp(ratio, self.amplitude_ratio, column)) for column in columns)
-        return energy, error
+        return within(ratio, self.amplitude_ratio, self.energy_aj, self.energy_error_aj)
+
+    @property
+    def largest(self) -> tuple[float, float, float]:
+        """The largest energy, its standard error and the amplitude, of the free one, that it is at."""
+        top = int(np.argmax(self.energy_aj))
+        return float(self.energy_aj[top]), float(self.energy_error_aj[top]), float(self.amplitude_ratio[top])
+
+    @property
+    def by_height(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Height, energy and its standard error in the order of the heights."""
+        order = np.argsort(self.height_nm)
+        return self.height_nm[order], self.energy_aj[order], self.energy_error_aj[order]
 
     def to_dict(self) -> dict[str, np.ndarray]:
         """Return amplitude ratio, height, energy and virial with their bands."""
@@ -115,7 +131,8 @@ def _curve(
     # an energy at a height is one at an amplitude that is known no better than it was read
     ratio_error = np.sqrt(ratio_variance)
     energy_error = np.hypot(fit.error(energy, own, slopes), _steepness(energy, ratio) * ratio_error)
-    read, noise = fit.energies_at.virial_aj[rows], virial_noise(curve, fit)[rows]
+    read = fit.energies_at.virial_aj[rows]
+    noise = fit.scale * virial_noise_of(curve, fit.energies_at)[rows]
     smoother = smoother_along(place[rows], read, noise, max(float(np.ptp(read)), float(noise.mean())))
     weights, virial_own = smoother.at(at)
     virial = weights @ smoother.bins.average(read)

@@ -6,6 +6,10 @@ plus a Gaussian process (Matern 5/2) over the logarithm of the amplitude lost, f
 contact, and readings are energies(instrument) = function + noise of the row. Linear in small changes of the instrument,
 that is generalised least squares: function and instrument are determined together, and the band of the function holds
 what the instrument leaves open. A process of no size leaves the constant, one energy for all rows.
+
+Fits of laws compare readings with those that a law predicts (`fitting.fits.objective`). Here no law predicts a reading:
+what is compared is the energy that a reading gives with the function that is fitted along, so that residuals and
+weights are others. Steps, covariance and thresholds are those of fits (`afm_jax.least_squares`).
 """
 
 from dataclasses import dataclass, field, replace
@@ -16,10 +20,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
 
-from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, descended
+from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, covariance_of, descended
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, lag_of_free_tip
-from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of, virial_noise_of
+from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of
 
 _inverse_triangle, _solve_triangle = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
 _FAR = 4.0
@@ -28,8 +32,6 @@ _MOST_OUTLIERS = 0.2
 _HARMONICS_THAT_TELL = 4
 """With as many measured, what is left of the others does not matter."""
 Z95 = 1.959964
-TORN = 3.0
-"""Distance of a nuisance from what is given, in its standard errors, from which neither is believed."""
 _DRIFT_DEG, _DRIFT = 3.0, 0.02
 """Usual drift of phase and of free amplitude over a table, where free rows do not determine it."""
 _WIDE_DRIFT_DEG, _WIDE_DRIFT = 30.0, 0.3
@@ -83,9 +85,13 @@ class _Unknown(NamedTuple):
     """A nuisance: which rows it moves, what is known of it, and the unit it is counted in."""
 
     name: str
-    kind: str
     rows: Bool[np.ndarray, " rows"]
     given: Given
+
+    @property
+    def kind(self) -> str:
+        """The name without the number of its drive."""
+        return self.name.rstrip("_0123456789")
 
     @property
     def unit(self) -> float:
@@ -309,6 +315,12 @@ class EnergyFit:
         """Return the variance that the instrument leaves in what changes by it with some slopes."""
         return np.einsum("nu,uv,nv->n", slopes, self.covariance, slopes)
 
+    def covariance_with(self, known: tuple[str, ...]) -> np.ndarray:
+        """Return the covariance of the unknowns if some of the nuisances, by name, were known."""
+        places = [i for i, one in enumerate(self.nuisances) if one.name in known]
+        gain = np.linalg.solve(self.covariance[np.ix_(places, places)], self.covariance[places])
+        return self.covariance - gain.T @ self.covariance[places]
+
     def budget(self, number: int) -> dict[str, float]:
         """Return what the variance of a constant comes from, in aJ^2."""
         energy, variance, slopes = self.function(number, np.zeros(1))
@@ -406,31 +418,23 @@ def _scale(found: EnergyFit) -> float:
 
 def _unknowns(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> list[_Unknown]:
     every = np.ones(curve.rows, bool)
-    found = [
-        _Unknown(name, name, every, given)
-        for name, given in (
-            ("free_frequency_khz", curve.free_frequency_khz),
-            ("quality_factor", curve.quality_factor),
-        )
-        if given.error > 0.0
-    ]
+    lever = {"free_frequency_khz": curve.free_frequency_khz, "quality_factor": curve.quality_factor}
+    found = [_Unknown(name, every, given) for name, given in lever.items() if given.error > 0.0]
     start = np.broadcast_to(plain_instrument(curve, free).phase_zero_deg, (curve.rows,))
     for i, frequency in enumerate(np.unique(curve.drive_frequency_khz).tolist()):
         here = curve.drive_frequency_khz == frequency
         known = curve.phase_zero_deg or Given(float(np.mean(start[here])), np.inf)
         if known.error > 0.0:
-            found.append(_Unknown(f"phase_zero_deg_{i}", "phase_zero_deg", here, known))
+            found.append(_Unknown(f"phase_zero_deg_{i}", here, known))
     if len(curve.harmonic_amplitudes_nm) < _HARMONICS_THAT_TELL:
-        found.append(_Unknown("harmonics_factor", "harmonics_factor", every, HARMONICS_FACTOR))
+        found.append(_Unknown("harmonics_factor", every, HARMONICS_FACTOR))
     if curve.free_amplitude_error > 0.0:
-        for i, here in enumerate(_levels(curve)):
-            found.append(
-                _Unknown(f"free_amplitude_{i}", "free_amplitude", here, Given(1.0, curve.free_amplitude_error))
-            )
+        known = Given(1.0, curve.free_amplitude_error)
+        found += [_Unknown(f"free_amplitude_{i}", here, known) for i, here in enumerate(_levels(curve))]
     if curve.time is not None:
         phase, amplitude = (_WIDE_DRIFT_DEG, _WIDE_DRIFT) if free_ends(curve, free) else (_DRIFT_DEG, _DRIFT)
-        found.append(_Unknown("phase_drift_deg", "phase_drift_deg", every, Given(0.0, phase)))
-        found.append(_Unknown("free_amplitude_drift", "free_amplitude_drift", every, Given(0.0, amplitude)))
+        found.append(_Unknown("phase_drift_deg", every, Given(0.0, phase)))
+        found.append(_Unknown("free_amplitude_drift", every, Given(0.0, amplitude)))
     return found
 
 
@@ -557,17 +561,15 @@ class _EnergySearch:
         time = np.zeros(curve.rows) if curve.time is None else curve.time
         fields = {"phase_drift_deg": "phase_zero_deg", "free_amplitude_drift": "free_amplitude_factor"}
         fields |= {"free_amplitude": "free_amplitude_factor"}
-        columns: list[list[np.ndarray]] = [[], [], [], []]
+        slopes = np.zeros((len(_EnergySlopes._fields), curve.rows, len(self.unknowns)))
         for i, one in enumerate(self.unknowns):
             field = fields.get(one.kind, one.kind)
             # the logarithm of Q is what moves
             unit = one.unit * (self.values(x)[i] / one.given.value if one.kind == "quality_factor" else 1.0)
             here = unit * one.rows * (time if one.kind.endswith(("drift", "drift_deg")) else 1.0)
-            for column, part in zip(columns, by[field], strict=False):
-                column.append(part * here)
-            columns[3].append(here if field == "free_amplitude_factor" else np.zeros(curve.rows))
-        shape = (curve.rows, 0)
-        return _EnergySlopes(*(np.stack(c, axis=1) if c else np.zeros(shape) for c in columns))
+            slopes[:-1, :, i] = np.stack(by[field]) * here
+            slopes[-1, :, i] = here if field == "free_amplitude_factor" else 0.0
+        return _EnergySlopes(*slopes)
 
     def fitted(self, groups: list[np.ndarray], scale: float) -> EnergyFit:
         """Return the fit of some groups, the rows' own errors multiplied by a scale."""
@@ -587,15 +589,12 @@ class _EnergySearch:
     def _start(self) -> np.ndarray:
         """Return the unknowns of the instrument as it is given."""
         plain = plain_instrument(self.curve, self.free)
-        at = np.zeros(len(self.unknowns))
-        time = self.curve.time
+        drifting = {"phase_drift_deg": plain.phase_zero_deg, "free_amplitude_drift": plain.free_amplitude_factor}
+        at, time = np.zeros(len(self.unknowns)), self.curve.time
         for i, one in enumerate(self.unknowns):
-            if one.kind == "phase_drift_deg" and time is not None and np.ptp(time) > 0.0:
-                zero = np.broadcast_to(plain.phase_zero_deg, (self.curve.rows,))
-                at[i] = np.polyfit(time, zero, 1)[0] / one.unit
-            if one.kind == "free_amplitude_drift" and time is not None and np.ptp(time) > 0.0:
-                factor = np.broadcast_to(plain.free_amplitude_factor, (self.curve.rows,))
-                at[i] = np.polyfit(time, factor, 1)[0] / one.unit
+            if one.kind in drifting and time is not None and np.ptp(time) > 0.0:
+                along = np.broadcast_to(drifting[one.kind], (self.curve.rows,))
+                at[i] = np.polyfit(time, along, 1)[0] / one.unit
         return at
 
     def _of_free(self, at: Instrument) -> np.ndarray:
@@ -727,27 +726,21 @@ class _EnergySearch:
     ) -> EnergyFit:
         """Return the fit at some unknowns; their covariance is that of its readings where none is given."""
         curve, state = self.curve, self._state(x, groups, scale)
-        found, of_free = state.found, state.of_free
         smoothers = [Smoother.of(*pair) for pair in zip(state.bins, processes, strict=True)]
         slopes = self._slopes(state, groups, smoothers)
         if covariance is None:
             _, jacobian = self._residuals(state, slopes, groups, smoothers)
-            covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian, hermitian=True))
+            covariance = covariance_of(jacobian.T @ jacobian)
         units = self.values(x) - self.values(x - 1e-6) if len(x) else x
         errors = np.sqrt(np.diag(covariance)) * units / 1e-6
-        noise = scale * noise_of(self.smoothed, state.smooth)
-        residual, taken = np.full(curve.rows, np.nan), 0.0
-        for rows, smoother, values in zip(groups, smoothers, state.energies, strict=True):
-            residual[rows] = (found.energy_aj[rows] - smoother.mean(self.place[rows], values)) / noise[rows]
-            taken += float(smoother.leverage(self.place[rows]).sum())
-        used = np.zeros(curve.rows, bool)
-        used[np.concatenate(groups)] = True
-        rows_chi2 = float(np.nansum(residual**2))
-        # what the instrument takes of the rows' freedom: at most one each
+        residual = self._of_rows(state, groups, smoothers, scale)
+        taken = sum(float(one.leverage(self.place[rows]).sum()) for rows, one in zip(groups, smoothers, strict=True))
+        used = np.isin(np.arange(curve.rows), np.concatenate(groups))
+        rows_chi2, of_free = float(np.nansum(residual**2)), state.of_free
         return EnergyFit(
             rows=tuple(groups),
             smoothers=tuple(smoothers),
-            energies_at=found,
+            energies_at=state.found,
             slopes=slopes.energy,
             virial_slopes=slopes.virial,
             covariance=covariance,
@@ -761,17 +754,23 @@ class _EnergySearch:
             outliers=np.zeros(curve.rows, bool),
             residual=residual,
             chi2=rows_chi2 + float(of_free @ of_free + np.sum((self.known * x) ** 2)),
+            # what the instrument takes of the rows' freedom: at most one each
             degrees_of_freedom=round(used.sum() + len(of_free) + self.known.sum() - len(x) - taken),
             rows_chi2=rows_chi2,
             rows_freedom=float(used.sum() - taken),
             scale=scale,
-            relative_error={
-                "spring_constant_n_per_m": curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
-                "tip_calibration": 2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
-            },
+            relative_error=curve.relative_errors,
             search=self,
             at=x,
         )
+
+    def _of_rows(self, state: _State, groups: list, smoothers: list[Smoother], scale: float) -> Rows:
+        """Return how far the rows' energies are from their functions, in errors; NaN for rows of none."""
+        noise = scale * noise_of(self.smoothed, state.smooth)
+        residual = np.full(self.curve.rows, np.nan)
+        for rows, one, values in zip(groups, smoothers, state.energies, strict=True):
+            residual[rows] = (state.found.energy_aj[rows] - one.mean(self.place[rows], values)) / noise[rows]
+        return residual
 
 
 COMMON = ("free_frequency_khz", "quality_factor", "harmonics_factor")
@@ -795,7 +794,7 @@ def fitted_together(fits: list[EnergyFit]) -> tuple[list[EnergyFit], Common]:
 
     Each curve alone tells them by a Gaussian, mostly by how smooth it makes the energy; energies of curves of one
     sample are alike, so that this is counted as that of one curve: the weighted mean with the error of one. Each
-    curve's own unknowns and functions follow.
+    curve's own unknowns and functions follow. Tables fitted together (`fitting.fits.several`) are independent instead.
 
     Args:
         fits: of curves for which the same is given of the lever.
@@ -933,8 +932,3 @@ def smoother_along(place: np.ndarray, values: np.ndarray, noise: np.ndarray, sca
     return max(
         Smoother.trials(bins, trials), key=lambda one: -float(np.sum(one.whitened(y) ** 2)) - one.log_determinant
     )
-
-
-def virial_noise(curve: TappingCurve, fit: EnergyFit) -> Rows:
-    """Return the standard error of each virial from its own row's noise, as the fit takes it, in aJ."""
-    return fit.scale * virial_noise_of(curve, fit.energies_at)

@@ -23,8 +23,9 @@ from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of
 from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
+from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
-from fitting.tapping_curves.curve import HARMONICS_FACTOR, USUAL_ERRORS, Given, Instrument, TappingCurve
+from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies
 
 _BEYOND = 3.0
@@ -318,6 +319,60 @@ def _forms(drive: str, frequency: float, instrument: Instrument, spring: float, 
     return _Forms(solved[:, 0], solved[:, 1])
 
 
+class _Pixels(NamedTuple):
+    """Energy or virial of every pixel.
+
+    Attributes:
+        values: of the pixels.
+        errors: standard error of each pixel, its own.
+        common: by how much each changes with one standard error of what all pixels share, by its name.
+    """
+
+    values: Float[np.ndarray, "rows columns"]
+    errors: Float[np.ndarray, "rows columns"]
+    common: dict[str, Float[np.ndarray, "rows columns"]]
+
+
+def _pixels(
+    form: Float[np.ndarray, " four"],
+    changes: dict[str, Float[np.ndarray, " four"]],
+    readings: _ImageReadings,
+    known: dict[str, Known],
+) -> _Pixels:
+    """Return energy or virial of every pixel.
+
+    Args:
+        form: its coefficients.
+        changes: of the coefficients with one standard error of each number of the instrument.
+        readings: of the image.
+        known: of the instrument.
+    """
+    amplitude, free, behind, *errors = readings
+    zero = known.get("free_phase_deg", Known(0.0, "deg", "", _USUAL_ZERO_DEG[0])).error or _USUAL_ZERO_DEG[0]
+    angle = np.deg2rad(behind)
+    across, along = amplitude * free * np.cos(angle), amplitude * free * np.sin(angle)
+    basis = (np.square(free), amplitude**2, across, along)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_amplitude = 2.0 * form[1] * amplitude + (form[2] * across + form[3] * along) / amplitude
+    by_lag = (form[3] * across - form[2] * along) * (np.pi / 180.0)
+    by_free = 2.0 * form[0] * basis[0] + _sum(form[2:], basis[2:])
+    common = {"free_amplitude": _error(known, "free_amplitude_nm") * by_free, "free_phase": -zero * by_lag}
+    common |= {source: _sum(change, basis) for source, change in changes.items()}
+    return _Pixels(_sum(form, basis), np.hypot(by_amplitude * errors[0], by_lag * errors[1]), common)
+
+
+def _states(readings: _ImageReadings, energy: _Pixels) -> Int[np.ndarray, "rows columns"]:
+    """Return what became of each pixel, a `PixelState`."""
+    amplitude, free = readings.amplitude_nm, readings.free_amplitude_nm
+    state = np.zeros(amplitude.shape, dtype=np.int8)
+    total = np.sqrt(energy.errors**2 + sum(part**2 for part in energy.common.values()))
+    with np.errstate(invalid="ignore"):
+        state[energy.values < -_BEYOND * total] = PixelState.ENERGY_BELOW_ZERO
+        state[amplitude > free + _BEYOND * readings.amplitude_error_nm] = PixelState.AMPLITUDE_ABOVE_FREE
+    state[~(np.isfinite(energy.values) & (amplitude > 0.0))] = PixelState.NOT_MEASURED
+    return state
+
+
 def _mapped(
     images: AmplitudeAndPhase,
     drive: str,
@@ -326,54 +381,27 @@ def _mapped(
     notes: list[str],
 ) -> TappingMap:
     """Return the map of readings."""
-    amplitude, free, behind, *errors = readings
     frequency = _value(known, "drive_frequency_khz")
     instrument = Instrument(_value(known, "free_frequency_khz"), _value(known, "quality_factor"))
     spring, calibration = _value(known, "spring_constant_n_per_m"), _value(known, "tip_calibration")
     forms = _forms(drive, frequency, instrument, spring, calibration)
-    angle = np.deg2rad(behind)
-    across, along = amplitude * free * np.cos(angle), amplitude * free * np.sin(angle)
-    basis = (np.square(free), amplitude**2, across, along)
-    values = {name: _sum(form, basis) for name, form in forms._asdict().items()}
-    by_amplitude, by_lag = {}, {}
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for name, form in forms._asdict().items():
-            by_amplitude[name] = 2.0 * form[1] * amplitude + (form[2] * across + form[3] * along) / amplitude
-            by_lag[name] = (form[3] * across - form[2] * along) * (np.pi / 180.0)
-    own = {name: np.hypot(by_amplitude[name] * errors[0], by_lag[name] * errors[1]) for name in values}
-
-    state = np.zeros(amplitude.shape, dtype=np.int8)
-    measured = np.isfinite(values["energy"]) & (amplitude > 0.0)
     sources = _sources(drive, frequency, instrument, spring, calibration, known, forms)
-    zero = known.get("free_phase_deg", Known(0.0, "deg", "", _USUAL_ZERO_DEG[0])).error or _USUAL_ZERO_DEG[0]
-
-    def parts(name: str) -> dict[str, Any]:
-        form = getattr(forms, name)
-        by_free = 2.0 * form[0] * basis[0] + _sum(form[2:], basis[2:])
-        own_zero = {"free_amplitude": _error(known, "free_amplitude_nm") * by_free, "free_phase": -zero * by_lag[name]}
-        return own_zero | {source: _sum(getattr(change, name), basis) for source, change in sources.items()}
-
-    common = parts("energy")
-    total = np.sqrt(own["energy"] ** 2 + sum(part**2 for part in common.values()))
-    with np.errstate(invalid="ignore"):
-        state[values["energy"] < -_BEYOND * total] = PixelState.ENERGY_BELOW_ZERO
-        state[amplitude > free + _BEYOND * errors[0]] = PixelState.AMPLITUDE_ABOVE_FREE
-    state[~measured] = PixelState.NOT_MEASURED
-    used = state == PixelState.USED
-    pixel = _median_pixel(values["energy"], used)
-    at, at_virial = (
-        {source: float(np.broadcast_to(part, amplitude.shape)[pixel]) for source, part in whole.items()}
-        for whole in (common, parts("virial"))
+    energy, virial = (
+        _pixels(form, {source: change[i] for source, change in sources.items()}, readings, known)
+        for i, form in enumerate(forms)
     )
-    masked = {name: np.where(used, array, np.nan) for name, array in values.items()}
+    state = _states(readings, energy)
+    used = state == PixelState.USED
+    pixel = _median_pixel(energy.values, used)
+    at, at_virial = ({name: float(part[pixel]) for name, part in one.common.items()} for one in (energy, virial))
     return TappingMap(
         source=images.source,
         drive=drive,
         unit="nm^2" if known["spring_constant_n_per_m"].origin.startswith("not known") else "aJ",
-        energy=masked["energy"],
-        energy_error=np.where(used, own["energy"], np.nan),
-        virial=masked["virial"],
-        virial_error=np.where(used, own["virial"], np.nan),
+        energy=np.where(used, energy.values, np.nan),
+        energy_error=np.where(used, energy.errors, np.nan),
+        virial=np.where(used, virial.values, np.nan),
+        virial_error=np.where(used, virial.errors, np.nan),
         state=state,
         energy_common_error=float(np.linalg.norm(list(at.values()))),
         virial_common_error=float(np.linalg.norm(list(at_virial.values()))),

@@ -12,6 +12,7 @@ from fitting.instruments.curve import MeasuredCurve, read_curves, table_text
 from fitting.instruments.formats import MARKS
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, parse_table
+from fitting.tapping_curves.branches import last_above
 
 _IS_TABLE = (b"lockin_amplitude_nm", b"peak_amplitude_nm", b"free_frequency_khz")
 
@@ -109,8 +110,7 @@ def _crossing(offset: Float[np.ndarray, " n"], amplitude: Float[np.ndarray, " n"
     """Return the height beyond which the amplitude stays below a level, between two rows by the straight line."""
     order = np.argsort(offset, kind="stable")
     offset, amplitude = offset[order], amplitude[order]
-    above = np.flatnonzero(amplitude >= level)
-    if not above.size or above[-1] + 1 == len(offset):
+    last = last_above(amplitude, level)
+    if last is None:
         return None
-    last = int(above[-1])
     return float(np.interp(-level, -amplitude[last : last + 2], offset[last : last + 2]))

@@ -107,12 +107,8 @@ def _predicted_lag(axes: Axes, result: Tapping) -> None:
     """Draw the lag at which a tap of the fitted energy leaves the amplitude that was read."""
     if result.functions is None:
         return
-    curve, wanted = result.curve, np.full(result.curve.rows, np.nan)
-    for branch in result.branches:
-        along = branch.curve
-        order = np.argsort(along.height_nm)
-        wanted[branch.rows] = np.interp(curve.offset_nm[branch.rows], along.height_nm[order], along.energy_aj[order])
-    lags = lags_of(curve, result.functions.instrument, wanted)
+    curve = result.curve
+    lags = lags_of(curve, result.functions.instrument, result.energy_along_branches_aj)
     for branch in result.branches:
         rows = branch.rows[np.isfinite(lags[branch.rows])]
         rows = rows[np.argsort(curve.offset_nm[rows])]
@@ -123,10 +119,8 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
     """Draw the energy along the branches with its 95 % band, and where there is one energy that; return their range."""
     ends = [0.0]
     for branch in result.branches:
-        along = branch.curve
-        order = np.argsort(along.height_nm)
-        height, energy = along.height_nm[order], along.energy_aj[order]
-        error = Z95 * along.energy_error_aj[order]
+        height, energy, error = branch.curve.by_height
+        error = Z95 * error
         colour = ACCENT if branch.retract else BLUE
         axes.plot(height, energy, color=colour, lw=1.2)
         axes.fill_between(height, energy - error, energy + error, color=colour, alpha=0.15, lw=0)

@@ -119,15 +119,15 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     several = len({branch.drive for branch in result.branches}) > 1
     cells = []
     for branch in result.branches:
-        curve, top = branch.curve, int(np.argmax(branch.curve.energy_aj))
+        curve = branch.curve
+        *largest, place = curve.largest
         drive = f", {branch.drive_frequency_khz:g} kHz, {branch.free_amplitude_nm:.4g} nm" if several else ""
-        largest = with_error(float(curve.energy_aj[top]), float(curve.energy_error_aj[top]))
         cells.append(
             [
                 branch.name + drive,
                 f"{curve.amplitude_ratio[0]:.2f} to {curve.amplitude_ratio[-1]:.2f}",
                 *("-" if (at := curve.at(ratio)) is None else with_error(*at) for ratio in HEADLINE),
-                f"{largest} at {curve.amplitude_ratio[top]:.2f}",
+                f"{with_error(*largest)} at {place:.2f}",
             ]
         )
     lines = [
@@ -277,7 +277,7 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     """
     # a call without --out needs neither matplotlib nor JAX
     from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.report import write_report, write_report_files  # noqa: PLC0415
+    from fitting.report.files import write_report_files  # noqa: PLC0415
     from fitting.tapping_curves.pictures import tapping_figures  # noqa: PLC0415
 
     figures = tapping_figures(result)
@@ -294,8 +294,12 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     write_whole(folder / "tapping_frames.png", frames)
     records = result.keyed(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
-    law = [] if result.law is None else write_report(result.law, folder, write_table)
-    return [*written, folder / "tapping_frames.png", *law]
+    written.append(folder / "tapping_frames.png")
+    if result.law is None:
+        return written
+    from fitting.report.report import write_report  # noqa: PLC0415
+
+    return [*written, *write_report(result.law, folder, write_table)]
 
 
 def tapping_page(result: Tapping, pictures: Sequence[bytes], shows: Sequence[str]) -> str:
@@ -386,7 +390,7 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
         OSError: if a file cannot be written.
     """
     from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.report import write_report_files  # noqa: PLC0415
+    from fitting.report.files import write_report_files  # noqa: PLC0415
     from fitting.tapping_curves.pictures import together_figure  # noqa: PLC0415
 
     figure, report = together_figure(result), together_report(result)

@@ -11,9 +11,10 @@ from afm_jax.outcomes import judge
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import effective_mass_ng
+from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
-from fitting.tapping_curves.curve import USUAL_ERRORS, Rows, TappingCurve
+from fitting.tapping_curves.curve import Rows, TappingCurve
 from fitting.tapping_curves.energy_by_speed import FEWEST_SPEEDS, LawOfEnergies, laws_of_energies
 from fitting.tapping_curves.energy_curve import HEADLINE, TappingBranch, WayDifference, differences_of_ways
 from fitting.tapping_curves.energy_fit import Z95, EnergyFit, Nuisance
@@ -29,6 +30,10 @@ from fitting.tapping_curves.verdict import (
 
 if TYPE_CHECKING:
     from fitting.fits.result import FitResult
+
+
+_STATISTICS = ("chi2", "degrees_of_freedom", "p_value", "scale")
+"""Of a fit of energies, as the JSON has them."""
 
 
 @dataclass(frozen=True)
@@ -231,18 +236,15 @@ class Tapping(Result):
         Where one energy does not explain the rows `value` is None and `reason` says why.
         """
         blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None}
-        if self.fit is None:
-            bound = None if self.bound_aj is None else (0.0, self.bound_aj)
-            kind = "none" if bound is None else "upper bound"
-            return blank | {"interval95": bound, "kind": kind, "reason": self.why_not_constant if bound is None else ""}
-        if self.why_not_constant:
+        if self.fit is None and self.bound_aj is not None:
+            return blank | {"interval95": (0.0, self.bound_aj), "kind": "upper bound", "reason": ""}
+        if self.fit is None or self.why_not_constant:
             return blank | {"kind": "none", "reason": self.why_not_constant}
         chosen = self.chief
         if len(chosen) > 1:
             each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
             return blank | {"kind": "several", "reason": f"each drive has its own: {each}"}
         value, error, interval = self.constant(chosen[0])
-        interval = np.maximum(interval, 0.0) if value > 0.0 else np.array(interval)
         if not value > 0.0:
             return blank | {
                 "kind": "none",
@@ -253,7 +255,7 @@ class Tapping(Result):
         return {
             "value": value,
             "standard_error": error,
-            "interval95": interval,
+            "interval95": np.maximum(interval, 0.0),
             "kind": "bracket" if not error < BRACKET * value else "fit",
             "reason": "",
             "assumption": "each tap of the branch takes the same energy",
@@ -281,14 +283,19 @@ class Tapping(Result):
     @property
     def largest(self) -> dict[str, float] | None:
         """The largest energy of a tap along the branches: `value`, `standard_error`, `amplitude_ratio`."""
-        tops = []
-        for branch in self.branches:
-            curve = branch.curve
-            top = int(np.argmax(curve.energy_aj))
-            tops.append((curve.energy_aj[top], curve.energy_error_aj[top], curve.amplitude_ratio[top]))
-        if not tops:
+        if not self.branches:
             return None
-        return dict(zip(("value", "standard_error", "amplitude_ratio"), map(float, max(tops)), strict=True))
+        top = max(branch.curve.largest for branch in self.branches)
+        return dict(zip(("value", "standard_error", "amplitude_ratio"), top, strict=True))
+
+    @property
+    def energy_along_branches_aj(self) -> Rows:
+        """Energy of each row's tap by the function of its branch; NaN for rows of none."""
+        found = np.full(self.curve.rows, np.nan)
+        for branch in self.branches:
+            height, energy, _ = branch.curve.by_height
+            found[branch.rows] = np.interp(self.curve.offset_nm[branch.rows], height, energy)
+        return found
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:
@@ -420,6 +427,44 @@ class Tapping(Result):
             if note.startswith("excluded")
         ]
 
+    def _named(self, *names: str) -> dict[str, Any]:
+        """Return attributes of the result by their names."""
+        return {name: getattr(self, name) for name in names}
+
+    def _branches(self) -> list[dict[str, Any]]:
+        """Return what is known of each branch: its rows, its one energy if it has one, and its curve."""
+        group = self.group_of_rows
+        return [
+            {
+                "drive_frequency_khz": branch.drive_frequency_khz,
+                "free_amplitude_nm": branch.free_amplitude_nm,
+                "branch": branch.way,
+                "repulsive": branch.repulsive,
+                "rows": len(branch.rows),
+                **self._constant_of(int(group[branch.rows[0]])),
+                "curve": branch.curve.to_dict(),
+            }
+            for branch in self.branches
+        ]
+
+    def _fits(self) -> dict[str, Any]:
+        """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
+        fit, functions, smooth = self.fit, self.functions, None
+        if functions is not None:
+            smooth = {
+                "valid": not self.why_not_functions,
+                "reason": self.why_not_functions or None,
+                **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
+                "nuisances": nuisances_as_dict(functions.nuisances),
+            }
+        # of one energy that does not describe the rows the instrument tells nothing
+        believed = fit if self.described or functions is None else functions
+        return {
+            "functions": smooth,
+            **{name: None if fit is None else getattr(fit, name) for name in _STATISTICS},
+            "nuisances": {} if believed is None else nuisances_as_dict(believed.nuisances),
+        }
+
     def _constant_of(self, number: int) -> dict[str, Any]:
         """Return whether one energy explains the rows of a group, and which."""
         blank: dict[str, Any] = {"energy_aj": None, "standard_error_aj": None, "interval95_aj": None}
@@ -462,72 +507,30 @@ class Tapping(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        fit, functions, energy = self.fit, self.functions, self.energy
-        # of one energy that does not describe the rows the instrument tells nothing
-        believed = fit if self.described or functions is None else functions
-        group = self.group_of_rows
-        branches = [
-            {
-                "drive_frequency_khz": branch.drive_frequency_khz,
-                "free_amplitude_nm": branch.free_amplitude_nm,
-                "branch": branch.way,
-                "repulsive": branch.repulsive,
-                "rows": len(branch.rows),
-                **self._constant_of(int(group[branch.rows[0]])),
-                "curve": branch.curve.to_dict(),
-            }
-            for branch in self.branches
-        ]
+        energy, law = self.energy, None if self.law is None else self.law.to_dict()
         payload = plain(
             {
-                "valid": self.valid,
-                "reasons": self.reasons,
-                "warnings": self.warnings,
+                **self._named("valid", "reasons", "warnings"),
                 "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
                 "energy_per_tap_reason": energy["reason"] or None,
                 "largest_energy_aj": self.largest,
-                "energies_at": self.energies_at,
-                "turning_points": self.turning_points,
+                **self._named("energies_at", "turning_points"),
                 "way_differences": [
                     {"approach": i, "retract": j, **vars(one)} for (i, j), one in self.way_differences.items()
                 ],
                 "plain_energy_aj": self.plain_energy,
                 "epsilon_nm2_per_us2": self.epsilon,
-                "energy_by_speed": self.energy_by_speed,
-                "assumptions": self.assumptions,
+                **self._named("energy_by_speed", "assumptions"),
                 "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
-                "branches": branches,
-                "functions": None
-                if functions is None
-                else {
-                    "valid": not self.why_not_functions,
-                    "reason": self.why_not_functions or None,
-                    "rows_chi2": functions.rows_chi2,
-                    "rows_freedom": functions.rows_freedom,
-                    "scale": functions.scale,
-                    "nuisances": nuisances_as_dict(functions.nuisances),
-                },
-                "chi2": None if fit is None else fit.chi2,
-                "degrees_of_freedom": None if fit is None else fit.degrees_of_freedom,
-                "p_value": None if fit is None else fit.p_value,
-                "scale": None if fit is None else fit.scale,
-                "nuisances": {} if believed is None else nuisances_as_dict(believed.nuisances),
-                "hysteresis": [
-                    {
-                        **vars(one),
-                        "approach": _height(one.approach),
-                        "retract": _height(one.retract),
-                        "width_nm": one.width_nm,
-                    }
-                    for one in self.hysteresis
-                ],
-                "law": None if self.law is None else self.law.to_dict()["law"],
+                "branches": self._branches(),
+                **self._fits(),
+                "hysteresis": [one.to_dict() for one in self.hysteresis],
+                "law": None if law is None else law["law"],
                 "reason": self.reason,
-                "fit": None if self.law is None else self.law.to_dict(),
+                "fit": law,
                 "rows": self.records(),
-                "set_aside": self.set_aside,
+                **self._named("set_aside", "versions"),
                 "input": {name: value for name, value in vars(self.table).items() if value is not None},
-                "versions": self.versions,
             }
         )
         if not self.curve.over_spring_constant:
@@ -550,7 +553,11 @@ def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
 
 
 def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
-    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive."""
+    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive.
+
+    Within its errors an energy is linear in what is fitted, so that no chi2 needs to be profiled as for laws
+    (`fitting.fits.intervals`).
+    """
     low, high = energy - Z95 * error, energy + Z95 * error
     if share == 0.0 or energy <= 0.0:
         return low, high
@@ -558,7 +565,3 @@ def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
     if low <= 0.0:
         return low, float(energy * np.exp(above))
     return float(energy * np.exp(-np.hypot(np.log(energy / low), Z95 * share))), float(energy * np.exp(above))
-
-
-def _height(found: Any) -> dict[str, float] | None:
-    return None if found is None else found._asdict()

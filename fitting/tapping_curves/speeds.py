@@ -4,6 +4,9 @@ Seen with the free motion taken away, w = z + A0 cos(omega t), the tip flies fre
 sigma + A0 cos(omega t). A flight that starts on the sample at t_out with the relative speed u_out and meets it again
 at t_out + T - tau has three unknowns and three conditions: the lock-in's complex W = Z + A0, and the sample's height at
 its end. The spring constant does not enter.
+
+`fitting.inversion.flight` finds such flights over a sample that moves by least squares, from the peak too, and takes
+back what a Hertz contact does to tip and readings. Here the tip counts as resting on the sample during the contact.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
 """`tapping`: what a tapping curve says of a tap, and where its drive allows it of the impact law."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -27,12 +27,14 @@ from fitting.tapping_curves.curve import (
     HARMONICS_FACTOR,
     Given,
     Instrument,
+    Rows,
     TappingCurve,
     given_or_usual,
     lag_of_free_tip,
     motion_of,
+    part_of,
 )
-from fitting.tapping_curves.energy import energies, largest_energies, noise_of, virial_noise_of
+from fitting.tapping_curves.energy import Energies, energies, largest_energies, noise_of, virial_noise_of
 from fitting.tapping_curves.energy_curve import FEWEST_ROWS, branches_of
 from fitting.tapping_curves.energy_fit import EnergyFit, fit_energy, plain_instrument, turned, usual_drifts
 from fitting.tapping_curves.result import EnergyGroup, MeasuredSpeeds, Tapping, TapRows
@@ -97,14 +99,6 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     rows = np.isfinite(table.lockin_amplitude_nm)
     blank = np.full(table.rows, np.nan)
     lag, lag_error = (blank if part is None else part for part in (table.phase_lag_deg, table.phase_lag_error_deg))
-    unknown = table.spring_constant_n_per_m is None and table.mass_ng is None
-    spring = 1.0 if unknown else table.spring_constant_n_per_m or _stiffness(table)
-    given = {
-        "free_frequency_khz": (table.free_frequency_khz, table.free_frequency_error_khz),
-        "quality_factor": (quality, table.quality_factor_error),
-        "spring_constant_n_per_m": (spring, table.spring_constant_error_n_per_m),
-        "tip_calibration": table.calibration.get("tip_calibration", (1.0, None)),
-    }
     noise = table.lockin_amplitude_error_nm / table.lockin_amplitude_nm
     zero = table.calibration.get("phase_zero_deg")
     whole = TappingCurve(
@@ -120,16 +114,7 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         drive_frequency_khz=table.drive_frequency_khz,
         retract=np.zeros(table.rows, bool) if table.retract is None else table.retract == 1.0,
         both_ways=table.retract is not None,
-        free_frequency_khz=given_or_usual("free_frequency_khz", *given["free_frequency_khz"]),
-        quality_factor=given_or_usual("quality_factor", *given["quality_factor"]),
-        spring_constant_n_per_m=Given(spring)
-        if unknown
-        else given_or_usual("spring_constant_n_per_m", *given["spring_constant_n_per_m"]),
-        over_spring_constant=unknown,
-        tip_calibration=given_or_usual("tip_calibration", *given["tip_calibration"]),
-        assumed=tuple(
-            name for name, (_, error) in given.items() if not error and not (unknown and name.startswith("spring"))
-        ),
+        **_lever_of(table, quality),
         phase_zero_deg=None if zero is None else Given(*zero),
         origin_error_nm=table.calibration.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1],
         lines=np.asarray(table.lines),
@@ -138,9 +123,22 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     return whole.part(rows)
 
 
-def _stiffness(table: AmplitudeTable) -> float:
-    assert table.mass_ng is not None  # checked before  # noqa: S101
-    return table.mass_ng * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
+def _lever_of(table: AmplitudeTable, quality_factor: float) -> dict[str, Any]:
+    """Return what a table says of lever and calibration, with usual errors where it says none, as a curve's fields."""
+    spring, mass = table.spring_constant_n_per_m, table.mass_ng
+    if spring is None and mass is not None:
+        spring = mass * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
+    given = {
+        "free_frequency_khz": (table.free_frequency_khz, table.free_frequency_error_khz),
+        "quality_factor": (quality_factor, table.quality_factor_error),
+        "spring_constant_n_per_m": (spring, table.spring_constant_error_n_per_m),
+        "tip_calibration": table.calibration.get("tip_calibration", (1.0, None)),
+    }
+    return {
+        **{name: Given(1.0) if pair[0] is None else given_or_usual(name, *pair) for name, pair in given.items()},
+        "over_spring_constant": spring is None,
+        "assumed": tuple(name for name, (value, error) in given.items() if value is not None and not error),
+    }
 
 
 _BEYOND_DEG = 20.0
@@ -224,9 +222,73 @@ def _check_range(curve: TappingCurve, zero: float, name: str) -> None:
 
 def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool) -> Tapping:
     """Return everything but the law."""
-    free, held = free_rows(curve), held_rows(curve)
+    free = free_rows(curve)
     given = plain_instrument(curve, free)
-    plain = energies(curve, given)
+    plain, kind = energies(curve, given), _kinds_of_rows(curve, given, free)
+    groups, alike = _groups(curve, kind.touching & ~kind.rough & ~kind.early, kind.repulsive)
+    fitted = fit_energy(curve, alike, free, smooth=False, scale_errors=scale_errors) if groups else None
+    stretches = [rows for rows in smooth_stretches(curve, kind.touching, kind.repulsive) if len(rows) >= FEWEST_ROWS]
+    functions = fit_energy(curve, stretches, free, smooth=True, scale_errors=scale_errors) if stretches else None
+    believed = functions or fitted
+    found = plain if believed is None else believed.energies_at
+    alone = kind.touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
+    nothing = np.zeros(curve.rows, bool)
+    rows = _tap_rows(
+        curve,
+        given,
+        kind,
+        plain,
+        energy_of_fit_aj=found.energy_aj,
+        virial_of_fit_aj=found.virial_aj,
+        used=nothing if fitted is None else fitted.used,
+        note=_notes(curve, kind, far=nothing if believed is None else believed.outliers, alone=alone),
+    )
+    energy = np.where(free, 0.0, found.energy_aj)
+    result = Tapping(
+        table=table,
+        curve=curve,
+        rows=rows,
+        groups=tuple(groups),
+        fit=fitted,
+        functions=functions,
+        branches=() if functions is None else branches_of(curve, functions, kind.repulsive),
+        scale_errors=scale_errors,
+        followed=_followed(curve, alike, free) if groups and curve.time is None else None,
+        bound_aj=None if curve.has_phase else _bound(curve, given, free),
+        hysteresis=tuple(
+            changes(curve, free=free, repulsive=kind.repulsive, energy=energy, noise=rows.energy_noise_aj)
+        ),
+        speeds=None,
+        versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
+    )
+    return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
+
+
+class _KindsOfRows(NamedTuple):
+    """What the rows of a curve are.
+
+    Attributes:
+        free: of the free tip.
+        held: the sample holds the tip.
+        touching: neither, with a phase.
+        repulsive: on the repulsive branch.
+        rough: off the smooth fall of their branch.
+        early: hardly touching yet.
+        lag_departure_deg: lag less that of the free tip.
+    """
+
+    free: Bool[np.ndarray, " rows"]
+    held: Bool[np.ndarray, " rows"]
+    touching: Bool[np.ndarray, " rows"]
+    repulsive: Bool[np.ndarray, " rows"]
+    rough: Bool[np.ndarray, " rows"]
+    early: Bool[np.ndarray, " rows"]
+    lag_departure_deg: Rows
+
+
+def _kinds_of_rows(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> _KindsOfRows:
+    """Return what the rows of a curve are, the instrument as given."""
+    held = held_rows(curve)
     departure = turned(curve.lag_deg - lag_of_free_tip(curve, given))
     touching = ~free & ~held & np.isfinite(curve.lag_deg)
     repulsive = ~free & repulsive_rows(curve, touching, departure)
@@ -234,54 +296,25 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     early = touching & hardly_touching_rows(motion_of(curve, given))
     if (touching & ~rough & ~early).sum() < FEWEST_ROWS:
         early = np.zeros(curve.rows, bool)
-    kinds, alike = _kinds(curve, touching & ~rough & ~early, repulsive)
-    fitted = fit_energy(curve, alike, free, smooth=False, scale_errors=scale_errors) if kinds else None
-    stretches = [rows for rows in smooth_stretches(curve, touching, repulsive) if len(rows) >= FEWEST_ROWS]
-    functions = fit_energy(curve, stretches, free, smooth=True, scale_errors=scale_errors) if stretches else None
-    at = functions or fitted
-    found = plain if at is None else at.energies_at
-    noise = noise_of(curve, plain)
-    hysteresis = changes(
-        curve, free=free, repulsive=repulsive, energy=np.where(free, 0.0, found.energy_aj), noise=noise
-    )
-    far = np.zeros(curve.rows, bool)
-    if functions is not None:
-        far = functions.outliers
-    elif fitted is not None:
-        far = fitted.outliers
-    alone = touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
-    shared, virial_shared = _errors(curve, given, free)
-    rows = TapRows(
-        state=tuple(_state(*row) for row in zip(free, held, np.isfinite(departure), repulsive, strict=True)),
-        lag_departure_deg=departure,
+    return _KindsOfRows(free, held, touching, repulsive, rough, early, departure)
+
+
+def _tap_rows(curve: TappingCurve, given: Instrument, kind: _KindsOfRows, plain: Energies, **of_fit: Any) -> TapRows:
+    """Return the rows one by one: what the instrument as given makes of them, beside what a fit does."""
+    states = zip(kind.free, kind.held, np.isfinite(kind.lag_departure_deg), kind.repulsive, strict=True)
+    energy_errors, virial_errors = _errors(curve, given, kind.free)
+    return TapRows(
+        state=tuple(_state(*row) for row in states),
+        lag_departure_deg=kind.lag_departure_deg,
         energy_aj=plain.energy_aj,
-        energy_noise_aj=noise,
-        energy_errors_aj=shared,
-        energy_of_fit_aj=found.energy_aj,
+        energy_noise_aj=noise_of(curve, plain),
+        energy_errors_aj=energy_errors,
         virial_aj=plain.virial_aj,
         virial_noise_aj=virial_noise_of(curve, plain),
-        virial_errors_aj=virial_shared,
-        virial_of_fit_aj=found.virial_aj,
+        virial_errors_aj=virial_errors,
         largest_energy_aj=largest_energies(curve, given),
-        used=np.zeros(curve.rows, bool) if fitted is None else fitted.used,
-        note=_notes(curve, free=free, held=held, rough=rough, early=early, far=far, alone=alone),
+        **of_fit,
     )
-    result = Tapping(
-        table=table,
-        curve=curve,
-        rows=rows,
-        groups=tuple(EnergyGroup(*key, repulsive=state) for key, state in kinds),
-        fit=fitted,
-        functions=functions,
-        branches=() if functions is None else branches_of(curve, functions, repulsive),
-        scale_errors=scale_errors,
-        followed=_followed(curve, alike, free) if kinds and curve.time is None else None,
-        bound_aj=None if curve.has_phase else _bound(curve, given, free),
-        hysteresis=tuple(hysteresis),
-        speeds=None,
-        versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
-    )
-    return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
 
 
 def _followed(curve: TappingCurve, alike: list[np.ndarray], free: Bool[np.ndarray, " rows"]) -> EnergyFit | None:
@@ -293,31 +326,26 @@ def _followed(curve: TappingCurve, alike: list[np.ndarray], free: Bool[np.ndarra
 
 def _energies_along(result: Tapping) -> np.ndarray:
     """Return the energy of each row's tap: the one of its kind, or where none explains the rows that of its branch."""
-    found = np.full(result.curve.rows, np.nan)
-    if result.described:
-        constants = np.array([result.constant(i)[0] for i in range(len(result.groups))])
-        return np.where(result.group_of_rows >= 0, constants[np.maximum(result.group_of_rows, 0)], found)
-    for branch in result.branches:
-        order = np.argsort(branch.curve.height_nm)
-        height, energy = branch.curve.height_nm[order], branch.curve.energy_aj[order]
-        found[branch.rows] = np.interp(result.curve.offset_nm[branch.rows], height, energy)
-    return found
+    if not result.described:
+        return result.energy_along_branches_aj
+    constants = np.array([result.constant(i)[0] for i in range(len(result.groups))])
+    return np.where(result.group_of_rows >= 0, constants[np.maximum(result.group_of_rows, 0)], np.nan)
 
 
-def _kinds(
+def _groups(
     curve: TappingCurve, usable: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
-) -> tuple[list[tuple[tuple[float, float], bool]], list[np.ndarray]]:
+) -> tuple[list[EnergyGroup], list[np.ndarray]]:
     """Return the kinds of rows that may share an energy (drive, attractive or repulsive), and the rows of each."""
-    kinds, rows = [], []
+    groups, rows = [], []
     drives = sorted(set(zip(curve.drive_frequency_khz.tolist(), curve.free_amplitude_nm.tolist(), strict=True)))
     for drive in drives:
         of_drive = (curve.drive_frequency_khz == drive[0]) & (curve.free_amplitude_nm == drive[1])
-        for state in (True, False):
-            here = np.flatnonzero(usable & of_drive & (repulsive == state))
+        for side in (True, False):
+            here = np.flatnonzero(usable & of_drive & (repulsive == side))
             if len(here) >= FEWEST_ROWS:
-                kinds.append((drive, state))
+                groups.append(EnergyGroup(*drive, repulsive=side))
                 rows.append(here)
-    return kinds, rows
+    return groups, rows
 
 
 def _state(free: np.bool_, held: np.bool_, phase: np.bool_, repulsive: np.bool_) -> str:
@@ -330,7 +358,7 @@ def _state(free: np.bool_, held: np.bool_, phase: np.bool_, repulsive: np.bool_)
     return side_of(repulsive)
 
 
-def _notes(curve: TappingCurve, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
+def _notes(curve: TappingCurve, kind: _KindsOfRows, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
     """Return why each row is not in the fit, or what it is for; the first reason that holds."""
     said = {
         "free": "free: fixes the zero of the phase" if curve.has_phase else "free",
@@ -341,7 +369,7 @@ def _notes(curve: TappingCurve, **which: Bool[np.ndarray, " rows"]) -> tuple[str
         "far": "excluded: its energy is more than 4 standard errors from the others'",
         "alone": f"excluded: fewer than {FEWEST_ROWS} rows of this branch",
     }
-    which["silent"] = np.isnan(curve.lag_deg)
+    which |= kind._asdict() | {"silent": np.isnan(curve.lag_deg)}
     return tuple(next((words for name, words in said.items() if which[name][i]), "") for i in range(curve.rows))
 
 
@@ -374,13 +402,9 @@ def _errors(
         moved["free_amplitude_drift"] = given._replace(free_amplitude_factor=factor)
     start = energies(curve, given)
     ends = {name: energies(curve, at) for name, at in moved.items()}
-    relative = {
-        "tip_calibration": 2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
-        "spring_constant_n_per_m": curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
-    }
     found = [
         {name: np.abs(getattr(end, column) - getattr(start, column)) for name, end in ends.items()}
-        | {name: share * np.abs(getattr(start, column)) for name, share in relative.items()}
+        | {name: share * np.abs(getattr(start, column)) for name, share in curve.relative_errors.items()}
         for column in ("energy_aj", "virial_aj")
     ]
     return found[0], found[1]
@@ -392,13 +416,8 @@ def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows
     if not touching.any():
         return None
     largest = largest_energies(curve, given)[touching]
-    share = np.hypot(
-        np.hypot(
-            2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
-            curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
-        ),
-        curve.quality_factor.error / curve.quality_factor.value,
-    )
+    quality = curve.quality_factor
+    share = np.linalg.norm([*curve.relative_errors.values(), quality.error / quality.value])
     return float(np.max(largest) * np.exp(1.645 * share))
 
 
@@ -425,11 +444,8 @@ def _speeds(result: Tapping, fitted: EnergyFit) -> MeasuredSpeeds:
     fast = known & (in_capture >= _SLOWEST) & (np.abs(start.pull) < _PULLED)
     blank = np.where(known, 1.0, np.nan)
     return MeasuredSpeeds(
-        approach_speed_nm_per_us=u * blank,
+        **{name: column * blank for name, column in start._asdict().items()},
         approach_speed_error_nm_per_us=error * blank,
-        rebound_speed_nm_per_us=start.rebound_speed_nm_per_us * blank,
-        contact_us=start.contact_us * blank,
-        pull=start.pull * blank,
         in_capture_speeds=in_capture,
         fast=fast,
         why_not=_why_not(curve, fast, known, in_capture, start.pull),
@@ -468,7 +484,7 @@ def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
     if result.speeds is None:
         return result
     chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
-    return replace(result, law=fit(_with_zero_of_phase(result, rows_of(result.table, chosen)), model))
+    return replace(result, law=fit(_with_zero_of_phase(result, part_of(result.table, chosen)), model))
 
 
 def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTable:
@@ -482,13 +498,3 @@ def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTabl
         return table
     calibration = table.calibration | {"phase_zero_deg": (float(found[0].value), float(found[0].standard_error))}
     return replace(table, calibration=calibration)
-
-
-def rows_of(table: AmplitudeTable, chosen: Bool[np.ndarray, " rows"]) -> AmplitudeTable:
-    """Return the rows chosen of a table."""
-    own: dict[str, Any] = {
-        name: value[chosen]
-        for name, value in vars(table).items()
-        if isinstance(value, np.ndarray) and value.shape == chosen.shape
-    }
-    return replace(table, **own)

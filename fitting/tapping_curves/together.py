@@ -14,7 +14,7 @@ from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TableLike, as_table
 from fitting.tapping_curves.branches import CurveBranch
-from fitting.tapping_curves.energy_curve import TappingBranch, branches_of
+from fitting.tapping_curves.energy_curve import TappingBranch, branches_of, within
 from fitting.tapping_curves.energy_fit import Common, fitted_together
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import tapping
@@ -44,13 +44,10 @@ class CurveScatter(CurveBranch):
     energy_own_error_aj: Float[np.ndarray, " points"]
     energy_common_error_aj: Float[np.ndarray, " points"]
 
-    def at(self, ratio: float) -> tuple[float, float, float, float] | None:
+    def at(self, ratio: float) -> tuple[float, ...] | None:
         """Return mean, scatter, own and common error at an amplitude, of the free one; None where not measured."""
-        if not self.amplitude_ratio[0] <= ratio <= self.amplitude_ratio[-1]:
-            return None
         columns = (self.energy_aj, self.energy_scatter_aj, self.energy_own_error_aj, self.energy_common_error_aj)
-        mean, scatter, own, common = (float(np.interp(ratio, self.amplitude_ratio, column)) for column in columns)
-        return mean, scatter, own, common
+        return within(ratio, self.amplitude_ratio, *columns)
 
 
 @public_result(picture="fitting.tapping_curves.pictures:together_figure")
@@ -200,25 +197,9 @@ def _scatter(
     if not low < high:
         return None
     ratio = np.linspace(low, high, _POINTS)
-    energy, own, shared = (np.full((len(members), _POINTS), np.nan) for _ in range(3))
-    for i, (one, branch) in enumerate(members):
-        curve, fit = branch.curve, one.functions
-        assert fit is not None  # noqa: S101
-        here = (ratio >= curve.amplitude_ratio[0]) & (ratio <= curve.amplitude_ratio[-1])
-        places = [j for j, n in enumerate(fit.nuisances) if n.name in common]
-        # what is left open if what all have in common were known
-        alone = fit.covariance.copy()
-        if places:
-            gain = np.linalg.solve(alone[np.ix_(places, places)], alone[places])
-            alone -= gain.T @ alone[places]
-        own_variance = np.einsum("nu,uv,nv->n", curve.energy_by_instrument, alone, curve.energy_by_instrument)
-        own_variance = np.maximum(own_variance, 0.0) + curve.energy_noise_aj**2
-        rest = np.maximum(curve.energy_error_aj**2 - own_variance, 0.0)
-        parts = (curve.energy_aj, own_variance, rest)
-        for into, part in zip((energy, own, shared), parts, strict=True):
-            into[i, here] = np.interp(ratio[here], curve.amplitude_ratio, part)
-    enough = np.isfinite(energy).sum(axis=0) >= fewest
-    energy, own, shared, ratio = energy[:, enough], own[:, enough], shared[:, enough], ratio[enough]
+    columns = np.array([_parts_at(ratio, one, branch, common) for one, branch in members])
+    enough = np.isfinite(columns[:, 0]).sum(axis=0) >= fewest
+    ratio, (energy, own, shared) = ratio[enough], np.moveaxis(columns[:, :, enough], 1, 0)
     if not len(ratio):
         return None
     return CurveScatter(
@@ -233,3 +214,20 @@ def _scatter(
         energy_own_error_aj=np.sqrt(np.nanmean(own, axis=0)),
         energy_common_error_aj=np.sqrt(np.nanmean(shared, axis=0)),
     )
+
+
+def _parts_at(
+    ratio: Float[np.ndarray, " points"], one: Tapping, branch: TappingBranch, common: tuple[str, ...]
+) -> Float[np.ndarray, "3 points"]:
+    """Return energy, its own variance and that by what all curves have in common, NaN where not measured.
+
+    The curve's own is what its errors leave open if what all have in common were known.
+    """
+    curve, fit = branch.curve, one.functions
+    assert fit is not None  # noqa: S101
+    slopes = curve.energy_by_instrument
+    own = np.einsum("nu,uv,nv->n", slopes, fit.covariance_with(common), slopes)
+    own = np.maximum(own, 0.0) + curve.energy_noise_aj**2
+    rest = np.maximum(curve.energy_error_aj**2 - own, 0.0)
+    parts = [np.interp(ratio, curve.amplitude_ratio, part, np.nan, np.nan) for part in (curve.energy_aj, own, rest)]
+    return np.stack(parts)

@@ -9,20 +9,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from afm_jax.least_squares import IMPROBABLE
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED
 from afm_jax.outcomes import Rule, Rules
+from fitting.parameters import USUAL_ERRORS
 from fitting.tapping_curves.branches import free_ends
-from fitting.tapping_curves.curve import USUAL_ERRORS, TappingCurve
+from fitting.tapping_curves.curve import TappingCurve
 from fitting.tapping_curves.energy_curve import FEWEST_ROWS
 from fitting.tapping_curves.energy_fit import EnergyFit, Nuisance
 
 BRACKET = 0.5
 """Relative standard error from which a number is only a bracket."""
-_LARGEST_SCALE, _MOST_SCALE = 2.0, 3.0
-"""Scatter of rows in contact, of their errors, that is believed without being asked for (measured curves have up to 1.8
-times that of the free tip), and where it is asked for (`scale_errors`)."""
-_PULLED = 2.0
-"""Distance of a nuisance from what is given, in its errors, from which it is named."""
+_LARGEST_UNASKED_SCALE = 2.0
+"""Scatter of rows in contact, of their errors, that is believed without `scale_errors`: measured curves have up to 1.8
+times that of the free tip."""
 _DRIFTING = 5.0
 """Errors of a drift of the free rows from which it is one."""
 _FOLLOWING = 3.0
@@ -74,7 +73,7 @@ NO_CONSTANT: tuple[Rule[Any], ...] = (
         "of freedom, probability {e.fit.p_value:.1g})",
     ),
     Rule(
-        lambda e: e.fit.scale > _MOST_SCALE,
+        lambda e: e.fit.scale > LARGEST_SCALE,
         "one energy a branch describes the rows only with errors {e.fit.scale:.1f} times as large",
     ),
     Rule(lambda e: _torn(e.fit), "for one energy a branch {case}"),
@@ -104,12 +103,10 @@ def drift_of_free_rows(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> 
         here = free & np.isfinite(values)
         if here.sum() < 2 * FEWEST_ROWS:
             continue
-        x, y, w = np.flatnonzero(here) / (curve.rows - 1.0), values[here], errors[here] ** -2.0
-        x = x - np.average(x, weights=w)
-        slope = float(np.sum(w * x * y) / np.sum(w * x * x))
-        left = y - np.average(y, weights=w) - slope * x
-        scatter = max(1.0, float(np.sum(w * left**2)) / max(len(x) - 2, 1))
-        error = float(np.sqrt(scatter / np.sum(w * x * x)))
+        x, y, weights = np.flatnonzero(here) / (curve.rows - 1.0), values[here], 1.0 / errors[here]
+        (slope, start), covariance = np.polyfit(x, y, 1, w=weights, cov="unscaled")
+        chi2 = float(np.sum((weights * (y - slope * x - start)) ** 2))
+        error = float(np.sqrt(max(1.0, chi2 / (len(x) - 2)) * covariance[0, 0]))
         if abs(slope) > _DRIFTING * error:
             drift = f"{slope:+.2g} +- {error:.1g} {unit}"
             found.append(
@@ -130,7 +127,7 @@ NO_FUNCTIONS: tuple[Rule[Any], ...] = (
     ),
     Rule(lambda e: _torn(e.functions), "the energy along the branches has no instrument as given: {case}"),
     Rule(
-        lambda e: e.functions.scale > (_MOST_SCALE if e.scale_errors else _LARGEST_SCALE),
+        lambda e: e.functions.scale > (LARGEST_SCALE if e.scale_errors else _LARGEST_UNASKED_SCALE),
         "the rows scatter {e.functions.scale:.1f} times as much about a smooth energy as their errors say",
     ),
     Rule(lambda e: e.drift, "{case}"),
@@ -198,7 +195,7 @@ WARNINGS: Rules[Any] = [
         "that",
     ),
     Rule(
-        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > _PULLED] if _given(e) and e.described else [],
+        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > PULLED] if _given(e) and e.described else [],
         lambda _, n: (
             f"{ORIGINS[n.kind]} ends {n.pull:+.1f} standard errors from what was given ({n.given} to {n.value:.6g})"
         ),
