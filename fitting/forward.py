@@ -644,11 +644,10 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
     def turned(e):
         return jax.jvp(lambda v: impact_of(v, measurement, problem), (values,), (e,))
 
-    own = jax.vmap(lambda e: turned(e)[1])(jnp.eye(len(problem.own), values.shape[0]))
+    impact, own = jax.vmap(turned, out_axes=(None, 0))(jnp.eye(len(problem.own), values.shape[0]))
     # those by a nuisance, of which the others come after the model's own, are zeros
     nothing = values.shape[0] - len(problem.own)
-    slopes = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, nothing), *[(0, 0)] * (leaf.ndim - 1)]), own)
-    return impact_of(values, measurement, problem), slopes
+    return impact, jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, nothing), *[(0, 0)] * (leaf.ndim - 1)]), own)
 
 
 class Free(NamedTuple):

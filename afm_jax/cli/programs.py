@@ -53,12 +53,12 @@ class _Keeping:
         arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
         if any(isinstance(leaf, core.Tracer) for leaf in arrays):
             return self.jitted(*arguments, **named)
-        call, (program, result) = self._trace(arrays, static, tree)
-        if call not in self.programs:
+        with _ONE_TRACE:
+            call, (program, result) = self._trace(arrays, static, tree)
             # at once: a jitted function would compile again where an argument comes from another program
             like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
-            with _ONE_TRACE:
-                lowered = jax.jit(program.call).lower(*like)
+            lowered = None if call in self.programs else jax.jit(program.call).lower(*like)
+        if lowered is not None:
             self.programs[call] = lowered.compile(quick_options())
         return jax.tree.unflatten(result, self.programs[call](arrays))
 
@@ -84,7 +84,7 @@ class _Keeping:
         return call, self.traced[call]
 
 
-_ONE_TRACE = threading.Lock()
+_ONE_TRACE = threading.RLock()
 """Traces need the interpreter: one after the other, so that the first is compiled while the next one is traced."""
 
 
