@@ -351,13 +351,16 @@ def impact_slopes(
     return ImpactSlopes(by_square, np.nan_to_num(speed)[:, None] * by_offset)
 
 
-def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
+def warm_up(
+    values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem, *, besides: Callable[[], object]
+) -> None:
     """Compile the large programs of `linearise`, or read them from the cache, side by side.
 
     Args:
         values: some values of the parameters.
         measurement: what will be compared with.
         problem: the model.
+        besides: compiles what else a search needs, which takes less time.
     """
     sets = np.asarray(values)[None]
     batch, calls = _calls_for_impacts(sets, measurement, problem)
@@ -379,7 +382,7 @@ def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: 
 
     with (
         compiling(lambda: batch_of(sets, measurement, problem)),
-        compiling(lambda: run(linearise_pairs, nowhere)),
+        compiling(lambda: (run(linearise_pairs, nowhere), besides())),
     ):
         run(located)
 

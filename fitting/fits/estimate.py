@@ -421,22 +421,25 @@ def _predicted_after(at: AtMinimum, parts: list[LinearStep], discrepancy: ModelD
     return predict(values, stacked, measurement, problem, np.array(near))
 
 
-def warm_up_predictions(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
-    """Compile what `_predicted_after` will run, or read it from the cache, for any law of the usual shape.
+def warm_up_laws(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
+    """Compile what makes and compares laws after the search, or read it from the cache, for any law of usual shape.
 
     Args:
         values: some values of the parameters.
         measurement: what the laws will be compared with.
         problem: the model.
     """
-    if problem.pulled or not problem.lasting:
-        return
     speeds = np.geomspace(20.0, 200.0, LAW_POINTS)
-    delay = None if problem.model == "contact" else problem.law(jnp.asarray(values), measurement.fixed).delay
-    law = table_of_law(speeds, 0.9 * speeds, -1.0 / speeds, capture_speed_nm_per_us=10.0, delay=delay)
-    laws = jax.tree.map(lambda leaf: np.stack([leaf] * PARTS_AT_ONCE), law)
-    nowhere = np.full((PARTS_AT_ONCE, len(measurement.rows.order)), np.nan)
-    predict(np.tile(values, (PARTS_AT_ONCE, 1)), laws, measurement, problem, nowhere)
+    known: dict[str, Any] = {"capture_speed_nm_per_us": 10.0, "delay": None}
+    late = -1.0 / speeds if problem.lasting else None
+    if problem.lasting and problem.model != "contact":
+        known["delay"] = problem.law(jnp.asarray(values), measurement.fixed).delay
+    if problem.lasting and not problem.pulled:
+        law = table_of_law(speeds, 0.9 * speeds, late, **known)
+        laws = jax.tree.map(lambda leaf: np.stack([leaf] * PARTS_AT_ONCE), law)
+        nowhere = np.full((PARTS_AT_ONCE, len(measurement.rows.order)), np.nan)
+        predict(np.tile(values, (PARTS_AT_ONCE, 1)), laws, measurement, problem, nowhere)
+    table_of_law(speeds, 0.9 * speeds, late, **known, errors=(np.zeros((LAW_POINTS, 2, 1)), np.zeros(1)))
 
 
 def _tabulated_after(at: AtMinimum, step: LinearStep, discrepancy: ModelDiscrepancy) -> TabulatedLaw:

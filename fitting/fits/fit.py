@@ -22,12 +22,12 @@ from fitting.fits.estimate import (
     courses_along_rows,
     estimate_of,
     hanging_on_held,
-    warm_up_predictions,
+    warm_up_laws,
 )
 from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED, Interval, profile_intervals, within_range
 from fitting.fits.law_after import holding, speed_range
 from fitting.fits.minimum import minimum_with_model_errors, rescale_errors, settle, starts, untabulated
-from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest
+from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest, warm_up_steps
 from fitting.fits.result import (
     FitResult,
     FittedParameter,
@@ -161,9 +161,9 @@ def find_fit(  # noqa: PLR0913
             f"{len(problem.own)} parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
     begin = starts(problem, measurement)[0]
-    warm_up(begin, measurement, problem)
+    warm_up(begin, measurement, problem, besides=lambda: warm_up_steps(len(problem.names)))
     stated = Objective(measurement, problem, robust=robust)
-    with compiling(lambda: warm_up_predictions(begin, measurement, problem)):
+    with compiling(lambda: warm_up_laws(begin, measurement, problem)):
         objective, minimum, model_errors, refused = minimum_with_model_errors(stated)
     scale = None
     if scale_errors:

@@ -288,6 +288,12 @@ def _lbfgs(
     return step[:count], after
 
 
+def warm_up_steps(count: int) -> None:
+    """Compile the optimiser's step for a number of parameters, or read it from the cache."""
+    z = np.zeros((BATCH, count))
+    _lbfgs(z, None, z)
+
+
 def _squared(gradient: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, " sets"]:
     return np.einsum("sp,sp->s", gradient, gradient)
 

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -381,7 +382,7 @@ def _tabulated(
 
 
 _TOGETHER = 8
-"""Unknowns are filled up to a multiple of this, so that laws have few shapes and programs."""
+"""Unknowns that one call takes, the last ones filled up: one program for laws of however many."""
 
 
 def table_of_law(
@@ -408,19 +409,17 @@ def table_of_law(
     u, w = speeds[leaves], np.minimum(rebound, speeds)[leaves]
     captured = speeds[~leaves][-1] if not leaves.all() else 0.0
     capture = np.clip(capture_speed_nm_per_us, captured, (1.0 - 1e-9) * u[0])
-    changes, count = None, 0
-    if errors is not None:
-        of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
-        count = of_capture.size
-        spare = -count % _TOGETHER
-        changes = np.pad(np.moveaxis(of_rows, 2, 0), ((0, spare), (0, 0), (0, 0))).transpose(0, 2, 1)
-        changes = np.ascontiguousarray(changes), np.pad(of_capture, (0, spare))
-    law = _tabulated(u, w, None if late is None else late[leaves], capture, None if late is None else delay, changes)
-    if law.deviations is None:
-        return law
-    return eqx.tree_at(
-        lambda law: law.deviations, law, {name: np.asarray(one)[:count] for name, one in law.deviations.items()}
-    )
+    known = u, w, None if late is None else late[leaves], capture, None if late is None else delay
+    if errors is None:
+        return _tabulated(*known, None)
+    of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
+    count, spare = of_capture.size, -of_capture.size % _TOGETHER
+    of_rows = np.ascontiguousarray(np.pad(np.moveaxis(of_rows, 2, 0), ((0, spare), (0, 0), (0, 0))).transpose(0, 2, 1))
+    of_capture = np.pad(of_capture, (0, spare))
+    together = [slice(first, first + _TOGETHER) for first in range(0, count, _TOGETHER)]
+    laws = [_tabulated(*known, (of_rows[some], of_capture[some])) for some in together]
+    deviations = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *(law.deviations for law in laws))
+    return eqx.tree_at(lambda law: law.deviations, laws[0], deviations)
 
 
 def fewest_unknowns(
