@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.impact.closure import COARSE, OrbitProblem, find_roots, follow_root
+from afm_jax.impact.closure import COARSE, OrbitProblem, find_roots, follow_root, near_fold
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.impact.orbits import orbit_state, steady_orbits
+from afm_jax.impact.orbits import contracts, is_stable, orbit_state, steady_orbits, trace_and_determinant
 from tests.package_scenes import scene_of
 from tests.reference_examples import DELAY, scene
 from tests.reference_flight import Parameters
@@ -118,3 +118,32 @@ def test_following_leads_to_the_root_that_a_search_finds(drive):
     # a tenth of a nanometre of drive: nothing leaves the sample
     weak = problem_of(dataclasses.replace(p, amplitude_nm=0.1), order)
     assert not bool(follow(begin.place.coordinate[slot], weak, WANTED).closes)
+
+
+def test_the_searchs_own_slopes_tell_stable_orbits_and_folds():
+    """By them steady orbits are those of the written-out Jacobians, folds those of the scalar closing condition."""
+    unstable = folds = 0
+
+    def driven(amplitude: float) -> OrbitProblem:
+        return problem_of(delayed(1, 0.97, amplitude, 0.0)[0], 1)
+
+    # from just above the fold, below which there is no orbit, up
+    nothing, weakest = 2.0, 2.17576
+    for _ in range(20):
+        middle = 0.5 * (nothing + weakest)
+        nothing, weakest = (nothing, middle) if bool(find(driven(middle)).found.any()) else (middle, weakest)
+    for amplitude in (weakest, weakest + 1e-6, weakest + 1e-4, 2.2, 2.5, 4.0, 8.0):
+        problem = driven(amplitude)
+        roots, steady_ones = find(problem), steady(problem)
+        assert roots.slopes is not None
+        for slot in np.flatnonzero(roots.found):
+            place = jax.tree.map(lambda leaf, slot=slot: leaf[slot], roots.place)
+            state = orbit_state(place, problem)
+            parts = trace_and_determinant(problem.impact, problem.cantilever, problem.platform, state.flight)
+            stable = bool(is_stable(place, roots.slopes[slot], state, problem))
+            assert stable == bool(contracts(*parts))
+            assert bool(roots.near_fold[slot]) == bool(near_fold(place.coordinate, problem))
+            assert stable or not bool(steady_ones.steady[slot])
+            unstable, folds = unstable + (not stable), folds + bool(roots.near_fold[slot])
+    assert unstable > 0
+    assert folds > 0

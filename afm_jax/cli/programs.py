@@ -49,42 +49,44 @@ class _Keeping:
         self.programs: dict[Any, Callable[..., Any]] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        leaves, tree = jax.tree.flatten((arguments, named))
-        arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
-        if any(isinstance(leaf, core.Tracer) for leaf in arrays):
+        if any(isinstance(leaf, core.Tracer) for leaf in jax.tree.leaves((arguments, named))):
             return self.jitted(*arguments, **named)
-        with _ONE_TRACE:
-            call, (program, result) = self._trace(arrays, static, tree)
-            # at once: a jitted function would compile again where an argument comes from another program
-            like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
-            lowered = None if call in self.programs else jax.jit(program.call).lower(*like)
-        if lowered is not None:
+        call, arrays, of_arrays = self._call(arguments, named)
+        if call not in self.programs:
+            with _ONE_TRACE:
+                program, _ = self._trace(call, arrays, of_arrays)
+                # at once: a jitted function would compile again where an argument comes from another program
+                like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
+                lowered = jax.jit(program.call).lower(*like)
             self.programs[call] = lowered.compile(quick_options())
-        return jax.tree.unflatten(result, self.programs[call](arrays))
+        return jax.tree.unflatten(self.traced[call][1], self.programs[call](arrays))
 
     def shapes(self, *arguments: Any, **named: Any) -> Any:
         """Return the result of a call with shapes and types in place of arrays; nothing is compiled."""
-        leaves, tree = jax.tree.flatten((arguments, named))
-        arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
-        _, (program, result) = self._trace(arrays, static, tree)
+        with _ONE_TRACE:
+            program, result = self._trace(*self._call(arguments, named))
         return jax.tree.unflatten(result, [jax.ShapeDtypeStruct(of.shape, of.dtype) for of in program.out_avals])
 
-    def _trace(self, arrays: list[Any], static: list[Any], tree: Any) -> tuple[Any, tuple[export.Exported, Any]]:
-        """Return what names a call, its traced program and the tree of the result."""
+    def _call(self, arguments: Any, named: Any) -> tuple[Any, list[Any], Callable[[list[Any]], Any]]:
+        """Return what names a call's program, its arrays, and the function of these."""
+        leaves, tree = jax.tree.flatten((arguments, named))
+        arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
 
         def of_arrays(arrays: list[Any]) -> Any:
             positional, by_name = jax.tree.unflatten(tree, eqx.combine(arrays, static))
             return self.jitted(*positional, **by_name)
 
-        call = (tree, *static, *((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arrays)))
-        with _ONE_TRACE:
-            if call not in self.traced:
-                path = self.folder / f"{self.jitted.__name__}-{_digest(call)}.program"
-                self.traced[call] = _traced(path, of_arrays, arrays, self.tell)
-        return call, self.traced[call]
+        return (tree, *static, *((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arrays))), arrays, of_arrays
+
+    def _trace(self, call: Any, arrays: list[Any], of_arrays: Callable[..., Any]) -> tuple[export.Exported, Any]:
+        """Return the traced program of a call and the tree of its result."""
+        if call not in self.traced:
+            path = self.folder / f"{self.jitted.__name__}-{_digest(call)}.program"
+            self.traced[call] = _traced(path, of_arrays, arrays, self.tell)
+        return self.traced[call]
 
 
-_ONE_TRACE = threading.RLock()
+_ONE_TRACE = threading.Lock()
 """Traces need the interpreter: one after the other, so that the first is compiled while the next one is traced."""
 
 

@@ -946,7 +946,9 @@ def _capture_speed(u: Float[Array, " n"], w: Float[Array, " n"], held: float) ->
     a, c, b = jnp.where(curved, a, flat_a), jnp.where(curved, c, 0.0), jnp.where(curved, b, flat_b)
     there = (a > 0.0) & (c * c + 4.0 * a * b > 0.0) & (b > -_NOTHING)
     root = jnp.sqrt(jnp.where(there, c * c + 4.0 * a * jnp.maximum(b, _NOTHING), 1.0))
-    found = low * jnp.where(there & ((c > _NOTHING) | (b > _NOTHING)), (c + root) / (2.0 * jnp.where(there, a, 1.0)), 0.0)
+    found = low * jnp.where(
+        there & ((c > _NOTHING) | (b > _NOTHING)), (c + root) / (2.0 * jnp.where(there, a, 1.0)), 0.0
+    )
     most = jnp.maximum((u[0] - w[0]) * (u[0] + w[0]), 0.0)
     most = jnp.where(most > 0.0, jnp.sqrt(jnp.where(most > 0.0, most, 1.0)), 0.0)
     return jnp.clip(found, held, jnp.maximum(most, held))

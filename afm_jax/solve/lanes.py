@@ -136,7 +136,7 @@ class QuicklyCompiled:
         return jax.jit(self.function, static_argnames=self.static_argnames)
 
     @cached_property
-    def outside(self) -> Callable[..., Any]:
+    def outside(self) -> Any:
         """The function by itself; the options are known once JAX has started."""
         return jax.jit(self.function, static_argnames=self.static_argnames, compiler_options=quick_options())
 
