@@ -49,9 +49,9 @@ class _Keeping:
         self.programs: dict[Any, Callable[..., Any]] = {}
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
-        if any(isinstance(leaf, core.Tracer) for leaf in jax.tree.leaves((arguments, named))):
-            return self.jitted(*arguments, **named)
         call, arrays, of_arrays = self._call(arguments, named)
+        if any(isinstance(leaf, core.Tracer) for leaf in arrays):
+            return self.jitted(*arguments, **named)
         if call not in self.programs:
             with _ONE_TRACE:
                 program, _ = self._trace(call, arrays, of_arrays)

@@ -36,8 +36,7 @@ from afm_jax.dynamics.impact_loop import (
 )
 from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
-from afm_jax.solve.bracketed_root import bracketed_root
-from afm_jax.solve.derivatives import largest
+from afm_jax.solve.derivatives import bracketed_root, largest
 from afm_jax.solve.lanes import compiled_quickly, in_blocks
 from afm_jax.solve.newton import Newton
 

@@ -25,7 +25,7 @@ from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
-from afm_jax.solve.bracketed_root import bracketed_root
+from afm_jax.solve.derivatives import bracketed_root
 from afm_jax.solve.lanes import Report, filled
 from afm_jax.units import within_turn
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import chi2_tail, covariance_of
+from afm_jax.solve.derivatives import bracketed_root
 from fitting.fits.intervals import CHI2_95
 from fitting.fits.step import StepSystem
 
@@ -261,8 +262,6 @@ def scatter_between(parts: Parts) -> Between:
 
 def _crossing(above: Callable[[float], float], inside: float, last: float) -> float:
     """Return where a function becomes positive between a place where it is not and the last one, or that."""
-    from scipy.optimize import brentq  # noqa: PLC0415 (as above)
-
     far = last
     if last > inside:
         far = max(2.0 * inside, 1.0)
@@ -270,4 +269,4 @@ def _crossing(above: Callable[[float], float], inside: float, last: float) -> fl
             far *= 2.0
     if far >= _LARGEST or above(far) < 0.0:
         return last
-    return float(brentq(above, inside, far, xtol=1e-4))  # pyright: ignore[reportArgumentType]
+    return bracketed_root(above, inside, far, tolerance=1e-4)
