@@ -29,49 +29,66 @@ _OFF = 0.03
 _MOST = 300
 
 
-def time_fits(models: Sequence[str], *, rows: int) -> list[dict[str, Any]]:
+def time_fits(models: Sequence[str], *, rows: int, beside: Path | None = None) -> list[dict[str, Any]]:
     """Fit made tables twice each, as a user would from the shell: with an empty cache, and again.
 
     Args:
         models: names of models, or "tapping": a driven tip's curves by viscous+delay. The law has a table of its own,
             the others that of viscous loss with a delay.
         rows: rows of each table.
+        beside: folder of another checkout of the project, whose fits are timed in turn with ours, in rows of their own.
 
     Raises:
         RuntimeError: if a command fails.
     """
     measured = []
+    ours = Path(__file__).resolve().parents[1]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         for name in models:
             model = DELAYED if name == "tapping" else name
             table = tapped_table(rows) if name == "tapping" else made_table(rows, model if model == "law" else DELAYED)
             write_table(table, place / "amplitudes.csv")
-            environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
-            environment["XDG_CACHE_HOME"] = str(place / "cache" / name)
-            command = [
-                sys.executable,
-                "-m",
-                "afm_jax",
-                "fit",
-                str(place / "amplitudes.csv"),
-                "--model",
-                model,
-                "--json",
-            ]
-            seconds, processor, found = [], [], {}
-            for _ in range(2):
-                begin, used = time.perf_counter(), _of_programs_started()
-                done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)  # noqa: S603
-                seconds.append(time.perf_counter() - begin)
-                processor.append(_of_programs_started() - used)
-                if done.returncode not in {0, 3}:
-                    raise RuntimeError(f"the fit of {model} ended with {done.returncode}: {done.stderr.strip()}")
-                found = json.loads(done.stdout)
-            row = {"model": name, "rows": rows, "first_s": seconds[0], "first_processor_s": processor[0]}
-            row |= {"warm_s": seconds[1], "warm_processor_s": processor[1]}
-            measured.append(row | {key: found[key] for key in ("valid", "chi2", "degrees_of_freedom")})
+            command = ["fit", str(place / "amplitudes.csv"), "--model", model, "--json"]
+            checkouts = {name: ours} if beside is None else {name: ours, f"{name} (beside)": beside}
+            made: dict[str, dict[str, Any]] = {label: {"model": label, "rows": rows} for label in checkouts}
+            for when in ("first", "warm"):
+                for label, sources in checkouts.items():
+                    seconds, processor, found = _timed(command, sources, place / "cache" / label)
+                    made[label] |= {f"{when}_s": seconds, f"{when}_processor_s": processor}
+                    made[label] |= {key: found[key] for key in ("valid", "chi2", "degrees_of_freedom")}
+            measured += made.values()
     return measured
+
+
+def _timed(command: Sequence[str], sources: Path, cache: Path) -> tuple[float, float, dict[str, Any]]:
+    """Run a command of a checkout; return seconds, processor seconds, and the JSON object that it writes.
+
+    Args:
+        command: behind `afm-jax`.
+        sources: folder of the checkout.
+        cache: folder of compiled programs.
+
+    Raises:
+        RuntimeError: if the command fails.
+    """
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment |= {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": str(sources)}
+    cache.mkdir(parents=True, exist_ok=True)
+    begin, used = time.perf_counter(), _of_programs_started()
+    # from a folder without sources, which Python would take first
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "afm_jax", *command],
+        env=environment,
+        cwd=cache,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    seconds, processor = time.perf_counter() - begin, _of_programs_started() - used
+    if done.returncode not in {0, 3}:
+        raise RuntimeError(f"`afm-jax {' '.join(command)}` ended with {done.returncode}: {done.stderr.strip()}")
+    return seconds, processor, json.loads(done.stdout)
 
 
 def _of_programs_started() -> float:

@@ -20,28 +20,37 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
+from afm_jax.checks import is_traced
 from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
-from afm_jax.impact.closure import OrbitPlace, OrbitProblem, follow_root, harmless_coordinate
+from afm_jax.impact.closure import (
+    Coordinates,
+    OrbitPlace,
+    OrbitProblem,
+    coordinates_of_roots,
+    first_seen,
+    follow_root,
+    harmless_coordinate,
+)
 from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
-from afm_jax.impact.orbits import amplitudes, steady_orbits
-from afm_jax.solve.lanes import compiled_quickly, compiling, filled, in_blocks
+from afm_jax.impact.orbits import SteadyOrbits, amplitudes, is_steady, steady_orbits, usual_scan
+from afm_jax.solve.lanes import compiled_quickly, filled, in_blocks
 from fitting.models import Measurement, Problem, Rows
 
 
 class Branch(NamedTuple):
     """The orbit that a row is taken to be on: where, whether there is one, and how many there are.
 
-    ``slopes`` are those of `FollowedRoot`, None where the orbit was not followed.
+    ``slopes`` are those of `FollowedRoot`.
     """
 
     place: OrbitPlace
     exists: Bool[Array, ""]
     orbits: Int[Array, ""]
     near_fold: Bool[Array, ""]
-    slopes: Float[Array, "2 2"] | None = None
+    slopes: Float[Array, "5 2"] | None
 
 
 AnyImpact = Law | TabulatedImpact | PulledImpact
@@ -120,35 +129,39 @@ def shown(
 
 
 def branch_of(orbit: OrbitProblem, row: Rows, values: Float[Array, " p"], problem: Problem) -> Branch:
-    """Choose among a row's steady orbits; no derivatives.
+    """Search for a row's steady orbits and choose the measured one; no derivatives."""
+    roots = steady_orbits(orbit)
+    read = jax.vmap(lambda seen: shown(seen, orbit, row, values, problem))(roots.amplitude_nm)
+    return chosen(roots._replace(amplitude_nm=read), row)
+
+
+def chosen(roots: SteadyOrbits, row: Rows) -> Branch:
+    """Choose among the steady orbits of a row, or of each row of a table.
 
     There can be several: the one that explains the measured readings best counts. A row without any is predicted as
     `nothing_shown`: a fixed penalty. A free tip has its steady motion.
+
+    Args:
+        roots: of shape (..., slots), with the readings as they are shown.
+        row: the row, or the rows, as arrays of NumPy or JAX like the roots.
     """
-    roots = steady_orbits(orbit)
-    read = jax.vmap(lambda seen: shown(seen, orbit, row, values, problem))(roots.amplitude_nm)
-    misfit = jnp.where(row.measured, (read - row.amplitude_nm) / row.error_nm, 0.0)
-    slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
-    return Branch(
-        place=OrbitPlace(roots.place.coordinate[slot], roots.place.phase[slot]),
-        exists=roots.steady[slot] | row.free,
-        orbits=jnp.where(row.free, 1, jnp.sum(roots.steady, dtype=jnp.int32)),
-        near_fold=roots.steady[slot] & roots.near_double[slot] & ~row.free,
-    )
+    numpy: Any = np if isinstance(roots.steady, np.ndarray) else jnp
+    measured, amplitude, error = (column[..., None, :] for column in (row.measured, row.amplitude_nm, row.error_nm))
+    misfit = numpy.where(measured, (roots.amplitude_nm - amplitude) / error, 0.0)
+    size = numpy.where(roots.steady, (misfit**2).sum(axis=-1), numpy.inf)
+    slot = size.argmin(axis=-1, keepdims=True)
 
+    def of_slot(leaf: Any) -> Any:
+        place = slot.reshape(slot.shape + (1,) * (leaf.ndim - slot.ndim))
+        return numpy.take_along_axis(leaf, place, axis=slot.ndim - 1).squeeze(slot.ndim - 1)
 
-def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
-    """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
-    harmless = harmless_coordinate(orbit)
-    wanted = known.exists & ~row.free
-    root = follow_root(jnp.where(wanted, known.place.coordinate, harmless), orbit, wanted)
-    there = wanted & root.closes
+    steady = of_slot(roots.steady)
     return Branch(
-        place=OrbitPlace(jnp.where(there, root.place.coordinate, harmless), root.place.phase),
-        exists=there | row.free,
-        orbits=jnp.where(row.free, 1, jnp.where(there, known.orbits, 0)),
-        near_fold=there & root.near_fold,
-        slopes=root.slopes,
+        place=jax.tree.map(of_slot, roots.place),
+        exists=steady | row.free,
+        orbits=numpy.where(row.free, 1, roots.steady.sum(axis=-1, dtype=np.int32)),
+        near_fold=steady & of_slot(roots.near_double) & ~row.free,
+        slopes=None if roots.slopes is None else of_slot(roots.slopes),
     )
 
 
@@ -244,7 +257,7 @@ def linearise(
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
     batch, impacts = batch_of(values, measurement, problem)
-    whole = _of_pairs(_Pairs(batch, sets, impacts, measurement, problem, near), linearise_pairs)
+    whole = _of_pairs(_Pairs(batch, sets, impacts, measurement, problem, near), _linearised)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
@@ -333,7 +346,7 @@ def impact_slopes(
         leaf = np.array(where(still))
         leaf[(slice(None), 0, *constant)] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
-        block = _of_pairs(_Pairs(batch, 1, turned, measurement, problem, near), linearise_pairs)
+        block = _of_pairs(_Pairs(batch, 1, turned, measurement, problem, near), _linearised)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     # -1: a larger loss, or epsilon, is a smaller squared speed; of a series the constant term is changed
@@ -351,16 +364,15 @@ def impact_slopes(
     return ImpactSlopes(by_square, np.nan_to_num(speed)[:, None] * by_offset)
 
 
-def warm_up(
-    values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem, *, besides: Callable[[], object]
-) -> None:
-    """Compile the large programs of `linearise`, or read them from the cache, side by side.
+def programs_of_search(
+    values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem
+) -> list[Callable[[], object]]:
+    """Return what compiles the programs of `linearise`, or reads them from the cache, one each.
 
     Args:
         values: some values of the parameters.
         measurement: what will be compared with.
         problem: the model.
-        besides: compiles what else a search needs, which takes less time.
     """
     sets = np.asarray(values)[None]
     batch, calls = _calls_for_impacts(sets, measurement, problem)
@@ -374,17 +386,18 @@ def warm_up(
         here = measurement.of_drive(drive)
     index = np.zeros(_lanes(own), dtype=int)
     rows = jax.tree.map(lambda column: np.asarray(column)[index], here.rows)
-    some, points = here._replace(rows=rows), batch[index]
-    nowhere = branch_near(np.full(index.shape, np.nan))
-
-    def run(program: Callable[..., Any], *more: Any) -> None:
-        jax.block_until_ready(program(points, impacts, index, some, own, *more))
-
-    with (
-        compiling(lambda: batch_of(sets, measurement, problem)),
-        compiling(lambda: (run(linearise_pairs, nowhere), besides())),
-    ):
-        run(located)
+    pairs = batch[index], impacts, index, here._replace(rows=rows), own
+    nothing, none = np.full(index.shape, np.nan), np.zeros(index.shape, bool)
+    slopes = np.zeros((*index.shape, 5, 2)) if own.lasting else None
+    nowhere = Branch(OrbitPlace(nothing, nothing), none, none.astype(np.int32), none, slopes)
+    # those that take longest to compile, next to their trace, first
+    return [
+        lambda: batch_of(sets, measurement, problem),
+        lambda: follow_pairs(*pairs, nothing),
+        lambda: linearise_pairs(*pairs, nowhere),
+        lambda: search_pairs(*pairs),
+        lambda: judge_pairs(*pairs, nowhere),
+    ]
 
 
 class _Block(NamedTuple):
@@ -480,7 +493,7 @@ def _of_pairs(pairs: _Pairs, program: Callable[..., _Block]) -> _Block:
 
     Args:
         pairs: on which it is to run.
-        program: `linearise_pairs` or `predict_pairs`.
+        program: `_linearised` or `predict_pairs`.
     """
     joint, table = pairs.measurement.joint, pairs.measurement.rows.table
     if joint is None or table is None:
@@ -508,19 +521,14 @@ def _of_pairs_of_one_drive(pairs: _Pairs, program: Callable[..., _Block]) -> _Bl
     filling, whole = _filling(columns), columns.order.shape[0]
     rows = whole - filling
     number, row = (index.ravel() for index in np.indices((sets, rows)))
-    branch = None
-    if pairs.near is not None:
-        branch = branch_near(np.broadcast_to(pairs.near, (sets, whole))[:, :rows].ravel())
+    near = None if pairs.near is None else np.broadcast_to(pairs.near, (sets, whole))[:, :rows].ravel()
     point = pairs.points[number, row if pairs.points.shape[1] > 1 else 0]
 
     def work(lanes: Any) -> _Block:
-        point, number, of_row, branch = lanes
-        lane = pairs.measurement._replace(rows=of_row)
-        if branch is None:
-            branch = located(point, impacts, number, lane, problem)
-        return program(point, impacts, number, lane, problem, branch)
+        point, number, of_row, near = lanes
+        return program(point, impacts, number, pairs.measurement._replace(rows=of_row), problem, near)
 
-    lanes = point, number, jax.tree.map(lambda column: column[row], columns), branch
+    lanes = point, number, jax.tree.map(lambda column: column[row], columns), near
 
     def of_table(column: np.ndarray) -> np.ndarray:
         column = column.reshape(sets, rows, *column.shape[1:])
@@ -544,31 +552,124 @@ def _filling(rows: Rows) -> int:
     return int(np.argmin(filling[::-1]))
 
 
-def branch_near(coordinate: Any) -> Branch:
-    """Return orbits that are taken to be near coordinates of shape (lanes,); NaN: there is none."""
-    # NumPy's for NumPy's: every JAX operation outside a compiled program would be compiled by itself
-    numpy: Any = np if isinstance(coordinate, np.ndarray) else jnp
-    coordinate = numpy.asarray(coordinate)
-    there = numpy.isfinite(coordinate)
-    nothing = numpy.zeros_like(there)
-    return Branch(OrbitPlace(coordinate, numpy.zeros_like(coordinate)), there, there.astype(np.int32), nothing)
+def located(
+    points: Float[np.ndarray, "lanes p"] | Float[Array, "lanes p"],
+    impacts: _Impacts,
+    index: Int[np.ndarray, " lanes"] | Int[Array, " lanes"],
+    measurement: Measurement,
+    problem: Problem,
+) -> Branch:
+    """Return the orbit that each pair of a row, with its values, and the set that its index names is on.
+
+    Outside of programs three of them share the work, `search_pairs`, `follow_pairs` and `judge_pairs`, the last two on
+    what the first has found.
+    """
+    if is_traced(points):
+
+        def one(point: Float[Array, " p"], impact, row: Rows) -> Branch:
+            return branch_of(orbit_problem(point, impact, row, measurement, problem), row, point, problem)
+
+        return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows)
+    points, index, rows = jax.tree.map(np.asarray, (points, index, measurement.rows))
+    near = jax.tree.map(np.asarray, search_pairs(points, impacts, index, measurement, problem))
+    wanted = near.found & ~rows.free[:, None]
+    # one that is nowhere if there are none
+    lane, slot = np.nonzero(wanted) if wanted.any() else np.zeros((2, 1), int)
+
+    def work(lanes: Any) -> Any:
+        point, number, of_row, coordinate = lanes
+        pairs = point, impacts, number, measurement._replace(rows=of_row), problem
+        root = follow_pairs(*pairs, coordinate)
+        return root, judge_pairs(*pairs, root)
+
+    def in_slots(values: np.ndarray) -> np.ndarray:
+        whole = np.zeros((*wanted.shape, *values.shape[1:]), values.dtype)
+        whole[lane, slot] = values
+        return whole
+
+    coordinate = np.where(wanted, near.coordinate, np.nan)[lane, slot]
+    pairs = points[lane], index[lane], jax.tree.map(lambda column: column[lane], rows), coordinate
+    known = located, problem, jax.tree.structure((impacts, measurement))
+    found, judged = jax.tree.map(in_slots, in_blocks(work, pairs, block=len(index), widths=(), program=known))
+    place = OrbitPlace(np.where(found.exists, found.place.coordinate, near.coordinate), found.place.phase)
+    steady = judged.steady & first_seen(place.coordinate, found.exists)
+    return chosen(SteadyOrbits(place, steady, found.near_fold, judged.shown, found.slopes), rows)
+
+
+def _of_sets(impacts: Any, index: Int[Array, " lanes"]) -> Any:
+    """Return the impacts, or their slopes, of the sets that an index names."""
+    return jax.tree.map(lambda leaf: leaf[index], impacts)
 
 
 @compiled_quickly(static_argnames="problem")
-def located(
+def search_pairs(
     points: Float[Array, "lanes p"],
     impacts: _Impacts,
     index: Int[Array, " lanes"],
     measurement: Measurement,
     problem: Problem,
+) -> Coordinates:
+    """Return where the orbits of each pair may be, of shape (lanes, slots)."""
+
+    def one(point: Float[Array, " p"], impact, row: Rows) -> Coordinates:
+        orbit = orbit_problem(point, impact, row, measurement, problem)
+        return coordinates_of_roots(orbit, usual_scan(orbit))
+
+    return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows)
+
+
+@compiled_quickly(static_argnames="problem")
+def follow_pairs(
+    points: Float[Array, "lanes p"],
+    impacts: _Impacts,
+    index: Int[Array, " lanes"],
+    measurement: Measurement,
+    problem: Problem,
+    near: Float[Array, " lanes"],
 ) -> Branch:
-    """Return the orbit that each pair of a row, with its values, and the set that its index names is on."""
+    """Return the orbit of each pair that is close to a coordinate, NaN: none; admissible and stable are not asked."""
 
-    def one(point: Float[Array, " p"], impact, row: Rows) -> Branch:
-        return branch_of(orbit_problem(point, impact, row, measurement, problem), row, point, problem)
+    def one(point: Float[Array, " p"], impact, row: Rows, near: Float[Array, ""]) -> Branch:
+        orbit = orbit_problem(point, impact, row, measurement, problem)
+        harmless = harmless_coordinate(orbit)
+        wanted = jnp.isfinite(near) & ~row.free
+        root = follow_root(jnp.where(wanted, near, harmless), orbit, wanted)
+        there = wanted & root.closes
+        return Branch(
+            place=OrbitPlace(jnp.where(there, root.place.coordinate, harmless), root.place.phase),
+            exists=there | row.free,
+            orbits=(there | row.free).astype(jnp.int32),
+            near_fold=there & root.near_fold,
+            slopes=root.slopes,
+        )
 
-    impact = jax.tree.map(lambda leaf: leaf[index], impacts.impact)
-    return jax.vmap(one)(points, impact, measurement.rows)
+    return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows, near)
+
+
+class _Steadiness(NamedTuple):
+    """Whether an orbit is steady, and its readings as they are shown."""
+
+    steady: Bool[Array, " lanes"]
+    shown: Float[Array, "lanes k"]
+
+
+@compiled_quickly(static_argnames="problem")
+def judge_pairs(
+    points: Float[Array, "lanes p"],
+    impacts: _Impacts,
+    index: Int[Array, " lanes"],
+    measurement: Measurement,
+    problem: Problem,
+    branch: Branch,
+) -> _Steadiness:
+    """Say which orbits of pairs are steady, and what is shown of them."""
+
+    def one(point: Float[Array, " p"], impact, row: Rows, known: Branch) -> _Steadiness:
+        orbit = lax.stop_gradient(orbit_problem(point, impact, row, measurement, problem))
+        steady, seen = is_steady(known.place, known.exists, known.slopes, orbit)
+        return _Steadiness(steady, shown(seen, orbit, row, point, problem))
+
+    return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows, branch)
 
 
 @compiled_quickly(static_argnames="problem")
@@ -584,11 +685,8 @@ def linearise_pairs(
 
     # One vmap over all pairs, not two nested ones: tracing costs as much as a fit otherwise.
     def one(point: Float[Array, " p"], impact, slope, row: Rows, known: Branch):
-        orbit = orbit_problem(point, impact, row, measurement, problem)
-        branch = followed(orbit, known, row) if orbit.impact.lasts else known
-
         def predict(v, impact):
-            return prediction_of(branch, v, orbit_problem(v, impact, row, measurement, problem), row, problem)
+            return prediction_of(known, v, orbit_problem(v, impact, row, measurement, problem), row, problem)
 
         def along(e, turn):
             predicted, change = jax.jvp(predict, (point, impact), (e, turn))
@@ -596,7 +694,7 @@ def linearise_pairs(
 
         return jax.vmap(along, out_axes=(-1, None))(jnp.eye(point.shape[0]), slope)
 
-    impact, slopes = jax.tree.map(lambda leaf: leaf[index], tuple(impacts))
+    impact, slopes = _of_sets(tuple(impacts), index)
     rows = measurement.rows
     slope, prediction = jax.vmap(one)(points, impact, slopes, rows, branch)
     return _block(prediction, slope, rows)
@@ -620,24 +718,31 @@ def _block(prediction: Prediction, slope: Float[Array, "lanes k p"], rows: Rows)
     )
 
 
-@compiled_quickly(static_argnames="problem")
+def _linearised(*pairs_and_near: Any) -> _Block:
+    """Return `linearise_pairs` on the orbits near coordinates, or on those that a search finds; arguments as there."""
+    *pairs, near = pairs_and_near
+    branch = located(*pairs) if near is None else follow_pairs(*pairs, near)
+    return linearise_pairs(*pairs, branch)
+
+
+@compiled_quickly(static_argnames="problem", level=0)
 def predict_pairs(
     points: Float[Array, "lanes p"],
     impacts: _Impacts,
     index: Int[Array, " lanes"],
     measurement: Measurement,
     problem: Problem,
-    branch: Branch,
+    near: Float[Array, " lanes"],
 ) -> _Block:
-    """Return misfits of pairs of a row, with its values, and the law that its index names; no slopes."""
+    """Return misfits of pairs of a row, with its values, and the law that its index names, near orbits; no slopes."""
 
     def one(point: Float[Array, " p"], impact, row: Rows, known: Branch) -> Prediction:
         orbit = orbit_problem(point, impact, row, measurement, problem)
-        branch = followed(orbit, known, row) if orbit.impact.lasts else known
-        return prediction_of(branch, point, orbit, row, problem)
+        return prediction_of(known, point, orbit, row, problem)
 
-    impact, rows = jax.tree.map(lambda leaf: leaf[index], impacts.impact), measurement.rows
-    prediction = jax.vmap(one)(points, impact, rows, branch)
+    rows = measurement.rows
+    branch = follow_pairs(points, impacts, index, measurement, problem, near)
+    prediction = jax.vmap(one)(points, _of_sets(impacts.impact, index), rows, branch)
     return _block(prediction, jnp.zeros((*rows.amplitude_nm.shape, 0)), rows)
 
 
@@ -665,7 +770,7 @@ class Free(NamedTuple):
     """Gap in nm at which the bridge breaks: the length over which a leaving tip loses its energy."""
 
 
-@compiled_quickly()
+@compiled_quickly(level=0)
 def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
     """Return what an impact does to free tips; coordinates of taps are taken for those of free ones."""
     if isinstance(impact, PulledImpact):

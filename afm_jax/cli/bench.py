@@ -7,9 +7,11 @@ import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import click
 from rich.table import Table
 
 from afm_jax.bench import collisions, dynamics, scenes, timing
@@ -24,11 +26,15 @@ AIMED_BATCH = 10_000
 
 
 class Size(NamedTuple):
-    """How much is measured: quickly or in full, on how many cores, and with which batches of the impact map."""
+    """How much is measured: quickly or in full, on how many cores, and with which batches of the impact map.
+
+    ``beside``: folder of another checkout, whose fits are timed, too.
+    """
 
     quick: bool
     cores: int
     batches: Sequence[int]
+    beside: Path | None = None
 
 
 class Measured(NamedTuple):
@@ -60,9 +66,11 @@ class Part(NamedTuple):
     further: Callable[[Sequence[Row]], Table] | None = None
 
 
-def bench(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> Output:
+def bench(session: Session, batches: tuple[int, ...], only: str | None, beside: Path | None, *, quick: bool) -> Output:
     """Measure all parts, or one."""
-    size = Size(quick, available_cores(), batches)
+    if beside is not None and not (beside / "afm_jax" / "__main__.py").is_file():
+        raise click.UsageError(f"--beside: {beside} holds no checkout of afm-jax; name the folder above its afm_jax")
+    size = Size(quick, available_cores(), batches, None if beside is None else beside.resolve())
     machine = machine_facts(size.cores)
     if (machine["load_before"] or 0.0) > 0.3 * size.cores:
         session.note(f"other programs are running (load {machine['load_before']:.1f}): times will be too long")
@@ -195,7 +203,8 @@ def measure_fits(size: Size) -> Measured:
     """Time fits of tables of 100 rows, the first time and with a warm cache."""
     from fitting.benchmark import time_fits  # noqa: PLC0415 (`fitting` is imported by the command that needs it)
 
-    rows = time_fits(("law",) if size.quick else tuple(_FIT_BOUNDS), rows=20 if size.quick else 100)
+    models = ("law",) if size.quick else tuple(_FIT_BOUNDS)
+    rows = time_fits(models, rows=20 if size.quick else 100, beside=size.beside)
     found = {} if size.quick else {row["model"]: row for row in rows}
     aims = [
         (f"s, fit of 100 rows, {model}, {when}", found.get(model, {}).get(column), bound)
@@ -365,8 +374,8 @@ FITS = Part(
     StudyTable(
         "bench_fits.csv",
         (
-            *("model", "rows", "first_s", "first_processor_s", "warm_s", "warm_processor_s", "valid", "chi2"),
-            "degrees_of_freedom",
+            *("model", "rows", "first_s", "first_processor_s", "warm_s", "warm_processor_s"),
+            *("valid", "chi2", "degrees_of_freedom"),
         ),
         "fits from the shell",
         {

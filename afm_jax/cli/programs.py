@@ -21,7 +21,6 @@ import equinox as eqx
 import jax
 from jax import core, export
 
-from afm_jax.compilation_cache import quick_options
 from afm_jax.whole_files import write_whole
 
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
@@ -58,7 +57,7 @@ class _Keeping:
                 # at once: a jitted function would compile again where an argument comes from another program
                 like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
                 lowered = jax.jit(program.call).lower(*like)
-            self.programs[call] = lowered.compile(quick_options())
+            self.programs[call] = lowered.compile(getattr(self.jitted, "options", None))
         return jax.tree.unflatten(self.traced[call][1], self.programs[call](arrays))
 
     def shapes(self, *arguments: Any, **named: Any) -> Any:
@@ -91,8 +90,13 @@ _ONE_TRACE = threading.Lock()
 
 
 def _digest(call: Any) -> str:
-    said = [call, *(getattr(jax.config, option) for option in _CONFIGURATION), jax.devices(), *map(version, _PACKAGES)]
+    said = [call, *(getattr(jax.config, option) for option in _CONFIGURATION), jax.devices(), *_versions()]
     return hashlib.sha256(f"{said}{_sources()}".encode()).hexdigest()
+
+
+@cache
+def _versions() -> tuple[str, ...]:
+    return tuple(map(version, _PACKAGES))
 
 
 @cache

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 
 FIT_PROGRAMS = tuple(
-    f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs", "predict_pairs")
+    f"fitting.forward:{name}"
+    for name in ("impacts_of", "search_pairs", "follow_pairs", "judge_pairs", "linearise_pairs", "predict_pairs")
 )
 """Jitted functions of a fit of the impact law whose traces are kept (see `Session.start_computing`)."""
 

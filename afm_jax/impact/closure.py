@@ -12,7 +12,7 @@ between them. Where the impact lasts, speeds and delay need the phase: three pas
 enough to find every orbit, and Newton's method closes the map itself from there (`follow_root`).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -152,9 +152,19 @@ def speeds_at_place(place: OrbitPlace, problem: OrbitProblem) -> Speeds:
     )
 
 
-@jax.jit
 def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array, " 2"]:
     """Return by how much one turn of the map misses its start: height over beta, velocity over beta omega."""
+    return turn_of_map(unknowns, problem)[:2]
+
+
+@jax.jit
+def turn_of_map(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array, " 5"]:
+    """Return what one turn of the map misses its start by (`map_gaps`), and the speeds and the delay of its impact.
+
+    Args:
+        unknowns: coordinate and phase of the impact.
+        problem: what orbits are of.
+    """
     cantilever, platform, _, order = problem
     place = OrbitPlace(*unknowns)
     arrival = place.phase / platform.angular_frequency
@@ -164,31 +174,32 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
     position, velocity = flight(height, speed + speeds.rebound)
     height, speed = platform.position_and_velocity(arrival)
     missing = (velocity - speed + speeds.approach) / platform.top_speed_nm_per_us
-    return jnp.stack([(position - height) / platform.amplitude_nm, missing])
+    return jnp.stack([(position - height) / platform.amplitude_nm, missing, *speeds])
 
 
 class FollowedRoot(NamedTuple):
-    """Where Newton's method for the map of a lasting impact ended.
+    """An orbit close to a coordinate.
 
-    ``closes``: whether the map closes there; ``slopes``: derivatives of `map_gaps` by coordinate and phase, shape
-    (2, 2), right to the size of the last step; ``near_fold``: see `NEAR_DOUBLE`.
+    ``closes``: whether there is one; ``near_fold``: see `NEAR_DOUBLE`; ``slopes``: derivatives of `turn_of_map` by
+    coordinate and phase, shape (5, 2), right to the size of the last step; None unless the impact lasts.
     """
 
     place: OrbitPlace
     closes: Bool[Array, ""]
-    slopes: Float[Array, "2 2"]
     near_fold: Bool[Array, ""]
+    slopes: Float[Array, "5 2"] | None
 
 
 @jax.jit
 def follow_root(near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Array, ""]) -> FollowedRoot:
-    """Return where the map of a lasting impact closes, and whether it does, without derivatives.
+    """Return where an orbit close to a coordinate is, and whether there is one, without derivatives.
 
-    With x(Y) the solution (a, b) of the linear system, the gaps are its matrix times (cos, sin) - x, so that the slope
-    of the closing condition on an orbit, d|x|^2/dY/2, is the determinant of the gaps' slopes over that of the matrix.
+    Where the impact lasts Newton's method closes the map. With x(Y) the solution (a, b) of the linear system, the gaps
+    are its matrix times (cos, sin) - x, so that the slope of the closing condition on an orbit, d|x|^2/dY/2, is the
+    determinant of the gaps' slopes over that of the matrix.
 
     Args:
-        near: coordinate of the impact, close to that of the orbit.
+        near: coordinate of the impact, close to that of the orbit; of an impact that does not last, that of the orbit.
         problem: what orbits are of.
         wanted: whether the orbit is asked for; if not, no step of Newton's method is made.
     """
@@ -202,15 +213,19 @@ def follow_root(near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Arra
         return jnp.clip(step, -most, most)
 
     speeds, system = closure(near, problem)
+    if not problem.impact.lasts:
+        return FollowedRoot(
+            place_of(near, speeds, system, problem), wanted & system.regular, near_fold(near, problem), None
+        )
     settings = Newton(_NEWTON, step_tolerance=_CLOSE, residual_tolerance=_CLOSE, unit=longest, damping=damped)
     place = jnp.stack(place_of(near, speeds, system, problem))
-    root = newton(map_gaps, place, problem, settings, where=wanted)
-    (a, b), (c, d) = root.slopes
+    root = newton(map_gaps, place, problem, settings, where=wanted, extended=turn_of_map)
+    (a, b), (c, d) = root.slopes[:2]
     return FollowedRoot(
         place=OrbitPlace(*root.x),
         closes=system.regular & jnp.all(jnp.abs(root.residual) < _CLOSED),
-        slopes=root.slopes,
         near_fold=jnp.abs((a * d - b * c) * root.x[0]) < NEAR_DOUBLE * jnp.abs(system.determinant),
+        slopes=root.slopes,
     )
 
 
@@ -354,8 +369,8 @@ class OrbitRoots(NamedTuple):
     """Whether there were no more roots than slots."""
     near_fold: Bool[Array, " slots"]
     """Which roots are near-double."""
-    slopes: Float[Array, "slots 2 2"] | None
-    """Derivatives of `map_gaps` by coordinate and phase, right to ten digits; None unless the impact lasts."""
+    slopes: Float[Array, "slots 5 2"] | None
+    """Those of `FollowedRoot`."""
 
 
 def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
@@ -369,19 +384,33 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
         The roots; a slot without one has a coordinate that is harmless to compute with.
     """
     problem = lax.stop_gradient(problem)
+    coordinate, wanted, complete = coordinates_of_roots(problem, scan)
+    roots = jax.vmap(follow_root, in_axes=(0, None, 0))(coordinate, problem, wanted)
+    found = first_seen(roots.place.coordinate, wanted & roots.closes)
+    place = OrbitPlace(jnp.where(found, roots.place.coordinate, coordinate), roots.place.phase)
+    return OrbitRoots(place, found, complete, found & roots.near_fold, roots.slopes)
+
+
+class Coordinates(NamedTuple):
+    """Roots of the scalar condition, close to those of the map: which slots hold one, and whether those are all.
+
+    A slot without one has a coordinate that is harmless to compute with.
+    """
+
+    coordinate: Float[Array, " slots"]
+    found: Bool[Array, " slots"]
+    complete: Bool[Array, ""]
+
+
+def coordinates_of_roots(problem: OrbitProblem, scan: Scan = FINE) -> Coordinates:
+    """Return where orbits may be, from where `follow_root` finds them, without derivatives; arguments of `find_roots`.
+
+    Without an amplitude, or over a ramp, there are none.
+    """
+    problem = lax.stop_gradient(problem)
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
     coordinate, found, complete = _quartic_roots(problem) if _is_quartic(problem) else _scanned_roots(problem, scan)
-    safe = jnp.where(found, coordinate, harmless_coordinate(problem))
-    if problem.impact.lasts:
-        place, closes, slopes, near_double = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
-        found = found & driven & closes
-        found = found & ~_seen_before(place.coordinate, found)
-    else:
-        place, regular = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
-        found, slopes = found & driven & regular, None
-        near_double = jax.vmap(near_fold, in_axes=(0, None))(safe, problem)
-    place = OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase)
-    return OrbitRoots(place, found, complete, found & near_double, slopes)
+    return Coordinates(jnp.where(found, coordinate, harmless_coordinate(problem)), found & driven, complete)
 
 
 def _is_quartic(problem: OrbitProblem) -> bool:
@@ -389,10 +418,14 @@ def _is_quartic(problem: OrbitProblem) -> bool:
     return isinstance(problem.impact, ImpactLaw) and not problem.impact.delayed
 
 
-def _seen_before(coordinate: Float[Array, " slots"], found: Bool[Array, " slots"]) -> Bool[Array, " slots"]:
-    """Say which roots are those of an earlier slot: from two brackets Newton's method may come to one orbit."""
-    same = jnp.abs(coordinate[:, None] - coordinate) <= _SAME * coordinate
-    return jnp.any(jnp.tril(same & found, k=-1), axis=1)
+def first_seen(coordinate: Any, found: Any) -> Any:
+    """Say which of the roots found are not those of an earlier slot: Newton's method may come to one from two brackets.
+
+    Arrays of NumPy or JAX, of shape (..., slots).
+    """
+    same = abs(coordinate[..., :, None] - coordinate[..., None, :]) <= _SAME * coordinate[..., None, :]
+    earlier = np.tri(coordinate.shape[-1], k=-1, dtype=bool)
+    return found & ~(same & earlier & found[..., None, :]).any(axis=-1)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -400,21 +433,7 @@ def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
     return problem.impact.lowest + 2.0 * _scale(problem) + 2.0
 
 
-def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[OrbitPlace, Bool[Array, ""]]:
-    """Return the place at a root, and whether the phase is determined there."""
-    speeds, system = closure(coordinate, problem)
-    return place_of(coordinate, speeds, system, problem), system.regular
-
-
-class _Coordinates(NamedTuple):
-    """Roots of the scalar condition: coordinates, which slots hold one, and whether those are all."""
-
-    coordinate: Float[Array, " slots"]
-    found: Bool[Array, " slots"]
-    complete: Bool[Array, ""]
-
-
-def _quartic_roots(problem: OrbitProblem) -> _Coordinates:
+def _quartic_roots(problem: OrbitProblem) -> Coordinates:
     """Solve (Y cosine)^2 + (Y sine)^2 = (Y determinant)^2, a quartic in Y over beta omega."""
     quartic = instantaneous_quartic(problem)
     scale = problem.platform.top_speed_nm_per_us
@@ -424,7 +443,7 @@ def _quartic_roots(problem: OrbitProblem) -> _Coordinates:
     leading = jnp.maximum(jnp.abs(quartic[0]), 1e-15 * top)
     high = jnp.maximum(1.0 + top / jnp.where(leading > 0.0, leading, 1.0), 2.0 * low + 1.0)
     roots, found = real_roots(quartic, low, high)
-    return _Coordinates(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
+    return Coordinates(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
 
 
 def _scale(problem: OrbitProblem) -> Float[Array, ""]:
@@ -440,7 +459,7 @@ class _Samples(NamedTuple):
     brief: Bool[Array, " points"]
 
 
-def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
+def _scanned_roots(problem: OrbitProblem, scan: Scan) -> Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
     coarse, fine = _sampled_twice(grid, problem, scan) if scan.within else (_sampled(grid, problem),) * 2
@@ -456,7 +475,7 @@ def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
     order = fastest[jnp.argsort(jnp.where(exists[fastest], root[fastest], jnp.inf))]
     most = jnp.maximum(jnp.sum(coarse_crossing), jnp.sum(crossing))
     complete = (most <= scan.crossings) & (jnp.sum(exists) <= scan.slots)
-    return _Coordinates(root[order], exists[order], complete)
+    return Coordinates(root[order], exists[order], complete)
 
 
 def _sampled(grid: Float[Array, " points"], problem: OrbitProblem) -> _Samples:

@@ -580,7 +580,8 @@ class TabulatedLaw(Law):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the law as numbers and lists, from which `law_of_dict` makes it again; what is absent is left out."""
-        found = _at_knots(self)
+        # a program for laws of however many unknowns
+        found = _at_knots(_replaced(self, deviations=None))
         told: dict[str, Any] = {
             "approach_speed_nm_per_us": np.asarray(found.approach).tolist(),
             "rebound_speed_nm_per_us": np.asarray(found.rebound).tolist(),

@@ -2,9 +2,9 @@
 
 `single_impact_orbits` takes a scene with a law and returns every orbit of an order N. The roots of the closing
 condition (`closure`) are approach speeds; `orbit_state` makes of a root the motion, the flight between two impacts;
-`judge` says whether the flight passes through the platform, and by the map's Jacobian (eq. 8) whether the orbit is
-stable; at the end stands what an experiment reads of the flight: peak height, lock-in amplitude and phase. Fits take
-the same functions for impacts of every kind (`steady_orbits`, `amplitudes`).
+`is_admissible` says whether the flight passes through the platform, `is_stable` judges by the map's Jacobian (eq. 8);
+at the end stands what an experiment reads of the flight: peak height, lock-in amplitude and phase. Fits take the same
+functions for impacts of every kind (`coordinates_of_roots`, `is_steady`, `amplitudes`).
 """
 
 from typing import NamedTuple
@@ -26,11 +26,13 @@ from afm_jax.impact.closure import (
     TAPPED,
     OrbitPlace,
     OrbitProblem,
+    Scan,
     closing_residual,
     closure,
     find_roots,
     map_gaps,
     speeds_at_place,
+    turn_of_map,
 )
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
@@ -242,13 +244,14 @@ class OrbitState(NamedTuple):
 class SteadyOrbits(NamedTuple):
     """The roots of a problem, which of them are steady (admissible and stable), and their readings.
 
-    A reading is peak and lock-in amplitude in nm and the phase in degrees.
+    A reading is peak and lock-in amplitude in nm and the phase in degrees; ``slopes`` are those of `FollowedRoot`.
     """
 
     place: OrbitPlace
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
     amplitude_nm: Float[Array, "slots 3"]
+    slopes: Float[Array, "slots 5 2"] | None = None
 
 
 def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[str, Float[Array, ""]]:
@@ -297,7 +300,7 @@ def _alone(wave: Wave) -> Surface:
 
 
 @jax.jit
-def orbit_state(place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "2 2"] | None = None) -> OrbitState:
+def orbit_state(place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "5 2"] | None = None) -> OrbitState:
     """Return the motion at a root, with the root's derivatives (implicit function theorem).
 
     Args:
@@ -310,9 +313,10 @@ def orbit_state(place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "
         root = jnp.stack(place)
         if slopes is None:
             place = OrbitPlace(*implicit_system(map_gaps, root, problem))
+            speeds = speeds_at_place(place, problem)
         else:
-            place = OrbitPlace(*implicit_step(map_gaps, root, problem, slopes))
-        speeds = speeds_at_place(place, problem)
+            root, of_impact = implicit_step(turn_of_map, root, problem, slopes)
+            place, speeds = OrbitPlace(*root), Speeds(*of_impact)
         phase = place.phase + platform.angular_frequency * speeds.delay
     else:
         speeds, system = closure(implicit_root(closing_residual, place.coordinate, problem), problem)
@@ -352,19 +356,35 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     A delayed closing condition is scanned coarsely: orbits close to each other or to capture may be missed.
     """
     problem = lax.stop_gradient(problem)
-    roots = find_roots(problem, TAPPED if isinstance(problem.impact, PulledImpact) else COARSE)
+    roots = find_roots(problem, usual_scan(problem))
+    judged = jax.vmap(is_steady, in_axes=(0, 0, 0, None))
+    steady, readings = judged(roots.place, roots.found, roots.slopes, problem)
+    return SteadyOrbits(roots.place, steady, roots.near_fold, readings, roots.slopes)
 
-    def orbit_of(place, found, slopes):
-        state = orbit_state(place, problem)
-        steady = is_admissible(found, state, problem) & is_stable(place, slopes, state, problem)
-        return steady, _readings(state, problem)
 
-    steady, readings = jax.vmap(orbit_of)(roots.place, roots.found, roots.slopes)
-    return SteadyOrbits(roots.place, steady, roots.near_fold, readings)
+def usual_scan(problem: OrbitProblem) -> Scan:
+    """Return the scan of searches that are made again and again, as fits make them."""
+    return TAPPED if isinstance(problem.impact, PulledImpact) else COARSE
+
+
+def is_steady(
+    place: OrbitPlace, found: Bool[Array, ""], slopes: Float[Array, "5 2"] | None, problem: OrbitProblem
+) -> tuple[Bool[Array, ""], Float[Array, " 3"]]:
+    """Say whether a root is a steady motion, admissible and stable, and return its readings as of `SteadyOrbits`.
+
+    Args:
+        place: the root.
+        found: whether there is one.
+        slopes: of `FollowedRoot`.
+        problem: what it is an orbit of.
+    """
+    state = orbit_state(place, problem)
+    steady = is_admissible(found, state, problem) & is_stable(place, slopes, state, problem)
+    return steady, _readings(state, problem)
 
 
 def is_stable(
-    place: OrbitPlace, slopes: Float[Array, "2 2"] | None, state: OrbitState, problem: OrbitProblem
+    place: OrbitPlace, slopes: Float[Array, "5 2"] | None, state: OrbitState, problem: OrbitProblem
 ) -> Bool[Array, ""]:
     """Say whether an orbit is stable, from the slopes that its search has found where the impact lasts.
 
@@ -374,7 +394,7 @@ def is_stable(
 
     Args:
         place: the root.
-        slopes: of `OrbitRoots`.
+        slopes: of `FollowedRoot`.
         state: the motion there.
         problem: what it is an orbit of.
     """
@@ -383,9 +403,8 @@ def is_stable(
     if slopes is None:
         return contracts(*trace_and_determinant(impact, cantilever, platform, flight))
     omega, approach = platform.angular_frequency, state.speeds.approach
-    coordinate = place.coordinate
-    _, per_coordinate = jax.jvp(lambda y: impact.speeds(y).approach, (coordinate,), (jnp.ones_like(coordinate),))
-    by_speed, by_time = slopes[:, 0] / per_coordinate, slopes[:, 1] * omega
+    gaps, per_coordinate = slopes[:2], slopes[2, 0]
+    by_speed, by_time = gaps[:, 0] / per_coordinate, gaps[:, 1] * omega
     pull = cantilever.acceleration(flight.end_position, flight.end_velocity)
     pull = pull - platform.acceleration(place.phase / omega)
 
@@ -426,7 +445,7 @@ def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array,
 
 
 def amplitudes(
-    place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "2 2"] | None = None
+    place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "5 2"] | None = None
 ) -> Float[Array, " 3"]:
     """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable.
 

@@ -8,7 +8,7 @@ need more are gathered into small blocks of their own, where no others wait for 
 """
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property, update_wrapper
@@ -38,6 +38,8 @@ Report = Callable[[int, int], object]
 
 def filled(values: Any, size: int) -> Any:
     """Return a NumPy or JAX array whose first axis is filled up to a size with copies of its last row."""
+    if len(values) == size:
+        return values
     pad = np.pad if isinstance(values, np.ndarray) else jnp.pad
     return pad(values, ((0, size - len(values)),) + ((0, 0),) * (values.ndim - 1), mode="edge")
 
@@ -61,7 +63,7 @@ def in_blocks(
     The first block is done alone, so that programs are compiled once, unless that is known to have happened before.
 
     Args:
-        work: takes a tree of JAX arrays with a leading axis of lanes, gives one of arrays with the same axis.
+        work: takes a tree of NumPy arrays with a leading axis of lanes, gives one of arrays with the same axis.
         lanes: the tree of all lanes, at least one.
         block: lanes of a block; of fewer lanes there is one smaller block.
         widths: sizes that a smaller block may have, in ascending order.
@@ -73,8 +75,8 @@ def in_blocks(
     whole = jax.tree.map(np.asarray, lanes)
 
     def part(first: int) -> Any:
-        def cut(leaf: np.ndarray) -> Array:
-            return jnp.asarray(filled(leaf[first : first + width], width))
+        def cut(leaf: np.ndarray) -> np.ndarray:
+            return filled(leaf[first : first + width], width)
 
         # a worker has JAX's usual precision, whatever its caller has said
         with jax.enable_x64(True):  # noqa: FBT003
@@ -98,19 +100,26 @@ def in_blocks(
 
 
 @contextmanager
-def compiling(work: Callable[[], object]) -> Iterator[None]:
-    """Do work on another core until the block ends and drop its result: the programs that it compiles stay.
+def compiling(*works: Callable[[], object], first: Sequence[Callable[[], object]] = ()) -> Iterator[None]:
+    """Do works on other cores until the block ends and drop their results: the programs that they compile stay.
 
     Compiling takes a core for seconds. Where a computation needs two programs one after the other, the second one is
     compiled while the first one is.
+
+    Args:
+        works: begun in this order, as many at once as there are cores and one more, which traces.
+        first: done before these and before the block begins.
     """
 
-    def in_usual_precision() -> None:
+    def in_usual_precision(work: Callable[[], object]) -> None:
         with jax.enable_x64(True):  # noqa: FBT003
             work()
 
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(in_usual_precision)
+    with ThreadPoolExecutor(available_cores() + 1) as pool:
+        before = [pool.submit(in_usual_precision, work) for work in first]
+        for work in works:
+            pool.submit(in_usual_precision, work)
+        wait(before)
         yield
 
 
@@ -121,10 +130,12 @@ class QuicklyCompiled:
     Attributes:
         function: of trees of arrays.
         static_argnames: as of `jax.jit`.
+        level: of `quick_options`.
     """
 
     function: Callable[..., Any]
     static_argnames: str | Sequence[str]
+    level: int
 
     def __post_init__(self) -> None:
         """Take the function's name and docstring."""
@@ -138,7 +149,12 @@ class QuicklyCompiled:
     @cached_property
     def outside(self) -> Any:
         """The function by itself; the options are known once JAX has started."""
-        return jax.jit(self.function, static_argnames=self.static_argnames, compiler_options=quick_options())
+        return jax.jit(self.function, static_argnames=self.static_argnames, compiler_options=self.options)
+
+    @property
+    def options(self) -> dict[str, Any] | None:
+        """The compiler's options."""
+        return quick_options(self.level)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Return the function's result."""
@@ -150,13 +166,16 @@ class QuicklyCompiled:
         return self.outside.eval_shape(*arguments, **named)
 
 
-def compiled_quickly(*, static_argnames: str | Sequence[str] = ()) -> Callable[[Callable[..., Any]], QuicklyCompiled]:
+def compiled_quickly(
+    *, static_argnames: str | Sequence[str] = (), level: int = 1
+) -> Callable[[Callable[..., Any]], QuicklyCompiled]:
     """Return a decorator like `jax.jit` for what takes longer to compile than to run: see `QuicklyCompiled`.
 
     Args:
         static_argnames: as of `jax.jit`.
+        level: of `quick_options`: 0 for what runs once or twice.
     """
-    return lambda function: QuicklyCompiled(function, static_argnames)
+    return lambda function: QuicklyCompiled(function, static_argnames, level)
 
 
 def map_in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int, recompute: bool = False) -> Any:

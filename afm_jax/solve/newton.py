@@ -74,8 +74,9 @@ class Root(NamedTuple):
     """A `NewtonOutcome`."""
     residual: Float[Array, " n"]
     """The residual before the last step; infinite where no round was made."""
-    slopes: Float[Array, "n n"]
-    """Derivatives of the residual by the unknowns before the last step; 0 where no round was made."""
+    slopes: Float[Array, "rows n"]
+    """Derivatives of the residual by the unknowns before the last step, and below them of what `newton` was asked for
+    besides; 0 where no round was made."""
 
 
 def newton(
@@ -85,6 +86,7 @@ def newton(
     settings: Newton,
     *,
     where: Bool[Array, ""] | None = None,
+    extended: Callable[[Array, Any], Float[Array, " rows"]] | None = None,
 ) -> Root:
     """Return the root of f(x, parameters) = 0 that Newton's method finds from a guess, differentiable.
 
@@ -94,21 +96,23 @@ def newton(
         parameters: pytree of arrays.
         settings: rounds, tolerances and limits.
         where: whether a root is asked for; if not, the guess is returned, and no round is made for it.
+        extended: f and, below it, more functions of the same arguments, for their slopes; None: f alone.
 
     Returns:
         The root with its implicit derivative, also where the search has not converged; 0 where df/dx is singular.
     """
     fixed = lax.stop_gradient(parameters)
     begin = lax.stop_gradient(guess)
+    count = begin.shape[0]
 
     def twice(x: Array) -> tuple[Array, Array]:
-        value = residual(x, fixed)
-        return value, value
+        value = (residual if extended is None else extended)(x, fixed)
+        return value, value[:count]
 
     def improve(state: tuple[Array, Root]) -> tuple[Array, Root]:
-        count, (x, outcome, *before) = state
+        done, (x, outcome, *before) = state
         slopes, value = jax.jacfwd(twice, has_aux=True)(x)
-        full = -solved_columns(list(slopes.T), value)
+        full = -solved_columns(list(slopes[:count].T), value)
         step, sizes = settings.limited(x, full)
         # of two equations the solution is 0 where the matrix is singular
         stands = jnp.all(full == 0.0) & jnp.any(value != 0.0)
@@ -119,7 +123,7 @@ def newton(
         now = jnp.where(found, NewtonOutcome.CONVERGED, outcome)
         now = jnp.where(finite, now, NewtonOutcome.NO_STEP)
         here = (jnp.where(going, new, old) for new, old in zip((value, slopes), before, strict=True))
-        return count + 1, Root(jnp.where(going & finite, x + step, x), jnp.where(going, now, outcome), *here)
+        return done + 1, Root(jnp.where(going & finite, x + step, x), jnp.where(going, now, outcome), *here)
 
     def unsettled(state: tuple[Array, Root]) -> Array:
         return (state[0] < settings.rounds) & (state[1].outcome == NewtonOutcome.NOT_CONVERGED)
@@ -127,7 +131,8 @@ def newton(
     asked = jnp.ones((), bool) if where is None else where
     first = jnp.where(asked, NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NOT_ASKED).astype(jnp.int32)
     # the batch's own from the start: a loop whose state joins the batch later is traced once more
-    start = Root(begin, first, jnp.abs(begin) + jnp.inf, 0.0 * jnp.outer(begin, begin))
+    none = jnp.zeros(count if extended is None else jax.eval_shape(extended, begin, fixed).shape[0])
+    start = Root(begin, first, jnp.abs(begin) + jnp.inf, jnp.outer(none, begin))
     root = lax.while_loop(unsettled, improve, (jnp.zeros((), jnp.int32), start))[1]
     return root._replace(x=implicit_system(residual, root.x, parameters))
 

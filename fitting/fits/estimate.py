@@ -5,6 +5,7 @@ out (`discrepancy`), as unknowns with priors beside the parameters: as much of t
 and not linearised, leads to the law. Of several tables it also says how far each one's law is from that of the others.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,7 +18,15 @@ from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.fits.discrepancy import ModelDiscrepancy, effects_of_held, seen_in_taps, with_runs
 from fitting.fits.intervals import Convergence, at_bound, check_minimum, covariance
-from fitting.fits.law_after import LAW_POINTS, ClosestMember, ModelLaw, member_after, points_of_law, speed_range
+from fitting.fits.law_after import (
+    LAW_POINTS,
+    ClosestMember,
+    ModelLaw,
+    law_before,
+    member_after,
+    points_of_law,
+    speed_range,
+)
 from fitting.fits.minimum import ATTRACTED, Minimum, ModelErrors
 from fitting.fits.objective import ROBUST, Objective, soft_square
 from fitting.fits.result import FittedRows, table_of_law
@@ -421,8 +430,10 @@ def _predicted_after(at: AtMinimum, parts: list[LinearStep], discrepancy: ModelD
     return predict(values, stacked, measurement, problem, np.array(near))
 
 
-def warm_up_laws(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
-    """Compile what makes and compares laws after the search, or read it from the cache, for any law of usual shape.
+def programs_of_laws(
+    values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem
+) -> list[Callable[[], object]]:
+    """Return what compiles the programs that make and compare laws after a search, or reads them from the cache.
 
     Args:
         values: some values of the parameters.
@@ -434,12 +445,22 @@ def warm_up_laws(values: Float[np.ndarray, " p"], measurement: Measurement, prob
     late = -1.0 / speeds if problem.lasting else None
     if problem.lasting and problem.model != "contact":
         known["delay"] = problem.law(jnp.asarray(values), measurement.fixed).delay
-    if problem.lasting and not problem.pulled:
+
+    def predicted() -> None:
         law = table_of_law(speeds, 0.9 * speeds, late, **known)
         laws = jax.tree.map(lambda leaf: np.stack([leaf] * PARTS_AT_ONCE), law)
         nowhere = np.full((PARTS_AT_ONCE, len(measurement.rows.order)), np.nan)
         predict(np.tile(values, (PARTS_AT_ONCE, 1)), laws, measurement, problem, nowhere)
-    table_of_law(speeds, 0.9 * speeds, late, **known, errors=(np.zeros((LAW_POINTS, 2, 1)), np.zeros(1)))
+
+    def with_errors() -> None:
+        errors = np.zeros((LAW_POINTS, 2, 1)), np.zeros(1)
+        table_of_law(speeds, 0.9 * speeds, late, **known, errors=errors).to_dict()
+
+    programs = [predicted, with_errors] if problem.lasting and not problem.pulled else [with_errors]
+    if problem.model != "contact":
+        # that of a contact takes its table, which takes long to compute
+        programs.append(lambda: law_before(problem, measurement, values, speeds))
+    return programs
 
 
 def _tabulated_after(at: AtMinimum, step: LinearStep, discrepancy: ModelDiscrepancy) -> TabulatedLaw:
@@ -526,7 +547,7 @@ def _slope_along(at: AtMinimum, along: Float[np.ndarray, " n"]) -> tuple[float, 
     return slope, slope * np.sqrt(length)
 
 
-@compiled_quickly()
+@compiled_quickly(level=0)
 def coordinates(law: Law, speeds: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return the coordinates of orbits at approach speeds in nm/us."""
     return law.coordinate(speeds)

@@ -22,7 +22,7 @@ from fitting.fits.estimate import (
     courses_along_rows,
     estimate_of,
     hanging_on_held,
-    warm_up_laws,
+    programs_of_laws,
 )
 from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED, Interval, profile_intervals, within_range
 from fitting.fits.law_after import holding, speed_range
@@ -39,7 +39,7 @@ from fitting.fits.result import (
 )
 from fitting.fits.several import Pull
 from fitting.fits.verdict import IMPROBABLE, Evidence, judge_fit, misfits
-from fitting.forward import warm_up
+from fitting.forward import programs_of_search
 from fitting.models import Problem, held_of, measurement_of, split_held, task_of
 from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables
@@ -161,9 +161,9 @@ def find_fit(  # noqa: PLR0913
             f"{len(problem.own)} parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
     begin = starts(problem, measurement)[0]
-    warm_up(begin, measurement, problem, besides=lambda: warm_up_steps(len(problem.names)))
     stated = Objective(measurement, problem, robust=robust)
-    with compiling(lambda: warm_up_laws(begin, measurement, problem)):
+    needed = *programs_of_search(begin, measurement, problem), lambda: warm_up_steps(len(problem.names))
+    with compiling(*programs_of_laws(begin, measurement, problem), first=needed):
         objective, minimum, model_errors, refused = minimum_with_model_errors(stated)
     scale = None
     if scale_errors:

@@ -124,7 +124,7 @@ def law_before(
     return LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
 
 
-@compiled_quickly()
+@compiled_quickly(level=0)
 def law_and_slope(
     impact: AnyImpact, slopes: AnyImpact, speeds: Float[Array, " n"]
 ) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:

@@ -13,7 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.solve.lanes import filled
+from afm_jax.solve.lanes import compiled_quickly, filled
 from fitting.forward import BATCH, Linearised, linearise
 from fitting.models import Measurement, Problem
 from fitting.parameters import is_of_one_table
@@ -32,8 +32,7 @@ ROUGH, FINE = 1e-2, 1e-10
 _MAX_STEPS = 60
 _SEARCHES_KEPT = 4
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
-_init = jax.jit(jax.vmap(_LBFGS.init))
-_update = jax.jit(jax.vmap(_LBFGS.update))
+_init, _update = (compiled_quickly(level=0)(jax.vmap(part)) for part in (_LBFGS.init, _LBFGS.update))
 
 
 class Polished(NamedTuple):

@@ -352,12 +352,12 @@ class FitResult(Result):
         )
 
 
-@compiled_quickly()
+@compiled_quickly(level=0)
 def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, Array]:
     return law.rebound_speed(speeds), law.collision_delay(speeds)
 
 
-@compiled_quickly()
+@compiled_quickly(level=0)
 def _tabulated(
     speeds: Float[Array, " rows"],
     rebound: Float[Array, " rows"],

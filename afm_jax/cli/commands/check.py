@@ -1,5 +1,7 @@
 """Commands that check equations, accuracy and the installation."""
 
+from pathlib import Path
+
 import click
 
 from afm_jax.cli.command import Command
@@ -85,8 +87,8 @@ BENCH = Command(
     The impact map is measured on one core and on all. The same run measures a chaotic scene, derivatives, and SciPy's
     solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
     finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
-    to do. Fits of 100 rows are timed as commands. With --out bench.csv, bench_contact.csv, bench_scenes.csv,
-    bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
+    to do. Fits of 100 rows are timed as commands, and those of another checkout beside them. With --out bench.csv,
+    bench_contact.csv, bench_scenes.csv, bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """,
     options=(
         flag("--quick", "Few and small measurements: to see that it works."),
@@ -103,6 +105,12 @@ BENCH = Command(
             type=click.Choice(["map", "contact", "scenes", "dynamics", "sweep", "fits"]),
             help="The impact map alone, the contact of free tips, driven contacts, charts, sweeps, or fits from the "
             "shell.",
+        ),
+        click.option(
+            "--beside",
+            type=click.Path(path_type=Path, file_okay=False, exists=True),
+            metavar="DIR",
+            help="Another checkout of the project: its fits are timed in turn with these.",
         ),
     ),
 )
