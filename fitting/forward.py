@@ -562,14 +562,10 @@ def located(
     """Return the orbit that each pair of a row, with its values, and the set that its index names is on.
 
     Outside of programs three of them share the work, `search_pairs`, `follow_pairs` and `judge_pairs`, the last two on
-    what the first has found.
+    what the first has found: they are compiled side by side.
     """
     if is_traced(points):
-
-        def one(point: Float[Array, " p"], impact, row: Rows) -> Branch:
-            return branch_of(orbit_problem(point, impact, row, measurement, problem), row, point, problem)
-
-        return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows)
+        return _located_in_a_program(points, impacts, index, measurement, problem)
     points, index, rows = jax.tree.map(np.asarray, (points, index, measurement.rows))
     near = jax.tree.map(np.asarray, search_pairs(points, impacts, index, measurement, problem))
     wanted = near.found & ~rows.free[:, None]
@@ -588,17 +584,45 @@ def located(
         return whole
 
     coordinate = np.where(wanted, near.coordinate, np.nan)[lane, slot]
-    pairs = points[lane], index[lane], jax.tree.map(lambda column: column[lane], rows), coordinate
+    pairs = points[lane], index[lane], _at(rows, lane), coordinate
     known = located, problem, jax.tree.structure((impacts, measurement))
-    found, judged = jax.tree.map(in_slots, in_blocks(work, pairs, block=len(index), widths=(), program=known))
-    place = OrbitPlace(np.where(found.exists, found.place.coordinate, near.coordinate), found.place.phase)
-    steady = judged.steady & first_seen(place.coordinate, found.exists)
-    return chosen(SteadyOrbits(place, steady, found.near_fold, judged.shown, found.slopes), rows)
+    found = jax.tree.map(in_slots, in_blocks(work, pairs, block=len(index), widths=(), program=known))
+    return _chosen_of(near.coordinate, wanted, found, rows)
 
 
-def _of_sets(impacts: Any, index: Int[Array, " lanes"]) -> Any:
-    """Return the impacts, or their slopes, of the sets that an index names."""
-    return jax.tree.map(lambda leaf: leaf[index], impacts)
+def _located_in_a_program(
+    points: Float[Array, "lanes p"],
+    impacts: _Impacts,
+    index: Int[Array, " lanes"],
+    measurement: Measurement,
+    problem: Problem,
+) -> Branch:
+    """Return what `located` does, where it is not known how many orbits there are."""
+    rows = measurement.rows
+    near = search_pairs(points, impacts, index, measurement, problem)
+    wanted = near.found & ~rows.free[:, None]
+    # one axis of all slots: every axis more is traced for itself
+    lane = np.repeat(np.arange(wanted.shape[0]), wanted.shape[1])
+    pairs = points[lane], impacts, index[lane], measurement._replace(rows=_at(rows, lane)), problem
+    root = follow_pairs(*pairs, jnp.where(wanted, near.coordinate, jnp.nan).ravel())
+    found = root, judge_pairs(*pairs, root)
+    in_slots = jax.tree.map(lambda leaf: leaf.reshape(*wanted.shape, *leaf.shape[1:]), found)
+    return _chosen_of(near.coordinate, wanted, in_slots, rows)
+
+
+def _chosen_of(coordinate: Any, wanted: Any, found: tuple[Branch, "_Steadiness"], rows: Rows) -> Branch:
+    """Return the chosen orbit of each row, given what was found in slots of coordinates; arrays of NumPy or JAX."""
+    root, judged = found
+    there = root.exists & wanted
+    numpy: Any = np if isinstance(there, np.ndarray) else jnp
+    place = OrbitPlace(numpy.where(there, root.place.coordinate, coordinate), root.place.phase)
+    steady = judged.steady & first_seen(place.coordinate, there)
+    return chosen(SteadyOrbits(place, steady, root.near_fold, judged.shown, root.slopes), rows)
+
+
+def _at(columns: Any, index: Any) -> Any:
+    """Return a tree of arrays with a row for each number of an index: impacts of sets, rows of lanes."""
+    return jax.tree.map(lambda leaf: leaf[index], columns)
 
 
 @compiled_quickly(static_argnames="problem")
@@ -615,7 +639,7 @@ def search_pairs(
         orbit = orbit_problem(point, impact, row, measurement, problem)
         return coordinates_of_roots(orbit, usual_scan(orbit))
 
-    return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows)
+    return jax.vmap(one)(points, _at(impacts.impact, index), measurement.rows)
 
 
 @compiled_quickly(static_argnames="problem")
@@ -643,7 +667,7 @@ def follow_pairs(
             slopes=root.slopes,
         )
 
-    return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows, near)
+    return jax.vmap(one)(points, _at(impacts.impact, index), measurement.rows, near)
 
 
 class _Steadiness(NamedTuple):
@@ -669,7 +693,7 @@ def judge_pairs(
         steady, seen = is_steady(known.place, known.exists, known.slopes, orbit)
         return _Steadiness(steady, shown(seen, orbit, row, point, problem))
 
-    return jax.vmap(one)(points, _of_sets(impacts.impact, index), measurement.rows, branch)
+    return jax.vmap(one)(points, _at(impacts.impact, index), measurement.rows, branch)
 
 
 @compiled_quickly(static_argnames="problem")
@@ -694,7 +718,7 @@ def linearise_pairs(
 
         return jax.vmap(along, out_axes=(-1, None))(jnp.eye(point.shape[0]), slope)
 
-    impact, slopes = _of_sets(tuple(impacts), index)
+    impact, slopes = _at(tuple(impacts), index)
     rows = measurement.rows
     slope, prediction = jax.vmap(one)(points, impact, slopes, rows, branch)
     return _block(prediction, slope, rows)
@@ -742,7 +766,7 @@ def predict_pairs(
 
     rows = measurement.rows
     branch = follow_pairs(points, impacts, index, measurement, problem, near)
-    prediction = jax.vmap(one)(points, _of_sets(impacts.impact, index), rows, branch)
+    prediction = jax.vmap(one)(points, _at(impacts.impact, index), rows, branch)
     return _block(prediction, jnp.zeros((*rows.amplitude_nm.shape, 0)), rows)
 
 

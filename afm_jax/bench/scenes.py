@@ -16,6 +16,7 @@ from afm_jax.bench.problems import SingleContacts, batch_run, bouncing_starts, s
 from afm_jax.bench.scipy_contacts import contact_contestants
 from afm_jax.bench.study import Row, measured
 from afm_jax.bench.timing import Compiled, compiled_for, progress, time_calls, time_compiled
+from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
@@ -61,7 +62,8 @@ def scenes_one_core(
     runs = {}
     for name, setting in [*((accuracy, DRIVEN_SETTINGS[accuracy]) for accuracy in accuracies), *_REFERENCES.items()]:
         progress(f"bench: scenes, compiling {name}")
-        runs[name] = compiled_for(batch_run(setting, rows), *arguments)
+        # as `simulate` compiles its own programs
+        runs[name] = compiled_for(batch_run(setting, rows), *arguments, options=quick_options())
     table, own = [], []
     for reduced, count in periods.items():
         scene = contact_scene(float(reduced), DRIVE_AMPLITUDE_NM, 0.0)

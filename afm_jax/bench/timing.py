@@ -52,10 +52,10 @@ class Compiled(NamedTuple):
     seconds: float
 
 
-def compiled_for(function: Callable[..., Any], *arguments: Any) -> Compiled:
-    """Compile a function for arguments of these shapes and types."""
+def compiled_for(function: Callable[..., Any], *arguments: Any, options: dict[str, Any] | None = None) -> Compiled:
+    """Compile a function for arguments of these shapes and types, with the compiler's options."""
     began = time.perf_counter()
-    run = jax.jit(function).lower(*arguments).compile()
+    run = jax.jit(function).lower(*arguments).compile(options)
     return Compiled(run, time.perf_counter() - began)
 
 
