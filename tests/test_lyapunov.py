@@ -13,7 +13,6 @@ from afm_jax.cli.main import main
 from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum
 from afm_jax.dynamics.many_tips import Record, recorded, tips_after_contacts
 from afm_jax.dynamics.starts import batch_and_tips
-from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.outcomes import Outcome
@@ -116,11 +115,11 @@ def test_the_contact_is_chaotic_at_high_frequency():
     for speed in np.arange(36.0, 56.0, 2.0):
         start = start_of(scene, (270.0, 5.0, speed))
         found = lyapunov_spectrum(scene, start, impacts=200, transient=40, accuracy=1e-6)
-        # chaos lasts some hundred contacts here; rounding decides which tips have settled on an orbit by then
-        if found.verdicts.kind == MotionKind.IRREGULAR:
+        larger, error = found.exponents_per_impact[0], found.exponents_per_impact_error[0]
+        # chaos lasts some hundred contacts here; rounding decides which tips have come to an orbit by then
+        if larger > 5.0 * error:
             break
-    larger, error = found.exponents_per_impact[0], found.exponents_per_impact_error[0]
-    assert larger > 3.0 * error
+    assert larger > 5.0 * error
     assert found.exponents_per_impact.sum() == pytest.approx(found.mean_log_determinant, abs=1e-10)
     # pairs of close tips, simulated: how far they part from the third contact to the tenth
     lanes, few = 10, 24
