@@ -387,8 +387,10 @@ def programs_of_search(
     index = np.zeros(_lanes(own), dtype=int)
     rows = jax.tree.map(lambda column: np.asarray(column)[index], here.rows)
     pairs = batch[index], impacts, index, here._replace(rows=rows), own
-    nothing, none = np.full(index.shape, np.nan), np.zeros(index.shape, bool)
-    slopes = np.zeros((*index.shape, 5, 2)) if own.lasting else None
+    # NumPy's arrays, as a search gives them
+    nothing: Any = np.full(index.shape, np.nan)
+    none: Any = np.zeros(index.shape, bool)
+    slopes: Any = np.zeros((*index.shape, 5, 2)) if own.lasting else None
     nowhere = Branch(OrbitPlace(nothing, nothing), none, none.astype(np.int32), none, slopes)
     # those that take longest to compile, next to their trace, first
     return [
@@ -591,9 +593,9 @@ def located(
 
 
 def _located_in_a_program(
-    points: Float[Array, "lanes p"],
+    points: Float[np.ndarray, "lanes p"] | Float[Array, "lanes p"],
     impacts: _Impacts,
-    index: Int[Array, " lanes"],
+    index: Int[np.ndarray, " lanes"] | Int[Array, " lanes"],
     measurement: Measurement,
     problem: Problem,
 ) -> Branch:

@@ -456,7 +456,9 @@ def programs_of_laws(
         errors = np.zeros((LAW_POINTS, 2, 1)), np.zeros(1)
         table_of_law(speeds, 0.9 * speeds, late, **known, errors=errors).to_dict()
 
-    programs = [predicted, with_errors] if problem.lasting and not problem.pulled else [with_errors]
+    programs: list[Callable[[], object]] = [with_errors]
+    if problem.lasting and not problem.pulled:
+        programs.insert(0, predicted)
     if problem.model != "contact":
         # that of a contact takes its table, which takes long to compute
         programs.append(lambda: law_before(problem, measurement, values, speeds))
