@@ -12,8 +12,9 @@ from afm_jax.bench import timing as own_process
 from afm_jax.bench.impacts import lane_states, one_core, sequence_errors, single_errors
 from afm_jax.bench.problems import chaotic_scene, regular_scene, settled_starts
 from afm_jax.bench.timing import run_in_own_process
-from afm_jax.cli.bench import AIMED_BATCH, PARTS, aim_of, aim_sentence, map_aims
+from afm_jax.cli.bench import AIMED_BATCH, FITS, PARTS, aim_of, aim_sentence, map_aims
 from afm_jax.verify.fifty_digits import ExactMap, reference_error
+from fitting.benchmark import time_fits
 from tests.answers import answer, table
 from tests.run_here import answered_with
 
@@ -114,6 +115,16 @@ def test_command_writes_tables_and_one_json_object(measured: dict, tmp_path: Pat
     assert payload["contact_rows"] == []
     assert not (tmp_path / "bench_contact.csv").exists()
     assert len(table(tmp_path / "bench.csv")) == len(payload["rows"])
+
+
+@pytest.mark.slow
+def test_fits_of_another_checkout_are_timed_in_turn():
+    rows = time_fits(["law"], rows=20, beside=Path(__file__).parents[1])
+    assert [row["model"] for row in rows] == ["law", "law (beside)"]
+    assert rows[0]["chi2"] == rows[1]["chi2"]
+    for row in rows:
+        assert set(row) == set(FITS.table.columns)
+        assert 0.0 < row["warm_s"] < row["first_s"]
 
 
 def batch_of_one(rows: NextImpact) -> NextImpact:

@@ -68,6 +68,8 @@ class Part(NamedTuple):
 
 def bench(session: Session, batches: tuple[int, ...], only: str | None, beside: Path | None, *, quick: bool) -> Output:
     """Measure all parts, or one."""
+    if beside is not None and only not in {None, FITS.name}:
+        raise click.UsageError(f"--beside is about fits: leave it out, or --only {only}")
     if beside is not None and not (beside / "afm_jax" / "__main__.py").is_file():
         raise click.UsageError(f"--beside: {beside} holds no checkout of afm-jax; name the folder above its afm_jax")
     size = Size(quick, available_cores(), batches, None if beside is None else beside.resolve())
