@@ -257,7 +257,7 @@ def linearise(
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
     batch, impacts = batch_of(values, measurement, problem)
-    whole = _of_pairs(_Pairs(batch, sets, impacts, measurement, problem, near), _linearised)
+    whole = _of_pairs(_Pairs(batch, sets, impacts, measurement, problem, near), linearised)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
@@ -346,7 +346,7 @@ def impact_slopes(
         leaf = np.array(where(still))
         leaf[(slice(None), 0, *constant)] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
-        block = _of_pairs(_Pairs(batch, 1, turned, measurement, problem, near), _linearised)
+        block = _of_pairs(_Pairs(batch, 1, turned, measurement, problem, near), linearised)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     # -1: a larger loss, or epsilon, is a smaller squared speed; of a series the constant term is changed
@@ -386,7 +386,7 @@ def programs_of_search(
         here = measurement.of_drive(drive)
     index = np.zeros(_lanes(own), dtype=int)
     rows = jax.tree.map(lambda column: np.asarray(column)[index], here.rows)
-    pairs = batch[index], impacts, index, here._replace(rows=rows), own
+    lanes = Lanes(batch[index], impacts, index, here._replace(rows=rows))
     # NumPy's arrays, as a search gives them
     nothing: Any = np.full(index.shape, np.nan)
     none: Any = np.zeros(index.shape, bool)
@@ -395,10 +395,10 @@ def programs_of_search(
     # those that take longest to compile, next to their trace, first
     return [
         lambda: batch_of(sets, measurement, problem),
-        lambda: follow_pairs(*pairs, nothing),
-        lambda: linearise_pairs(*pairs, nowhere),
-        lambda: search_pairs(*pairs),
-        lambda: judge_pairs(*pairs, nowhere),
+        lambda: follow_pairs(lanes, own, nothing),
+        lambda: linearise_pairs(lanes, own, nowhere),
+        lambda: search_pairs(lanes, own),
+        lambda: judge_pairs(lanes, own, nowhere),
     ]
 
 
@@ -495,7 +495,7 @@ def _of_pairs(pairs: _Pairs, program: Callable[..., _Block]) -> _Block:
 
     Args:
         pairs: on which it is to run.
-        program: `_linearised` or `predict_pairs`.
+        program: `linearised` or `predict_pairs`.
     """
     joint, table = pairs.measurement.joint, pairs.measurement.rows.table
     if joint is None or table is None:
@@ -528,7 +528,7 @@ def _of_pairs_of_one_drive(pairs: _Pairs, program: Callable[..., _Block]) -> _Bl
 
     def work(lanes: Any) -> _Block:
         point, number, of_row, near = lanes
-        return program(point, impacts, number, pairs.measurement._replace(rows=of_row), problem, near)
+        return program(Lanes(point, impacts, number, pairs.measurement._replace(rows=of_row)), problem, near)
 
     lanes = point, number, jax.tree.map(lambda column: column[row], columns), near
 
@@ -554,31 +554,47 @@ def _filling(rows: Rows) -> int:
     return int(np.argmin(filling[::-1]))
 
 
-def located(
-    points: Float[np.ndarray, "lanes p"] | Float[Array, "lanes p"],
-    impacts: _Impacts,
-    index: Int[np.ndarray, " lanes"] | Int[Array, " lanes"],
-    measurement: Measurement,
-    problem: Problem,
-) -> Branch:
+class Lanes(NamedTuple):
+    """Pairs of a row and a set of values side by side: what a program takes; arrays of NumPy or JAX.
+
+    Attributes:
+        points: values of each row, shape (lanes, p).
+        impacts: of every set.
+        index: number of each lane's set.
+        measurement: the rows, one a lane.
+    """
+
+    points: Any
+    impacts: _Impacts
+    index: Any
+    measurement: Measurement
+
+    def each(self, function: Callable[..., Any], *more: Any) -> Any:
+        """Return what a function gives of every lane's values, impact and row, and of more arrays with its axis."""
+        impact = _at(self.impacts.impact, self.index)
+        return jax.vmap(function)(self.points, impact, self.measurement.rows, *more)
+
+
+def located(lanes: Lanes, problem: Problem) -> Branch:
     """Return the orbit that each pair of a row, with its values, and the set that its index names is on.
 
     Outside of programs three of them share the work, `search_pairs`, `follow_pairs` and `judge_pairs`, the last two on
     what the first has found: they are compiled side by side.
     """
-    if is_traced(points):
-        return _located_in_a_program(points, impacts, index, measurement, problem)
-    points, index, rows = jax.tree.map(np.asarray, (points, index, measurement.rows))
-    near = jax.tree.map(np.asarray, search_pairs(points, impacts, index, measurement, problem))
+    if is_traced(lanes.points):
+        return _located_in_a_program(lanes, problem)
+    lanes = lanes._replace(points=np.asarray(lanes.points), index=np.asarray(lanes.index))
+    rows = jax.tree.map(np.asarray, lanes.measurement.rows)
+    near = jax.tree.map(np.asarray, search_pairs(lanes, problem))
     wanted = near.found & ~rows.free[:, None]
     # one that is nowhere if there are none
     lane, slot = np.nonzero(wanted) if wanted.any() else np.zeros((2, 1), int)
 
-    def work(lanes: Any) -> Any:
-        point, number, of_row, coordinate = lanes
-        pairs = point, impacts, number, measurement._replace(rows=of_row), problem
-        root = follow_pairs(*pairs, coordinate)
-        return root, judge_pairs(*pairs, root)
+    def work(part: Any) -> Any:
+        points, index, rows, coordinate = part
+        some = Lanes(points, lanes.impacts, index, lanes.measurement._replace(rows=rows))
+        root = follow_pairs(some, problem, coordinate)
+        return root, judge_pairs(some, problem, root)
 
     def in_slots(values: np.ndarray) -> np.ndarray:
         whole = np.zeros((*wanted.shape, *values.shape[1:]), values.dtype)
@@ -586,28 +602,23 @@ def located(
         return whole
 
     coordinate = np.where(wanted, near.coordinate, np.nan)[lane, slot]
-    pairs = points[lane], index[lane], _at(rows, lane), coordinate
-    known = located, problem, jax.tree.structure((impacts, measurement))
-    found = jax.tree.map(in_slots, in_blocks(work, pairs, block=len(index), widths=(), program=known))
+    pairs = lanes.points[lane], lanes.index[lane], _at(rows, lane), coordinate
+    known = located, problem, jax.tree.structure((lanes.impacts, lanes.measurement))
+    found = jax.tree.map(in_slots, in_blocks(work, pairs, block=len(rows.order), widths=(), program=known))
     return _chosen_of(near.coordinate, wanted, found, rows)
 
 
-def _located_in_a_program(
-    points: Float[np.ndarray, "lanes p"] | Float[Array, "lanes p"],
-    impacts: _Impacts,
-    index: Int[np.ndarray, " lanes"] | Int[Array, " lanes"],
-    measurement: Measurement,
-    problem: Problem,
-) -> Branch:
+def _located_in_a_program(lanes: Lanes, problem: Problem) -> Branch:
     """Return what `located` does, where it is not known how many orbits there are."""
+    points, impacts, index, measurement = lanes
     rows = measurement.rows
-    near = search_pairs(points, impacts, index, measurement, problem)
+    near = search_pairs(lanes, problem)
     wanted = near.found & ~rows.free[:, None]
     # one axis of all slots: every axis more is traced for itself
     lane = np.repeat(np.arange(wanted.shape[0]), wanted.shape[1])
-    pairs = points[lane], impacts, index[lane], measurement._replace(rows=_at(rows, lane)), problem
-    root = follow_pairs(*pairs, jnp.where(wanted, near.coordinate, jnp.nan).ravel())
-    found = root, judge_pairs(*pairs, root)
+    slots = Lanes(points[lane], impacts, index[lane], measurement._replace(rows=_at(rows, lane)))
+    root = follow_pairs(slots, problem, jnp.where(wanted, near.coordinate, jnp.nan).ravel())
+    found = root, judge_pairs(slots, problem, root)
     in_slots = jax.tree.map(lambda leaf: leaf.reshape(*wanted.shape, *leaf.shape[1:]), found)
     return _chosen_of(near.coordinate, wanted, in_slots, rows)
 
@@ -628,35 +639,22 @@ def _at(columns: Any, index: Any) -> Any:
 
 
 @compiled_quickly(static_argnames="problem")
-def search_pairs(
-    points: Float[Array, "lanes p"],
-    impacts: _Impacts,
-    index: Int[Array, " lanes"],
-    measurement: Measurement,
-    problem: Problem,
-) -> Coordinates:
+def search_pairs(lanes: Lanes, problem: Problem) -> Coordinates:
     """Return where the orbits of each pair may be, of shape (lanes, slots)."""
 
     def one(point: Float[Array, " p"], impact, row: Rows) -> Coordinates:
-        orbit = orbit_problem(point, impact, row, measurement, problem)
+        orbit = orbit_problem(point, impact, row, lanes.measurement, problem)
         return coordinates_of_roots(orbit, usual_scan(orbit))
 
-    return jax.vmap(one)(points, _at(impacts.impact, index), measurement.rows)
+    return lanes.each(one)
 
 
 @compiled_quickly(static_argnames="problem")
-def follow_pairs(
-    points: Float[Array, "lanes p"],
-    impacts: _Impacts,
-    index: Int[Array, " lanes"],
-    measurement: Measurement,
-    problem: Problem,
-    near: Float[Array, " lanes"],
-) -> Branch:
+def follow_pairs(lanes: Lanes, problem: Problem, near: Float[Array, " lanes"]) -> Branch:
     """Return the orbit of each pair that is close to a coordinate, NaN: none; admissible and stable are not asked."""
 
     def one(point: Float[Array, " p"], impact, row: Rows, near: Float[Array, ""]) -> Branch:
-        orbit = orbit_problem(point, impact, row, measurement, problem)
+        orbit = orbit_problem(point, impact, row, lanes.measurement, problem)
         harmless = harmless_coordinate(orbit)
         wanted = jnp.isfinite(near) & ~row.free
         root = follow_root(jnp.where(wanted, near, harmless), orbit, wanted)
@@ -669,7 +667,7 @@ def follow_pairs(
             slopes=root.slopes,
         )
 
-    return jax.vmap(one)(points, _at(impacts.impact, index), measurement.rows, near)
+    return lanes.each(one, near)
 
 
 class _Steadiness(NamedTuple):
@@ -680,39 +678,25 @@ class _Steadiness(NamedTuple):
 
 
 @compiled_quickly(static_argnames="problem")
-def judge_pairs(
-    points: Float[Array, "lanes p"],
-    impacts: _Impacts,
-    index: Int[Array, " lanes"],
-    measurement: Measurement,
-    problem: Problem,
-    branch: Branch,
-) -> _Steadiness:
+def judge_pairs(lanes: Lanes, problem: Problem, branch: Branch) -> _Steadiness:
     """Say which orbits of pairs are steady, and what is shown of them."""
 
     def one(point: Float[Array, " p"], impact, row: Rows, known: Branch) -> _Steadiness:
-        orbit = lax.stop_gradient(orbit_problem(point, impact, row, measurement, problem))
+        orbit = lax.stop_gradient(orbit_problem(point, impact, row, lanes.measurement, problem))
         steady, seen = is_steady(known.place, known.exists, known.slopes, orbit)
         return _Steadiness(steady, shown(seen, orbit, row, point, problem))
 
-    return jax.vmap(one)(points, _at(impacts.impact, index), measurement.rows, branch)
+    return lanes.each(one, branch)
 
 
 @compiled_quickly(static_argnames="problem")
-def linearise_pairs(
-    points: Float[Array, "lanes p"],
-    impacts: _Impacts,
-    index: Int[Array, " lanes"],
-    measurement: Measurement,
-    problem: Problem,
-    branch: Branch,
-) -> _Block:
+def linearise_pairs(lanes: Lanes, problem: Problem, branch: Branch) -> _Block:
     """Return misfits and slopes of pairs of a row, with its values, and the set that its index names, on its orbit."""
 
     # One vmap over all pairs, not two nested ones: tracing costs as much as a fit otherwise.
-    def one(point: Float[Array, " p"], impact, slope, row: Rows, known: Branch):
+    def one(point: Float[Array, " p"], impact, row: Rows, slope, known: Branch):
         def predict(v, impact):
-            return prediction_of(known, v, orbit_problem(v, impact, row, measurement, problem), row, problem)
+            return prediction_of(known, v, orbit_problem(v, impact, row, lanes.measurement, problem), row, problem)
 
         def along(e, turn):
             predicted, change = jax.jvp(predict, (point, impact), (e, turn))
@@ -720,10 +704,8 @@ def linearise_pairs(
 
         return jax.vmap(along, out_axes=(-1, None))(jnp.eye(point.shape[0]), slope)
 
-    impact, slopes = _at(tuple(impacts), index)
-    rows = measurement.rows
-    slope, prediction = jax.vmap(one)(points, impact, slopes, rows, branch)
-    return _block(prediction, slope, rows)
+    slope, prediction = lanes.each(one, _at(lanes.impacts.slopes, lanes.index), branch)
+    return _block(prediction, slope, lanes.measurement.rows)
 
 
 def _block(prediction: Prediction, slope: Float[Array, "lanes k p"], rows: Rows) -> _Block:
@@ -744,31 +726,22 @@ def _block(prediction: Prediction, slope: Float[Array, "lanes k p"], rows: Rows)
     )
 
 
-def _linearised(*pairs_and_near: Any) -> _Block:
-    """Return `linearise_pairs` on the orbits near coordinates, or on those that a search finds; arguments as there."""
-    *pairs, near = pairs_and_near
-    branch = located(*pairs) if near is None else follow_pairs(*pairs, near)
-    return linearise_pairs(*pairs, branch)
+def linearised(lanes: Lanes, problem: Problem, near: Float[Array, " lanes"] | None) -> _Block:
+    """Return `linearise_pairs` on the orbits near coordinates, or, None, on those that a search finds."""
+    branch = located(lanes, problem) if near is None else follow_pairs(lanes, problem, near)
+    return linearise_pairs(lanes, problem, branch)
 
 
 @compiled_quickly(static_argnames="problem", level=0)
-def predict_pairs(
-    points: Float[Array, "lanes p"],
-    impacts: _Impacts,
-    index: Int[Array, " lanes"],
-    measurement: Measurement,
-    problem: Problem,
-    near: Float[Array, " lanes"],
-) -> _Block:
+def predict_pairs(lanes: Lanes, problem: Problem, near: Float[Array, " lanes"]) -> _Block:
     """Return misfits of pairs of a row, with its values, and the law that its index names, near orbits; no slopes."""
 
     def one(point: Float[Array, " p"], impact, row: Rows, known: Branch) -> Prediction:
-        orbit = orbit_problem(point, impact, row, measurement, problem)
+        orbit = orbit_problem(point, impact, row, lanes.measurement, problem)
         return prediction_of(known, point, orbit, row, problem)
 
-    rows = measurement.rows
-    branch = follow_pairs(points, impacts, index, measurement, problem, near)
-    prediction = jax.vmap(one)(points, _at(impacts.impact, index), rows, branch)
+    rows = lanes.measurement.rows
+    prediction = lanes.each(one, follow_pairs(lanes, problem, near))
     return _block(prediction, jnp.zeros((*rows.amplitude_nm.shape, 0)), rows)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from afm_jax.checks import checked
 from fitting.fits.objective import ROBUST
 from fitting.fits.result import FitResult
-from fitting.forward import follow_pairs, impacts_of, linearise_pairs, located
+from fitting.forward import Lanes, impacts_of, linearised
 from fitting.models import Measurement, Problem
 from fitting.parameters import Parameter
 from fitting.sampling.bootstrap import Refit, compact, objective_of, require_valid, standard_covariance
@@ -222,9 +222,7 @@ class LogDensity(eqx.Module):
         lanes = jnp.zeros(measurement.rows.order.shape[0], dtype=int)
         impacts = impacts_of(values[None], measurement, problem)
         points = jnp.broadcast_to(values, (lanes.size, values.size))
-        pairs = points, impacts, lanes, measurement, problem
-        branch = located(*pairs) if self.near is None else follow_pairs(*pairs, self.near)
-        block = linearise_pairs(*pairs, branch)
+        block = linearised(Lanes(points, impacts, lanes, measurement), problem, self.near)
         constraint = (values - measurement.constraint_value) / measurement.constraint_error
         residual = jnp.concatenate([block.misfit.ravel(), block.unseen, constraint])
         root = jnp.sqrt(1.0 + (residual / ROBUST) ** 2) if self.robust else jnp.ones_like(residual)
