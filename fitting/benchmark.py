@@ -15,8 +15,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from afm_jax.accuracy.overview import overview_row
-from afm_jax.bench.timing import progress, time_calls
 from afm_jax.least_squares import Box, Searches, descended
+from afm_jax.studies.timing import progress, time_calls
 from fitting.fits.objective import PLAIN, Objective, polish
 from fitting.models import Problem, measurement_of
 from fitting.parameters import model_parameters, paper_values

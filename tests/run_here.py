@@ -7,7 +7,7 @@ from typing import Any
 
 
 def run_here(task: str, settings: Mapping[str, Any], *, cores: int) -> Any:
-    """Stand in for `afm_jax.bench.timing.run_in_own_process`; the number of cores is left as it is."""
+    """Stand in for `afm_jax.studies.timing.run_in_own_process`; the number of cores is left as it is."""
     del cores
     return _function(task)(**settings)
 

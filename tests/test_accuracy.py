@@ -6,8 +6,8 @@ import pytest
 
 from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
 from afm_jax.accuracy.overview import cheapest, impacts, orbits, overview_row
-from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
+from afm_jax.studies import timing as own_process
 from tests.answers import answer
 
 

@@ -8,7 +8,6 @@ import pytest
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene
 from afm_jax.accuracy.scenes import contact_accuracy, fidelity_ladder, law_accuracy
 from afm_jax.apparatus.drives import BaseDrive
-from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy_scene import fitted_law, scene_to_study
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
@@ -16,6 +15,7 @@ from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import Start, save_scene
+from afm_jax.studies import timing as own_process
 from tests.answers import answer, table
 from tests.reference_driven_contact import DrivenContact, follow
 from tests.run_here import answered_with

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from afm_jax import NextImpact, iterate_map
-from afm_jax.bench import timing as own_process
 from afm_jax.bench.impacts import lane_states, one_core, sequence_errors, single_errors
 from afm_jax.bench.problems import chaotic_scene, regular_scene, settled_starts
-from afm_jax.bench.timing import run_in_own_process
 from afm_jax.cli.bench import AIMED_BATCH, FITS, PARTS, aim_of, aim_sentence, map_aims
+from afm_jax.studies import timing as own_process
+from afm_jax.studies.timing import run_in_own_process
 from afm_jax.verify.fifty_digits import ExactMap, reference_error
 from fitting.benchmark import time_fits
 from tests.answers import answer, table
@@ -60,7 +60,7 @@ def test_one_core_really_is_one():
 
 def test_a_process_that_fails_is_an_error():
     with pytest.raises(ValueError, match="ended with exit code 1"):
-        run_in_own_process("afm_jax.bench.timing:no_such_function", {}, cores=1)
+        run_in_own_process("afm_jax.studies.timing:no_such_function", {}, cores=1)
 
 
 def test_the_error_is_that_of_the_times():

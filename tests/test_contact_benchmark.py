@@ -5,13 +5,13 @@ import pytest
 
 from afm_jax.accuracy.collisions import cheapest_collision
 from afm_jax.bench import collisions
-from afm_jax.bench import timing as own_process
 from afm_jax.bench.collisions import REFERENCE, errors_against, speeds_of
 from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.settings import SETTINGS
 from afm_jax.plots.accuracy import collide_accuracy_figure
+from afm_jax.studies import timing as own_process
 from tests import reference_contact as exact
 from tests.answers import answer, table
 from tests.run_here import run_here

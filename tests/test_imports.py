@@ -22,7 +22,7 @@ ROWS = {
         ("contact",),
         ("motion",),
         ("dynamics", "scenefile"),
-        ("effects", "sweeps", "verify"),
+        ("studies", "effects", "sweeps", "verify"),
         ("bench",),
         ("accuracy",),
         ("plots",),
@@ -175,7 +175,7 @@ def test_the_library_leaves_jax_as_it_is():
     # commands are programs of their own, `use_cache` is asked to change it, and examples are made by programs
     excused = [path for path in changing if path.parts[1] == "cli" or path.match("fitting/examples/make_*.py")]
     assert len(excused) > 3
-    own_programs = {"afm_jax/__main__.py", "afm_jax/bench/timing.py", "afm_jax/compilation_cache.py"}
+    own_programs = {"afm_jax/__main__.py", "afm_jax/studies/timing.py", "afm_jax/compilation_cache.py"}
     assert set(map(str, changing)) - set(map(str, excused)) == own_programs
 
 

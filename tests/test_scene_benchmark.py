@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.bench import timing as own_process
 from afm_jax.bench.problems import batch_run, bouncing_starts, single_contacts, spread_starts
 from afm_jax.bench.scenes import REFERENCE, contact_errors
 from afm_jax.bench.scipy_contacts import diffrax_driven_contact, scipy_driven_contact
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.scenefile.presets import contact_scene
+from afm_jax.studies import timing as own_process
 from tests.answers import answer
 from tests.reference_driven_contact import DrivenContact, follow
 

@@ -26,12 +26,12 @@ from afm_jax.bench.collisions import (
     speeds_of,
 )
 from afm_jax.bench.study import Contestant, Row, measured, named, timed
-from afm_jax.bench.timing import compiled_for
 from afm_jax.contact.bridge_leg import Passage, Way, nothing_spent, way_rates
 from afm_jax.contact.collide import Collision, batch_of, capture_speed, collision_of, three_parts
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.settings import SETTINGS, Setting
+from afm_jax.studies.timing import compiled_for
 
 SOLVERS = {
     "Tsit5": diffrax.Tsit5,

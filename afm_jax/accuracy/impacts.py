@@ -29,12 +29,12 @@ from afm_jax.bench.problems import (
 )
 from afm_jax.bench.scipy_impacts import scipy_impacts
 from afm_jax.bench.study import Contestant, Row, measured, named, timed
-from afm_jax.bench.timing import compiled_for
 from afm_jax.checks import float32_allowed
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import iterate_batch
 from afm_jax.outcomes import Outcome
+from afm_jax.studies.timing import compiled_for
 from afm_jax.verify.fifty_digits import reference_error
 
 COST = ("microseconds_per_impact", "error_us")

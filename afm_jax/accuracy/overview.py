@@ -37,7 +37,6 @@ from afm_jax.bench.scenes import DRIVE_AMPLITUDE_NM, HIGH_ORDER, contact_errors
 from afm_jax.bench.scipy_contacts import contact_contestants, scipy_collision
 from afm_jax.bench.scipy_impacts import scipy_impacts
 from afm_jax.bench.study import RIVALS, Contestant, Row, measured, named, timed
-from afm_jax.bench.timing import compiled_for, progress
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
@@ -45,6 +44,7 @@ from afm_jax.contact.parameters import PAPER
 from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.scenefile.presets import contact_scene
+from afm_jax.studies.timing import compiled_for, progress
 from afm_jax.verify.fifty_digits import exact_orbit_state, mpmath_or_reason
 
 Study = dict[str, Any]

@@ -22,7 +22,6 @@ from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.bench.problems import ROUNDS
 from afm_jax.bench.study import Row, named
-from afm_jax.bench.timing import Compiled, compiled_for, progress, time_calls, time_compiled
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting
 from afm_jax.impact.first_impact import Flight, first_impact
@@ -38,6 +37,7 @@ from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.presets import PRESETS, preset
 from afm_jax.scenefile.scenefile import load_scene
+from afm_jax.studies.timing import Compiled, compiled_for, progress, time_calls, time_compiled
 
 _TRIALS = 240
 _BEYOND_US = 1e-3

@@ -13,11 +13,11 @@ from jaxtyping import Array, Float
 from afm_jax.bench.integrators import title
 from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.bench.study import Contestant, Row, measured, named, timed
-from afm_jax.bench.timing import compiled_for, progress, time_calls
 from afm_jax.contact.collide import Collision, batch_of, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.contact.settings import SETTINGS, Setting
+from afm_jax.studies.timing import compiled_for, progress, time_calls
 
 SPEEDS_NM_PER_US = (12.0, 200.0)
 REFERENCE = Setting("collocation", 40, 40, 48, iterations=14)

@@ -12,12 +12,12 @@ import numpy as np
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.problems import chaotic_scene
 from afm_jax.bench.scipy_impacts import scipy_impacts
-from afm_jax.bench.timing import progress, time_calls
 from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
+from afm_jax.studies.timing import progress, time_calls
 
 Row = dict[str, Any]
 

@@ -27,9 +27,9 @@ from afm_jax.bench.problems import (
 )
 from afm_jax.bench.scipy_impacts import scipy_impacts
 from afm_jax.bench.study import Row, timed
-from afm_jax.bench.timing import compiled_for, progress
 from afm_jax.impact.map import DEFAULT_BLOCK, NEAR_GRAZING, NextImpact, iterate_batch
 from afm_jax.outcomes import Outcome
+from afm_jax.studies.timing import compiled_for, progress
 from afm_jax.verify.fifty_digits import ExactMap, derivatives_by_r
 
 IMPACT_BY_IMPACT = "impact by impact"

@@ -15,12 +15,12 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.problems import SingleContacts, batch_run, bouncing_starts, single_contacts, spread_starts
 from afm_jax.bench.scipy_contacts import contact_contestants
 from afm_jax.bench.study import Row, measured
-from afm_jax.bench.timing import Compiled, compiled_for, progress, time_calls, time_compiled
 from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.presets import contact_scene
+from afm_jax.studies.timing import Compiled, compiled_for, progress, time_calls, time_compiled
 
 REFERENCE = DrivenSetting(None, 8.0, 240)
 """Every contact in time, in fine steps; the tests compare it with an independent integration."""

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from afm_jax.bench.timing import Compiled, progress, time_compiled
 from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.studies.timing import Compiled, progress, time_compiled
 
 Row = dict[str, Any]
 

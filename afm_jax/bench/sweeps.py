@@ -17,8 +17,8 @@ from typing import Any
 import jax
 
 from afm_jax.bench.problems import chaotic_scene
-from afm_jax.bench.timing import progress, run_in_own_process
 from afm_jax.scenefile.scenefile import scene_tables
+from afm_jax.studies.timing import progress, run_in_own_process
 from afm_jax.sweeps.plan import SweepPlan, plan_of
 from afm_jax.sweeps.scenes import SCENE_BUILDER
 from afm_jax.sweeps.sweep import local_cluster, peak_memory, run_plan

@@ -8,13 +8,13 @@ import click
 from afm_jax.accuracy.collisions import cheapest_collision
 from afm_jax.accuracy.impacts import cheapest_settings
 from afm_jax.accuracy.overview import cheapest
-from afm_jax.bench import timing
 from afm_jax.bench.study import StudyTable
 from afm_jax.cli.accuracy_scene import scene_study
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES
 from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.studies import timing
 
 Row = dict[str, Any]
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from afm_jax.accuracy.scenes import ladder_duration
 from afm_jax.apparatus.scene import Scene
-from afm_jax.bench import timing
 from afm_jax.bench.study import StudyTable
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.session import Session
@@ -18,6 +17,7 @@ from afm_jax.contact.law_of_contact import fit_delay, fit_law
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import start_of
+from afm_jax.studies import timing
 
 SETTINGS = StudyTable(
     "accuracy.csv",

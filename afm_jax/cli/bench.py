@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 import click
 from rich.table import Table
 
-from afm_jax.bench import collisions, dynamics, scenes, timing
+from afm_jax.bench import collisions, dynamics, scenes
 from afm_jax.bench.study import StudyTable
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.columns import Cell, printed_table
 from afm_jax.compilation_cache import available_cores
+from afm_jax.studies import timing
 
 Row = dict[str, Any]
 AIMED_BATCH = 10_000

@@ -97,9 +97,9 @@ def time_impacts() -> float:
     """Return microseconds that an impact of many tips takes, the best of three times."""
     import jax  # noqa: PLC0415
 
-    from afm_jax.bench.timing import time_calls  # noqa: PLC0415
     from afm_jax.impact.map import iterate_batch  # noqa: PLC0415
     from afm_jax.scenefile.presets import preset  # noqa: PLC0415
+    from afm_jax.studies.timing import time_calls  # noqa: PLC0415
 
     scene = preset("figure2")
     times, speeds = jax.numpy.linspace(0.0, 5.0, _TIPS), jax.numpy.linspace(50.0, 100.0, _TIPS)

@@ -106,7 +106,7 @@ def run_in_own_process(task: str, settings: Mapping[str, Any], *, cores: int) ->
         # XLA reads that; its flags do not bring its threads down to one
         threads = {"NPROC": "1"}
     done = subprocess.run(  # noqa: S603
-        [sys.executable, "-m", "afm_jax.bench.timing", task, str(cores)],
+        [sys.executable, "-m", "afm_jax.studies.timing", task, str(cores)],
         input=json.dumps(dict(settings)),
         stdout=subprocess.PIPE,
         text=True,

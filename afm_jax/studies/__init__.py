@@ -1,0 +1,1 @@
+"""What is measured about scenes and settings: times, errors, effects."""
