@@ -47,6 +47,6 @@ from fitting.tapping_curves.tapping import tapping as tapping
 from fitting.tapping_curves.together import TappingTogether as TappingTogether
 from fitting.tapping_curves.together import tapping_together as tapping_together
 from fitting.traces.lockin import LockinResult as LockinResult
+from fitting.traces.lockin import Trace as Trace
 from fitting.traces.lockin import lockin as lockin
-from fitting.traces.trace import Trace as Trace
-from fitting.traces.trace import read_trace as read_trace
+from fitting.traces.lockin import read_trace as read_trace

@@ -36,8 +36,7 @@ from fitting.experiments.prior import read_prior
 from fitting.instruments.curve import read_curves
 from fitting.tables.table import read_table
 from fitting.tapping_curves.tapping import tapping
-from fitting.traces.lockin import lockin
-from fitting.traces.trace import read_trace
+from fitting.traces.lockin import Trace, lockin, read_trace
 from tests.flight_families import FAMILIES
 from tests.malformed import corpus
 from tests.test_first_impact import compare_with_brute_force
@@ -172,13 +171,17 @@ def spoiled(text: str, random: Random) -> bytes:
     return data
 
 
+def _lockin(trace: Trace) -> Any:
+    return lockin(trace.time_us, trace.deflection_nm, trace.drive_frequency_khz or 180.0, 1, platform=trace.platform)
+
+
 READERS: dict[str, Callable[[Path], Any]] = {
     "table": read_table,
     "tap": lambda path: tapping(read_table(path), law=False),
     "scene": read_scene,
     "contact": read_scene,
     "sweep": lambda path: axes_of(read_toml(str(path)).get("axes", ())),
-    "trace": lambda path: lockin(read_trace(path)),
+    "trace": lambda path: _lockin(read_trace(path)),
     "spectrum": read_sweep,
     "psd": read_sweep,
     "curve": read_curves,

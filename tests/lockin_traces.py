@@ -2,7 +2,6 @@
 
 import cmath
 import math
-from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -11,7 +10,6 @@ from afm_jax import Cantilever, ImpactLaw, Platform, Scene, single_impact_orbits
 from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.start import state
 from afm_jax.motion.trajectory import trajectory
-from fitting.traces.trace import Trace, TraceSettings
 
 FREE_KHZ = 90.0
 OMEGA = 2e-3 * np.pi * FREE_KHZ
@@ -34,25 +32,16 @@ def bounce(
     return peak * np.asarray(np.cos(OMEGA * since)), value
 
 
-def trace_of(
-    height: np.ndarray, *, rate: float, drive_khz: float, start_us: float = 0.0, **settings: float | None
-) -> Trace:
-    """Return a trace in memory, with the free frequency and a drive phase of 0 unless told otherwise."""
-    known: dict[str, Any] = {"free_frequency_khz": FREE_KHZ, "drive_phase_deg": 0.0, "drive_amplitude_nm": 4.0}
-    joined = TraceSettings(**(known | {"drive_frequency_khz": drive_khz} | settings))
-    return Trace(deflection_nm=height, start_us=start_us, step_us=1.0 / rate, settings=joined)
-
-
 def noisy_bounce(
     seed: int, *, periods: float = 60.0, noise: float = 0.7, rate: float = 5.3, order: int = 1, memory: float = 0.0
-) -> tuple[Trace, complex]:
-    """Return a bounce with noise; `memory` is what a sample's noise keeps of the one before."""
+) -> tuple[np.ndarray, np.ndarray, complex]:
+    """Return times, heights and lock-in value of a bounce with noise; `memory`: of the noise of the sample before."""
     drive = 181.8 * order
     time = np.arange(0.0, periods * 1e3 / drive, 1.0 / rate)
     height, value = bounce(time, order=order, drive_khz=drive)
     white = np.random.default_rng(seed).standard_normal(time.size)
     kept = np.asarray(lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white))
-    return trace_of(height + noise * kept, rate=rate, drive_khz=drive), value
+    return time, height + noise * kept, value
 
 
 def law_motion(reduced: float, r: float, *, offset: float = -1.0, amplitude: float = 4.0) -> tuple[Scene, LongRun]:
@@ -63,14 +52,14 @@ def law_motion(reduced: float, r: float, *, offset: float = -1.0, amplitude: flo
     return scene, follow_long(scene, start, 600.0 * period)
 
 
-def trace_of_motion(scene: Scene, run: LongRun, *, periods: float, rate: float, noise: float) -> Trace:
-    """Return the end of a motion, sampled, with noise relative to its standard deviation."""
+def trace_of_motion(
+    scene: Scene, run: LongRun, *, periods: float, rate: float, noise: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and heights of the end of a motion, with noise relative to their standard deviation."""
     end = float(run.simulation.final.time_us)
     time = np.arange(end - periods * float(scene.platform.period_us), end, 1.0 / rate)
     height = trajectory(scene, run.simulation, time).position_nm
-    height = height + noise * height.std() * np.random.default_rng(7).standard_normal(time.size)
-    drive = float(scene.platform.frequency_khz)
-    return trace_of(height, rate=rate, drive_khz=drive, start_us=float(time[0]), quality_factor=40.0, offset_nm=-1.0)
+    return time, height + noise * height.std() * np.random.default_rng(7).standard_normal(time.size)
 
 
 def orbit_heights(scene: Scene, order: int, time: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:

@@ -175,7 +175,11 @@ MUTATIONS = {
         "noise {* => /} values", "tests/test_table.py::test_noise_stands_in_for_missing_errors_only"
     ),
     "lock-in of a trace with half its height": Mutation(
-        "complex({2.0 *  => }self.waveform", "tests/test_lockin.py::test_a_bounce_in_closed_form"
+        "return {2.0 => 1.0} / (length or 1.0)", "tests/test_lockin.py::test_a_bounce_in_closed_form"
+    ),
+    "blocks without the other order's periods": Mutation(
+        "both = {math.lcm(n, order) => n} * period",
+        "tests/test_lockin.py::test_harmonics_of_a_motion_are_read_and_nothing_beside_them",
     ),
     "lead of the regressed delay as a sum": Mutation(
         "u, w: 1.0 / u {- => +} 1.0 / w", "tests/test_inversion_law.py::test_values_without_noise_are_exact"

@@ -39,12 +39,7 @@ drive_frequency_khz,free_amplitude_nm,offset_nm,lockin_amplitude_nm,lockin_ampli
 
 def _written(path: Path) -> Path:
     """Write the files of the calls below into a folder and return it."""
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(path / "trace.h5", "w") as file:
-        file["scan/deflection_nm"] = np.zeros(300)
     for name, text in {
-        "trace.csv": "deflection_nm\n" + "1\n" * 300,
-        "times.csv": "time_us,deflection_nm\n" + "".join(f"{0.02 * k},1\n" for k in range(300)),
         "abc.csv": separated({"a": OFFSET, "b": AMPLITUDE, "c": LAG}, ";"),
         "force.csv": separated({"Z (nm)": OFFSET, "Amp (nm)": AMPLITUDE, "Phase (deg)": np.deg2rad(LAG)}),
         "wrong.csv": separated({"Z (V)": OFFSET, "Amp (nm)": AMPLITUDE}),
@@ -93,24 +88,6 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
         "`bin_nm` must be finite and not below 0, but is -1.0",
         ("read", "volts.csv", "--bin-nm", "-1"),
         "--bin-nm must be finite and not below 0, but is -1.0",
-    ),
-    "the sampling rate": (
-        lambda path: fitting.read_trace(path / "trace.csv"),
-        "give a column time_us, `sampling_rate_mhz=...` or",
-        ("lockin", "trace.csv"),
-        "give a column time_us, --sampling-rate-mhz or",
-    ),
-    "the drive": (
-        lambda path: fitting.read_trace(path / "times.csv"),
-        "give `drive_frequency_khz=...` or a comment",
-        ("lockin", "times.csv"),
-        "give --drive-frequency-khz or a comment",
-    ),
-    "a group": (
-        lambda path: fitting.read_trace(path / "trace.h5"),
-        'name its group: `group="scan"`',
-        ("lockin", "trace.h5"),
-        "name its group: --group scan",
     ),
     "errors": (
         lambda path: fitting.read_table(path / "no_errors.csv"),

@@ -167,7 +167,7 @@ def test_paths_and_presets_work_where_scenes_and_tables_do(tmp_path: Path):
         np.testing.assert_array_equal(afm.single_impact_orbits(given, 1).phase_rad, wanted.phase_rad)
     with pytest.raises(ValueError, match="nothing: there is no such file or preset; presets are figure2, figure3"):
         afm.single_impact_orbits("nothing", 1)
-    for function in (fitting.fit, fitting.calibrate, fitting.lockin):
+    for function in (fitting.fit, fitting.calibrate, fitting.read_trace):
         with pytest.raises(fitting.TableError, match="there is no such file"):
             function(tmp_path / "none.csv")
     table = EXAMPLES / "amplitudes_law.csv"

@@ -292,7 +292,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         fitting.design(prior, fitting.drive_grid(**size, free_frequency_khz=90.0), points=2),
         Comparison([{"model": "law"}], "one only", {"law": fitted}),
         fitting.Bootstrap(("r", "epsilon"), np.zeros(2), samples, failures=0, seed=3),
-        fitting.lockin(noisy_bounce(1)[0]),
+        fitting.lockin(*noisy_bounce(1)[:2], 181.8, 1),
     ]
     assert {type(record).__name__ for record in computed} >= DRAWN_BELOW
     for record in computed:

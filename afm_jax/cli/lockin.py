@@ -1,41 +1,25 @@
-"""`afm-jax lockin TRACE...`: response order, amplitudes and phase from time traces of the deflection."""
+"""`afm-jax lockin TRACE`: amplitudes and phase of a deflection in time at the drive's frequency over each order."""
 
-from functools import partial
 from pathlib import Path
 
-from afm_jax.cli.command import Output
+from afm_jax.cli.command import Output, later
 from afm_jax.cli.session import Session
+from afm_jax.plots.picture_style import save
 from fitting.tables.csv_text import TableError
-from fitting.traces.lockin import lockin, table_of
-from fitting.traces.report import lockin_payload, lockin_summary, write_lockin
-from fitting.traces.trace import read_trace
+from fitting.traces.lockin import lockin, read_trace
 
 
-def lockin_of_traces(
-    session: Session, *, traces: tuple[Path, ...], order: int | None, group: str | None, **settings: float | None
-) -> Output:
-    """Return what a lock-in reads of each trace, and the table of those that are steady."""
-    # all are read first: a fault in the last should not come after minutes of work on the others
-    read = [read_trace(path, group=group, **settings) for path in traces]
-    results = []
-    for trace in read:
-        with session.working(f"reading {trace.samples} samples of {trace.source}"):
-            results.append(lockin(trace, order=order))
-    table, fault = None, None
+def lockin_of_trace(_: Session, *, trace: Path, drive_frequency_khz: float | None, order: int) -> Output:
+    """Return what a lock-in reads of a trace."""
+    read = read_trace(trace)
+    frequency = read.drive_frequency_khz if drive_frequency_khz is None else drive_frequency_khz
+    if frequency is None:
+        raise TableError(
+            f"{trace}: the drive frequency is missing; give `drive_frequency_khz=...` or '# drive_frequency_khz = 180'"
+        )
     try:
-        table = table_of(results)
+        result = lockin(read.time_us, read.deflection_nm, frequency, order, platform=read.platform)
     except TableError as error:
-        fault = str(error)
-    flagged = [f"{result.trace.source}: {result.verdict}" for result in results if not result.steady]
-    if session.out is not None and fault is not None:
-        session.note(f"no amplitudes.csv: {fault}")
-    for remark in () if table is None else table.remarks[1:]:
-        session.note(remark)
-    for verdict in flagged[1:]:
-        session.note(f"flagged: {verdict}")
-    return Output(
-        payload=lockin_payload(results, fault),
-        text=[partial(lockin_summary, result) for result in results],
-        report=lambda folder, _: write_lockin(results, folder, table, fault),
-        not_valid=flagged[0] if flagged else None,
-    )
+        raise TableError(f"{trace}: {error}") from error
+    figure = later("fitting.traces.picture:lockin_figure")
+    return Output.of(result, files={"lockin.png": lambda path: save(figure(result), path)}, json_file="lockin.json")

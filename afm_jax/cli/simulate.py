@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
+from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.cli.approach_curve import NOISE, PHASE_NOISE_DEG, approach
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.commands.simulate import DEFAULT_PERIODS
@@ -155,17 +155,6 @@ def _write_trace(session: Session, scene: Scene, run: LongRun, window: Window) -
         columns["drive"] = np.asarray(scene.force.force(times))
     else:
         columns["platform_nm"] = np.asarray(scene.platform.position(times))
-    session.write_columns("trace.csv", columns, _trace_comments(scene, drive))
-
-
-def _trace_comments(scene: Scene, drive: DrivePeriod) -> list[str]:
-    """Return what a trace says of its measurement, a setting each."""
-    cantilever, platform = scene.cantilever, scene.platform
-    settings = {"drive_frequency_khz": drive.angular_frequency / RAD_PER_US_PER_KHZ}
-    if scene.base is None and scene.force is None and drive.aperiodic is None and platform.second is None:
-        settings |= {"drive_amplitude_nm": platform.amplitude_nm, "offset_nm": platform.offset_nm}
-    settings |= {"free_frequency_khz": cantilever.frequency_khz, "mass_ng": cantilever.mass_ng}
-    if cantilever.quality_factor is not None:
-        settings["quality_factor"] = cantilever.quality_factor
-    damping = ["quality_factor = none"] if cantilever.quality_factor is None else []
-    return [*(f"{name} = {float(value)!r}" for name, value in settings.items()), *damping]
+    session.write_columns(
+        "trace.csv", columns, [f"drive_frequency_khz = {float(drive.angular_frequency / RAD_PER_US_PER_KHZ)!r}"]
+    )

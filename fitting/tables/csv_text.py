@@ -11,7 +11,7 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, NoReturn
 
@@ -37,6 +37,15 @@ _SHORT_NAMES = {
 """What people call a key, too far from its name for a comparison of letters."""
 _SUGGESTIONS = 20
 """How many unknown column names are compared with the known ones; it takes some milliseconds each."""
+
+SETTING_NAMES = frozenset(
+    {
+        *("drive", "rows", "free_frequency_khz", "quality_factor", "mass_ng", "spring_constant_n_per_m"),
+        *("tip_calibration", "drive_calibration", "offset_origin_nm", "phase_zero_deg"),
+        *("averages", "temperature_k", "length_um", "width_um", "scale_error", "drive_frequency_khz"),
+    }
+)
+"""What a comment sets in one file or another: where it sets nothing it is refused, never left among the remarks."""
 
 NumberedLines = list[tuple[int, str]]
 """Lines of a file, each with its number."""
@@ -186,7 +195,7 @@ class Form:
         open: whether columns of other names are left alone, not refused.
         blanks: whether cells may be blank (NaN); else every cell is needed.
         example: a row of column names to show, where the row above the numbers is the whole head.
-        separator: what stands between cells.
+        separator: what stands between cells; empty: commas, tabs, semicolons or spaces, as the row of names has them.
         separators: what to add where columns are not separated by it.
         fewer: what to do with a row of too few cells.
         more: and with one of too many.
@@ -424,6 +433,7 @@ def columns_of_rows(
     Raises:
         TableError: at once where the column names are wrong.
     """
+    form = form if form.separator else replace(form, separator=_separator_of(rows[0][1]))
     head, rows = named_rows(rows, form, faults)
     faults.raise_any()
     columns, _, lines = parse_rows(rows, head.names, form, faults)
@@ -433,6 +443,11 @@ def columns_of_rows(
             values = columns[column.name]
             found[column.becomes] = values if column.convert is None else column.convert(values)
     return found, tuple(columns), lines
+
+
+def _separator_of(names: str) -> str:
+    """Return what separates a row of names."""
+    return next((sign for sign in ",\t; " if sign in names.strip()), ",")
 
 
 def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
@@ -512,6 +527,10 @@ def settings_in(
     for line, text in comments:
         setting = setting_in(text, settings)
         if setting is None:
+            match = _KEY_AND_VALUE.fullmatch(text)
+            name = "" if match is None else plain_name(match["key"])
+            if name in SETTING_NAMES:
+                faults.add(f"{name} sets nothing in such a file; remove the line", line=line)
             remarks.append(text)
         elif setting.key in seen:
             faults.add(f"{setting.key} was given in line {seen[setting.key]} already; remove one of the two", line=line)
@@ -551,8 +570,9 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
 
 def _cells(text: str, separator: str) -> list[str]:
     """Return the cells of one line, without the spaces and quotation marks around them."""
-    # instruments end their lines with a tab
+    # instruments end their lines with a tab, and put several spaces between columns
     text = text.rstrip(" ").removesuffix("\t") if separator == "\t" else text
+    text = " ".join(text.split()) if separator == " " else text
     # The csv module is needed for quotation marks only, and costs more than the rest of the reading.
     quotes = '"' in text
     cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True)) if quotes else text.split(separator)
@@ -769,7 +789,7 @@ def parse_rows(
 def _plain_block(rows: NumberedLines, names: list[str], wanted: Mapping[str, Column], form: Form) -> Columns | None:
     """Return the wanted columns of a file of nothing but finite numbers at once, None where it holds something else."""
     sign = form.separator
-    if not rows or sign != "," or any(column.kind == "whole" for column in wanted.values()):
+    if not rows or sign == " " or any(column.kind == "whole" for column in wanted.values()):
         return None
     if any('"' in text or text.count(sign) != len(names) - 1 for _, text in rows):
         return None

@@ -1,461 +1,373 @@
-"""From a time trace to response order, peak and lock-in amplitude and phase, with errors and a verdict.
+"""A lock-in: what of a deflection in time is at the drive's frequency over N, N = 1 to 8, and over twice the order.
 
-Readings of several traces make an amplitude table that the fitter reads.
+    a exp(i phi) = 2/T times the integral of z exp(-i omega t/N) dt over T, a whole number of periods,
+
+so that z has the part a cos(omega t/N + phi), t = 0 when the platform is highest. T holds whole periods of the order
+asked for, too: the other lines of a motion of that order then cancel. T is cut into blocks; their scatter is the error.
 """
 
 import math
-import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Complex, Float, Int
 
 from afm_jax.checks import checked
+from afm_jax.columns import printed_table
+from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.results import Result, public_result
 from afm_jax.units import within_turn
-from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable
-from fitting.traces.fold import Fold, OrderSearch, Reference, find_order, find_reference, fold, sampling_error_nm
-from fitting.traces.impacts import (
-    ImpactCount,
-    Peak,
-    Steadiness,
-    count_impacts,
-    find_peak,
-    find_ringing,
-    look_at_periods,
-)
-from fitting.traces.trace import Trace, read_trace
-from fitting.traces.verdict import Lines, TraceEvidence, TraceKind, judge_trace
+from afm_jax.words import bullets
+from fitting.tables.csv_text import Column, Faults, FileSetting, Form, TableError, read_columns, read_text
 
-FORMAT_VERSION = 1
-"""Version of the JSON layout; raised when a key changes its meaning or goes."""
+HIGHEST_ORDER = 8
+"""Subharmonics that are read: the paper's proposal; higher ones are hardly ever seen."""
+SHARE = 0.02
+"""Of the amplitude at the order asked for: what another order, or the scatter of the blocks, may have at most."""
+_BLOCKS = 12
+_LEAST_PERIODS = 4
+_LEAST_SAMPLES = 4.0
+"""Samples per drive period."""
+_SILENT_NM = 1e-9
+_SEEN = 4.0
+"""Standard errors from which an amplitude stands out of the noise."""
 
 
-@public_result(picture="fitting.traces.report:lockin_figure")
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LockinResult(Result):
-    """Order, amplitudes and phase that `lockin` reads of one trace; attributes are named like the keys of its JSON.
-
-    All errors are standard errors.
+class Trace(NamedTuple):
+    """A deflection in time, as a file has it.
 
     Attributes:
-        steady: whether it is a steady orbit with one impact in a response period.
-        kind: what kind of motion the trace shows, a `TraceKind`.
-        verdict: the kind of motion in a sentence.
-        order: N, drive periods in a response period; None where nothing repeats.
-        impacts_per_period: m; None where it is not known.
-        peak_amplitude_nm: largest height above the rest position; None where nothing repeats.
-        peak_amplitude_error_nm: from noise and sampling.
-        lockin_amplitude_nm: 2/T |integral of z exp(-i omega t/N)| over whole response periods.
-        lockin_amplitude_error_nm: from noise and sampling.
-        phase_deg: phi in z ~ a cos(omega t/N + phi), modulo 360/N, t = 0 when the platform is highest.
-        phase_error_deg: from the noise of deflection and reference.
-        drive_lockin_amplitude_nm: 2/T |integral of z exp(-i omega t)|, what every lock-in reads at the drive's
-            frequency, of a motion that does not repeat too; None where too few phases are sampled.
-        drive_lockin_amplitude_error_nm: from noise and sampling.
-        drive_lockin_phase_deg: phi in z ~ a cos(omega t + phi), t = 0 when the platform is highest.
-        drive_lockin_phase_error_deg: from the noise of deflection and reference.
-        phase_reference: "column", "drive_phase_deg" or "time zero" (taken as when the platform is highest).
-        noise_nm: standard deviation of one sample.
-        sampling_error_nm: part of the lock-in amplitude's error that more samples per period would remove.
-        scatter: how much response periods differ beyond noise, of the deflection's standard deviation.
-        response_periods: how many response periods were evaluated.
-        free_frequency_khz: given, or read off the bending at the top.
-        free_frequency_origin: "given" or "trace".
-        drive_amplitude_nm: given, or the platform column's; None where not known.
-        offset_nm: given, or the platform column's; None where not known.
+        time_us: of the samples, in us, shape (samples,).
+        deflection_nm: height of the tip, in nm; the zero does not matter.
+        platform: a signal in phase with the platform's height, in any unit, or None.
+        drive_frequency_khz: of the platform, or None where the file does not say it.
+    """
+
+    time_us: Float[np.ndarray, " samples"]
+    deflection_nm: Float[np.ndarray, " samples"]
+    platform: Float[np.ndarray, " samples"] | None
+    drive_frequency_khz: float | None
+
+
+@public_result(picture="fitting.traces.picture:lockin_figure")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LockinResult(Result):
+    """What `lockin` reads, named like the columns of an amplitude table.
+
+    Attributes:
+        drive_frequency_khz: omega/2 pi.
+        order: N that was asked for.
+        response_periods: whole periods of order N that were read.
+        lockin_amplitude_nm: amplitude a at the drive's frequency over N.
+        lockin_amplitude_error_nm: its standard error, from the scatter of the blocks and the sampling.
+        phase_deg: phi, modulo 360/N.
+        phase_error_deg: its standard error.
+        scatter: root mean square by which the blocks differ, as a share of the amplitude.
+        orders: 1 to 8, and twice the order asked for, shape (lines,).
+        amplitudes_nm: at the drive's frequency over each order; NaN where the trace is too short for it.
+        amplitude_errors_nm: their standard errors, NaN where there is one block only.
+        phases_deg: their phases, modulo 360 over the order.
+        block_amplitudes_nm: at the order asked for, one after another.
+        largest_share: what the amplitude at another order may be of that at the order asked for: 2 %, or what few
+            samples a period make of the harmonics.
+        valid: whether the trace is periodic at the order asked for.
+        reasons: why it is not; a sentence each.
         warnings: what a reader should know besides.
-        trace: what was read.
-        folded: the last whole response periods, folded onto one.
-        search: what the search for the order found.
     """
 
-    steady: bool
-    kind: TraceKind
-    verdict: str
-    order: int | None
-    impacts_per_period: int | None
-    peak_amplitude_nm: float | None
-    peak_amplitude_error_nm: float | None
-    lockin_amplitude_nm: float | None
-    lockin_amplitude_error_nm: float | None
-    phase_deg: float | None
-    phase_error_deg: float | None
-    drive_lockin_amplitude_nm: float | None
-    drive_lockin_amplitude_error_nm: float | None
-    drive_lockin_phase_deg: float | None
-    drive_lockin_phase_error_deg: float | None
-    phase_reference: str
-    noise_nm: float
-    sampling_error_nm: float
-    scatter: float
-    response_periods: int
-    free_frequency_khz: float | None
-    free_frequency_origin: str | None
-    drive_amplitude_nm: float | None
-    offset_nm: float | None
-    warnings: list[str]
-    trace: Trace
-    folded: Fold
-    search: OrderSearch
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything but the samples as plain lists, numbers and strings; what is not known is None."""
-        trace, settings = self.trace, self.trace.settings
-        own = {name: value for name, value in vars(self).items() if name not in {"trace", "folded", "search"}}
-        own |= {
-            "kind": str(self.kind),
-            "drive_frequency_khz": trace.drive_frequency_khz,
-            "quality_factor": settings.quality_factor,
-            "samples": trace.samples,
-            "sampling_rate_mhz": 1.0 / trace.step_us,
-            "drive_periods": trace.drive_periods,
-            "prediction_misfit_nm": self.search.misfit_nm.tolist(),
-            "remarks": list(trace.remarks),
-        }
-        plain = {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in own.items()}
-        return {"source": trace.source} | plain
-
-
-_UNREPEATED = (TraceKind.NOT_PERIODIC, TraceKind.NO_RESPONSE, TraceKind.RINGING)
-_UNCOUNTED = (*_UNREPEATED, TraceKind.DRIFTING)
-_OTHER_FREQUENCY = 0.1
-"""Share by which the bending at the top may contradict the given free frequency."""
-_ENOUGH_PERIODS = 4
-_ROUNDING = 1e-9
-"""Of an amplitude: smallest error, as a fit divides by it."""
-
-
-@checked
-def lockin(trace: Trace | str | os.PathLike[str], *, order: int | None = None) -> LockinResult:
-    """Read response order, amplitudes and phase of a trace, and say whether it is a steady single-impact orbit.
-
-    The order is the smallest N at which one half of the response periods predicts the other. Folded onto one response
-    period, the samples give the lock-in value by least squares with all harmonics that they determine, the peak by a
-    polynomial around the top, and the impacts as jumps of the velocity between free flights. Errors are those of the
-    scatter between response periods (white noise where there are fewer than twelve).
-
-    Args:
-        trace: the samples; they should begin after the transient.
-        order: the order that is expected; another one is flagged. None takes whichever is found.
-
-    Raises:
-        TableError: if the trace is shorter than two response periods of the expected order, or the reference column
-            does not hold the drive frequency.
-    """
-    if not isinstance(trace, Trace):
-        trace = read_trace(Path(os.fspath(trace)))
-    if order is not None:
-        _check_order(trace, order)
-    reference = find_reference(trace)
-    search = find_order(trace)
-    folded = fold(trace, search.order)
-    peak = find_peak(folded)
-    frequency, origin = _free_frequency(trace, peak)
-    lines = Lines(folded, trace.settings.drive_amplitude_nm)
-    impacts = ImpactCount(0, None) if lines.flightless else _impacts(trace, folded, peak, frequency)
-    periods = look_at_periods(folded, peak)
-    count = 0 if impacts is None else impacts.impacts or 0
-    ringing = find_ringing(trace) if periods.excess > 0.0 or periods.lockin_drift > 0.0 else None
-    verdict = judge_trace(TraceEvidence(lines, search, periods, impacts, order, ringing))
-    readings = _Readings(folded, peak, reference)
-    repeats = verdict.kind not in _UNREPEATED
-    phase, phase_error = readings.phase()
-    # what does not repeat is read over whole periods of the drive
-    whole = (folded if repeats else fold(trace, 1)).at_drive()
-    at_drive = None if whole is None else _Readings(whole, peak, reference)
-    drive_phase = (None, None) if at_drive is None else at_drive.phase()
-    return LockinResult(
-        steady=verdict.kind is TraceKind.STEADY,
-        kind=verdict.kind,
-        verdict=verdict.sentence,
-        order=search.order if repeats else None,
-        impacts_per_period=impacts.impacts if impacts is not None and verdict.kind not in _UNCOUNTED else None,
-        peak_amplitude_nm=peak.height_nm if repeats else None,
-        peak_amplitude_error_nm=readings.peak_error() if repeats else None,
-        lockin_amplitude_nm=abs(folded.lockin) if repeats else None,
-        lockin_amplitude_error_nm=readings.lockin_error() if repeats else None,
-        phase_deg=phase if repeats else None,
-        phase_error_deg=phase_error if repeats else None,
-        drive_lockin_amplitude_nm=None if whole is None else abs(whole.lockin),
-        drive_lockin_amplitude_error_nm=None if at_drive is None else at_drive.lockin_error(),
-        drive_lockin_phase_deg=drive_phase[0],
-        drive_lockin_phase_error_deg=drive_phase[1],
-        phase_reference=reference.origin,
-        noise_nm=folded.noise_nm,
-        sampling_error_nm=sampling_error_nm(folded),
-        scatter=periods.excess,
-        response_periods=folded.cycles,
-        free_frequency_khz=frequency,
-        free_frequency_origin=origin,
-        drive_amplitude_nm=reference.amplitude_nm,
-        offset_nm=reference.offset_nm,
-        warnings=_warnings(trace, folded, peak, reference, search, periods, count) if repeats else [],
-        trace=trace,
-        folded=folded,
-        search=search,
-    )
-
-
-def _check_order(trace: Trace, order: int) -> None:
-    if order < 1:
-        raise TableError(f"{trace.source}: the order must be 1, 2, 3, ..., but is {order}")
-    if trace.drive_periods < 2.0 * order - 1e-9:
-        least = 2.0 * order * trace.drive_period_us
-        raise TableError(
-            f"{trace.source}: the trace spans {trace.drive_periods:.3g} drive periods, too short for two response "
-            f"periods of order {order}; record at least {least:.4g} us"
-        )
-
-
-def _free_frequency(trace: Trace, peak: Peak) -> tuple[float | None, str | None]:
-    given = trace.settings.free_frequency_khz
-    if given is not None:
-        return given, "given"
-    return peak.frequency_khz, None if peak.frequency_khz is None else "trace"
-
-
-def _impacts(trace: Trace, folded: Fold, peak: Peak, frequency: float | None) -> ImpactCount | None:
-    """Return the impacts of a motion with flights, None where the free frequency is not known."""
-    if frequency is None or peak.height_nm <= 0.0:
-        return None
-    quality = trace.settings.quality_factor
-    quality = None if quality is None or math.isinf(quality) else quality
-    return count_impacts(folded, free_frequency_khz=frequency, quality_factor=quality, peak_nm=peak.height_nm)
-
-
-class _Readings(NamedTuple):
-    """Phase and errors of a folded trace."""
-
-    folded: Fold
-    peak: Peak
-    reference: Reference
-
-    def lockin_error(self) -> float:
-        """Return the error of the lock-in amplitude: along its direction in the complex plane, and of the sampling."""
-        noise = self._error_along(1.0 + 0.0j)
-        return max(float(np.hypot(noise, sampling_error_nm(self.folded))), _ROUNDING * abs(self.folded.lockin))
-
-    def peak_error(self) -> float:
-        """Return the error of the peak."""
-        error = float(np.hypot(self.peak.error_nm, self.peak.sampling_error_nm))
-        return max(error, _ROUNDING * abs(self.peak.height_nm))
-
-    def phase(self) -> tuple[float, float]:
-        """Return the phase in [0, 360/N), [0, 360) at the drive's frequency, after the platform's, and its error."""
-        value = self.folded.lockin
-        order = self.folded.order / self.folded.waveform.line
-        phase = np.degrees(np.angle(value)) - self.reference.phase_deg / order
-        across = float(np.hypot(self._error_along(1j), sampling_error_nm(self.folded))) / max(abs(value), 1e-300)
-        error = float(np.hypot(np.degrees(across), self.reference.phase_error_deg / order))
-        return float(within_turn(phase, 360.0 / order)), max(min(error, 180.0), _ROUNDING)
-
-    def _error_along(self, turned: complex) -> float:
-        """Return the error of the lock-in value along its own direction, turned by a unit complex number."""
-        value = self.folded.lockin
-        direction = np.conj(turned * value / max(abs(value), 1e-300))
-        weights = 2.0 * self.folded.waveform.weights(self.folded.angle)
-        return self.folded.error_of((weights * direction).real)
-
-
-def _warnings(
-    trace: Trace,
-    folded: Fold,
-    peak: Peak,
-    reference: Reference,
-    search: OrderSearch,
-    periods: Steadiness,
-    impacts: int,
-) -> list[str]:
-    found = []
-    if reference.origin == "time zero":
-        found.append("The phase takes time 0 as when the platform is highest: give `drive_phase_deg=...` or a column.")
-    share = sampling_error_nm(folded) / max(abs(folded.lockin), 1e-300)
-    if share > 1e-3:
-        advice = "sample faster, or not in step with the drive"
-        found.append(f"Few distinct phases are sampled: the lock-in amplitude may be off by {share:.1%}; {advice}.")
-    given, seen = trace.settings.free_frequency_khz, peak.frequency_khz
-    if (
-        given is not None
-        and seen is not None
-        and abs(seen / given - 1.0) > _OTHER_FREQUENCY
-        and share < 1e-2
-        and impacts
-    ):
-        what = f"The flight bends at its top like one of {seen:.4g} kHz, not {given:g} kHz"
-        found.append(f"{what}: wrong rest position (`rest_nm=...`), other free frequency, or a filtered trace.")
-    if 2 * search.order > len(search.misfit_nm):
-        what = f"The trace spans {trace.drive_periods:.3g} drive periods"
-        found.append(f"{what}: too few to see a doubled period of order {2 * search.order}.")
-    if folded.cycles < _ENOUGH_PERIODS:
-        found.append(f"Only {folded.cycles} response periods: a slow drift would not be seen.")
-    if periods.excess > 1e-3:
-        found.append(f"Response periods differ by {periods.excess:.2%} of the motion beyond the noise.")
-    return found
-
-
-_SHARED = (
-    "free_frequency_khz",
-    "quality_factor",
-    "quality_factor_error",
-    "mass_ng",
-    "spring_constant_n_per_m",
-    "spring_constant_error_n_per_m",
-)
-
-
-class _Row(NamedTuple):
-    """A row of the amplitude table; NaN where something is not known."""
-
-    order: int
     drive_frequency_khz: float
-    drive_amplitude_nm: float
-    offset_nm: float
-    peak_amplitude_nm: float
-    peak_amplitude_error_nm: float
+    order: int
+    response_periods: int
     lockin_amplitude_nm: float
     lockin_amplitude_error_nm: float
     phase_deg: float
     phase_error_deg: float
+    scatter: float
+    orders: Int[np.ndarray, " lines"]
+    amplitudes_nm: Float[np.ndarray, " lines"]
+    amplitude_errors_nm: Float[np.ndarray, " lines"]
+    phases_deg: Float[np.ndarray, " lines"]
+    block_amplitudes_nm: Float[np.ndarray, " blocks"]
+    largest_share: float
+    valid: bool = True
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def reason(self) -> str | None:
+        """Why the trace is not periodic at the order; None if it is."""
+        return next(iter(self.reasons), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax lockin`."""
+        return {"format": "afm-jax lockin", "format_version": 2} | vars(self)
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of lockin.csv, a row an order."""
+        names = ("orders", "amplitudes_nm", "amplitude_errors_nm", "phases_deg")
+        columns = ("order", "lockin_amplitude_nm", "lockin_amplitude_error_nm", "phase_deg")
+        return {"lockin.csv": {column: getattr(self, name) for column, name in zip(columns, names, strict=True)}}
+
+    def printed(self) -> list[Any]:
+        """Return the verdict, the amplitudes, and what a reader should know."""
+        (columns,) = self.tables().values()
+        rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+        cells: dict[str, Any] = {
+            "drive /": "order:d",
+            "amplitude\nnm": "lockin_amplitude_nm",
+            "+-": "lockin_amplitude_error_nm:.2g",
+            "phase\ndegrees": "phase_deg:.2f",
+        }
+        verdict = "VALID" if self.valid else "NOT VALID"
+        head = f"{verdict}: order {self.order} of {self.drive_frequency_khz:g} kHz, {self.response_periods} periods"
+        lines = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
+        return [head, printed_table("", cells, rows), *lines]
 
 
-_READ = (("peak_amplitude_nm", "peak_amplitude_error_nm"), ("lockin_amplitude_nm", "lockin_amplitude_error_nm"))
-_AGREE = 4.0
-"""Standard errors by which readings of one drive may differ from their mean."""
-
-
-def table_of(results: Sequence[LockinResult]) -> AmplitudeTable:
-    """Return the table of the steady readings, a row for each drive, in the order of drive frequency and order.
-
-    The phase is left out where its reference was taken for granted. Several readings of one drive are averaged, with
-    the error of the best one, as errors of sampling do not average; where they contradict each other, as on two orbits
-    of one drive, all of them are left out. Both is said in the table's remarks.
+@checked
+def lockin(
+    time_us: Float[np.ndarray, " samples"],
+    deflection_nm: Float[np.ndarray, " samples"],
+    drive_frequency_khz: float,
+    order: int,
+    *,
+    platform: Float[np.ndarray, " samples"] | None = None,
+) -> LockinResult:
+    """Read amplitude and phase of a deflection at the drive's frequency over an order, and at the orders beside it.
 
     Args:
-        results: of traces of one cantilever; those that are not steady are left out.
+        time_us: of the samples, in us, rising in nearly equal steps; without `platform` 0 when that is highest.
+        deflection_nm: height of the tip, in nm; the zero does not matter.
+        drive_frequency_khz: of the platform.
+        order: N, drive periods in a period of the response, 1 to 8.
+        platform: a signal in phase with the platform's height, in any unit: what the phase counts from.
+
+    Returns:
+        Amplitudes, phases, errors and a verdict; see `LockinResult`.
 
     Raises:
-        TableError: if there is no row, drive amplitude, offset or free frequency of one is not known, or the
-            cantilevers differ.
+        TableError: if the trace is too short, has gaps, or the platform's signal is no wave of the drive's frequency.
+        ValueError: if the order or the frequency is impossible.
     """
-    steady = [result for result in results if result.steady]
-    if not steady:
-        raise TableError("amplitudes.csv: no trace is a steady single-impact orbit, so there is no row")
-    for result in steady:
-        _check_known(result)
-    shared = _cantilever(steady)
-    drives: dict[tuple[float, ...], dict[_Row, str]] = {}
-    for result in steady:
-        row = _row_of(result)
-        same = drives.setdefault((row.order, round(row.drive_frequency_khz, 9), *row[2:4]), {})
-        # a trace that is given twice is one measurement
-        same.setdefault(row, result.trace.source)
-    remarks: list[str] = []
-    joined = [_joined(same, remarks) for _, same in sorted(drives.items(), key=lambda item: item[0])]
-    rows = [row for row in joined if row is not None]
-    if not rows:
-        raise TableError(f"amplitudes.csv: there is no row: {'; '.join(remarks)}")
-    columns: dict[str, Any] = {
-        name: np.array(list(column)) for name, column in zip(_Row._fields, np.array(rows, dtype=object).T, strict=True)
-    }
-    if not np.isfinite(columns["phase_deg"]).any():
-        columns |= {"phase_deg": None, "phase_error_deg": None}
-    return AmplitudeTable(
-        **columns,
-        free_frequency_khz=_or_nan(shared["free_frequency_khz"]),
-        quality_factor=None if shared["quality_factor"] == math.inf else _or_nan(shared["quality_factor"]),
-        quality_factor_error=shared["quality_factor_error"],
-        mass_ng=shared["mass_ng"],
-        spring_constant_n_per_m=shared["spring_constant_n_per_m"],
-        spring_constant_error_n_per_m=shared["spring_constant_error_n_per_m"],
-        source="amplitudes.csv",
-        remarks=("read from time traces by afm-jax lockin", *remarks),
+    if not 1 <= order <= HIGHEST_ORDER:
+        raise ValueError(f"`order` must be 1 to {HIGHEST_ORDER}, but is {order}")
+    if not 0.0 < drive_frequency_khz < 1e9:
+        raise ValueError(f"`drive_frequency_khz` must be positive, but is {drive_frequency_khz!r}")
+    period = 1e3 / drive_frequency_khz
+    time, height = (np.asarray(column, dtype=np.float64) for column in (time_us, deflection_nm))
+    _check(time, height, period, order)
+    behind, reference_error = 0.0, 0.0
+    if platform is not None:
+        wave = _blocks(time, np.asarray(platform, dtype=np.float64), period, 1, order)
+        _check_wave(wave, drive_frequency_khz)
+        behind, reference_error = float(np.angle(wave.mean())), _errors(wave)[1] / order
+    orders = np.array(sorted({*range(1, HIGHEST_ORDER + 1), 2 * order}))
+    # counted from when the platform is highest
+    since = time + behind / (2.0 * np.pi) * period
+    lines = {int(n): _blocks(since, height, period, int(n), order) for n in orders}
+    values = np.array([blocks.mean() if blocks.size else np.nan for blocks in lines.values()])
+    size, asked = np.abs(values), int(np.flatnonzero(orders == order)[0])
+    errors = np.array([_errors(blocks)[0] if blocks.size else np.nan for blocks in lines.values()])
+    sampling = _sampling_error(time, order * period)
+    phases = [float(within_turn(angle, 360.0 / n)) for angle, n in zip(np.angle(values, deg=True), orders, strict=True)]
+    found = LockinResult(
+        drive_frequency_khz=drive_frequency_khz,
+        order=order,
+        response_periods=int(_whole(time, order * period)),
+        lockin_amplitude_nm=float(size[asked]),
+        lockin_amplitude_error_nm=math.hypot(float(errors[asked]), sampling * float(size[asked])),
+        phase_deg=phases[asked],
+        phase_error_deg=math.degrees(math.hypot(_errors(lines[order])[1], sampling, reference_error)),
+        scatter=_scatter(lines[order]),
+        orders=orders,
+        amplitudes_nm=size,
+        amplitude_errors_nm=errors,
+        phases_deg=np.array(phases),
+        block_amplitudes_nm=np.abs(lines[order]),
+        # the first harmonic that sampling turns into a slow line; the k-th of a bounce is 3/(4 k^2)
+        largest_share=max(SHARE, 0.75 / (order * (period / float(np.median(np.diff(time))) - 1.0)) ** 2),
     )
+    reasons = tuple(judge(REASONS, found))
+    warnings = []
+    unseen = ", ".join(str(n) for n in orders[np.isnan(size)])
+    if unseen:
+        warnings.append(f"The trace is too short to see the drive's frequency over {unseen}.")
+    if platform is None:
+        warnings.append("The phase takes time 0 as when the platform is highest; a column of the platform says it.")
+    if sampling > SHARE / 10.0:
+        warnings.append(f"Few phases are sampled (error {sampling:.1%}): sample faster, or not in step with the drive.")
+    return replace(found, valid=not reasons, reasons=reasons, warnings=tuple(warnings))
 
 
-def _row_of(result: LockinResult) -> _Row:
-    read = {name: _or_nan(getattr(result, name)) for names in _READ for name in names}
-    phase = result.phase_deg if result.phase_reference != "time zero" else None
-    return _Row(
-        order=result.order or 0,
-        drive_frequency_khz=result.trace.drive_frequency_khz,
-        drive_amplitude_nm=_or_nan(result.drive_amplitude_nm),
-        offset_nm=_or_nan(result.offset_nm),
-        phase_deg=_or_nan(phase),
-        phase_error_deg=_or_nan(None if phase is None else result.phase_error_deg),
-        **read,
-    )
+def _whole(time: Float[np.ndarray, " samples"], period_us: float) -> int:
+    """Return how many whole periods a trace holds."""
+    return int((time[-1] - time[0]) / period_us + 1e-9)
 
 
-def _joined(same: dict[_Row, str], remarks: list[str]) -> _Row | None:
-    """Return the mean of readings of one drive; None where they contradict each other.
+def _blocks(
+    time: Float[np.ndarray, " samples"], height: Float[np.ndarray, " samples"], period: float, n: int, order: int
+) -> Complex[np.ndarray, " blocks"]:
+    """Return 2/T times the integral of z exp(-i omega t/n) over each of at most twelve blocks; none if too short.
+
+    Blocks hold equally many whole periods of both orders, the last ones of the trace.
 
     Args:
-        same: the rows, and the file of each.
-        remarks: takes what is to be said of it.
+        time: of the samples, in us.
+        height: z.
+        period: of the drive, in us.
+        n: the line is at the drive's frequency over n.
+        order: of the motion, whose other lines are to cancel.
     """
-    first, *others = rows = list(same)
-    if not others:
-        return first
-    means: dict[str, float] = {}
-    pulls = [0.0]
-    for name, error_name in (*_READ, ("phase_deg", "phase_error_deg")):
-        turn = 360.0 / first.order if name == "phase_deg" else np.inf
-        known = [row for row in rows if np.isfinite(getattr(row, name))]
-        if not known:
-            continue
-        base = getattr(known[0], name)
-        apart = np.array([_wrapped(getattr(row, name) - base, turn) for row in known])
-        error = np.array([getattr(row, error_name) for row in known])
-        mean = float(np.average(apart, weights=error**-2.0))
-        pulls.extend(np.abs(apart - mean) / error)
-        means |= {name: float(np.mod(base + mean, turn)), error_name: float(error.min())}
-    names = ", ".join(same.values())
-    if max(pulls) > _AGREE:
-        remarks.append(
-            f"{names} are of one drive and contradict each other by {max(pulls):.2g} standard errors: left out"
-        )
-        return None
-    remarks.append(f"{names} are of one drive: one row, their mean")
-    return first._replace(**means)
+    both = math.lcm(n, order) * period
+    length = math.ceil(_whole(time, both) / _BLOCKS) * both
+    count = _whole(time, length) if length else 0
+    wave = (height - height.mean()) * np.exp(-2j * np.pi * time / (n * period))
+    edges = np.maximum(time[-1] - length * np.arange(count, -1, -1), time[0])
+    # trapezia: up to the sample before an edge, and from there to the edge
+    until = np.concatenate([[0.0], np.cumsum(0.5 * (wave[1:] + wave[:-1]) * np.diff(time))])
+    before = np.minimum(np.searchsorted(time, edges, side="right") - 1, len(time) - 2)
+    at_edge = np.interp(edges, time, wave)
+    return 2.0 / (length or 1.0) * np.diff(until[before] + 0.5 * (wave[before] + at_edge) * (edges - time[before]))
 
 
-def _wrapped(value: float, turn: float) -> float:
-    return value - turn * round(value / turn) if np.isfinite(turn) else value
+def _errors(blocks: Complex[np.ndarray, " blocks"]) -> tuple[float, float]:
+    """Return standard errors of the mean: of its size, and of its angle in rad; NaN of one block."""
+    mean, count = blocks.mean(), len(blocks)
+    size = max(abs(mean), 1e-300)
+    apart = blocks * np.conj(mean) / size
+    if count == 1:
+        return np.nan, np.nan
+    along, across = (float(np.std(part, ddof=1)) / math.sqrt(count) for part in (apart.real, apart.imag))
+    return along, min(across / size, math.pi)
 
 
-def _or_nan(value: float | None) -> float:
-    return float("nan") if value is None else float(value)
+def _scatter(blocks: Complex[np.ndarray, " blocks"]) -> float:
+    """Return the root mean square by which blocks differ from their mean, as a share of it."""
+    return float(np.sqrt(np.mean(np.abs(blocks - blocks.mean()) ** 2)) / max(abs(blocks.mean()), 1e-300))
 
 
-def _check_known(result: LockinResult) -> None:
-    values = {"drive_amplitude_nm": result.drive_amplitude_nm, "offset_nm": result.offset_nm}
-    for name, value in values.items():
-        if value is None:
-            mend = f"give `{name}=...` or a comment '# {name} = 1'"
-            raise TableError(
-                f"{result.trace.source}: {name} is not known, so that it cannot enter the amplitude table; {mend}"
-            )
+def _sampling_error(time: Float[np.ndarray, " samples"], period: float) -> float:
+    """Return by which share an amplitude may be wrong as few phases of the period are sampled.
+
+    Sampled at M phases, the harmonics M - 1 and M + 1 look like the first; the k-th of a bounce is 3/(4 k^2) of it.
+    """
+    turns = np.sort(np.mod(time / period, 1.0))
+    m = max(1.0 / max(float(np.max(np.diff(turns))), 1.0 - float(turns[-1] - turns[0])), 2.0)
+    return 0.75 * (1.0 / (m - 1.0) ** 2 + 1.0 / (m + 1.0) ** 2)
 
 
-def _cantilever(steady: Sequence[LockinResult]) -> dict[str, float | None]:
-    """Return what all traces say of the cantilever."""
-    first, shared = steady[0].trace, {}
-    for name in _SHARED:
-        shared[name] = getattr(first.settings, name)
-        for result in steady[1:]:
-            other = getattr(result.trace.settings, name)
-            if other != shared[name]:
-                raise TableError(
-                    f"{result.trace.source}: {name} is {other}, but {shared[name]} in {first.source}; one table holds "
-                    "one cantilever: give the option for all, or run them apart"
-                )
-    if shared["free_frequency_khz"] is None:
+def _check(
+    time: Float[np.ndarray, " samples"], height: Float[np.ndarray, " samples"], period: float, order: int
+) -> None:
+    """Refuse times that do not rise in nearly equal steps, or that are too few or too short."""
+    if time.shape != height.shape or time.ndim != 1 or len(time) < 2 or not np.isfinite(time + height).all():
+        raise TableError("the trace must be two or more finite numbers of time and as many of the deflection")
+    steps = np.diff(time)
+    typical, worst = float(np.median(steps)), int(np.argmax(np.abs(steps - np.median(steps))))
+    if steps.min() <= 0.0 or steps[worst] > 1.5 * typical:
         raise TableError(
-            f"{first.source}: free_frequency_khz is not known, so that there is no amplitude table; give "
-            "`free_frequency_khz=...` or a comment '# free_frequency_khz = 90' (afm-jax calibrate measures it)"
+            f"sample {worst + 2}, column time_us: the step is {steps[worst]:.6g} us, the usual one {typical:.6g} us; "
+            "times must rise evenly: cut the trace where samples are missing"
         )
-    return shared
+    if _LEAST_SAMPLES * typical > period:
+        raise TableError(
+            f"there are {period / typical:.3g} samples in a drive period; sample {_LEAST_SAMPLES:g} or more"
+        )
+    if _whole(time, order * period) < _LEAST_PERIODS:
+        raise TableError(
+            f"the trace spans {(time[-1] - time[0]) / period:.3g} drive periods, too short for {_LEAST_PERIODS} "
+            f"periods of order {order}; record at least {_LEAST_PERIODS * order * period:.4g} us"
+        )
+
+
+def _check_wave(wave: Complex[np.ndarray, " blocks"], drive_frequency_khz: float) -> None:
+    """Refuse a signal of the platform that is no wave of the drive's frequency."""
+    if not abs(wave.mean()) > 0.0 or _scatter(wave) > SHARE:
+        raise TableError(
+            f"column platform_nm: is no steady wave of {drive_frequency_khz:g} kHz (its parts differ by "
+            f"{_scatter(wave):.1%}); correct the drive frequency, or remove the column"
+        )
+
+
+def _lines(found: LockinResult, *, within: bool) -> list[tuple[int, float]]:
+    """Return other orders with their amplitudes: divisors of the order (``within``), or the rest."""
+    rows = zip(found.orders.tolist(), found.amplitudes_nm.tolist(), strict=True)
+    return [row for row in rows if row[0] != found.order and (found.order % row[0] == 0) == within]
+
+
+def _others(found: LockinResult) -> list[tuple[int, float]]:
+    """Return the strongest line at which a motion of the order has none, and its amplitude, if it is too strong."""
+    # errors of few blocks are uncertain: noise is alike at all lines
+    noise = _SEEN * float(np.nanmax(found.amplitude_errors_nm))
+    least = max(found.largest_share * found.lockin_amplitude_nm, noise, _SILENT_NM)
+    seen = [(a, n) for n, a in _lines(found, within=False) if a > least]
+    return [(n, a) for a, n in sorted(seen)[-1:]]
+
+
+_NOT = "not periodic at order {e.order}: "
+REASONS: Rules[LockinResult] = [
+    (
+        Rule(
+            _others,
+            _NOT
+            + "{case[1]:.3g} nm at the drive's frequency over {case[0]}, beside {e.lockin_amplitude_nm:.3g} nm over "
+            "{e.order} (at most {e.largest_share:.1%} of it); is it `order={case[0]}`?",
+        ),
+        Rule(
+            lambda e: not e.lockin_amplitude_nm > max(_SEEN * e.lockin_amplitude_error_nm, _SILENT_NM),
+            _NOT + "no response at the drive's frequency over it, {e.lockin_amplitude_nm:.3g} nm are noise",
+        ),
+        Rule(
+            lambda e: e.scatter > SHARE,
+            _NOT + f"parts of the trace differ by {{e.scatter:.1%}} (at most {SHARE:.0%}): it still settles, drifts, "
+            "or never repeats, the drive frequency is wrong, or the noise is large; record longer, later",
+        ),
+        Rule(
+            lambda e: [n for n, a in _lines(e, within=True) if a > e.lockin_amplitude_nm],
+            _NOT + "the response is larger at the drive's frequency over {case}: use `order={case}`",
+        ),
+    )
+]
+
+TRACE = Form(
+    (
+        Column("time_us", "us", kind="number", needed="time"),
+        Column("time_ms", kind="number", meaning="time_us", needed="time", convert=lambda ms: 1e3 * ms),
+        Column("time_s", kind="number", meaning="time_us", needed="time", convert=lambda s: 1e6 * s),
+        Column("deflection_nm", "nm", kind="number", needed="deflection"),
+        Column("position_nm", kind="number", meaning="deflection_nm", needed="deflection"),
+        Column("platform_nm", kind="number", meaning="platform"),
+        Column("drive", kind="number", meaning="platform"),
+    ),
+    "sample",
+    open=True,
+    example="time_us,deflection_nm",
+    separator="",
+    mend="cut the trace there or repair it",
+)
+SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180", unit="kHz")}
+
+
+@checked
+def read_trace(path: str | Path) -> Trace:
+    """Read a trace from text of two columns, time_us and deflection_nm, or three with platform_nm (or drive).
+
+    Cells are separated by commas, tabs, semicolons or spaces; a comment `# drive_frequency_khz = 180` may stand above.
+
+    Args:
+        path: the file.
+
+    Raises:
+        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+    """
+    faults = Faults(str(path))
+    table = read_columns(read_text(path), TRACE, SETTINGS, faults)
+    faults.raise_any()
+    frequency, _ = table.settings.get("drive_frequency_khz", (None, None))
+    columns = table.columns
+    for name, numbers in columns.items():
+        TRACE.check_numbers(name, numbers, table.lines, faults)
+    faults.raise_any()
+    return Trace(columns["time_us"], columns["deflection_nm"], columns.get("platform"), frequency)

@@ -313,48 +313,27 @@ INVERT = Command(
     check=_check_table,
 )
 
-_OF_A_TRACE = (
-    ("sampling-rate-mhz", "MHz", "Samples per us; not needed with a column time_us."),
-    ("drive-frequency-khz", "kHz", "Frequency of the platform."),
-    ("drive-amplitude-nm", "nm", "Amplitude of the platform, for the table; else the column platform_nm tells it."),
-    ("offset-nm", "nm", "Mean height of the platform above the tip's rest position, for the table."),
-    (
-        "drive-phase-deg",
-        "DEGREES",
-        "psi in platform = offset + beta cos(omega t + psi), t the trace's time [default: 0].",
-    ),
-    ("free-frequency-khz", "kHz", "Undamped natural frequency; else read off the trace, for counting impacts only."),
-    ("quality-factor", "Q", "Quality factor of the cantilever; none: no air damping."),
-    ("mass-ng", "ng", "Effective mass, for the table."),
-    ("spring-constant-n-per-m", "N_PER_M", "Or the spring constant, which says the mass k/Omega^2."),
-    ("rest-nm", "nm", "What the deflection reads at the tip's rest position [default: 0]."),
-)
-_TRACE_SETTINGS = tuple(
-    click.option(f"--{name}", type=Finite(none=name == "quality-factor"), metavar=unit, help=text)
-    for name, unit, text in _OF_A_TRACE
-)
-
 LOCKIN = Command(
     name="lockin",
     group="measure",
-    summary="Read response order, amplitudes and phase off time traces of the deflection.",
-    runs="afm_jax.cli.lockin:lockin_of_traces",
-    help="""Turn time traces of the deflection into response order, amplitudes and phase.
+    summary="Read amplitudes and phase off a deflection in time, at the drive's frequency over 1 to 8.",
+    runs="afm_jax.cli.lockin:lockin_of_trace",
+    help="""Read amplitude and phase of a deflection in time at the drive's frequency over N, and over 1 to 8 besides.
 
-    TRACE is CSV or HDF5 with the columns deflection_nm (the tip's height), time_us (or a sampling rate) and, as
-    reference of the phase, platform_nm or drive. Every setting below may stand in the file instead, as a comment
-    `# drive_frequency_khz = 180` or an HDF5 attribute; options hold for all traces. Orbits that are not steady with
-    one impact are flagged: several impacts, period doubled, chaotic, drifting, ringing, stuck, no response. With --out
-    lockin.html, lockin.json, a picture of every trace, and amplitudes.csv for `afm-jax fit` with the steady ones;
-    traces of one drive give one row, their mean. Exit code 3 if a trace is flagged.
+    TRACE is text with the columns time_us (or time_ms, time_s) and deflection_nm (the tip's height), separated by
+    commas, tabs, semicolons or spaces. The phase counts from a third column, platform_nm or drive, or from time 0.
+    Amplitudes are integrals over whole periods, errors the scatter of up to twelve parts of the trace. Exit code 3 if
+    the trace is not periodic at order N: the scatter, or the amplitude at another order, is above 2 % of that at N.
+    With --out lockin.csv, .json and .png.
     """,
     options=(
-        click.argument("traces", metavar="TRACE...", nargs=-1, required=True, type=click.Path(path_type=Path)),
-        *_TRACE_SETTINGS,
+        click.argument("trace", metavar="TRACE", type=click.Path(path_type=Path)),
         click.option(
-            "--order", type=click.IntRange(1, 16), metavar="N", help="Flag responses of another order than N."
+            "--drive-frequency-khz", type=Finite(positive=True), metavar="KHZ", help="Of the platform; else the file's."
         ),
-        click.option("--group", metavar="NAME", help="Group of an HDF5 file that holds the data sets."),
+        click.option(
+            "--order", type=click.IntRange(1, 8), default=1, help="Drive periods in a period of the response."
+        ),
     ),
     computes=False,
 )
