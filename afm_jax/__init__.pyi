@@ -46,6 +46,7 @@ from afm_jax.outcomes import Outcome as Outcome
 from afm_jax.saved import load as load
 from afm_jax.scenefile.law_files import load_law as load_law
 from afm_jax.scenefile.law_files import save_law as save_law
+from afm_jax.scenefile.parameter_paths import ParameterRange as ParameterRange
 from afm_jax.scenefile.parameter_paths import scene_family as scene_family
 from afm_jax.scenefile.scenefile import load_scene as load_scene
 from afm_jax.scenefile.scenefile import save_scene as save_scene

@@ -27,7 +27,7 @@ _KEPT_ELSEWHERE = {
     "security.md": "SECURITY.md",
 }
 _GALLERY = """Each notebook is shown as it ran, ends with assertions on what it claims, and is run by the tests.
-They are in the repository's folder `notebooks/`; open them in JupyterLab, where *An orbit by sliders* moves."""
+They are in the repository's folder `notebooks/`."""
 _CODE_IN_CELLS = re.compile(r"(?<=<code>)[^<]*(?=</code>(?:(?!<t[dh]|</table>).)*</t[dh]>)", re.DOTALL)
 _JOINT = re.compile(r"(?<=[a-z]_)(?=[a-z0-9])|(?<=[(=/,])(?=[\w&])|(?<=[a-z]\.)(?=[a-z])")
 _WHOLE = re.compile(r"(?<![\w-])(--[a-z][\w-]*|afm-jax)")

@@ -1,10 +1,70 @@
-"""The notebooks: stored without outputs, run from the first cell to the last, ended by an assertion."""
+"""The notebooks: eight, on public names, stored without outputs, run from first to last cell, ended by an assertion."""
 
+import ast
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import afm_jax
+import fitting
+
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
+
+
+PACKAGES = {"afm_jax": afm_jax, "fitting": fitting}
+
+
+def names_that_are_not_public(source: str) -> list[str]:
+    """Return what a program takes of the two packages by import or attribute that `dir` of them does not list."""
+    public = {package: {*dir(module)} - {"cli"} for package, module in PACKAGES.items()}
+    found, called = [], {}
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            for name in node.names:
+                if name.name in PACKAGES:
+                    called[name.asname or name.name] = name.name
+                elif name.name.partition(".")[0] in PACKAGES:
+                    found.append(name.name)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] in PACKAGES:
+            names = public.get(str(node.module), set())
+            found += [f"{node.module}.{name.name}" for name in node.names if name.name not in names]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in called:
+            package = called[node.value.id]
+            if node.attr not in public[package] | {"__file__"}:
+                found.append(f"{package}.{node.attr}")
+    return found
+
+
+def code_of(path: Path) -> str:
+    """Return the cells of code of a notebook as one program, without lines that are for IPython alone."""
+    import nbformat  # noqa: PLC0415  # a second and a half, which listing the tests need not take
+
+    cells: list[Any] = nbformat.read(path, as_version=4).cells
+    text = "\n".join(cell.source for cell in cells if cell.cell_type == "code")
+    return "\n".join(line for line in text.splitlines() if not line.startswith("%"))
+
+
+def test_there_are_eight():
+    assert len(NOTEBOOKS) == 8
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_only_public_names(path):
+    assert names_that_are_not_public(code_of(path)) == []
+
+
+def test_names_of_rooms_are_found():
+    source = (
+        "import afm_jax as afm, afm_jax.impact.map\nfrom fitting.fits import fit\nfrom afm_jax import solve\nafm.motion"
+    )
+    assert names_that_are_not_public(source) == [
+        "afm_jax.impact.map",
+        "fitting.fits.fit",
+        "afm_jax.solve",
+        "afm_jax.motion",
+    ]
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

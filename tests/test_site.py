@@ -1,15 +1,11 @@
-"""The site: whole, strict, nothing fetched from other machines; its search and the sliders work in a browser."""
+"""The site: whole, strict, nothing fetched from other machines; its search works in a browser."""
 
 import os
 import re
 import shutil
-import signal
-import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -97,42 +93,3 @@ def test_search_works_from_disk(site: Path, page: Any):
     page.locator("input.md-search__input").press_sequentially("capture speed")
     page.locator(".md-search-result__item").first.wait_for(timeout=60_000)
     assert {url.partition(":")[0] for url in asked} <= {"file", "data", "blob", "about"}
-
-
-def _wait_for(port: int, seconds: float = 120.0) -> None:
-    """Wait until a server answers."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=10):
-            return
-        time.sleep(0.5)
-    raise TimeoutError(port)
-
-
-@pytest.mark.slow
-@needs_browser
-@pytest.mark.skipif(not find_spec("jupyterlab"), reason="no JupyterLab; tests/test_notebooks.py runs the page without")
-def test_sliders_move_the_picture_in_jupyterlab(tmp_path: Path, page: Any):
-    shutil.copy(ROOT / "notebooks" / "sliders.ipynb", tmp_path)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    options = ["--no-browser", "--allow-root", "--IdentityProvider.token=", "--ServerApp.ip=127.0.0.1"]
-    options += [f"--ServerApp.port={port}", f"--ServerApp.root_dir={tmp_path}"]
-    there = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    with (tmp_path / "messages.txt").open("w") as messages:
-        server = subprocess.Popen([sys.executable, "-m", "jupyterlab", *options], env=there, stderr=messages)
-    try:
-        _wait_for(port)
-        page.goto(f"http://127.0.0.1:{port}/lab/tree/sliders.ipynb?reset")
-        page.get_by_text("Python 3 (ipykernel) | Idle").wait_for(timeout=120_000)
-        page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
-        page.locator(".lm-Menu-itemLabel", has_text="Run All Cells").first.click()
-        picture = page.locator("img.widget-image, .widget-image img").first
-        picture.wait_for(timeout=120_000)
-        before = picture.get_attribute("src")
-        page.locator(".noUi-handle").nth(1).focus()
-        page.keyboard.press("ArrowRight")
-        page.wait_for_function("([image, old]) => image.src !== old", arg=[picture.element_handle(), before])
-    finally:
-        server.send_signal(signal.SIGTERM)
-        server.wait(timeout=60)

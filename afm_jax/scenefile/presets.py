@@ -75,10 +75,10 @@ def figure9_scene(reduced_frequency: ArrayLike, offset_nm: ArrayLike, r: ArrayLi
 def figure8_scene() -> Scene:
     """Return the scene of figure 8: n = 5.277, beta = 4 nm, sigma = 0; the paper's strange attractor.
 
-    Followed longer, it is transient chaos: from all twelve starts of the notebook on motions (drive phase 270
-    degrees, 5 nm above the platform, upward at 40 to 110 nm/us) the motion locks to the (1,5) orbit in the end, after
-    some tens to a thousand broadband impacts. After how many is a matter of rounding, and so of the machine; while it
-    lasts, small distances grow by an exponent of about 0.8 an impact.
+    Followed longer, it is transient chaos: from all twelve starts of the notebook on the paper's figures (drive phase
+    270 degrees, 5 nm above the platform, upward at 40 to 110 nm/us) the motion locks to the (1,5) orbit in the end,
+    after some tens to a thousand broadband impacts. After how many is a matter of rounding, and so of the machine;
+    while it lasts, small distances grow by an exponent of about 0.8 an impact.
     """
     return contact_scene(reduced_frequency=5.277, drive_amplitude_nm=4.0, offset_nm=0.0)
 

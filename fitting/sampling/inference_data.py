@@ -1,7 +1,6 @@
 """A posterior as a netCDF file in ArviZ's layout: a group each for draws, predictions, likelihoods and readings.
 
-What ArviZ computes of it (leave-one-out, Pareto k by row, predictive checks) is shown in the notebook
-`how_far_to_trust_a_posterior`.
+ArviZ computes leave-one-out, Pareto k by row and predictive checks of it.
 """
 
 import importlib
