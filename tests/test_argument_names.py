@@ -108,9 +108,9 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
         "give --quality-factor '40 +- 2' (",
     ),
     "sensitivity": (
-        lambda path: fitting.tapping_map(path / "volts.npz", free_amplitude_nm=13.4, **LEVER),
+        lambda path: fitting.tapping_map(path / "volts.npz", free_amplitude_nm=13.4, free_phase_deg=90.0, **LEVER),
         "give `nm_per_volt=NM`",
-        ("tapping-map", "volts.npz", "--free-amplitude-nm", "13.4", *LEVER_OPTIONS),
+        ("tapping-map", "volts.npz", "--free-amplitude-nm", "13.4", "--free-phase-deg", "90", *LEVER_OPTIONS),
         "give --nm-per-volt NM",
     ),
     "which images": (
@@ -118,12 +118,6 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
         'say `columns="lockin_amplitude_nm=CHANNEL:nm"`',
         ("tapping-map", "names.npz"),
         "say --columns lockin_amplitude_nm=CHANNEL:nm",
-    ),
-    "an argument with an option of another name": (
-        lambda path: read_images(path / "names.npz", ratio=0.01),
-        "`ratio` must be at least 0.05 and below 1, but is 0.01",
-        ("tapping-map", "names.npz", "--at", "0.01"),
-        "--at must be at least 0.05 and below 1, but is 0.01",
     ),
     "a parameter's value": (
         lambda _: model_parameters("law", fixed={"r": 3.0}),
@@ -153,9 +147,9 @@ def test_text_json_and_files_of_a_command_name_its_options(tmp_path: Path, monke
     images = 10.0 + noise.normal(size=(9, 9)), 80.0 + noise.normal(size=(9, 9))
     np.savez("image.npz", amplitude_nm=images[0], phase_deg=images[1])
     (curve,) = fitting.read_curves("abc.csv", columns=columns, **LEVER)
-    found = fitting.tapping_map("image.npz", free_amplitude_nm=13.4, **LEVER)
+    found = fitting.tapping_map("image.npz", free_amplitude_nm=13.4, free_phase_deg=90.0, **LEVER)
     assert any('if it leads, `columns="phase_lag_deg=CHANNEL:-1"`' in note for note in curve.notes)
-    assert any("else `free_phase_deg=...`" in note for note in found.notes)
+    assert any("(`amplitude_error_nm=...`, `phase_error_deg=...`)" in note for note in found.notes)
     for call, out, files, said in (
         (
             ["read", "abc.csv", "--columns", columns],
@@ -164,10 +158,10 @@ def test_text_json_and_files_of_a_command_name_its_options(tmp_path: Path, monke
             "it leads, --columns phase_lag_deg=CHANNEL:-1.",
         ),
         (
-            ["tapping-map", "image.npz", "--free-amplitude-nm", "13.4"],
+            ["tapping-map", "image.npz", "--free-amplitude-nm", "13.4", "--free-phase-deg", "90"],
             "map",
             ["map/map.html", "map/map.json", "map/map.txt"],
-            "else --free-phase-deg.",
+            "(--amplitude-error-nm, --phase-error-deg)",
         ),
     ):
         text, as_json = (

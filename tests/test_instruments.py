@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import fitting.instruments.formats as formats_module
+import fitting.instruments.recording as recording_module
 from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
 from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, OPTIONS, raw_curve, true_energy_aj
@@ -398,13 +398,35 @@ def test_several_curves_of_one_file_in_metres_and_reversed(tmp_path: Path):
 # ---- wrong and damaged files
 
 
-def test_what_reads_a_format_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("write", "package"), [(asylum_ramp, "igor2"), (gwyddion_bytes, "gwyfile")], ids=["igor2", "gwyfile"]
+)
+def test_what_reads_a_format_is_named_where_it_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[], bytes], package: str
+):
     def missing(name: str):
         raise ModuleNotFoundError(name=name)
 
-    monkeypatch.setattr(formats_module, "import_module", missing)
-    with pytest.raises(TableError, match=r"the package igor2; install it with: pip install 'afm-jax\[instruments\]'"):
-        read_curves(saved(tmp_path, asylum_ramp()))
+    path = saved(tmp_path, write())
+    monkeypatch.setattr(recording_module, "import_module", missing)
+    said = rf"the package {package}; install it with: pip install 'afm-jax\[instruments\]'"
+    with pytest.raises(TableError, match=said):
+        read_curves(path)
+
+
+def test_labels_of_igor_end_where_their_text_ends(tmp_path: Path):
+    # what stands behind a text's NUL in its field of 32 bytes is left over from an earlier label
+    field = b"Phase".ljust(32, b"\0")
+    data = asylum_ramp()
+    assert data.count(field) == 1
+    for told, name in (
+        (b"Phase\0Retrace\xe4\0rest", "Phase"),
+        ("Phase °".encode(), "Phase °"),
+        (b"Phase \xb0", "Phase °"),
+        (b"\0nothing", "channel 3"),
+    ):
+        path = saved(tmp_path, data.replace(field, told.ljust(32, b"\0")))
+        assert read_recording(path).channels == ["ZSnsr", "Amp", name, "Defl"]
 
 
 def damaged(data: bytes, random: np.random.Generator) -> bytes:

@@ -17,12 +17,13 @@ from fitting.examples.make_raw_curve import (
     FREE_NM,
     QUALITY_FACTOR,
     SPRING_CONSTANT,
-    raw_curve,
     true_energy_aj,
     true_lag_deg,
 )
-from fitting.instruments.gwyddion import images_as_bytes
+from fitting.instruments import images as images_module
+from fitting.instruments import recording as recording_module
 from fitting.instruments.images import read_images
+from fitting.instruments.recording import refuse_other_modes
 from fitting.tapping_curves.curve import Instrument
 from fitting.tapping_curves.energy import energies
 from tests.html_pages import read_page
@@ -71,7 +72,7 @@ def test_every_pixel_has_the_energy_of_the_formula_and_its_own_error():
     np.testing.assert_allclose(found.virial, drawn.mean(axis=0), atol=0.01)
     np.testing.assert_allclose(found.virial_error, drawn.std(axis=0), rtol=0.15)
     # the spring constant's part of the common error is its share of the median energy
-    assert found.common["spring_constant"] == pytest.approx(4.0 / 44.0 * np.median(energy), rel=0.02)
+    assert found.common["spring_constant_n_per_m"] == pytest.approx(4.0 / 44.0 * np.median(energy), rel=0.02)
     assert found.energy_common_error == pytest.approx(np.linalg.norm(list(found.common.values())))
 
 
@@ -81,7 +82,8 @@ def test_maps_are_the_energies_of_curves_row_by_row(drive: Literal["force", "bas
     amplitude, behind = random.uniform(5.0, 40.0, 42), random.uniform(-30.0, 10.0, 42)
     known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "spring_constant_n_per_m": 5.4}
     known |= {"free_amplitude_nm": 40.0, "drive_frequency_khz": 90.0 * ratio, "free_phase_deg": 33.0}
-    found = tapping_map((amplitude.reshape(6, 7), 33.0 + behind.reshape(6, 7)), drive=drive, **known)
+    images = amplitude.reshape(6, 7), 33.0 + behind.reshape(6, 7)
+    found = tapping_map(images, columns="phase_lag_deg=phase:1", drive=drive, **known)
     gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
     lag = np.rad2deg(np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)) + behind
     rows = {"amplitude_nm": amplitude, "lag_deg": lag, "drive_frequency_khz": 90.0 * ratio}
@@ -113,23 +115,152 @@ def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip_and_without_a_stif
     turned = tapping_map((amplitude, -lag), **{**LEVER, "free_phase_deg": (-FREE_LAG, 0.2)})
     np.testing.assert_allclose(turned.energy, straight.energy, rtol=1e-12)
     np.testing.assert_allclose(turned.virial, straight.virial, rtol=1e-9)
-    unknown = ("free_phase_deg", "spring_constant_n_per_m")
-    found = tapping_map((amplitude, -lag), **{key: value for key, value in LEVER.items() if key not in unknown})
+    # on resonance only the sign of the virial hangs on the sense
+    for one, word in ((straight, "lag"), (turned, "lead")):
+        assert any(f"Sense: assumed: the phase grows with the {word}" in note for note in one.notes)
+    stated = tapping_map((amplitude, -lag), columns="phase_lag_deg=phase:-1", **LEVER | {"free_phase_deg": -FREE_LAG})
+    np.testing.assert_allclose(stated.energy, energy, rtol=2e-4)
+    assert not any("Sense" in note for note in stated.notes)
+    found = tapping_map((amplitude, lag), **{k: v for k, v in LEVER.items() if k != "spring_constant_n_per_m"})
     assert found.unit == "nm^2"
     np.testing.assert_allclose(found.energy, energy / SPRING_CONSTANT, rtol=2e-4)
-    assert "spring_constant" not in found.common
-    for one, said in (
-        (turned, "Sign: the free tip reads"),
-        (found, "Phase: the free tip is taken to read"),
-        (found, "over it, in nm^2"),
+    assert "spring_constant_n_per_m" not in found.common
+    assert any("over it, in nm^2" in note for note in found.notes)
+
+
+def energy_of(drive: str, amplitude: float, behind: float, ratio: float, quality: float) -> float:
+    """Return E in aJ of k = 44 N/m at a free amplitude of 13.4 nm: what the drive gives less what the air takes.
+
+    With all harmonics of one brief impact a period, a tenth less; `behind`, of the free tip, is in degrees.
+    """
+    n = np.arange(1, 41)
+    gamma = 1.0 - (n * ratio) ** 2 + 1j * n * ratio / quality
+    free, turned = FREE_NM, np.exp(-1j * np.deg2rad(behind))
+    z = -amplitude * turned
+    if drive == "base":
+        free = FREE_NM / abs(1.0 - gamma[0])
+        z = z * np.exp(1j * np.angle(1.0 - gamma[0])) - gamma[0] * free
+    # force of the drive k gamma (-A0) works pi Im(F conj Z) a period, friction k s/Q takes pi k s n^2 |Z_n|^2/Q
+    force = gamma[0] * (z + free)
+    given, others = np.pi * np.imag(gamma[0] * free * np.conj(z)), 0.9 * np.abs(n[1:] * force / gamma[1:]) ** 2
+    taken = np.pi * ratio / quality * (abs(z) ** 2 + others.sum())
+    return float(SPRING_CONSTANT * (-given - taken))
+
+
+@pytest.mark.parametrize("drive", ["force", "base"])
+@pytest.mark.parametrize("quality", [150.0, 400.0])
+@pytest.mark.parametrize("ratio", [0.99, 1.0, 1.03, 1.05])
+def test_no_sense_of_the_phase_makes_a_wrong_energy_valid(drive: str, quality: float, ratio: float):
+    gamma = 1.0 - ratio**2 + 1j * ratio / quality
+    free_lag = float(np.rad2deg(np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)))
+    lever = LEVER | {"quality_factor": (quality, 0.5), "free_frequency_khz": (300.0, 0.003), "drive": drive}
+    lever |= {"drive_frequency_khz": 300.0 * ratio, "amplitude_error_nm": 0.03, "phase_error_deg": 0.1}
+    seen = []
+    for behind in (-25.0, -8.0, -2.0, 2.0, 8.0, 25.0):
+        energy = energy_of(drive, 0.9 * FREE_NM, behind, ratio, quality)
+        if energy <= 0.0:
+            continue
+        for free, sign in ((free_lag, 1.0), (-free_lag, -1.0), (0.0, 1.0), (0.0, -1.0)):
+            arrays = np.full((5, 5), 0.9 * FREE_NM), np.full((5, 5), free + sign * behind)
+            known = lever | {"free_phase_deg": (free, 0.02)}
+            right = tapping_map(arrays, columns=f"phase_lag_deg=phase:{sign:.0f}", **known)
+            assert np.median(right.energy) == pytest.approx(energy, rel=1e-9)
+            found = tapping_map(arrays, **known)
+            same = np.sign(np.median(found.virial)) == np.sign(np.median(right.virial))
+            assumed = any("Sense: assumed" in note for note in found.notes)
+            if found.valid:
+                assert abs(np.median(found.energy) - energy) < 3.0 * found.energy_common_error
+                assert same or (assumed and ratio == 1.0)
+            elif right.valid:
+                assert 'say `columns="phase_lag_deg=CHANNEL:1"`' in found.reasons[0]
+            seen.append(found.valid)
+    assert any(seen) or (ratio == 1.05 and not seen)
+
+
+def test_without_the_free_tip_an_image_gives_no_energy(tmp_path: Path):
+    (path,) = written(tmp_path, "npz")
+    for left_out in ("free_phase_deg", "free_amplitude_nm"):
+        known = {key: value for key, value in LEVER.items() if key != left_out}
+        with pytest.raises(TableError, match=f"give `{left_out}=.*; record amplitude and phase of the free tip"):
+            tapping_map(path, **known)
+    result = run(path, *GRID_CALL, "--free-amplitude-nm", "13.4")
+    assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1)
+    assert "give --free-phase-deg DEGREES; record" in result.stderr
+
+
+def test_an_energy_below_zero_or_within_its_errors_is_not_valid():
+    # 13 nm behind by 30 degrees: the drive gives less than the air takes, however the phase counts
+    low = tapping_map((np.full((5, 5), 13.0), np.full((5, 5), 60.0)), **LEVER)
+    energy = energy_of("force", 13.0, 60.0 - FREE_LAG, DRIVE_KHZ / FREE_FREQUENCY_KHZ, QUALITY_FACTOR)
+    assert energy < 0.0
+    assert not low.valid
+    assert any(f"below zero beyond its errors ({energy:.3g} +- " in reason for reason in low.reasons)
+    amplitude, lag, energies_aj = image()
+    middle = np.median(energies_aj)
+    # the free amplitude's share: E = pi k A (A0 sin(lag) - A)/Q
+    slope = np.pi * SPRING_CONSTANT / QUALITY_FACTOR * np.median(amplitude)
+    for share, valid in ((0.2, True), (0.3, False)):
+        known = LEVER | {"free_amplitude_nm": (FREE_NM, share * middle / slope)}
+        found = tapping_map((amplitude, lag), **known)
+        assert found.energy_common_error / middle == pytest.approx(share, rel=0.25)
+        assert found.valid == valid
+    assert "only bracketed" in found.reasons[0]
+    assert "most of its error comes from free_amplitude_nm" in found.reasons[0]
+    noisy = tapping_map((amplitude, lag), amplitude_error_nm=0.5, phase_error_deg=0.1, **LEVER)
+    assert "most of its error comes from noise of a pixel" in noisy.reasons[0]
+
+
+def test_the_free_phase_takes_an_error(tmp_path: Path):
+    (path,) = written(tmp_path, "npz")
+    shares = []
+    for error in ("", " +- 0.05"):
+        result = run(
+            path, *GRID_CALL, "--free-phase-deg", f"{FREE_LAG}{error}", "--free-amplitude-nm", "13.4", "--json"
+        )
+        shares.append(strictly(result.stdout)["common"]["free_phase_deg"])
+    # 0.2 degrees is the usual error
+    assert shares[1] / shares[0] == pytest.approx(0.25, rel=0.02)
+
+
+def test_images_of_other_modes_are_refused_by_name(tmp_path: Path):
+    for name, value, refused in (
+        ("ImagingMode", "PFM Mode", True),
+        ("ImagingMode", "Contact", True),
+        ("ImagingMode", "FM Mode", True),
+        ("ImagingMode", "SS-PFM something new", True),
+        ("ImagingMode", "AC Mode", False),
+        ("DualACMode", "1", True),
+        ("DualACMode", "0", False),
+        ("Op. mode", "Lateral Force", True),
+        ("Op. mode", "Phase Contrast", False),
+        ("Op. mode", "Dynamic Force", False),
+        ("AFM mode", "PeakForce Tapping", True),
+        ("AFM mode", "Tapping", False),
+        ("Control::Imaging mode", "non-contact", False),
+        ("Control::Imaging mode", "Contact", True),
+        ("Feedback Mode", "ac-ultra-speed-direct-drive", False),
+        ("Feedback mode", "Free", False),
     ):
-        assert any(said in note for note in one.notes)
+        said = ""
+        try:
+            refuse_other_modes({name: value}, "image")
+        except TableError as error:
+            said = str(error)
+        assert (f"the mode {value!r} ({name})" in said) == refused, name
+    amplitude, lag, _ = image()
+    note = "ImagingMode: PFM Mode\rFreeAirAmplitude: NaN\r"
+    (tmp_path / "pfm.ibw").write_bytes(igor_image(amplitude, lag, note))
+    result = run(tmp_path / "pfm.ibw", *CALL, "13.4")
+    assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
+    assert "was recorded in the mode 'PFM Mode' (ImagingMode)" in result.stderr
 
 
 def nanosurf_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
     """Return a NanoSurf file of two images, amplitude in m and phase in degrees, as 32-bit integers of their range."""
-    header, data = ["[DataSet]", "Version=2"], b""
-    size = ["SaveBits=32", "Frame=Scan forward", "Dim0Name=X*", "Dim0Unit=m"]
+    header, data = ["[DataSet]", "Version=2", "GroupCount=1", "Gr0-Name=Scan", "Gr0-ID=1", "Gr0-Count=2"], b""
+    header += ["Gr0-Ch0=DataSet-0:0", "Gr0-Ch1=DataSet-0:1"]
+    size = ["Version=2", "SaveMode=Binary", "SaveBits=32", "SaveSign=Signed", "SaveOrder=Intel"]
+    size += ["Frame=Scan forward", "Dim0Name=X*", "Dim0Unit=m", "Dim1Name=Y*", "Dim1Unit=m", "Dim1Min=0"]
     size += ["Dim0Min=0", "Dim0Range=2e-6", "Dim1Range=1e-6"]
     for number, (name, unit, values) in enumerate((("Amplitude", "m", 1e-9 * amplitude), ("Phase", "°", phase))):
         low, width = float(values.min()), float(np.ptp(values))
@@ -137,7 +268,8 @@ def nanosurf_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
         header += [f"[DataSet-0:{number}]", f"Points={columns}", f"Lines={rows}", *size]
         header += [f"Dim2Name={name}", f"Dim2Unit={unit}", f"Dim2Min={low!r}", f"Dim2Range={width!r}"]
         counts = np.round((values - low) / width * (2.0**32 - 1.0) - 2.0**31).astype("<i4")
-        data += counts.tobytes()
+        # the first line stands below
+        data += counts[::-1].tobytes()
     return "\r\n".join(header).encode("latin-1") + b"\r\n\r\n#!" + data
 
 
@@ -152,10 +284,10 @@ def gwyddion_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
     return b"GWYP" + content.serialize()
 
 
-def igor_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
+def igor_image(amplitude: np.ndarray, phase: np.ndarray, more: str = "ImagingMode: AC Mode\r") -> bytes:
     """Return an Igor wave of three images."""
     channels = {"HeightRetrace": amplitude, "AmplitudeRetrace": 1e-9 * amplitude, "PhaseRetrace": phase}
-    note = "FastScanSize: 2e-06\rSlowScanSize: 1e-06\r"
+    note = f"FastScanSize: 2e-06\rSlowScanSize: 1e-06\r{more}"
     return igor_wave({name: values.T[:, ::-1] for name, values in channels.items()}, note)
 
 
@@ -177,6 +309,8 @@ def written(folder: Path, kind: str) -> list[Path]:
 
 @pytest.mark.parametrize("kind", ["npz", "npy", "csv", "ibw", "gwy", "nid"])
 def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
+    if kind == "nid":
+        pytest.importorskip("gwyddionpy")
     amplitude, lag, _ = image()
     found = read_images(*written(tmp_path, kind))
     np.testing.assert_allclose(found.amplitude, amplitude, rtol=3e-7)
@@ -184,11 +318,59 @@ def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
     assert found.size_m == ((1e-6, 2e-6) if kind in {"ibw", "gwy", "nid"} else None)
 
 
+@pytest.mark.filterwarnings("ignore")
+def test_a_measured_image_by_gwyddion_is_what_the_vendors_package_reads():
+    package = pytest.importorskip("NSFopen.read")
+    pytest.importorskip("gwyddionpy")
+    examples = Path(pytest.importorskip("NSFopen").__file__).parent / "example"
+    image, friction = examples / "Plotting_Data" / "MoS2.nid", examples / "Lateral_Force" / "SBS-PMMA.nid"
+    if not (image.exists() and friction.exists()):
+        pytest.skip("this release of NSFopen comes without its examples")
+    theirs = package.read(str(image)).data["Image"]["Forward"]
+    found = read_images(image)
+    # Gwyddion counts rows from above
+    for ours, name in ((found.amplitude, "Amplitude"), (found.phase_deg, "Phase")):
+        wanted = np.asarray(theirs[name])
+        assert any(np.allclose(ours, rows, rtol=1e-6, atol=1e-9) for rows in (wanted, wanted[::-1]))
+    assert found.in_volts
+    assert found.known["drive_frequency_khz"].value == 172.823
+    with pytest.raises(TableError, match=r"the mode 'Lateral Force' \(Op\. mode\)"):
+        read_images(friction)
+
+
+def test_gwyddions_program_is_limited_and_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("gwyddionpy")
+    system = pytest.importorskip("resource")
+    before = system.getrlimit(system.RLIMIT_FSIZE)
+    (path,) = written(tmp_path, "nid")
+    strange = tmp_path / "-strange.xyz"
+    strange.write_bytes(b"\xff\xfe nothing that anybody knows")
+    for name, value, file, said in (
+        ("_PATIENCE_S", 60.0, strange, "gwyddionpy does not read it (cannot load"),
+        ("_PATIENCE_S", 1e-3, path, "did not finish within 0.001 s"),
+        ("LARGEST_BYTES", 1000, path, "gwyddionpy does not read it"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(images_module, name, value)
+            with pytest.raises(TableError) as raised:
+                read_images(file)
+        assert said in str(raised.value)
+        assert "\n" not in str(raised.value)
+        assert system.getrlimit(system.RLIMIT_FSIZE) == before
+
+    def missing(name: str):
+        raise ModuleNotFoundError(name=name)
+
+    monkeypatch.setattr(recording_module, "import_module", missing)
+    with pytest.raises(TableError, match=r"package gwyddionpy; install it with: pip install 'afm-jax\[gwyddion\]'"):
+        read_images(path)
+
+
 def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tmp_path: Path):
-    zarr, gwyfile = pytest.importorskip("zarr"), pytest.importorskip("gwyfile")
+    zarr = pytest.importorskip("zarr")
     (path,) = written(tmp_path, "gwy")
     out = tmp_path / "report"
-    formats = ["--format", "npz", "--format", "gwy", "--format", "zarr"]
+    formats = ["--format", "npz", "--format", "gsf", "--format", "zarr"]
     result = run(path, *CALL, "13.4", *formats, "--json", "--out", out)
     assert result.exit_code == 0, result.stderr
     _, _, energy = image()
@@ -196,50 +378,40 @@ def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tm
     assert answer["pixels"]["used"] == 240
     assert answer["energy"]["median"] == pytest.approx(np.median(energy), rel=1e-3)
     assert (out / "map.txt").read_text("utf-8").count("common error of the energy") == 1
-    endings = ("html", "png", "json", "txt", "npz", "gwy", "zarr")
-    assert {one.name for one in out.iterdir()} == {f"map.{ending}" for ending in endings}
+    names = {f"map.{ending}" for ending in ("html", "png", "json", "txt", "npz", "zarr")}
+    names |= {f"map_{name}.gsf" for name in ("energy", "energy_error", "virial", "virial_error")}
+    assert {one.name for one in out.iterdir()} == names
     assert len(list(read_page((out / "map.html").read_text("utf-8")).iter("img"))) == 1
-    theirs = gwyfile.load(str(out / "map.gwy"))
-    assert theirs["/0/data/title"] == "Energy of a tap"
-    assert theirs["/0/data"].xreal == pytest.approx(2e-6)
     stored = zarr.open_group(str(out / "map.zarr"), mode="r")["energy"]
-    for found in (np.load(out / "map.npz")["energy"], np.asarray(stored), 1e18 * theirs["/0/data"].data):
+    for found in (np.load(out / "map.npz")["energy"], np.asarray(stored)):
         np.testing.assert_allclose(found, energy, rtol=2e-4)
     assert run(path, *CALL, "9").exit_code == 3
 
 
-def test_masked_pixels_are_masked_in_gwyddion_too():
-    theirs = pytest.importorskip("gwyfile.objects")
-    data = images_as_bytes({"e": (np.array([[1.0, np.nan], [2.0, 3.0]]), "J")}, (1.0, 1.0), "")
-    content: Any = theirs.GwyObject.frombuffer(data[4:])
-    np.testing.assert_array_equal(content["/0/mask"].data, [[0.0, 1.0], [0.0, 0.0]])
-    np.testing.assert_array_equal(content["/0/data"].data, [[1.0, 1.0], [2.0, 3.0]])
+def test_gwyddion_opens_its_simple_fields(tmp_path: Path):
+    package = pytest.importorskip("gwyddionpy")
+    amplitude, lag, energy = image(7, 9)
+    amplitude[2, 3] = np.nan
+    (tmp_path / "image.gwy").write_bytes(gwyddion_image(amplitude, lag))
+    assert run(tmp_path / "image.gwy", *CALL, "13.4", "--format", "gsf", "--out", tmp_path / "out").exit_code == 0
+    (theirs,) = package.load(tmp_path / "out" / "map_energy.gsf").channels.values()
+    assert (theirs.name, theirs.si_unit_z, theirs.si_unit_xy) == ("energy", "J", "m")
+    assert (theirs.yreal, theirs.xreal) == pytest.approx((1e-6, 2e-6))
+    kept = np.isfinite(amplitude)
+    np.testing.assert_allclose(1e18 * theirs.data[kept], energy[kept], rtol=2e-4)
 
 
-def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
-    curves = [raw_curve(300, seed=seed, drift=0.0) for seed in range(6)]
-    names = ("amplitude_v", "phase_deg", "height_nm")
-    arrays: dict[str, Any] = {
-        name: np.reshape([getattr(one, name)[0] for one in curves], (2, 3, 300)) for name in names
-    }
-    np.savez(tmp_path / "grid.npz", **arrays)
-    lever = [*GRID_CALL, "--nm-per-volt", "42", "--at", "0.85", "--json"]
-    result = run(tmp_path / "grid.npz", *lever)
-    assert result.exit_code == 0, result.stderr
-    answer = strictly(result.stdout)
-    masked = ("amplitude above free", "energy below zero", "not measured")
-    assert answer["pixels"] == {"rows": 2, "columns": 3, "used": 6} | dict.fromkeys(masked, 0)
-    assert answer["energy"]["median"] == pytest.approx(float(true_energy_aj(np.full(1, 0.85))[0]), rel=0.03)
-    # the same curves side by side in a file without a head
-    blocks = [[*c.height_nm, *c.deflection_v, *c.amplitude_v, *c.phase_deg] for c in curves]
-    np.savetxt(tmp_path / "grid.txt", np.concatenate(blocks).T, delimiter="\t")
-    columns = "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
-    call = [tmp_path / "grid.txt", *lever, "--columns", columns, "--grid"]
-    again = strictly(run(*call, "2x3").stdout)
-    assert again["energy"]["median"] == pytest.approx(answer["energy"]["median"], rel=0.01)
-    refused = run(*call, "2x2")
-    assert (refused.exit_code, len(refused.stderr.splitlines())) == (2, 1)
-    assert "holds 6 curves, not 2 x 2 = 4" in refused.stderr
+def test_images_of_one_number_or_of_none(tmp_path: Path):
+    one, errors = (np.array([[12.0]]), np.array([[85.0]])), {"amplitude_error_nm": 0.03, "phase_error_deg": 0.1}
+    with pytest.raises(TableError, match="no three pixels stand side by side to read the noise off"):
+        tapping_map(one, **LEVER)
+    found = tapping_map(one, **errors, **LEVER)
+    energy = energy_of("force", 12.0, 85.0 - FREE_LAG, DRIVE_KHZ / FREE_FREQUENCY_KHZ, QUALITY_FACTOR)
+    assert found.energy.item() == pytest.approx(energy, rel=1e-9)
+    found.plot(tmp_path / "one.png")
+    for empty in (np.full((4, 4), np.nan), np.full((4, 4), -1.0)):
+        with pytest.raises(TableError, match="no pixel has both an amplitude above 0 and a phase"):
+            tapping_map((empty, np.full((4, 4), 80.0)), **LEVER)
 
 
 def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path):
@@ -251,27 +423,30 @@ def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path)
     (tmp_path / "cut.gwy").write_bytes(b"GWYPGwyContainer\0" + struct.pack("<I", 1000) + b"/0/data\0o")
     (stored,), _ = written(tmp_path, "npz"), written(tmp_path, "gwy")
     for name, said in (
-        ("one.npz", "none of the images amplitude is called"),
-        ("sizes.npz", "must be of one size"),
+        ("one.npz", "no channel has such a name for phase_lag_deg, of amplitude; say --columns"),
+        ("sizes.npz", "must be rows of one size"),
         ("volts.npz", "give --nm-per-volt NM"),
-        ("ragged.csv", "an image is rows of numbers"),
+        ("ragged.csv", "cannot be read (ValueError: the number of columns changed"),
         ("cut.gwy", "damaged or cut off"),
     ):
         result = run(tmp_path / name, *CALL, "13.4")
         assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1), name
         assert said in result.stderr
     for call, said in (
-        (["tapping-map", stored], "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM"),
+        (
+            ["tapping-map", stored],
+            "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM --free-phase-deg DEGREES",
+        ),
         (["read", tmp_path / "image.gwy"], "holds images; their energies: afm-jax tapping-map"),
         (["tapping", stored], "energies of images: afm-jax tapping-map"),
     ):
         result = CliRunner().invoke(main, [str(word) for word in call])
         assert result.exit_code == 2
         assert said in result.stderr
-    with pytest.raises(TableError, match="must be two arrays"):
+    with pytest.raises(
+        TableError, match="the amplitude has 12 x 20 pixels, the phase 20; they must be rows of one size"
+    ):
         tapping_map((amplitude, lag[0]), **LEVER)
-    with pytest.raises(ValueError, match="`ratio` must be at least 0\\.05 and below 1"):
-        read_images(stored, ratio=0.049)
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """One parser for each format of file that instruments write; which one a file is its content says, not its name.
 
-neaSNOM text, WSxM curves, Nanonis text, NanoSurf .nid, Gwyddion .gwy and separated text are read here; Asylum's .ibw by
-the package igor2 (`pip install afm-jax[instruments]`), imported only for such a file.
+neaSNOM text, WSxM curves, Nanonis text, NanoSurf .nid and separated text are read here; Asylum's .ibw by the package
+igor2 and Gwyddion's .gwy by gwyfile (`pip install afm-jax[instruments]`), imported only for such a file.
 """
 
 import csv
@@ -11,7 +11,6 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from jaxtyping import Float
 
 from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import MOST_VALUES
-from fitting.instruments.gwyddion import read_objects
 from fitting.instruments.recording import (
     HEADER_KEYS,
     UNITS,
@@ -32,6 +30,7 @@ from fitting.instruments.recording import (
     damaged_as_one_line,
     known_from,
     number_in,
+    package_for,
     unit_named,
 )
 from fitting.tables.csv_text import NUMBER, TableError, read_bytes
@@ -75,7 +74,7 @@ def _spelled(recording: Recording) -> Recording:
 
 def _parser_of(data: bytes, path: str) -> Callable[[bytes, str], Recording]:
     head = data[:4096]
-    if head[:2] in {b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"} or path.lower().endswith(".ibw"):
+    if is_igor(head) or path.lower().endswith(".ibw"):
         return parse_igor
     found = next((parse for mark, parse in MARKS.items() if head.startswith(mark)), None)
     if found is not None:
@@ -85,6 +84,11 @@ def _parser_of(data: bytes, path: str) -> Callable[[bytes, str], Recording]:
     if b"neaspec" in head.lower():
         return parse_neasnom
     return parse_nanonis_text if re.search(rb"^\[DATA\]\s*$", data, re.MULTILINE) else parse_separated
+
+
+def is_igor(head: bytes) -> bool:
+    """Say whether a file that begins so is an Igor binary wave: version 5 or 2, in either order of bytes."""
+    return head[:2] in {b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"}
 
 
 def _refuse_arrays(_: bytes, name: str) -> Recording:
@@ -238,7 +242,7 @@ def _wsxm_header(data: bytes, start: int, name: str) -> tuple[dict[str, str], in
     return {key.strip(): value.strip() for key, _, value in pairs}, end + len(_WSXM_END)
 
 
-_NANOSURF_KEYS = {
+NANOSURF_KEYS = {
     "Frequency:": ("free_frequency_khz", "Hz"),
     "Q Factor:": ("quality_factor", ""),
     "Spring Constant:": ("spring_constant_n_per_m", "N/m"),
@@ -285,7 +289,7 @@ def nanosurf_sets(data: bytes, name: str) -> tuple[list[tuple[dict[str, str], It
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
         raise cut_off(name, f"the header announces {sum(sizes)} bytes of data, {len(data) - mark - 2} are there")
     starts = mark + 2 + np.cumsum([0, *sizes])
-    known = known_from(header, _NANOSURF_KEYS)
+    known = known_from(header, NANOSURF_KEYS)
     warm = number_in(header.get("Cantilever temperature", ""))
     if warm is not None and -100.0 < warm[0] < 500.0:
         known["temperature_k"] = Known(
@@ -456,6 +460,8 @@ _IGOR_KEYS = {
     "InvOLS": ("deflection_nm_per_volt", "m/V"),
     "AmpInvOLS": ("nm_per_volt", "m/V"),
 }
+_IGOR_HEADER = 64
+"""Bytes in front of a wave of version 5, the only one with labels."""
 _IGOR_UNITS = {"amp": "m", "defl": "m", "zsnsr": "m", "raw": "m", "lvdt": "m", "phase": "deg", "phas": "deg"}
 
 
@@ -467,11 +473,7 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
     """
     if len(data) < 64 or _igor_points(data) > min(len(data), MOST_VALUES):
         raise cut_off(name, "the header announces more numbers than the file holds")
-    try:
-        package: Any = import_module("igor2.binarywave")
-    except ModuleNotFoundError:
-        install = "install it with: pip install 'afm-jax[instruments]'"
-        raise TableError(f".ibw files are read by the package igor2; {install}") from None
+    package = package_for("igor2.binarywave", "instruments", f"{name}: .ibw files")
     # of a damaged file it would log every number
     logging.getLogger("igor2").setLevel(logging.CRITICAL)
     with warnings.catch_warnings():
@@ -479,13 +481,36 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
         warnings.simplefilter("ignore", RuntimeWarning)
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
-    side = min(numbers.ndim - 1, 2)
-    names = wave["labels"][side] if 0 < side < len(wave["labels"]) else []
-    labels = [label.decode("latin-1") for label in names if label]
+    labels = _igor_labels(data, wave["bin_header"], min(numbers.ndim - 1, 2))
     note = bytes(wave["note"]).decode("latin-1").replace("\r", "\n")
     header = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in note.split("\n") if ":" in line)}
     known = known_from(header, _IGOR_KEYS, "note")
     return numbers, labels, header, known | _igor_free(header, known)
+
+
+def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
+    """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
+
+    What stands behind a text's NUL in its field is left over from earlier texts; a field without NUL goes on in the
+    next one.
+    """
+    sizes = [int(size) for size in header.get("dimLabelsSize", ())]
+    parts = [header.get(f"{part}Size", 0) for part in ("wfm", "formula", "note", "dataEUnits", "dimEUnits")]
+    start = _IGOR_HEADER + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
+    labels = [b""]
+    for place in range(start, start + sum(sizes[side : side + 1]), 32):
+        text, end, _ = data[place : place + 32].partition(b"\0")
+        labels[-1] += text
+        labels += [b""] if end else []
+    return [_decoded(label) or f"channel {number}" for number, label in enumerate(labels[1:-1], start=1)]
+
+
+def _decoded(text: bytes) -> str:
+    """Return a text of Igor, UTF-8 since version 7, as it can be printed."""
+    try:
+        return printable(text.decode())
+    except UnicodeDecodeError:
+        return printable(text.decode("latin-1"))
 
 
 def parse_igor(data: bytes, name: str) -> Recording:
@@ -545,9 +570,19 @@ def _igor_segments(header: dict[str, str], columns: dict[str, Any]) -> list[Segm
     return segments or [Segment(1, "", columns)]
 
 
+def gwyddion_objects(data: bytes, name: str) -> Mapping[str, Any]:
+    """Return the components of a Gwyddion file.
+
+    Raises:
+        TableError: if the package that reads it is missing; the line names the extra.
+    """
+    package = package_for("gwyfile.objects", "instruments", f"{name}: .gwy files")
+    return package.GwyObject.frombuffer(data[len(b"GWYP") :])
+
+
 def parse_gwyddion(data: bytes, name: str) -> Recording:
     """Read the graphs of a Gwyddion file: every curve is a channel over the height, which is the channel Z."""
-    content = read_objects(data, name)
+    content = gwyddion_objects(data, name)
     graphs = [value for key, value in sorted(content.items()) if "/graph/graph/" in key and "curves" in value]
     if not graphs:
         if any(key.endswith("/data") for key in content):

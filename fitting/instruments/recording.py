@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -197,6 +198,53 @@ def given_numbers(
 
 ASSUMED_RESONANCE = "assumed: on resonance, at the free frequency; else `drive_frequency_khz=...`"
 """Origin of a drive's frequency that nobody gave."""
+
+
+def package_for(module: str, extra: str, what: str) -> Any:
+    """Return the module of a package that reads some files and comes with one of this package's extras.
+
+    Raises:
+        TableError: if it is not installed; the line begins with `what` and says how to install it.
+    """
+    try:
+        return import_module(module)
+    except ModuleNotFoundError:
+        package = module.partition(".")[0]
+        raise TableError(
+            f"{what} are read by the package {package}; install it with: pip install 'afm-jax[{extra}]'"
+        ) from None
+
+
+_AMPLITUDE_MODES = re.compile(
+    r"\b(ac|am|tapping|dynamic|phase[ -]contrast|(intermittent|semi|non)[ -]?contact)\b", re.IGNORECASE
+)
+"""What instruments call amplitude modulation."""
+_OTHER_MODES = re.compile(
+    r"\b(pfm|dart|piezo\w*|contact|static|lateral|friction|force[ -](modulation|mapping|volume)|fm"
+    r"|frequency[ -]modulation|pll|stm|kpfm|skpm|efm|mfm|bimodal|dual|peak ?force|scanasyst|hopping|qi|qnm)\b",
+    re.IGNORECASE,
+)
+_MODE_KEYS = re.compile(r"((imaging|operating|operation|afm|feedback|scan)[ _-]?)?mode", re.IGNORECASE)
+_STRICT_KEYS = {"ImagingMode", "Op. mode"}
+"""Asylum's and NanoSurf's, which name amplitude modulation by the words above."""
+
+
+def refuse_other_modes(settings: Mapping[str, str], source: str) -> None:
+    """Check that a file, where it says in which mode it was recorded, says amplitude modulation (tapping).
+
+    Raises:
+        TableError: with the mode's name.
+    """
+    for key, value in settings.items():
+        name = re.split(r"::|[/:]", key)[-1].strip()
+        others = _AMPLITUDE_MODES.sub("", value)
+        strict = name in _STRICT_KEYS and others == value
+        bimodal = name == "DualACMode" and value.strip() not in {"", "0"}
+        if bimodal or strict or ((_MODE_KEYS.fullmatch(name) or name in _STRICT_KEYS) and _OTHER_MODES.search(others)):
+            raise TableError(
+                f"{source}: was recorded in the mode {printable(value)!r} ({printable(key)}), not in amplitude "
+                "modulation (tapping); its amplitude and phase tell no energy of a tap"
+            )
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A map as a person reads it: sections, and the files of --out, arrays for NumPy, Gwyddion and Zarr among them."""
+"""A map as a person reads it: sections, its picture, and the files of --out, arrays for NumPy, Zarr and Gwyddion."""
 
 import io
 from collections.abc import Sequence
@@ -6,31 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import png_of, svg_of
+from afm_jax.plots.picture_style import BLUE, DARK, label_axes, new_figure, png_of, svg_of
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import whole_folder, write_whole
-from fitting.instruments.gwyddion import images_as_bytes
 from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
-from fitting.tapping_curves.map_pictures import map_figure
-from fitting.tapping_curves.maps import TappingMap
+from fitting.tapping_curves.maps import ARRAYS, PixelState, TappingMap
 
-ARRAYS = ("energy", "energy_error", "virial", "virial_error", "state")
-
-
-def map_summary(result: TappingMap) -> str:
-    """Return a map as text: pixels, median energy and virial with the two kinds of errors, what was assumed."""
-    return text_of(map_report(result))
+_MOST = 1024
+"""Pixels a side of a picture."""
 
 
 def map_report(result: TappingMap) -> Report:
     """Return a map as sections: median energy and virial with the two kinds of errors, what is known, notes."""
-    counts, unit = result.counts, result.unit
+    counts, unit, numbers = result.counts, result.unit, result.to_dict()
     rows, columns = result.state.shape
     masked = [f"{count} {name}" for name, count in counts.items() if count and name != "used"]
     sections = []
     if counts["used"]:
-        numbers = result.to_dict()
         head = ["", f"2.5 % ({unit})", "median", "97.5 %", "error of a pixel", "error of all in common"]
         cells = [
             [
@@ -45,14 +39,10 @@ def map_report(result: TappingMap) -> Report:
         common = f"The common error of the energy comes of ({unit}, one standard error each): {', '.join(parts)}."
         table = Table("95 of 100 pixels lie between the first and the third number", head, cells)
         sections = [ReportSection("Energy and virial", [table], "Energy"), ReportSection("Errors", [Text(common)])]
-    known = [
-        [key, f"{one.value:.7g}" if not isinstance(one.value, str) else one.value, one.unit, one.origin]
-        for key, one in result.known.items()
-    ]
+    known = [[key, f"{one.value:.7g}", one.unit, one.origin] for key, one in result.known.items()]
     head = ["known", "value", "unit", "from"]
     sections.append(ReportSection("What is known", [Table("Of the instrument", head, known, words=head[2:])], "Known"))
-    if result.notes:
-        sections.append(ReportSection("Notes", [Bullets(result.notes, "Notes:")], "Notes"))
+    sections.append(ReportSection("Notes", [Bullets(result.notes, "Notes:")], "Notes"))
     return Report(
         title=f"Map {result.source}: {rows} x {columns} pixels, {counts['used']} used, "
         + (f"masked: {', '.join(masked)}" if masked else "none masked"),
@@ -63,13 +53,42 @@ def map_report(result: TappingMap) -> Report:
     )
 
 
+def map_figure(result: TappingMap) -> Figure:
+    """Return energy and virial over the image with colour bars, pixels out of range in grey, and their histograms."""
+    figure = new_figure(11.0, 8.0)
+    axes = figure.subplots(2, 2, height_ratios=(2.0, 1.0))
+    used = result.state == PixelState.USED
+    step = max(1, int(np.ceil(max(used.shape) / _MOST)))
+    size = result.size_m
+    extent = None if size is None else (0.0, 1e6 * size[1], 1e6 * size[0], 0.0)
+    where = "um" if size is not None else "pixel"
+    for (top, bottom), name, colours in zip(axes.T, ("energy", "virial"), ("viridis", "coolwarm"), strict=True):
+        image, values = getattr(result, name), getattr(result, name)[used]
+        low, high = np.percentile(values, (0.5, 99.5)) if values.size else (0.0, 1.0)
+        if name == "virial":
+            low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+        top.set_facecolor("#d0d0d0")
+        colour = {"cmap": colours, "vmin": low, "vmax": high, "interpolation": "nearest"}
+        shown = top.imshow(image[::step, ::step], extent=extent, **colour)
+        label = f"{'energy of a tap' if name == 'energy' else name} ({result.unit})"
+        figure.colorbar(shown, ax=top, label=label)
+        label_axes(top, x=f"x ({where})", y=f"y ({where})")
+        if values.size:
+            bottom.hist(values, bins=80, range=(low, high) if high > low else None, color=BLUE)
+            bottom.axvline(float(np.median(values)), color=DARK)
+        label_axes(bottom, x=label, y="pixels")
+    common = f"; common error at the median {result.energy_common_error:.2g} {result.unit}" if used.any() else ""
+    figure.suptitle(f"{used.sum()} pixels, {(~used).sum()} masked (grey){common}", fontsize=11)
+    return figure
+
+
 def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[Path]:
     """Write page, picture, JSON, text and the arrays in the formats wanted, and return their paths.
 
     Args:
         result: the map.
         folder: that is there already.
-        formats: of "npz", "gwy" and "zarr".
+        formats: of "npz", "gsf" and "zarr".
     """
     payload = {"format": "afm-jax tapping-map", "format_version": 1, **result.to_dict()}
     report, figure = map_report(result), map_figure(result)
@@ -85,30 +104,31 @@ def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[
     }
     if "npz" in formats:
         packed = io.BytesIO()
-        np.savez(packed, **{name: getattr(result, name) for name in ARRAYS}, unit=np.array(result.unit))
+        arrays = {name: getattr(result, name) for name in (*ARRAYS, "state")}
+        np.savez(packed, allow_pickle=False, **arrays, unit=np.array(result.unit))
         contents["map.npz"] = packed.getvalue()
-    if "gwy" in formats:
-        contents["map.gwy"] = _gwyddion(result)
-    written = []
+    if "gsf" in formats:
+        contents |= {f"map_{name}.gsf": _simple_field(result, name) for name in ARRAYS}
     for name, content in contents.items():
         write_whole(folder / name, content, within=folder)
-        written.append(folder / name)
     if "zarr" in formats:
         _write_zarr(result, folder / "map.zarr")
-        written.append(folder / "map.zarr")
-    return written
+    return [folder / name for name in (*contents, *(["map.zarr"] if "zarr" in formats else []))]
 
 
-def _gwyddion(result: TappingMap) -> bytes:
-    """Return the map as a Gwyddion file, in J or m^2."""
-    unit, size = "J" if result.unit == "aJ" else "m^2", 1e-18
-    titles = {"energy": "Energy of a tap", "energy_error": "Error of the energy"}
-    titles |= {"virial": "Virial", "virial_error": "Error of the virial"}
-    images = {title: (getattr(result, name) * size, unit) for name, title in titles.items()}
+def _simple_field(result: TappingMap, name: str) -> bytes:
+    """Return an array as a file of Gwyddion's, a Gwyddion Simple Field, in J or m^2; NaN are masked there.
+
+    After a head of lines, filled with NUL to a multiple of four bytes, stand numbers of 32 bits, little-endian, row by
+    row (Gwyddion's user guide, "Gwyddion simple field files").
+    """
     rows, columns = result.state.shape
-    if result.size_m is None:
-        return images_as_bytes(images, (float(rows), float(columns)), "")
-    return images_as_bytes(images, result.size_m, "m")
+    title, unit = name.replace("_", " "), "J" if result.unit == "aJ" else "m^2"
+    lines = ["Gwyddion Simple Field 1.0", f"XRes = {columns}", f"YRes = {rows}", f"Title = {title}", f"ZUnits = {unit}"]
+    if result.size_m is not None:
+        lines += [f"XReal = {result.size_m[1]!r}", f"YReal = {result.size_m[0]!r}", "XYUnits = m"]
+    head = "\n".join([*lines, ""]).encode()
+    return head + b"\0" * (4 - len(head) % 4) + (1e-18 * getattr(result, name)).astype("<f4").tobytes()
 
 
 def _write_zarr(result: TappingMap, path: Path) -> None:
@@ -116,7 +136,7 @@ def _write_zarr(result: TappingMap, path: Path) -> None:
 
     with whole_folder(path) as fresh:
         group = zarr.open_group(str(fresh), mode="w")
-        for name in ARRAYS:
+        for name in (*ARRAYS, "state"):
             array = group.create_array(name, data=getattr(result, name), dimension_names=("rows", "columns"))
             array.attrs["units"] = "" if name == "state" else result.unit
         group.attrs["source"], group.attrs["unit"] = result.source, result.unit

@@ -1,12 +1,7 @@
 """Maps: energy of a tap and virial in every pixel of an image of amplitude and phase, with their errors.
 
-At one drive energy and virial are quadratic forms of the reading and the free motion: with A the amplitude, A0 the free
-one and d how far the lag is behind that of the free tip,
-
-    E = e0 A0^2 + e1 A^2 + A A0 (e2 cos d + e3 sin d),
-
-the virial likewise. The coefficients are those of `energies`, found from a few rows; an image of a million pixels is
-then a sum of four terms, and so is what it changes by with every number of the instrument.
+Pixels are rows of `energies`. The free tip must be recorded with the image: nothing else tells the zero of the phase,
+on which every energy hangs.
 """
 
 import enum
@@ -21,19 +16,38 @@ from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
-from fitting.instruments.lag import free_lag_deg, sense_of
+from fitting.instruments.lag import free_lag_deg
 from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve
-from fitting.tapping_curves.energy import energies
+from fitting.tapping_curves.energy import energies, noise_of, virial_noise_of
 
 _BEYOND = 3.0
 """Standard errors beyond which a pixel is out of range."""
+_BAND = 1.96
+"""Standard errors of half a band of 95 %."""
 _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 """Relative standard errors of what is given without one."""
-_USUAL_ZERO_DEG = (0.2, 1.0)
-"""Standard error of the free tip's phase where it is given without one, and where it is not given."""
+_USUAL_ZERO_DEG = 0.2
+"""Standard error of the free tip's phase where it is given without one."""
+_NEAR_DEG, _READS_DEG = 20.0, 2.0
+"""How near to the opposite of its lag the free tip must read for a phase that leads to be the likelier one; how near to
+its lag for the instrument to have no zero of its own."""
+_BLOCK = 1 << 16
+"""Pixels that are computed at once, for the memory."""
+_UNITS = {
+    "free_frequency_khz": "kHz",
+    "drive_frequency_khz": "kHz",
+    "quality_factor": "",
+    "spring_constant_n_per_m": "N/m",
+    "free_amplitude_nm": "nm",
+    "free_phase_deg": "deg",
+    "nm_per_volt": "nm/V",
+    "tip_calibration": "",
+}
+_NEEDED = {"free_frequency_khz": "KHZ", "quality_factor": "Q", "free_amplitude_nm": "NM", "free_phase_deg": "DEGREES"}
+ARRAYS = ("energy", "energy_error", "virial", "virial_error")
 
 
 class PixelState(enum.IntEnum):
@@ -45,7 +59,7 @@ class PixelState(enum.IntEnum):
     NOT_MEASURED = 3
 
 
-@public_result(picture="fitting.tapping_curves.map_pictures:map_figure", state=PixelState)
+@public_result(picture="fitting.tapping_curves.map_report:map_figure", state=PixelState)
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TappingMap(Result):
     """Energy and virial of a tap in every pixel, NaN where a pixel is out of range or nothing was measured.
@@ -60,8 +74,9 @@ class TappingMap(Result):
         virial_error: standard errors of the virials from each pixel's own noise.
         state: a `PixelState` for each pixel.
         energy_common_error: standard error of the energy that all pixels have in common, at the median energy.
-        virial_common_error: standard error of the virial that all pixels have in common, at the median pixel.
+        virial_common_error: standard error of the virial that all pixels have in common, at the median energy.
         common: parts of `energy_common_error` by what they come from, with their signs.
+        reasons: why the energies must not be used; empty if they may.
         size_m: height and width of the image in m, or None.
         known: what was taken for the instrument, with where it comes from.
         notes: what was assumed.
@@ -78,84 +93,40 @@ class TappingMap(Result):
     energy_common_error: float
     virial_common_error: float
     common: dict[str, float]
+    reasons: tuple[str, ...] = ()
     size_m: tuple[float, float] | None = None
     known: dict[str, Known] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @property
     def valid(self) -> bool:
-        """Whether at least half of the pixels that were measured are in range."""
-        counts = self.counts
-        return counts["used"] > 0 and 2 * counts["used"] >= self.state.size - counts["not measured"]
-
-    @property
-    def reasons(self) -> list[str]:
-        """Why it is not valid, empty if it is."""
-        if self.valid:
-            return []
-        masked = {name: count for name, count in self.counts.items() if count and name != "used"}
-        said = ", ".join(f"{count} {name}" for name, count in masked.items())
-        why = "free amplitude, its phase, quality factor or units do not belong to this image"
-        return [f"only {self.counts['used']} of {self.state.size} pixels are in range ({said}): {why}"]
+        """Whether the energies may be used."""
+        return not self.reasons
 
     @property
     def counts(self) -> dict[str, int]:
         """How many pixels are in each state, by its name in words."""
-        numbers = np.bincount(self.state.ravel(), minlength=len(PixelState)).tolist()
-        return {state.name.lower().replace("_", " "): numbers[state] for state in PixelState}
-
-    def median(self, name: str) -> float | None:
-        """Return the median of an array over the pixels in range, None without any."""
-        array = getattr(self, name)[self.state == PixelState.USED]
-        return float(np.median(array)) if array.size else None
+        return {state.name.lower().replace("_", " "): int(np.sum(self.state == state)) for state in PixelState}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all but the arrays, and of these the median and the ends of 95 % of the pixels."""
+        """Return all but the arrays, and of these the median and the ends of 95 % of the pixels in range."""
         used = self.state == PixelState.USED
-        arrays = {}
-        for name in ("energy", "energy_error", "virial", "virial_error"):
-            values = getattr(self, name)[used]
-            low, middle, high = np.percentile(values, (2.5, 50.0, 97.5)).tolist() if values.size else (None,) * 3
-            arrays[name] = {"median": middle, "percentile_2_5": low, "percentile_97_5": high}
-        own = {
-            "valid": self.valid,
-            "reasons": self.reasons,
-            "source": self.source,
-            "drive": self.drive,
-            "unit": self.unit,
-            "pixels": {"rows": self.state.shape[0], "columns": self.state.shape[1], **self.counts},
-            **arrays,
-            "energy_common_error": self.energy_common_error if used.any() else None,
-            "virial_common_error": self.virial_common_error if used.any() else None,
-            "common": self.common if used.any() else {},
-            "size_m": self.size_m,
-            "known": {key: vars(one) for key, one in self.known.items()},
-            "notes": self.notes,
+        ends = {"percentile_2_5": 2.5, "median": 50.0, "percentile_97_5": 97.5}
+        arrays = {
+            name: {end: np.percentile(getattr(self, name)[used], p) if used.any() else None for end, p in ends.items()}
+            for name in ARRAYS
         }
-        return plain(own)
-
-
-class _ImageReadings(NamedTuple):
-    """Amplitude and free amplitude in nm, degrees behind the free tip, and the standard errors of a pixel."""
-
-    amplitude_nm: Float[np.ndarray, "rows columns"]
-    free_amplitude_nm: float | Float[np.ndarray, "rows columns"]
-    behind_deg: Float[np.ndarray, "rows columns"]
-    amplitude_error_nm: float
-    phase_error_deg: float
-
-
-class _Forms(NamedTuple):
-    """Coefficients of A0^2, A^2, A A0 cos d and A A0 sin d."""
-
-    energy: Float[np.ndarray, " four"]
-    virial: Float[np.ndarray, " four"]
+        own = {name: value for name, value in vars(self).items() if name not in {*ARRAYS, "state"}}
+        pixels = {"rows": used.shape[0], "columns": used.shape[1], **self.counts}
+        known = {key: vars(one) for key, one in self.known.items()}
+        return plain(own | arrays | {"valid": self.valid, "pixels": pixels, "known": known})
 
 
 @checked
 def tapping_map(
     images: AmplitudeAndPhase | str | Path | tuple[np.ndarray, np.ndarray],
     *,
+    columns: str = "",
     drive: Literal["base", "force"] = "base",
     amplitude_error_nm: float | None = None,
     phase_error_deg: float | None = None,
@@ -164,12 +135,13 @@ def tapping_map(
     """Return energy and virial of a tap in every pixel of an image of amplitude and phase.
 
     Args:
-        images: from `read_images`, a file for it, or the arrays of amplitude in nm and phase in degrees.
+        images: a file for `read_images`, what that returned, or the arrays of amplitude in nm and phase in degrees.
+        columns: which channel is which, as for `read_images`, where `images` does not come from there.
         drive: what shakes the cantilever.
         amplitude_error_nm: standard error of every pixel's amplitude; else from the roughness along its lines.
         phase_error_deg: of every pixel's phase; else likewise.
         given: instead of the file's, each a number or a pair with its standard error: free_frequency_khz,
-            quality_factor, spring_constant_n_per_m (left out: energies over it, in nm^2), free_amplitude_nm,
+            quality_factor, spring_constant_n_per_m (left out: energies over it, in nm^2), free_amplitude_nm and
             free_phase_deg (what the instrument reads with the tip free), drive_frequency_khz (left out: on resonance),
             nm_per_volt, tip_calibration.
 
@@ -177,60 +149,73 @@ def tapping_map(
         TableError: if the images do not fit, or something is missing that no energy can do without.
         TypeError: if an argument is of another kind.
     """
-    if isinstance(images, tuple):
-        arrays = [np.asarray(array, dtype=float) for array in images]
-        if len(arrays) != 2 or arrays[0].shape != arrays[1].shape or arrays[0].ndim != 2:
-            raise TableError("amplitude and phase must be two arrays (rows, columns) of one shape")
-        images = AmplitudeAndPhase("arrays", arrays[0], "nm", arrays[1])
-    elif not isinstance(images, AmplitudeAndPhase):
-        images = read_images(images)
-    notes = list(images.notes)
+    if not isinstance(images, AmplitudeAndPhase):
+        images = read_images(images, columns=columns)
+    notes = [images.note]
     known = _known(images, given, notes)
-    amplitude, free = _in_nm(images, known)
-    ratio = _value(known, "drive_frequency_khz") / _value(known, "free_frequency_khz")
-    free_lag = float(free_lag_deg(drive, ratio, _value(known, "quality_factor")))
-    behind = _behind_free(images, known, free_lag, notes)
-    errors = (
-        _roughness(amplitude) if amplitude_error_nm is None else amplitude_error_nm,
-        _roughness(behind) if phase_error_deg is None else phase_error_deg,
-    )
+    value = {key: float(one.value) for key, one in known.items()} | {"harmonics_factor": HARMONICS_FACTOR.value}
+    amplitude = images.amplitude * (value["nm_per_volt"] if images.in_volts else 1.0)
+    behind = _half_turn(images.phase_deg - value["free_phase_deg"])
+    measured = np.isfinite(amplitude) & (amplitude > 0.0) & np.isfinite(behind)
+    if not measured.any():
+        raise TableError(f"{images.source}: no pixel has both an amplitude above 0 and a phase")
+    noise = [
+        _roughness(amplitude, images.source) if amplitude_error_nm is None else amplitude_error_nm,
+        _roughness(behind, images.source) if phase_error_deg is None else phase_error_deg,
+    ]
     if amplitude_error_nm is None or phase_error_deg is None:
         notes.append(
-            f"Noise: {errors[0]:.3g} nm and {errors[1]:.3g} degrees a pixel, from the roughness along the lines "
+            f"Noise: {noise[0]:.3g} nm and {noise[1]:.3g} degrees a pixel, from the roughness along the lines "
             "(`amplitude_error_nm=...`, `phase_error_deg=...`)."
         )
-    return _mapped(images, drive, known, _ImageReadings(amplitude, free, behind, *errors), notes)
+    senses = {
+        sense: _taps(drive, value, _errors(known, value), amplitude[measured], sense * behind[measured], noise)
+        for sense in ([images.sense] if images.sense else [1.0, -1.0])
+    }
+    sense, undecided = _sense(senses, value["free_phase_deg"], _free_lag(drive, value), notes)
+    taps, unit = senses[sense], "aJ" if _spring_is_known(known) else "nm^2"
+    state = np.full(amplitude.shape, PixelState.NOT_MEASURED, dtype=np.int8)
+    state[measured] = np.where(
+        amplitude[measured] > value["free_amplitude_nm"] + _BEYOND * noise[0],
+        PixelState.AMPLITUDE_ABOVE_FREE,
+        np.where(taps.values[0] < -_BEYOND * taps.total_errors, PixelState.ENERGY_BELOW_ZERO, PixelState.USED),
+    )
+    arrays = np.full((4, *amplitude.shape), np.nan)
+    arrays[:, measured] = np.stack([taps.values[0], taps.errors[0], taps.values[1], taps.errors[1]])
+    arrays[:, state != PixelState.USED] = np.nan
+    return TappingMap(
+        source=images.source,
+        drive=drive,
+        unit=unit,
+        **dict(zip(ARRAYS, arrays, strict=True)),
+        state=state,
+        energy_common_error=taps.common_error,
+        virial_common_error=float(np.linalg.norm([change[1] for change in taps.common.values()])),
+        common={name: change[0] for name, change in taps.common.items()},
+        reasons=tuple(filter(None, [undecided, *_reasons(taps, state, unit)])),
+        size_m=images.size_m,
+        known=known,
+        notes=tuple(notes),
+    )
 
 
 def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -> dict[str, Known]:
-    """Return what is known of the instrument: as given, else of the file's header.
+    """Return what is known of the instrument: as given, else as the file says it.
 
     Raises:
         TableError: if something is missing.
     """
-    units = {
-        "free_frequency_khz": "kHz",
-        "drive_frequency_khz": "kHz",
-        "quality_factor": "",
-        "spring_constant_n_per_m": "N/m",
-        "free_amplitude_nm": "nm",
-        "free_phase_deg": "deg",
-        "nm_per_volt": "nm/V",
-        "tip_calibration": "",
-    }
-    known = {key: one for key, one in images.known.items() if key in units}
-    known |= given_numbers(given, units, any_sign=("free_phase_deg",))
-    if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
+    known = {key: one for key, one in images.known.items() if key in _UNITS}
+    known |= given_numbers(given, _UNITS, any_sign=("free_phase_deg",))
+    needed = _NEEDED | ({"nm_per_volt": "NM"} if images.in_volts else {})
+    missing = " ".join(f"`{key}={unit}`" for key, unit in needed.items() if key not in known)
+    if missing:
+        free = "free_amplitude_nm" in missing or "free_phase_deg" in missing
+        record = "; record amplitude and phase of the free tip, off the sample and at the same drive" if free else ""
+        raise TableError(f"{images.source}: the file does not say all that an energy needs; give {missing}{record}")
+    if "drive_frequency_khz" not in known:
         known["drive_frequency_khz"] = Known(known["free_frequency_khz"].value, "kHz", ASSUMED_RESONANCE)
         notes.append(f"Drive frequency: {ASSUMED_RESONANCE}.")
-    needed = {"free_frequency_khz": "KHZ", "quality_factor": "Q"}
-    if images.free_amplitude is None:
-        needed["free_amplitude_nm"] = "NM"
-    if images.amplitude_unit == "V":
-        needed["nm_per_volt"] = "NM"
-    missing = [f"`{key}={unit}`" for key, unit in needed.items() if key not in known]
-    if missing:
-        raise TableError(f"{images.source}: the file does not say all that an energy needs; give {' '.join(missing)}")
     if "spring_constant_n_per_m" not in known:
         known["spring_constant_n_per_m"] = Known(1.0, "N/m", "not known: energies are over it, in nm^2")
         notes.append("The spring constant is not known: energies and virials are over it, in nm^2 (1 aJ over 1 N/m).")
@@ -238,224 +223,190 @@ def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -
     return known
 
 
-def _value(known: dict[str, Known], key: str) -> float:
-    return float(known[key].value)
+def _spring_is_known(known: dict[str, Known]) -> bool:
+    return not known["spring_constant_n_per_m"].origin.startswith("not known")
 
 
-def _in_nm(
-    images: AmplitudeAndPhase, known: dict[str, Known]
-) -> tuple[Float[np.ndarray, "rows columns"], float | Float[np.ndarray, "rows columns"]]:
-    """Return amplitude and free amplitude in nm."""
-    scale = _value(known, "nm_per_volt") if images.amplitude_unit == "V" else 1.0
-    amplitude = images.amplitude * scale
-    if "free_amplitude_nm" in known and not known["free_amplitude_nm"].origin.startswith(("note", "header")):
-        return amplitude, _value(known, "free_amplitude_nm")
-    if images.free_amplitude is not None:
-        return amplitude, images.free_amplitude * scale
-    return amplitude, _value(known, "free_amplitude_nm")
+def _errors(known: dict[str, Known], value: dict[str, float]) -> dict[str, float]:
+    """Return the standard errors of what all pixels have in common."""
+    errors = {key: known[key].error or usual * value[key] for key, usual in _USUAL.items()}
+    errors |= {"free_phase_deg": known["free_phase_deg"].error or _USUAL_ZERO_DEG}
+    errors |= {"harmonics_factor": HARMONICS_FACTOR.error}
+    if not _spring_is_known(known):
+        del errors["spring_constant_n_per_m"]
+    scale = known.get("nm_per_volt")
+    if scale is not None and scale.error:
+        # free amplitude and amplitudes go with it, as with the calibration
+        errors["tip_calibration"] = float(np.hypot(errors["tip_calibration"], scale.error / float(scale.value)))
+    return errors
 
 
-def _behind_free(
-    images: AmplitudeAndPhase, known: dict[str, Known], free_lag: float, notes: list[str]
-) -> Float[np.ndarray, "rows columns"]:
-    """Return how far each pixel lags behind the free tip, in degrees."""
-    if images.free_phase_deg is not None:
-        sense = sense_of(float(np.nanmedian(images.free_phase_deg)), free_lag)
-        notes += [sense.note] if sense.note else []
-        return sense.sign * (images.phase_deg - images.free_phase_deg)
-    if "free_phase_deg" in known:
-        reading = _value(known, "free_phase_deg")
-    else:
-        middle = np.nanmedian(images.phase_deg)
-        reading = -free_lag if -180.0 < middle < 0.0 else free_lag
-        notes.append(
-            f"Phase: the free tip is taken to read {reading:.1f} +- {_USUAL_ZERO_DEG[1]:g} deg; else "
-            "`free_phase_deg=...`."
-        )
-        origin = f"assumed: the free tip reads {'the opposite of ' if reading < 0.0 else ''}its lag"
-        known["free_phase_deg"] = Known(reading, "deg", origin, _USUAL_ZERO_DEG[1])
-    sense = sense_of(reading, free_lag)
-    notes += [sense.note] if sense.note else []
-    return sense.sign * (images.phase_deg - reading)
+def _half_turn(degrees: Any) -> Any:
+    """Return angles between -180 and 180 degrees."""
+    return (degrees + 180.0) % 360.0 - 180.0
 
 
-def _roughness(image: Float[np.ndarray, "rows columns"]) -> float:
-    """Return the noise of a pixel: the spread of second differences along the lines, robust against edges."""
+def _free_lag(drive: str, value: dict[str, float]) -> float:
+    """Return the lag of the free tip in degrees."""
+    ratio = value["drive_frequency_khz"] / value["free_frequency_khz"]
+    return float(free_lag_deg(drive, ratio, value["quality_factor"]))
+
+
+def _roughness(image: Float[np.ndarray, "rows columns"], source: str) -> float:
+    """Return the noise of a pixel: the spread of second differences along the lines, robust against edges.
+
+    Raises:
+        TableError: if no three pixels stand side by side.
+    """
     second = image[:, :-2] - 2.0 * image[:, 1:-1] + image[:, 2:]
     second = second[np.isfinite(second)]
-    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0)) if second.size else 0.0
+    if not second.size:
+        numbers = "`amplitude_error_nm=NM` and `phase_error_deg=DEGREES`"
+        raise TableError(f"{source}: no three pixels stand side by side to read the noise off; give {numbers}")
+    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
 
 
-_TRIALS = 24
-
-
-def _forms(drive: str, frequency: float, instrument: Instrument, spring: float, calibration: float) -> _Forms:
-    """Return the coefficients of energy and virial, from `energies` of a few rows with a free amplitude of 1 nm."""
-    random = np.random.default_rng(0)
-    amplitude, behind = random.uniform(0.2, 1.0, _TRIALS), random.uniform(-60.0, 60.0, _TRIALS)
-    ones, zeros = np.ones(_TRIALS), np.zeros(_TRIALS)
-    lag = free_lag_deg(drive, frequency / instrument.free_frequency_khz, instrument.quality_factor)
-    curve = TappingCurve(
-        source="",
-        drive="base" if drive == "base" else "force",
-        offset_nm=zeros,
-        amplitude_nm=amplitude,
-        amplitude_error_nm=zeros,
-        lag_deg=lag + behind,
-        lag_error_deg=zeros,
-        free_amplitude_nm=ones,
-        drive_frequency_khz=frequency * ones,
-        retract=zeros > 0.0,
-        free_frequency_khz=Given(instrument.free_frequency_khz),
-        quality_factor=Given(instrument.quality_factor),
-        spring_constant_n_per_m=Given(spring),
-        tip_calibration=Given(calibration),
-        lines=np.arange(_TRIALS),
-    )
-    found = energies(curve, instrument)
-    angle = np.deg2rad(behind)
-    basis = np.stack([ones, amplitude**2, amplitude * np.cos(angle), amplitude * np.sin(angle)], axis=1)
-    solved = np.linalg.lstsq(basis, np.stack([found.energy_aj, found.virial_aj], axis=1), rcond=None)[0]
-    return _Forms(solved[:, 0], solved[:, 1])
-
-
-class _Pixels(NamedTuple):
-    """Energy or virial of every pixel.
+class _Taps(NamedTuple):
+    """Energies and virials of pixels for one sense of the phase.
 
     Attributes:
-        values: of the pixels.
-        errors: standard error of each pixel, its own.
-        common: by how much each changes with one standard error of what all pixels share, by its name.
+        values: energies and virials.
+        errors: their standard errors from each pixel's own noise.
+        median: place of the median energy.
+        common: how energy and virial there change with one standard error of each number that all pixels share.
     """
 
-    values: Float[np.ndarray, "rows columns"]
-    errors: Float[np.ndarray, "rows columns"]
-    common: dict[str, Float[np.ndarray, "rows columns"]]
+    values: Float[np.ndarray, "2 pixels"]
+    errors: Float[np.ndarray, "2 pixels"]
+    median: int
+    common: dict[str, list[float]]
+
+    @property
+    def energy(self) -> float:
+        """The median energy."""
+        return float(self.values[0, self.median])
+
+    @property
+    def common_error(self) -> float:
+        """The standard error of the median energy that all pixels have in common."""
+        return float(np.linalg.norm([change[0] for change in self.common.values()]))
+
+    @property
+    def total_errors(self) -> Float[np.ndarray, " pixels"]:
+        """Standard errors of the energies, own noise and what all have in common together."""
+        return np.hypot(self.errors[0], self.common_error)
+
+    @property
+    def possible(self) -> bool:
+        """Whether the median energy is not below zero beyond its errors."""
+        return self.energy + _BAND * self.common_error >= 0.0
 
 
-def _pixels(
-    form: Float[np.ndarray, " four"],
-    changes: dict[str, Float[np.ndarray, " four"]],
-    readings: _ImageReadings,
-    known: dict[str, Known],
-) -> _Pixels:
-    """Return energy or virial of every pixel.
+def _taps(
+    drive: Literal["base", "force"],
+    value: dict[str, float],
+    errors: dict[str, float],
+    amplitude: Float[np.ndarray, " pixels"],
+    behind: Float[np.ndarray, " pixels"],
+    noise: list[float],
+) -> _Taps:
+    """Return what pixels mean that lag behind the free tip by so many degrees."""
+    blocks = [slice(first, first + _BLOCK) for first in range(0, len(amplitude), _BLOCK)]
+    parts = [_of_rows(drive, value, amplitude[block], behind[block], noise) for block in blocks]
+    values, own = np.concatenate(parts, axis=2)
+    median = int(np.argsort(values[0])[(len(amplitude) - 1) // 2])
+    common = {}
+    for name, error in errors.items():
+        turned = behind[[median]] - (error if name == "free_phase_deg" else 0.0)
+        changed = _of_rows(drive, value | {name: value[name] + error}, amplitude[[median]], turned, noise)
+        common[name] = (changed[0, :, 0] - values[:, median]).tolist()
+    return _Taps(values, own, median, common)
+
+
+def _of_rows(
+    drive: Literal["base", "force"],
+    value: dict[str, float],
+    amplitude: Float[np.ndarray, " pixels"],
+    behind: Float[np.ndarray, " pixels"],
+    noise: list[float],
+) -> Float[np.ndarray, "2 2 pixels"]:
+    """Return energies and virials of pixels and their errors from noise, as those of rows of a tapping curve."""
+    ones, f0, q = np.ones(len(amplitude)), value["free_frequency_khz"], value["quality_factor"]
+    curve = TappingCurve(
+        source="",
+        drive=drive,
+        offset_nm=ones,
+        amplitude_nm=amplitude,
+        amplitude_error_nm=noise[0] * ones,
+        lag_deg=_free_lag(drive, value) + behind,
+        lag_error_deg=noise[1] * ones,
+        free_amplitude_nm=value["free_amplitude_nm"] * ones,
+        drive_frequency_khz=value["drive_frequency_khz"] * ones,
+        retract=ones < 0.0,
+        free_frequency_khz=Given(f0),
+        quality_factor=Given(q),
+        spring_constant_n_per_m=Given(value["spring_constant_n_per_m"]),
+        tip_calibration=Given(value["tip_calibration"]),
+        lines=np.arange(len(amplitude)),
+    )
+    found = energies(curve, Instrument(f0, q, harmonics_factor=value["harmonics_factor"]))
+    return np.array([[found.energy_aj, found.virial_aj], [noise_of(curve, found), virial_noise_of(curve, found)]])
+
+
+def _sense(senses: dict[float, _Taps], reading: float, lag: float, notes: list[str]) -> tuple[float, str]:
+    """Return the sense of the phase, 1 where it grows with the lag and -1 where with the lead, and why it is undecided.
+
+    No sample gives energy: a sense that makes the median energy negative is wrong. On resonance both make it the same.
+    Elsewhere a free tip that reads its lag, or the opposite, decides.
 
     Args:
-        form: its coefficients.
-        changes: of the coefficients with one standard error of each number of the instrument.
-        readings: of the image.
-        known: of the instrument.
+        senses: what the pixels mean for each sense that is possible; a single one was stated.
+        reading: of the free tip, in degrees.
+        lag: of the free tip, in degrees.
+        notes: get what was decided or assumed.
     """
-    amplitude, free, behind, *errors = readings
-    zero = known.get("free_phase_deg", Known(0.0, "deg", "", _USUAL_ZERO_DEG[0])).error or _USUAL_ZERO_DEG[0]
-    angle = np.deg2rad(behind)
-    across, along = amplitude * free * np.cos(angle), amplitude * free * np.sin(angle)
-    basis = (np.square(free), amplitude**2, across, along)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        by_amplitude = 2.0 * form[1] * amplitude + (form[2] * across + form[3] * along) / amplitude
-    by_lag = (form[3] * across - form[2] * along) * (np.pi / 180.0)
-    by_free = 2.0 * form[0] * basis[0] + _sum(form[2:], basis[2:])
-    common = {"free_amplitude": _error(known, "free_amplitude_nm") * by_free, "free_phase": -zero * by_lag}
-    common |= {source: _sum(change, basis) for source, change in changes.items()}
-    return _Pixels(_sum(form, basis), np.hypot(by_amplitude * errors[0], by_lag * errors[1]), common)
+    if len(senses) == 1:
+        return next(iter(senses)), ""
+    words = {1.0: "grows with the lag", -1.0: "grows with the lead"}
+    off = {sense: abs(_half_turn(reading - sense * lag)) for sense in senses}
+    likelier = -1.0 if off[-1.0] < _NEAR_DEG < off[1.0] else 1.0
+    taps, other = senses[likelier], senses[-likelier]
+    state = 'say `columns="phase_lag_deg=CHANNEL:1"` where it grows with the lag, -1 with the lead'
+    if taps.possible != other.possible:
+        likelier = likelier if taps.possible else -likelier
+        notes.append(f"Sense: the phase {words[likelier]}; the other way energies would be below zero.")
+    elif abs(taps.energy - other.energy) <= min(taps.common_error, other.common_error):
+        notes.append(
+            f"Sense: assumed: the phase {words[likelier]}. The energy hardly hangs on it, but the sign of the virial "
+            f"does, attractive or repulsive; {state}."
+        )
+    elif off[likelier] < _READS_DEG and off[-likelier] > 3.0 * _READS_DEG:
+        notes.append(f"Sense: the phase {words[likelier]}; the free tip reads {reading:.1f} deg, its lag is {lag:.1f}.")
+    elif taps.possible:
+        both = f"{senses[1.0].energy:.3g} where it grows with the lag, {senses[-1.0].energy:.3g} where with the lead"
+        return likelier, f"the sense of the phase is not known, and the median energy hangs on it ({both}); {state}"
+    return likelier, ""
 
 
-def _states(readings: _ImageReadings, energy: _Pixels) -> Int[np.ndarray, "rows columns"]:
-    """Return what became of each pixel, a `PixelState`."""
-    amplitude, free = readings.amplitude_nm, readings.free_amplitude_nm
-    state = np.zeros(amplitude.shape, dtype=np.int8)
-    total = np.sqrt(energy.errors**2 + sum(part**2 for part in energy.common.values()))
-    with np.errstate(invalid="ignore"):
-        state[energy.values < -_BEYOND * total] = PixelState.ENERGY_BELOW_ZERO
-        state[amplitude > free + _BEYOND * readings.amplitude_error_nm] = PixelState.AMPLITUDE_ABOVE_FREE
-    state[~(np.isfinite(energy.values) & (amplitude > 0.0))] = PixelState.NOT_MEASURED
-    return state
-
-
-def _mapped(
-    images: AmplitudeAndPhase,
-    drive: str,
-    known: dict[str, Known],
-    readings: _ImageReadings,
-    notes: list[str],
-) -> TappingMap:
-    """Return the map of readings."""
-    frequency = _value(known, "drive_frequency_khz")
-    instrument = Instrument(_value(known, "free_frequency_khz"), _value(known, "quality_factor"))
-    spring, calibration = _value(known, "spring_constant_n_per_m"), _value(known, "tip_calibration")
-    forms = _forms(drive, frequency, instrument, spring, calibration)
-    sources = _sources(drive, frequency, instrument, spring, calibration, known, forms)
-    energy, virial = (
-        _pixels(form, {source: change[i] for source, change in sources.items()}, readings, known)
-        for i, form in enumerate(forms)
-    )
-    state = _states(readings, energy)
-    used = state == PixelState.USED
-    pixel = _median_pixel(energy.values, used)
-    at, at_virial = ({name: float(part[pixel]) for name, part in one.common.items()} for one in (energy, virial))
-    return TappingMap(
-        source=images.source,
-        drive=drive,
-        unit="nm^2" if known["spring_constant_n_per_m"].origin.startswith("not known") else "aJ",
-        energy=np.where(used, energy.values, np.nan),
-        energy_error=np.where(used, energy.errors, np.nan),
-        virial=np.where(used, virial.values, np.nan),
-        virial_error=np.where(used, virial.errors, np.nan),
-        state=state,
-        energy_common_error=float(np.linalg.norm(list(at.values()))),
-        virial_common_error=float(np.linalg.norm(list(at_virial.values()))),
-        common=at,
-        size_m=images.size_m,
-        known=known,
-        notes=tuple(notes),
-    )
-
-
-def _sum(form: Float[np.ndarray, " some"], basis: tuple[Any, ...]) -> Any:
-    return sum(float(factor) * part for factor, part in zip(form, basis, strict=True))
-
-
-def _error(known: dict[str, Known], key: str) -> float:
-    """Return the relative standard error of a number, the usual one where none is given."""
-    one = known.get(key)
-    return one.error / float(one.value) if one is not None and one.error else _USUAL[key]
-
-
-def _sources(
-    drive: str,
-    frequency: float,
-    instrument: Instrument,
-    spring: float,
-    calibration: float,
-    known: dict[str, Known],
-    forms: _Forms,
-) -> dict[str, _Forms]:
-    """Return how the forms change with one standard error of each number of the instrument."""
-
-    def changed(**numbers: float) -> _Forms:
-        other = _forms(drive, frequency, instrument._replace(**numbers), spring, calibration)
-        return _Forms(*(new - old for new, old in zip(other, forms, strict=True)))
-
-    frequency_error = _error(known, "free_frequency_khz") * instrument.free_frequency_khz
-    quality_error = _error(known, "quality_factor") * instrument.quality_factor
-    found = {
-        "free_frequency": changed(free_frequency_khz=instrument.free_frequency_khz + frequency_error),
-        "quality_factor": changed(quality_factor=instrument.quality_factor + quality_error),
-        "harmonics": changed(harmonics_factor=HARMONICS_FACTOR.value + HARMONICS_FACTOR.error),
-        "tip_calibration": _Forms(*(2.0 * _error(known, "tip_calibration") * form for form in forms)),
-    }
-    if not known["spring_constant_n_per_m"].origin.startswith("not known"):
-        part = _error(known, "spring_constant_n_per_m")
-        found["spring_constant"] = _Forms(*(part * form for form in forms))
-    return found
-
-
-def _median_pixel(values: Float[np.ndarray, "rows columns"], used: np.ndarray) -> tuple[int, int]:
-    """Return the pixel in range whose value is the median, the first one without any."""
-    places = np.flatnonzero(used.ravel())
-    if not places.size:
-        return 0, 0
-    flat = values.ravel()[places]
-    middle = places[np.argpartition(flat, len(flat) // 2)[len(flat) // 2]]
-    return int(middle // values.shape[1]), int(middle % values.shape[1])
+def _reasons(taps: _Taps, state: Int[np.ndarray, "rows columns"], unit: str) -> list[str]:
+    """Return why the energies must not be used."""
+    used, above, below = (int(np.sum(state == one)) for one in list(PixelState)[:3])
+    doubt = "free amplitude, its phase, quality factor or units do not belong to this image"
+    total = float(taps.total_errors[taps.median])
+    low, high = max(taps.energy - _BAND * total, 0.0), taps.energy + _BAND * total
+    reasons = []
+    if 2 * used < len(taps.errors[0]):
+        why = f"{above} with an amplitude above the free one, {below} with an energy below zero"
+        reasons.append(f"only {used} of {len(taps.errors[0])} pixels are in range ({why}): {doubt}")
+    if not taps.possible:
+        said = f"{taps.energy:.3g} +- {taps.common_error:.2g} {unit}"
+        reasons.append(f"the median energy is below zero beyond its errors ({said}): {doubt}")
+    elif _BAND * total > 0.5 * taps.energy:
+        shares = {name: abs(change[0]) for name, change in taps.common.items()}
+        shares["noise of a pixel"] = float(taps.errors[0, taps.median])
+        largest = max(shares, key=lambda name: shares[name])
+        reasons.append(
+            f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} {unit} in the median pixel "
+            f"({taps.energy:.3g} +- {total:.2g}); most of its error comes from {largest}"
+        )
+    return reasons

@@ -1,6 +1,5 @@
 """Commands that read data of instruments, fit them, and plan what to measure next."""
 
-import re
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from afm_jax.cli.design_prior import PRIOR_OPTIONS, check_prior
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
 from afm_jax.cli.session import FIT_PROGRAMS, Session
-from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError, ValueKind
+from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
 
 
@@ -474,25 +473,13 @@ _IMAGE_NUMBERS = (
         "N_PER_M",
         "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are over it, in nm^2.",
     ),
-    ("free-amplitude-nm", "NM", "Amplitude of the free tip."),
+    ("free-amplitude-nm", "NM", "Amplitude of the free tip, as the instrument reads it, '13.4 +- 0.1'."),
+    ("free-phase-deg", "DEGREES", "Phase of the free tip, as the instrument reads it, '90 +- 0.05' [its error: 0.2]."),
     ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
     ("nm-per-volt", "NM", "Sensitivity of an amplitude in volts."),
     ("tip-calibration", "C", "True over stated amplitude; '1 +- 0.02'."),
 )
 _IMAGE_SETTINGS = tuple(_number(*row) for row in _IMAGE_NUMBERS)
-
-
-class RowsAndColumns(ValueKind):
-    """Rows and columns, as 10x12."""
-
-    name = "grid"
-
-    def read(self, text: str) -> tuple[int, int]:
-        """Return rows and columns."""
-        match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
-        if match is None:
-            raise ValueError(f"`{text}` is no ROWSxCOLUMNS; write 10x12")
-        return int(match[1]), int(match[2])
 
 
 def _check_zarr(_: Session, options: Options) -> None:
@@ -508,12 +495,14 @@ TAPPING_MAP = Command(
     runs="afm_jax.cli.tapping_map:map_of_an_image",
     help="""Read the energy of a tap and the virial off every pixel of an image of amplitude and phase.
 
-    IMAGE is an Asylum .ibw, Gwyddion .gwy or NanoSurf .nid with channels of both, a NumPy file (.npz with the arrays
-    amplitude and phase, or .npy of the two), or text of numbers with amplitude, PHASE_IMAGE then the phase; or a grid
-    of curves: arrays (rows, columns, points) with their height_nm, or with --grid a file of curves. Each pixel has its
-    own error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said
-    once. Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
-    With --out the report: map.html, .png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range.
+    IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), text of numbers with
+    amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw and Gwyddion .gwy
+    (`pip install 'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs
+    its program on the file). Needed are amplitude and phase of the free tip, at the same drive. Each pixel has its own
+    error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said once.
+    Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
+    With --out the report: map.html, .png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
+    median energy is below zero or only bracketed, or the sense of the phase decides and is not known.
     """,
     options=(
         click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path)),
@@ -523,16 +512,11 @@ TAPPING_MAP = Command(
             metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
             default="",
             show_default=False,
-            help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase:-1.",
+            help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase:-1 (1: the phase grows "
+            "with the lag, -1: with the lead).",
         ),
         click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What is driven."),
         *_IMAGE_SETTINGS,
-        click.option(
-            "--free-phase-deg",
-            type=Finite(),
-            metavar="DEGREES",
-            help="What the instrument reads with the tip free; else its lag.",
-        ),
         click.option(
             "--amplitude-error-nm", type=Finite(positive=True), metavar="NM", help="Standard error of a pixel's."
         ),
@@ -540,26 +524,12 @@ TAPPING_MAP = Command(
             "--phase-error-deg", type=Finite(positive=True), metavar="DEGREES", help="Standard error of a pixel's."
         ),
         click.option(
-            "--grid",
-            type=RowsAndColumns(),
-            metavar="ROWSxCOLUMNS",
-            help="IMAGE is a file of curves, one a pixel, as for `read`.",
-        ),
-        click.option(
-            "--at",
-            "ratio",
-            type=Share("a share"),
-            default=0.9,
-            metavar="RATIO",
-            help="Of a grid of curves: amplitude over the free one at which each pixel is read.",
-        ),
-        click.option(
             "--format",
             "formats",
-            type=click.Choice(["npz", "gwy", "zarr"]),
+            type=click.Choice(["npz", "gsf", "zarr"]),
             multiple=True,
             default=("npz",),
-            help="Of the arrays written into --out; may be given several times.",
+            help="Of the arrays written into --out (gsf: for Gwyddion); may be given several times.",
         ),
     ),
     check=_check_zarr,
