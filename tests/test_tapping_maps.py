@@ -205,7 +205,7 @@ def test_an_energy_below_zero_or_within_its_errors_is_not_valid():
         assert found.energy_common_error / middle == pytest.approx(share, rel=0.25)
         assert found.valid == valid
     assert "only bracketed" in found.reasons[0]
-    assert "most of its error comes from free_amplitude_nm" in found.reasons[0]
+    assert "most of its error comes from free amplitude" in found.reasons[0]
     noisy = tapping_map((amplitude, lag), amplitude_error_nm=0.5, phase_error_deg=0.1, **LEVER)
     assert "most of its error comes from noise of a pixel" in noisy.reasons[0]
 

@@ -254,32 +254,6 @@ NANOSURF_KEYS = {
 
 def parse_nanosurf(data: bytes, name: str) -> Recording:
     """Read NanoSurf .nid: sections of `key=value`, the mark `#!`, then the data sets as integers, one after another."""
-    sets, known = nanosurf_sets(data, name)
-    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": "", "Spectrum Fit": ""}
-    parts: dict[tuple[int, str], dict[str, Any]] = {}
-    units: dict[str, str] = {}
-    for keys, lines in sets:
-        frame = keys.get("Frame", "")
-        if frame in branches:
-            ending = " (vendor's fit)" if frame == "Spectrum Fit" else ""
-            axis, channel = keys["Dim0Name"], keys["Dim2Name"] + ending
-            units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
-            for line, (at, numbers) in enumerate(lines):
-                channels = parts.setdefault((line + 1, branches[frame]), {})
-                channels.setdefault(axis, at)
-                channels[channel] = numbers
-    if not parts:
-        frames = ", ".join(dict.fromkeys(keys.get("Frame", "?") for keys, _ in sets)) or "none"
-        raise TableError(
-            f"{name}: holds no curve and no spectrum, but {frames}; export the spectroscopy data; energies of images: "
-            "afm-jax tapping-map"
-        )
-    segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
-    return Recording("NanoSurf .nid", name, segments, units, known)
-
-
-def nanosurf_sets(data: bytes, name: str) -> tuple[list[tuple[dict[str, str], Iterator[Any]]], dict[str, Known]]:
-    """Return a NanoSurf file's data sets, each its keys and its lines (axis, numbers), and what the header says."""
     mark = data.find(b"#!")
     if mark < 0:
         raise cut_off(name, "the mark '#!' in front of the data is missing")
@@ -289,14 +263,33 @@ def nanosurf_sets(data: bytes, name: str) -> tuple[list[tuple[dict[str, str], It
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
         raise cut_off(name, f"the header announces {sum(sizes)} bytes of data, {len(data) - mark - 2} are there")
     starts = mark + 2 + np.cumsum([0, *sizes])
+    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": "", "Spectrum Fit": ""}
+    parts: dict[tuple[int, str], dict[str, Any]] = {}
+    units: dict[str, str] = {}
+    for keys, (start, end) in zip(sets, pairwise(starts.tolist()), strict=True):
+        frame = keys.get("Frame", "")
+        if frame in branches:
+            ending = " (vendor's fit)" if frame == "Spectrum Fit" else ""
+            axis, channel = keys["Dim0Name"], keys["Dim2Name"] + ending
+            units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
+            for line, (at, numbers) in enumerate(_nid_lines(keys, data[start:end])):
+                channels = parts.setdefault((line + 1, branches[frame]), {})
+                channels.setdefault(axis, at)
+                channels[channel] = numbers
+    if not parts:
+        frames = ", ".join(dict.fromkeys(keys.get("Frame", "?") for keys in sets)) or "none"
+        raise TableError(
+            f"{name}: holds no curve and no spectrum, but {frames}; export the spectroscopy data; energies of images: "
+            "afm-jax tapping-map"
+        )
     known = known_from(header, NANOSURF_KEYS)
     warm = number_in(header.get("Cantilever temperature", ""))
     if warm is not None and -100.0 < warm[0] < 500.0:
         known["temperature_k"] = Known(
             warm[0] + 273.15, "K", "header: Cantilever temperature, taken in degrees Celsius"
         )
-    lines = [_nid_lines(keys, data[a:b]) for keys, (a, b) in zip(sets, pairwise(starts.tolist()), strict=True)]
-    return list(zip(sets, lines, strict=True)), known
+    segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
+    return Recording("NanoSurf .nid", name, segments, units, known)
 
 
 def _nid_sections(text: str) -> tuple[list[tuple[str, dict[str, str]]], dict[str, str]]:

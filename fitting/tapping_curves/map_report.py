@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import BLUE, DARK, label_axes, new_figure, png_of, svg_of
+from afm_jax.results import words_of
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import whole_folder, write_whole
 from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
@@ -35,11 +36,11 @@ def map_report(result: TappingMap) -> Report:
             ]
             for name, key in (("energy of a tap", "energy"), ("virial", "virial"))
         ]
-        parts = [f"{name.replace('_', ' ')} {value:+.2g}" for name, value in result.common.items()]
+        parts = [f"{words_of(name)} {value:+.2g}" for name, value in result.common.items()]
         common = f"The common error of the energy comes of ({unit}, one standard error each): {', '.join(parts)}."
         table = Table("95 of 100 pixels lie between the first and the third number", head, cells)
         sections = [ReportSection("Energy and virial", [table], "Energy"), ReportSection("Errors", [Text(common)])]
-    known = [[key, f"{one.value:.7g}", one.unit, one.origin] for key, one in result.known.items()]
+    known = [[words_of(key), f"{one.value:.7g}", one.unit, one.origin] for key, one in result.known.items()]
     head = ["known", "value", "unit", "from"]
     sections.append(ReportSection("What is known", [Table("Of the instrument", head, known, words=head[2:])], "Known"))
     sections.append(ReportSection("Notes", [Bullets(result.notes, "Notes:")], "Notes"))

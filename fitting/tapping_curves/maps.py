@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.checks import checked
-from afm_jax.results import Result, public_result
+from afm_jax.results import Result, public_result, words_of
 from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg
@@ -172,8 +172,8 @@ def tapping_map(
         sense: _taps(drive, value, _errors(known, value), amplitude[measured], sense * behind[measured], noise)
         for sense in ([images.sense] if images.sense else [1.0, -1.0])
     }
-    sense, undecided = _sense(senses, value["free_phase_deg"], _free_lag(drive, value), notes)
-    taps, unit = senses[sense], "aJ" if _spring_is_known(known) else "nm^2"
+    taps, undecided = _sense(senses, value["free_phase_deg"], _free_lag(drive, value), notes)
+    unit = "aJ" if _spring_is_known(known) else "nm^2"
     state = np.full(amplitude.shape, PixelState.NOT_MEASURED, dtype=np.int8)
     state[measured] = np.where(
         amplitude[measured] > value["free_amplitude_nm"] + _BEYOND * noise[0],
@@ -353,20 +353,21 @@ def _of_rows(
     return np.array([[found.energy_aj, found.virial_aj], [noise_of(curve, found), virial_noise_of(curve, found)]])
 
 
-def _sense(senses: dict[float, _Taps], reading: float, lag: float, notes: list[str]) -> tuple[float, str]:
-    """Return the sense of the phase, 1 where it grows with the lag and -1 where with the lead, and why it is undecided.
+def _sense(senses: dict[float, _Taps], reading: float, lag: float, notes: list[str]) -> tuple[_Taps, str]:
+    """Return the pixels in the sense of the phase, and why it is undecided.
 
-    No sample gives energy: a sense that makes the median energy negative is wrong. On resonance both make it the same.
-    Elsewhere a free tip that reads its lag, or the opposite, decides.
+    No sample gives energy: a sense that makes the median energy negative is wrong. Near resonance both make it about
+    the same; one is assumed, and the other a part of the error. Elsewhere a free tip that reads its lag, or the
+    opposite, decides.
 
     Args:
-        senses: what the pixels mean for each sense that is possible; a single one was stated.
+        senses: what the pixels mean where the phase grows with the lag (1) or the lead (-1); one alone was stated.
         reading: of the free tip, in degrees.
         lag: of the free tip, in degrees.
         notes: get what was decided or assumed.
     """
     if len(senses) == 1:
-        return next(iter(senses)), ""
+        return next(iter(senses.values())), ""
     words = {1.0: "grows with the lag", -1.0: "grows with the lead"}
     off = {sense: abs(_half_turn(reading - sense * lag)) for sense in senses}
     likelier = -1.0 if off[-1.0] < _NEAR_DEG < off[1.0] else 1.0
@@ -375,17 +376,18 @@ def _sense(senses: dict[float, _Taps], reading: float, lag: float, notes: list[s
     if taps.possible != other.possible:
         likelier = likelier if taps.possible else -likelier
         notes.append(f"Sense: the phase {words[likelier]}; the other way energies would be below zero.")
-    elif abs(taps.energy - other.energy) <= min(taps.common_error, other.common_error):
+    elif abs(lag - 90.0) < _NEAR_DEG:
         notes.append(
             f"Sense: assumed: the phase {words[likelier]}. The energy hardly hangs on it, but the sign of the virial "
             f"does, attractive or repulsive; {state}."
         )
+        return taps._replace(common=taps.common | {"sense_of_the_phase": [taps.energy - other.energy, 0.0]}), ""
     elif off[likelier] < _READS_DEG and off[-likelier] > 3.0 * _READS_DEG:
         notes.append(f"Sense: the phase {words[likelier]}; the free tip reads {reading:.1f} deg, its lag is {lag:.1f}.")
     elif taps.possible:
         both = f"{senses[1.0].energy:.3g} where it grows with the lag, {senses[-1.0].energy:.3g} where with the lead"
-        return likelier, f"the sense of the phase is not known, and the median energy hangs on it ({both}); {state}"
-    return likelier, ""
+        return taps, f"the sense of the phase is not known, and the median energy hangs on it ({both}); {state}"
+    return senses[likelier], ""
 
 
 def _reasons(taps: _Taps, state: Int[np.ndarray, "rows columns"], unit: str) -> list[str]:
@@ -402,7 +404,7 @@ def _reasons(taps: _Taps, state: Int[np.ndarray, "rows columns"], unit: str) -> 
         said = f"{taps.energy:.3g} +- {taps.common_error:.2g} {unit}"
         reasons.append(f"the median energy is below zero beyond its errors ({said}): {doubt}")
     elif _BAND * total > 0.5 * taps.energy:
-        shares = {name: abs(change[0]) for name, change in taps.common.items()}
+        shares = {words_of(name): abs(change[0]) for name, change in taps.common.items()}
         shares["noise of a pixel"] = float(taps.errors[0, taps.median])
         largest = max(shares, key=lambda name: shares[name])
         reasons.append(
