@@ -83,7 +83,7 @@ def test_maps_are_the_energies_of_curves_row_by_row(drive: Literal["force", "bas
     known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "spring_constant_n_per_m": 5.4}
     known |= {"free_amplitude_nm": 40.0, "drive_frequency_khz": 90.0 * ratio, "free_phase_deg": 33.0}
     images = amplitude.reshape(6, 7), 33.0 + behind.reshape(6, 7)
-    found = tapping_map(images, columns="phase_lag_deg=phase:1", drive=drive, **known)
+    found = tapping_map(images, phase_sense="lag", drive=drive, **known)
     gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
     lag = np.rad2deg(np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)) + behind
     rows = {"amplitude_nm": amplitude, "lag_deg": lag, "drive_frequency_khz": 90.0 * ratio}
@@ -116,9 +116,9 @@ def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip_and_without_a_stif
     np.testing.assert_allclose(turned.energy, straight.energy, rtol=1e-12)
     np.testing.assert_allclose(turned.virial, straight.virial, rtol=1e-9)
     # on resonance only the sign of the virial hangs on the sense
-    for one, word in ((straight, "lag"), (turned, "lead")):
-        assert any(f"Sense: assumed: the phase grows with the {word}" in note for note in one.notes)
-    stated = tapping_map((amplitude, -lag), columns="phase_lag_deg=phase:-1", **LEVER | {"free_phase_deg": -FREE_LAG})
+    for one, word in ((straight, "lags"), (turned, "leads")):
+        assert any(f"Sense: assumed: the phase {word}" in note for note in one.notes)
+    stated = tapping_map((amplitude, -lag), phase_sense="lead", **LEVER | {"free_phase_deg": -FREE_LAG})
     np.testing.assert_allclose(stated.energy, energy, rtol=2e-4)
     assert not any("Sense" in note for note in stated.notes)
     found = tapping_map((amplitude, lag), **{k: v for k, v in LEVER.items() if k != "spring_constant_n_per_m"})
@@ -163,7 +163,7 @@ def test_no_sense_of_the_phase_makes_a_wrong_energy_valid(drive: str, quality: f
         for free, sign in ((free_lag, 1.0), (-free_lag, -1.0), (0.0, 1.0), (0.0, -1.0)):
             arrays = np.full((5, 5), 0.9 * FREE_NM), np.full((5, 5), free + sign * behind)
             known = lever | {"free_phase_deg": (free, 0.02)}
-            right = tapping_map(arrays, columns=f"phase_lag_deg=phase:{sign:.0f}", **known)
+            right = tapping_map(arrays, phase_sense="lag" if sign > 0.0 else "lead", **known)
             assert np.median(right.energy) == pytest.approx(energy, rel=1e-9)
             found = tapping_map(arrays, **known)
             same = np.sign(np.median(found.virial)) == np.sign(np.median(right.virial))
@@ -172,7 +172,7 @@ def test_no_sense_of_the_phase_makes_a_wrong_energy_valid(drive: str, quality: f
                 assert abs(np.median(found.energy) - energy) < 3.0 * found.energy_common_error
                 assert same or (assumed and ratio == 1.0)
             elif right.valid:
-                assert 'say `columns="phase_lag_deg=CHANNEL:1"`' in found.reasons[0]
+                assert 'say `phase_sense="lag|lead"`' in found.reasons[0]
             seen.append(found.valid)
     assert any(seen) or (ratio == 1.05 and not seen)
 

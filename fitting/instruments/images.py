@@ -50,7 +50,7 @@ class AmplitudeAndPhase(NamedTuple):
         amplitude: in nm or V, shape (rows, columns).
         in_volts: whether it is in V.
         phase_deg: as the instrument counts it.
-        sense: 1 or -1 where it is stated that the phase grows with the lag or with the lead, else 0.
+        sense: 1 or -1 where a factor of the phase states that it lags or leads, else 0.
         known: what the file says.
         size_m: height and width, or None.
         note: which channels were taken.
@@ -84,8 +84,8 @@ def read_images(
         path: NumPy .npz or .npy, text of numbers (one channel), Asylum .ibw, Gwyddion .gwy or any format that Gwyddion
             reads; or the arrays of amplitude in nm and phase in degrees, the channels `amplitude` and `phase`.
         phase_path: file of the phase, where amplitude and phase are two.
-        columns: which channel is which, as for `read_curves`; a factor of the phase, 1 or -1, says that it grows with
-            the lag or with the lead.
+        columns: which channel is which, as for `read_curves`; a factor of the phase, 1 or -1, says that it lags or
+            leads.
 
     Raises:
         TableError: one line: the file is damaged, of no known format or of another mode, has no such channel, or the

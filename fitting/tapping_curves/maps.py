@@ -128,6 +128,7 @@ def tapping_map(
     *,
     columns: str = "",
     drive: Literal["base", "force"] = "base",
+    phase_sense: Literal["lag", "lead"] | None = None,
     amplitude_error_nm: float | None = None,
     phase_error_deg: float | None = None,
     **given: Any,
@@ -138,6 +139,7 @@ def tapping_map(
         images: a file for `read_images`, what that returned, or the arrays of amplitude in nm and phase in degrees.
         columns: which channel is which, as for `read_images`, where `images` does not come from there.
         drive: what shakes the cantilever.
+        phase_sense: whether the phase grows as the tip lags more, or falls; None: the energies decide where they can.
         amplitude_error_nm: standard error of every pixel's amplitude; else from the roughness along its lines.
         phase_error_deg: of every pixel's phase; else likewise.
         given: instead of the file's, each a number or a pair with its standard error: free_frequency_khz,
@@ -168,9 +170,10 @@ def tapping_map(
             f"Noise: {noise[0]:.3g} nm and {noise[1]:.3g} degrees a pixel, from the roughness along the lines "
             "(`amplitude_error_nm=...`, `phase_error_deg=...`)."
         )
+    stated = {"lag": 1.0, "lead": -1.0}.get(phase_sense or "", images.sense)
     senses = {
         sense: _taps(drive, value, _errors(known, value), amplitude[measured], sense * behind[measured], noise)
-        for sense in ([images.sense] if images.sense else [1.0, -1.0])
+        for sense in ([stated] if stated else [1.0, -1.0])
     }
     taps, undecided = _sense(senses, value["free_phase_deg"], _free_lag(drive, value), notes)
     unit = "aJ" if _spring_is_known(known) else "nm^2"
@@ -361,18 +364,18 @@ def _sense(senses: dict[float, _Taps], reading: float, lag: float, notes: list[s
     opposite, decides.
 
     Args:
-        senses: what the pixels mean where the phase grows with the lag (1) or the lead (-1); one alone was stated.
+        senses: what the pixels mean where the phase lags (1) or leads (-1); one alone was stated.
         reading: of the free tip, in degrees.
         lag: of the free tip, in degrees.
         notes: get what was decided or assumed.
     """
     if len(senses) == 1:
         return next(iter(senses.values())), ""
-    words = {1.0: "grows with the lag", -1.0: "grows with the lead"}
+    words = {1.0: "lags", -1.0: "leads"}
     off = {sense: abs(_half_turn(reading - sense * lag)) for sense in senses}
     likelier = -1.0 if off[-1.0] < _NEAR_DEG < off[1.0] else 1.0
     taps, other = senses[likelier], senses[-likelier]
-    state = 'say `columns="phase_lag_deg=CHANNEL:1"` where it grows with the lag, -1 with the lead'
+    state = 'say `phase_sense="lag|lead"`'
     if taps.possible != other.possible:
         likelier = likelier if taps.possible else -likelier
         notes.append(f"Sense: the phase {words[likelier]}; the other way energies would be below zero.")
@@ -385,7 +388,7 @@ def _sense(senses: dict[float, _Taps], reading: float, lag: float, notes: list[s
     elif off[likelier] < _READS_DEG and off[-likelier] > 3.0 * _READS_DEG:
         notes.append(f"Sense: the phase {words[likelier]}; the free tip reads {reading:.1f} deg, its lag is {lag:.1f}.")
     elif taps.possible:
-        both = f"{senses[1.0].energy:.3g} where it grows with the lag, {senses[-1.0].energy:.3g} where with the lead"
+        both = f"{senses[1.0].energy:.3g} where it lags, {senses[-1.0].energy:.3g} where it leads"
         return taps, f"the sense of the phase is not known, and the median energy hangs on it ({both}); {state}"
     return senses[likelier], ""
 

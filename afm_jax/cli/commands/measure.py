@@ -512,10 +512,15 @@ TAPPING_MAP = Command(
             metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
             default="",
             show_default=False,
-            help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase:-1 (1: the phase grows "
-            "with the lag, -1: with the lead).",
+            help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.",
         ),
         click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What is driven."),
+        click.option(
+            "--phase-sense",
+            type=click.Choice(["lag", "lead"]),
+            help="Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the image "
+            "decides where it can.",
+        ),
         *_IMAGE_SETTINGS,
         click.option(
             "--amplitude-error-nm", type=Finite(positive=True), metavar="NM", help="Standard error of a pixel's."
