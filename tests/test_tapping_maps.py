@@ -118,7 +118,7 @@ def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip_and_without_a_stif
     # on resonance only the sign of the virial hangs on the sense
     for one, word in ((straight, "lags"), (turned, "leads")):
         assert any(f"Sense: assumed: the phase {word}" in note for note in one.notes)
-    stated = tapping_map((amplitude, -lag), phase_sense="lead", **LEVER | {"free_phase_deg": -FREE_LAG})
+    stated = tapping_map((amplitude, -lag), phase_sense="lead", **{**LEVER, "free_phase_deg": -FREE_LAG})
     np.testing.assert_allclose(stated.energy, energy, rtol=2e-4)
     assert not any("Sense" in note for note in stated.notes)
     found = tapping_map((amplitude, lag), **{k: v for k, v in LEVER.items() if k != "spring_constant_n_per_m"})
@@ -153,7 +153,11 @@ def energy_of(drive: str, amplitude: float, behind: float, ratio: float, quality
 def test_no_sense_of_the_phase_makes_a_wrong_energy_valid(drive: str, quality: float, ratio: float):
     gamma = 1.0 - ratio**2 + 1j * ratio / quality
     free_lag = float(np.rad2deg(np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)))
-    lever = LEVER | {"quality_factor": (quality, 0.5), "free_frequency_khz": (300.0, 0.003), "drive": drive}
+    lever: dict[str, Any] = LEVER | {
+        "quality_factor": (quality, 0.5),
+        "free_frequency_khz": (300.0, 0.003),
+        "drive": drive,
+    }
     lever |= {"drive_frequency_khz": 300.0 * ratio, "amplitude_error_nm": 0.03, "phase_error_deg": 0.1}
     seen = []
     for behind in (-25.0, -8.0, -2.0, 2.0, 8.0, 25.0):
@@ -162,7 +166,7 @@ def test_no_sense_of_the_phase_makes_a_wrong_energy_valid(drive: str, quality: f
             continue
         for free, sign in ((free_lag, 1.0), (-free_lag, -1.0), (0.0, 1.0), (0.0, -1.0)):
             arrays = np.full((5, 5), 0.9 * FREE_NM), np.full((5, 5), free + sign * behind)
-            known = lever | {"free_phase_deg": (free, 0.02)}
+            known: dict[str, Any] = lever | {"free_phase_deg": (free, 0.02)}
             right = tapping_map(arrays, phase_sense="lag" if sign > 0.0 else "lead", **known)
             assert np.median(right.energy) == pytest.approx(energy, rel=1e-9)
             found = tapping_map(arrays, **known)
@@ -200,7 +204,7 @@ def test_an_energy_below_zero_or_within_its_errors_is_not_valid():
     # the free amplitude's share: E = pi k A (A0 sin(lag) - A)/Q
     slope = np.pi * SPRING_CONSTANT / QUALITY_FACTOR * np.median(amplitude)
     for share, valid in ((0.2, True), (0.3, False)):
-        known = LEVER | {"free_amplitude_nm": (FREE_NM, share * middle / slope)}
+        known: dict[str, Any] = LEVER | {"free_amplitude_nm": (FREE_NM, share * middle / slope)}
         found = tapping_map((amplitude, lag), **known)
         assert found.energy_common_error / middle == pytest.approx(share, rel=0.25)
         assert found.valid == valid

@@ -219,7 +219,7 @@ def _of_others(path: Path, name: str) -> _Images:
     package = package_for("gwyddionpy", "gwyddion", f"{name}: images of this format")
     # not on Windows
     system = import_module("resource") if find_spec("resource") else None
-    before = system.getrlimit(system.RLIMIT_FSIZE) if system else None
+    before = system.getrlimit(system.RLIMIT_FSIZE) if system else (0, 0)
     try:
         if system:
             system.setrlimit(system.RLIMIT_FSIZE, (LARGEST_BYTES, before[1]))
