@@ -1,4 +1,4 @@
-"""Orbits of several impacts and orbits with a rest: fixed points of the map, and closed forms of the release."""
+"""Orbits of several impacts: fixed points of the map."""
 
 import json
 from pathlib import Path
@@ -19,9 +19,7 @@ from afm_jax import (
 )
 from afm_jax.cli.main import main
 from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of
-from afm_jax.dynamics.sticking_orbits import StickingOrbit, follow_sticking, sticking_orbit
 from afm_jax.outcomes import Outcome
-from afm_jax.scenefile.parameter_paths import ParameterRange
 
 FREE = 2.0 * np.pi * 0.09
 """Omega in rad/us."""
@@ -92,62 +90,6 @@ def test_one_impact_is_the_single_impact_orbit(law: ImpactLaw):
         np.testing.assert_allclose(value, expected, rtol=rtol, atol=atol, err_msg=name)
 
 
-@pytest.mark.slow
-def test_a_tip_that_comes_to_rest_repeats_from_its_release():
-    n, r, sigma = 1.6, 0.3, 0.5
-    omega, found = 2.0 * n * FREE, sticking_orbit(scene(n, r, sigma))
-    assert not isinstance(found, str)
-    # s'' + Omega^2 s = 0, becoming negative: Omega^2 sigma = (omega^2 - Omega^2) beta cos(phase), rising cosine
-    phase = 2.0 * np.pi - np.arccos(FREE**2 * sigma / (2.0 * (omega**2 - FREE**2)))
-    assert found.release_phase_rad == pytest.approx(phase, abs=1e-6)
-    # flown here from just after the release: impacts become slower by r until the tip rests, while it is pressed
-    time = phase / omega + 1e-3
-    height = sigma + 2.0 * np.cos(phase)
-    velocity = -height * FREE * np.sin(FREE * 1e-3) - 2.0 * omega * np.sin(phase) * np.cos(FREE * 1e-3)
-    approach = np.inf
-    for _ in range(40):
-        time, velocity, approach = flown(scene(n, r, sigma), time, velocity)
-        if approach < 1e-4:
-            break
-    assert approach < 1e-4
-    push = -2.0 * omega**2 * np.cos(omega * time) + FREE**2 * (sigma + 2.0 * np.cos(omega * time))
-    assert push > 0.0
-    turns = (omega * time - phase) / (2.0 * np.pi)
-    assert found.order == int(np.ceil(turns))
-    # the top of the flight after the release
-    assert found.peak_amplitude_nm == pytest.approx(np.hypot(height, 2.0 * omega * np.sin(phase) / FREE), rel=1e-6)
-
-
-@pytest.mark.slow
-def test_an_orbit_with_a_rest_is_followed_to_where_it_ends():
-    """Its release lies where the closed form says; on either side of an end the single scene says the same."""
-    given = ParameterRange("platform.offset_nm", 0.1, 1.2)
-    own = sticking_orbit(scene(1.6, 0.3, 0.5))
-    assert isinstance(own, StickingOrbit)
-    found = follow_sticking(scene(1.6, 0.3, 0.5), own.order, given, values=9)
-    omega = 2.0 * 1.6 * FREE
-    branch = max(found.branches, key=lambda one: len(one.parameter))
-    assert len(branch.parameter) > 4
-    sigma = branch.parameter
-    phase = 2.0 * np.pi - np.arccos(FREE**2 * sigma / (2.0 * (omega**2 - FREE**2)))
-    np.testing.assert_allclose(branch.reading.phase_rad[:, 0], phase, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(branch.reading.velocity_after_nm_per_us[:, 0], -2.0 * omega * np.sin(phase), rtol=1e-5)
-    assert found.special
-    for point in found.special:
-        ends = [sticking_orbit(scene(1.6, 0.3, point.parameter + shift)) for shift in (-1e-7, 1e-7)]
-        assert sum(isinstance(one, StickingOrbit) and one.order == own.order for one in ends) == 1
-
-
-@pytest.mark.slow
-def test_an_orbit_with_a_rest_ends_where_the_sample_holds_the_tip():
-    """There the sample's largest acceleration is the spring's: beta (Omega^2 - omega^2) = Omega^2 sigma."""
-    found = follow_sticking(scene(0.35, 0.4, 1.0), 1, ParameterRange("platform.offset_nm", 0.98, 1.1), values=4)
-    (point,) = found.special
-    assert point.kind == "held"
-    assert found.branches[0].ends == ("range", "held")
-    assert point.parameter == pytest.approx(2.0 * (1.0 - 0.7**2), abs=1e-10)
-
-
 def test_multipliers_are_those_of_numpy():
     rng = np.random.default_rng(2)
     matrices = rng.normal(size=(200, 2, 2))
@@ -160,10 +102,6 @@ def test_multipliers_are_those_of_numpy():
     assert np.all(np.abs(found[:, 0]) >= np.abs(found[:, 1]) * (1.0 - 1e-12))
 
 
-def test_why_a_tip_does_not_rest():
-    assert sticking_orbit(scene(1.6, 0.3, epsilon=1.0)) == "with adhesion or a delay a tip that comes to rest stays"
-
-
 @pytest.mark.slow
 def test_the_command_tells_every_impact(tmp_path: Path):
     save_scene(scene(1.24, 0.5), tmp_path / "scene.toml")
@@ -174,4 +112,3 @@ def test_the_command_tells_every_impact(tmp_path: Path):
     found = many_impact_orbits(scene(1.24, 0.5), 2, 2)
     told = [[impact["phase_rad"] for impact in orbit["impacts"]] for orbit in answer["orbits"]]
     assert told == found.reading.phase_rad.tolist()
-    assert answer["sticking"] is None

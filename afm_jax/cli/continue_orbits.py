@@ -7,10 +7,9 @@ from afm_jax.cli.values import ranges_of
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import amplitude_errors, special_errors
 from afm_jax.dynamics.continuation import continue_orbits
-from afm_jax.dynamics.sticking_orbits import follow_sticking
 
 
-def follow(  # noqa: PLR0913
+def follow(
     session: Session,
     scene: NamedScene,
     *,
@@ -18,19 +17,15 @@ def follow(  # noqa: PLR0913
     impacts: int,
     parameter: str,
     second: str | None,
-    sticking: bool,
     picture: str,
 ) -> Output:
     """Return the branches of orbits through a parameter, their special points, and these as curves in two."""
-    if sticking or not isinstance(scene.scene.interaction, Contact):
+    if not isinstance(scene.scene.interaction, Contact):
         refuse_other_than_law(scene.scene, scene.name)
     given = [parameter, *([] if second is None else [second])]
     first, *others = ranges_of(scene.name, scene.scene, given, counted=False)
-    with session.working("following orbits (the first run compiles for some seconds)", "values") as report:
-        if sticking:
-            followed = follow_sticking(scene.scene, order, first, report=report)
-        else:
-            followed = continue_orbits(scene.scene, order, first, impacts=impacts, second=others[0] if others else None)
+    with session.working("following orbits (the first run compiles for some seconds)"):
+        followed = continue_orbits(scene.scene, order, first, impacts=impacts, second=others[0] if others else None)
     uncertain = scene.unknowns
     if uncertain is not None:
         followed = followed._replace(

@@ -7,7 +7,6 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.impact_orbits import many_impact_orbits
 from afm_jax.dynamics.orbit_tables import ManyOrbitTable, OrbitTable
-from afm_jax.dynamics.sticking_orbits import sticking_orbit
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
 
@@ -28,12 +27,9 @@ def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | No
     else:
         impacts = impacts or 1
         with session.working("searching for orbits (the first run compiles for some seconds)"):
-            if resolved:
-                of_scene = contact_orbits(scene.scene, order, impacts)
-                resting = "a tip that the liquid bridge holds stays"
-            else:
-                of_scene, resting = many_impact_orbits(scene.scene, order, impacts), sticking_orbit(scene.scene)
-        told = ManyOrbitTable(scene.scene, order, impacts, of_scene, resting)
+            search = contact_orbits if resolved else many_impact_orbits
+            of_scene = search(scene.scene, order, impacts)
+        told = ManyOrbitTable(scene.scene, order, impacts, of_scene)
     return Output.of(told, files={"orbits.png": lambda path: save(told.plot(), path)})
 
 

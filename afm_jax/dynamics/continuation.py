@@ -72,8 +72,6 @@ _ENDS = {
     "delay": "close to capture, where the law's delay is longer than half a drive period",
     "shorter": "where it becomes an orbit of fewer impacts",
     "closed": "where it began (it is closed)",
-    "held": "where the sample no longer lets the tip go",
-    "rest_lost": "where the sample no longer holds the tip for a while",
     "grazing": "where a flight grazes the sample, and another motion follows",
     "lost": "a point that it could not be followed beyond",
     "too long": "the most points that are followed",
@@ -95,8 +93,6 @@ class Continuation(ResultTuple):
     rejected: int
     """Orbits found to begin with whose flights pass through the surface; not followed."""
     family: LoopFamily
-    sticking: bool = False
-    """The orbits rest on the surface (`follow_sticking`)."""
     law_parameters: tuple[str, ...] | None = None
     """Names of the law's uncertain parameters, which give the errors that follow; None: the law is known exactly."""
     amplitude_errors: tuple[Float[np.ndarray, " points"], ...] | None = None
@@ -120,8 +116,6 @@ class Continuation(ResultTuple):
         if any(branch.reading.admissible.any() for branch in self.branches):
             return None
         order, where = self.order, f"with {self.range}"
-        if self.sticking:
-            return f"no tip rests on the sample, is let go and rests again after {order} periods {where}"
         what = f"orbit of {counted(self.impacts, 'impact')} in {order} drive periods"
         if self.impacts == 0:
             return f"the tip meets the sample at every value of {self.range}; try `impacts=1`"
@@ -180,15 +174,12 @@ class Continuation(ResultTuple):
                 for curve in self.curves
             ],
             "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in self.branches],
-            "sticking": self.sticking,
             "law_parameters": None if self.law_parameters is None else list(self.law_parameters),
         }
 
     def printed(self) -> list[str | Table]:
         """Return what `afm-jax continue` prints: a line a branch, a table of special points, lines for each curve."""
         kind = f"({self.impacts}, {self.order}) orbits"
-        if self.sticking:
-            kind = f"Orbits with a rest, N = {self.order},"
         parts: list[str | Table] = [f"{'' if self.branches else 'No '}{kind} with {self.range}"]
         for number, branch in enumerate(self.branches):
             low, high = branch.parameter.min(), branch.parameter.max()

@@ -13,7 +13,6 @@ from rich.table import Table
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, ManyImpactOrbits, orbit_facts
-from afm_jax.dynamics.sticking_orbits import StickingOrbit
 from afm_jax.impact.orbits import SingleImpactOrbits
 from afm_jax.results import Result
 from afm_jax.words import counted
@@ -110,14 +109,12 @@ class OrbitTable(NamedTuple):
 
 
 class ManyOrbitTable(NamedTuple):
-    """The orbits of one scene with several impacts, or of its contact, and the one that rests on the sample."""
+    """The orbits of one scene with several impacts, or of its contact."""
 
     scene: Scene
     order: int
     impacts: int
     orbits: ManyImpactOrbits
-    resting: StickingOrbit | str
-    """The orbit with a rest, or a sentence on why there is none."""
 
     text, plot = Result.text, _picture_of_orbits
 
@@ -128,9 +125,8 @@ class ManyOrbitTable(NamedTuple):
 
     @property
     def reason(self) -> str | None:
-        """Why there is no orbit of this order, with a rest or without; None where there is one."""
-        rests = isinstance(self.resting, StickingOrbit) and self.resting.order == self.order
-        if len(self.orbits.stable) or rests:
+        """Why there is no orbit of this order; None where there is one."""
+        if len(self.orbits.stable):
             return None
         return why_none(self.scene, self.order, rejected=0, impacts=self.impacts)
 
@@ -141,17 +137,10 @@ class ManyOrbitTable(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
-        resting = self.resting
-        return {
-            "order": self.order,
-            "impacts": self.impacts,
-            "orbits": self.rows,
-            "sticking": None if isinstance(resting, str) else resting._asdict(),
-            "sticking_reason": resting if isinstance(resting, str) else None,
-        }
+        return {"order": self.order, "impacts": self.impacts, "orbits": self.rows}
 
     def printed(self) -> list[str | Table]:
-        """Return the orbits as a table, a line an impact, an orbit's numbers in its first; and the one that rests."""
+        """Return the orbits as a table, a line an impact, an orbit's numbers in its first."""
 
         def of_orbit(cell: Callable[[dict[str, Any]], str]) -> Cell:
             return lambda row: cell(row["orbit"]) if row["first"] else ""
@@ -169,18 +158,7 @@ class ManyOrbitTable(NamedTuple):
             "stable": of_orbit(lambda orbit: "yes" if orbit["stable"] else "no"),
         }
         title = f"Orbits with {counted(self.impacts, 'impact')} in {counted(self.order, 'drive period')}"
-        return [printed_table(title, cells, rows), self._resting_words()]
-
-    def _resting_words(self) -> str:
-        rests = self.resting
-        if isinstance(rests, str):
-            return f"No orbit with a rest: {rests}."
-        return (
-            f"Orbit with a rest on the sample: it repeats after {rests.order} drive periods, peak "
-            f"{rests.peak_amplitude_nm:.6g} nm; the sample lets go at a drive phase of {rests.release_phase_rad:.6g} "
-            f"rad, {rests.impacts} impacts were followed one by one, the rest of them and the rest take "
-            f"{rests.rest_us:.4g} us. Its multipliers are 0."
-        )
+        return [printed_table(title, cells, rows)]
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of orbits.csv, a row an orbit, and of impacts.csv, a row an impact."""

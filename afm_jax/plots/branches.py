@@ -68,7 +68,7 @@ def continuation_figure(
             label=_once(point.kind.replace("_", " "), labels),
         )
     label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
-    what = f"orbits with a rest, N = {found.order}" if found.sticking else f"({found.impacts}, {found.order}) orbits"
+    what = f"({found.impacts}, {found.order}) orbits"
     axes.set_title(what, fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.margins(x=0.02)

@@ -132,13 +132,6 @@ LYAPUNOV = Command(
 )
 
 
-def _check_sticking(_: Session, options: Options) -> None:
-    """Check that an orbit with a rest is followed through one parameter."""
-    others = options["second"] is not None or options["law"] is not None or options["impacts"] != 1
-    if options["sticking"] and others:
-        raise ValueError("--sticking goes without --impacts, --second and --law: an orbit with a rest has no equations")
-
-
 CONTINUE = Command(
     name="continue",
     group="simulate",
@@ -148,10 +141,8 @@ CONTINUE = Command(
 
     Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
     followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
-    instead of the map, and curves end where the orbit grazes or is captured. With --sticking the phase is that of the
-    release, and the branches end where the rest is lost, the sample lets go no more or a flight grazes. With --law
-    every special point has a 95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible
-    orbit in the range.
+    instead of the map, and curves end where the orbit grazes or is captured. With --law every special point has a 95 %
+    interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
     """,
     options=(
         SCENE,
@@ -172,11 +163,9 @@ CONTINUE = Command(
         click.option(
             "--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both."
         ),
-        flag("--sticking", "Follow the orbit with a rest on the sample: chatter, ride, release."),
         LAW,
         PICTURE,
     ),
-    check=_check_sticking,
 )
 
 
@@ -233,9 +222,8 @@ ORBITS = Command(
     Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
     whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase and lag
     at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and orbits.png. Exit
-    code 3 if none is admissible. With --impacts every impact is listed, the hardest first, and the orbit with a rest on
-    the sample if there is one. A contact's orbits are listed like this, too: its impacts begin where the bridge forms
-    and end, with phase and velocity, where it breaks.
+    code 3 if none is admissible. With --impacts every impact is listed, the hardest first. A contact's orbits are
+    listed like this, too: its impacts begin where the bridge forms and end, with phase and velocity, where it breaks.
     """,
     options=(
         SCENE,
