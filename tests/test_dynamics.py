@@ -13,7 +13,7 @@ from click.testing import CliRunner
 import afm_jax as afm
 from afm_jax.bench.dynamics import orbits_by_numpy
 from afm_jax.cli.main import main
-from afm_jax.dynamics.basins import basins_of_attraction, boundary_dimension
+from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.starts import bouncing_tips
@@ -128,16 +128,6 @@ def test_shares_of_basins_are_those_of_random_starts():
     for attractor, share, error in zip(found.attractors, found.share, found.share_error, strict=True):
         other = np.mean(m == attractor.impacts)
         assert abs(share - other) < 4.0 * np.hypot(error, np.sqrt(other * (1.0 - other) / starts))
-    assert 1.0 < found.boundary_dimension < 2.0
-
-
-def test_the_dimension_of_a_line_is_1_and_of_noise_2():
-    columns, rows = np.meshgrid(np.arange(512), np.arange(512))
-    line = (columns + 0.37 * rows > 350).astype(int)
-    assert boundary_dimension(line)[0] == pytest.approx(1.0, abs=0.02)
-    noise = np.random.default_rng(1).integers(0, 2, (512, 512))
-    assert boundary_dimension(noise)[0] == pytest.approx(2.0, abs=0.02)
-    assert np.isnan(boundary_dimension(np.zeros((512, 512), int))[0])
 
 
 @pytest.mark.slow

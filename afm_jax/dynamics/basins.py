@@ -1,4 +1,4 @@
-"""Basins of attraction: which start ends where, and how rough the boundaries between basins are.
+"""Basins of attraction: which start ends where.
 
 A sample of starts is followed for long; what it comes to are the attractors. Around each point of each orbit the
 largest radius is sought from within which all of a ring and a disc of tips come back. Then every start is followed
@@ -42,8 +42,6 @@ _ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
 _PART = 8 * LANES
 _LEFT = 20_000
 """Starts at most that are told apart one by one in the end."""
-_NARROWEST = 16
-"""Cells at least that the widest pair of the uncertainty exponent fits into the picture."""
 
 
 _NOTHING = np.zeros(0)
@@ -78,8 +76,6 @@ class Basins(ResultTuple):
         attractor: the number of each start's attractor, (rows, columns).
         share: fraction of the starts that ends on each attractor.
         share_error: standard errors of the shares, as of random starts.
-        boundary_dimension: dimension of the basins' boundary, by the uncertainty exponent; NaN with one attractor.
-        boundary_dimension_error: standard error of that dimension.
         share_interval95: of each attractor the interval that holds 95 % of its shares for drawn laws; None: none drawn.
     """
 
@@ -89,8 +85,6 @@ class Basins(ResultTuple):
     attractor: Int[np.ndarray, "rows columns"]
     share: Float[np.ndarray, " attractors"]
     share_error: Float[np.ndarray, " attractors"]
-    boundary_dimension: float
-    boundary_dimension_error: float
     share_interval95: Float[np.ndarray, "attractors 2"] | None = None
 
     def table(self) -> list[dict[str, object]]:
@@ -133,12 +127,7 @@ class Basins(ResultTuple):
             if self.share_interval95 is not None:
                 told["share_interval95"] = self.share_interval95[number].tolist()
             attractors.append(told)
-        return {
-            "starts": self.attractor.size,
-            "attractors": attractors,
-            "boundary_dimension": self.boundary_dimension,
-            "boundary_dimension_error": self.boundary_dimension_error,
-        }
+        return {"starts": self.attractor.size, "attractors": attractors}
 
     def printed(self) -> list[str]:
         """Return what `afm-jax basins` prints, a line an attractor."""
@@ -155,9 +144,6 @@ class Basins(ResultTuple):
                 f"{line}; {low:.4g} to {high:.4g} % in 95 % of the draws"
                 for line, (low, high) in zip(lines, ends, strict=True)
             ]
-        if np.isfinite(self.boundary_dimension):
-            dimension = f"{self.boundary_dimension:.3f} +- {self.boundary_dimension_error:.3f}"
-            lines.append(f"dimension of the boundaries: {dimension}")
         return [starts, *lines]
 
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -238,7 +224,6 @@ def basins_of_attraction(
     place[order] = np.arange(len(order))
     label = place[label].reshape(rows, columns)
     share = count[order] / label.size
-    dimension, error = boundary_dimension(label)
 
     def in_lab(attractor: Attractor) -> Attractor:
         moved = np.asarray(seen.response(attractor.phase_rad / finder.omega)[1])
@@ -252,8 +237,6 @@ def basins_of_attraction(
         attractor=label,
         share=share,
         share_error=np.sqrt(share * (1.0 - share) / label.size),
-        boundary_dimension=dimension,
-        boundary_dimension_error=error,
     )
 
 
@@ -479,28 +462,3 @@ def _with_names(attractors: list[Attractor]) -> list[Attractor]:
     letters = {name: iter("abcdefghijklmnopqrstuvwxyz") for name in names if names.count(name) > 1}
     told_apart = [f"{name} {next(letters[name], '+')}" if name in letters else name for name in names]
     return [attractor._replace(name=name) for attractor, name in zip(attractors, told_apart, strict=True)]
-
-
-def boundary_dimension(attractor: Int[np.ndarray, "rows columns"]) -> tuple[float, float]:
-    """Return the dimension of the boundary between basins, and its standard error.
-
-    The fraction of pairs of starts k cells apart that end in different places goes as k^alpha, and the dimension is
-    2 - alpha. NaN where all starts end in one place, or the grid is too small.
-
-    Args:
-        attractor: the number of each start's attractor.
-    """
-    widest = min(attractor.shape) // _NARROWEST
-    apart = [1 << power for power in range(max(widest, 1).bit_length())]
-    fractions = []
-    for cells in apart:
-        across = attractor[:, cells:] != attractor[:, :-cells]
-        up = attractor[cells:] != attractor[:-cells]
-        fractions.append((across.sum() + up.sum()) / (across.size + up.size))
-    if len(apart) < 3 or not all(fractions):
-        return float("nan"), float("nan")
-    x, y = np.log(apart), np.log(fractions)
-    slope, _ = np.polyfit(x, y, 1)
-    off = y - np.polyval(np.polyfit(x, y, 1), x)
-    error = np.sqrt((off**2).sum() / (len(x) - 2) / ((x - x.mean()) ** 2).sum())
-    return float(2.0 - slope), float(error)
