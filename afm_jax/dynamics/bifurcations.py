@@ -1,17 +1,16 @@
 """Bifurcation diagrams: what motions come to while a parameter is ramped up, and down.
 
 A sweep carries the tip from value to value, which is what makes hysteresis show, and is a long sequence. It is done in
-many lanes at once, each a stretch of neighbouring values, like this: a first tip hurries along the first values of all
-stretches; from where it was, all stretches are ramped side by side; then every stretch is ramped again from the end of
-the one before it, for as long as that makes a difference, and those behind the ones whose end became another are, too,
-until none is left. What remains is what one tip that is ramped along all values does, where its motion is regular; it
-carries drive phase and rebound speed from value to value. A tip that the platform holds, or that flies away, begins
-anew at the next value, where it is told to or where there is motion (`bouncing_tips`).
+many lanes at once, each a stretch of neighbouring values: all stretches are ramped side by side, each from a start of
+its own; then every stretch is ramped again from the end of the one before it, for as long as that makes a difference,
+and those behind the ones whose end became another are, too, until none is left. What remains is what one tip that is
+ramped along all values does, where its motion is regular; it carries drive phase and rebound speed from value to value.
+A tip that the platform holds, or that flies away, begins anew at the next value, where it is told to or where there is
+motion (`bouncing_tips`).
 """
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -23,22 +22,20 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import Record, Tips, follow, skipped, tips_after_contacts
-from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, leaving_tips, sample_driven
+from afm_jax.dynamics.many_tips import Record, Tips, follow
+from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
-from afm_jax.solve.lanes import LANES, Report, compiled_quickly, compiling, in_blocks
+from afm_jax.solve.lanes import LANES, Report, compiled_quickly, in_blocks
 from afm_jax.units import within_turn
 
 _STRETCHES, _MORE_STRETCHES = 512, 1024
 """Stretches at most that are ramped side by side: one block of tips; two where that leaves long ones."""
 _LONG_STRETCH = 8
 """Values: the shorter stretches are, the more often they are ramped again."""
-_HURRIED = 100
-"""Impacts at each value of the first, hurried sweep."""
 _PASSES = 40
 """Times at most that stretches are ramped again."""
 _FEW = 16
@@ -218,26 +215,14 @@ def bifurcation_diagram(  # noqa: PLR0913
     if impacts < RECORDED:
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
     begin = None if start is None else seen.start(start_of(scenes, start))
-    with _compiling_for(seen.scenes, impacts, accuracy):
-        _, fresh = batch_and_tips(seen.scenes, begin)
-        seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
-        sweeper = _Sweeper(seen.scenes, fresh, impacts, accuracy)
-        starts = sweeper.hurried()
-    swept, complete = sweeper.run(starts, report)
+    _, fresh = batch_and_tips(seen.scenes, begin)
+    seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
+    swept, complete = _Sweeper(seen.scenes, fresh, impacts, accuracy).run(report)
     restarted = np.append(False, swept.end.outcome[:-1] != Outcome.IMPACT)
     order = slice(None) if upward else slice(None, None, -1)
     seen, platform, swept, restarted = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept, restarted))
     seen, platform = jax.tree.map(jnp.asarray, (seen, platform))
     return _sweep_of(seen, platform, swept, restarted, ordered, upward=upward, complete=complete)
-
-
-def _compiling_for(scenes: Scene, impacts: int, accuracy: float) -> AbstractContextManager[None]:
-    """Compile on another core what will follow the tips of scenes with laws, many and few."""
-    if isinstance(scenes.interaction, Contact):
-        return nullcontext()
-    scenes, ended = jax.tree.map(np.asarray, (scenes, leaving_tips(scenes)))
-    ended = ended._replace(outcome=np.full_like(ended.outcome, Outcome.CAPTURED))
-    return compiling(_Sweeper(scenes, ended, impacts, accuracy).follow_some)
 
 
 class _SweptRows(NamedTuple):
@@ -259,14 +244,13 @@ class _Sweeper:
         self.stretch = max(shortest, min(longest, _LONG_STRETCH))
         self.lanes = -(-self.count // self.stretch)
 
-    def run(self, starts: Tips, report: Report | None) -> tuple[_SweptRows, bool]:
+    def run(self, report: Report | None) -> tuple[_SweptRows, bool]:
         """Return the sweep of all values, and whether nothing was left to be ramped again.
 
         Args:
-            starts: tips at the first values of all stretches.
             report: told how many of how many values are done.
         """
-        parts, changed = self._sweep(starts, report), np.arange(self.lanes)
+        parts, changed = self._sweep(report), np.arange(self.lanes)
         for _ in range(_PASSES):
             changed = self._swept_again(parts, changed[changed + 1 < self.lanes] + 1)
             if not changed.size:
@@ -287,9 +271,10 @@ class _Sweeper:
         """Return the scenes of values, and the tips that begin there."""
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), (self.scenes, self.fresh))
 
-    def _sweep(self, tips: Tips, report: Report | None) -> list[_SweptRows]:
+    def _sweep(self, report: Report | None) -> list[_SweptRows]:
         """Return what comes out at the first, second, ... value of all stretches."""
         lanes, parts = np.arange(self.lanes), []
+        tips = jax.tree.map(lambda leaf: leaf[self._numbers(lanes)[:, 0]], self.fresh)
         for place in range(self.stretch):
             if place:
                 tips = self._carried(parts, lanes, place)
@@ -341,38 +326,6 @@ class _Sweeper:
             end, record = in_blocks(work, (scenes, tips), block=width, widths=(width,), program=program)
         period = self.period_us[numbers]
         return _SweptRows(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
-
-    def follow_some(self) -> None:
-        """Follow the tips that begin at the first values of all stretches, and those of few."""
-        firsts = self._numbers(np.arange(self.lanes))[:, 0]
-        for some in (firsts, firsts[:_FEW]):
-            self._follow(some, self._at(some)[1])
-
-    def hurried(self) -> Tips:
-        """Return the tips that one gets at the first values of all stretches in a sweep of those alone."""
-        firsts, fresh = self._at(self._numbers(np.arange(self.lanes))[:, 0])
-        if not isinstance(self.scenes.interaction, Contact):
-            return jax.tree.map(np.asarray, _hurried_law(firsts, fresh))
-        rows, tips, before = [], None, None
-        for lane in range(self.lanes):
-            scene, begin = jax.tree.map(lambda leaf, lane=lane: leaf[lane : lane + 1], (firsts, fresh))
-            tips = begin if tips is None else carried(before, scene, begin, tips)
-            before = scene
-            rows.append(jax.tree.map(np.asarray, tips))
-            tips, _ = tips_after_contacts(scene, tips, skip=1, record=0, accuracy=self.accuracy)
-        return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
-
-
-@compiled_quickly()
-def _hurried_law(firsts: Scene, fresh: Tips) -> Tips:
-    def carry_on(state, place: tuple[Scene, Tips]):
-        scene, _ = place
-        tips = carried(state[0], *place, state[1])
-        return (scene, skipped(scene, tips, impacts=_HURRIED)), tips
-
-    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], (firsts, fresh))
-    first = jax.tree.map(lambda leaf: leaf[0], each)
-    return jax.tree.map(lambda part: part[:, 0], jax.lax.scan(carry_on, first, each)[1])
 
 
 @jax.jit
