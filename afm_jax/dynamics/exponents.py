@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
@@ -45,6 +46,10 @@ _PARTS = 20
 """Parts of a motion whose means tell the errors."""
 _CONTACTS_AT_ONCE = 256
 """Contacts whose Jacobians are computed together."""
+_PUSH = 1e-3
+"""Of the speed off the platform, by which a tip leaves an unstable orbit."""
+_GROWS = 1e-9
+"""Larger exponent per impact above which an orbit is unstable; below it is rounding."""
 _ARRIVED = 1e-8
 """Estimated distance from an orbit below which its multipliers are taken for the exponents."""
 
@@ -173,11 +178,13 @@ CHAOTIC_ERRORS = 3.0
 
 def exponent_verdicts(exponents: Lyapunov) -> list[str]:
     """Return in words what the exponents of each of many motions say."""
-    words = []
+    words, unstable = [], on_unstable_orbit(exponents)
     for lane, name in enumerate(exponents.verdicts.names()):
         kind = exponents.verdicts.kind[lane]
         larger, error = exponents.exponents_per_impact[lane, 0], exponents.exponents_per_impact_error[lane, 0]
-        if kind == MotionKind.ORBIT:
+        if unstable[lane]:
+            words.append(f"undecided: the motion stays on a {name} orbit that is unstable; try another [start]")
+        elif kind == MotionKind.ORBIT:
             forgets = ", the tip rests on the platform and forgets its start" if np.isneginf(larger) else ""
             words.append(f"regular: the motion has come to a {name} orbit{forgets}")
         elif kind == MotionKind.STUCK:
@@ -193,6 +200,12 @@ def exponent_verdicts(exponents: Lyapunov) -> list[str]:
         else:
             words.append(f"unresolved: the motion comes {WHY_UNRESOLVED}")
     return words
+
+
+def on_unstable_orbit(exponents: Lyapunov) -> Bool[np.ndarray, " lanes"]:
+    """Say which of many motions repeat on an orbit with a multiplier outside the unit circle."""
+    larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
+    return (exponents.verdicts.kind == MotionKind.ORBIT) & (larger > np.maximum(_GROWS, error))
 
 
 class _Sums(NamedTuple):
@@ -241,10 +254,21 @@ def lyapunov_spectrum(
         raise ValueError(f"`impacts` must be {_PARTS} or more and `transient` not negative: {impacts} and {transient}")
     single = scene.platform.frequency_khz.ndim == 0
     scenes, tips = batch_and_tips(seen.scenes, None if start is None else seen.start(start))
-    if isinstance(scene.interaction, Contact):
-        exponents = _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
-    else:
-        exponents = exponents_of_law(scenes, tips, impacts=impacts, transient=transient, report=report)
+
+    def spectrum_from(tips: Tips) -> Lyapunov:
+        if isinstance(scene.interaction, Contact):
+            return _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
+        return exponents_of_law(scenes, tips, impacts=impacts, transient=transient, report=report)
+
+    exponents = spectrum_from(tips)
+    unstable = on_unstable_orbit(exponents)
+    if unstable.any():
+        # rounding may hold a tip on such an orbit for ever: no neighbour comes to it
+        velocity = np.asarray(tips.velocity_nm_per_us)
+        speed = velocity - np.asarray(jax.vmap(Platform.velocity)(scenes.platform, jnp.asarray(tips.time_us)))
+        exponents = spectrum_from(
+            tips._replace(velocity_nm_per_us=velocity + np.where(unstable, _PUSH * np.abs(speed), 0.0))
+        )
     return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 

@@ -18,14 +18,17 @@ from afm_jax.motion.record import State
 
 _HIGHEST_ORDER = 200
 _NEWTON_STEPS = 30
+_PUSH = 1e-3
+"""Of the rebound speed, by which a start misses an unstable orbit: rounding may hold a tip there for ever."""
 
 
 def default_start(scene: Scene) -> State:
     """Return where a simulation of a scene begins that has no start of its own.
 
     Driven with one frequency: just after the impact of the single-impact orbit that the scene's law, or the law with
-    delay closest to its contact, has for the order nearest to resonance; the stable one, the fastest if there are
-    several. Without such an orbit: with a drive of base or force at rest where that is above the sample, else leaving
+    delay closest to its contact, has for the order nearest to resonance; a stable one, the fastest if there are
+    several, or else beside the fastest unstable one. Without an orbit: with a drive of base or force at rest where that
+    is above the sample, else leaving
     the platform upward at its highest speed, at that speed again or twice the capture speed relative to it. A free
     cantilever starts at rest.
 
@@ -105,7 +108,8 @@ def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
     time = float(orbits.phase_rad[slot]) / omega
     velocity = float(orbits.velocity_after_nm_per_us[slot])
     if not isinstance(scene.interaction, Contact):
-        return state(time, float(scene.platform.position(time)), velocity)
+        height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
+        return state(time, height, velocity if stable.any() else velocity + _PUSH * (velocity - speed))
     return _risen(scene, time, velocity, _clearance(scene))
 
 

@@ -48,12 +48,12 @@ BIFURCATION = Command(
     help="""Ramp a parameter and record on which motion the tip settles at each of its values.
 
     The tip is carried from value to value with its drive phase and rebound speed. It starts, and starts again where the
-    platform held it or it flew away, at the file's [start]; without one on the stable single-impact orbit of the order
-    nearest to resonance, else leaving the platform upward. The output gives the motion at each value, (m,N): m impacts
-    in N drive periods, irregular, stuck or free; and its last impacts. With --out bifurcation.csv (a row a value),
-    impacts.csv (a row an impact; of an orbit each once), strobe.csv (heights whenever the platform is highest) and a
-    picture. With --law it also gives the fraction of the fit's draws with the same motion. Exit code 3 if no motion
-    went on anywhere.
+    sample held it or it flew away, at the file's [start]; without one on a stable single-impact orbit of the order
+    nearest to resonance (of a contact: of the law closest to it), else leaving the sample upward. The output gives the
+    motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last impacts. With
+    --out bifurcation.csv (a row a value), impacts.csv (a row an impact; of an orbit each once), strobe.csv (heights
+    whenever the platform is highest) and a picture. With --law it also gives the fraction of the fit's draws with the
+    same motion. Exit code 3 if no motion went on anywhere.
     """,
     options=(
         SCENE,
@@ -112,10 +112,12 @@ LYAPUNOV = Command(
     help="""Compute Lyapunov exponents by QR of the impact map's exact Jacobians; a contact's come from its simulation.
 
     Of a motion that has come to an orbit they are the logarithms of its multipliers. A tip that rests on the platform
-    forgets its start: its exponents are minus infinity, null in JSON. Begins at the file's [start]; without one on the
-    stable single-impact orbit of the order nearest to resonance, if there is one, else leaving the platform upward.
-    With --law there is a band for the larger one, begun without [start]. With --out lyapunov.csv, and with --parameter
-    a picture. Exit code 3 where every motion ends before enough impacts.
+    forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start]; without
+    one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it if it is
+    unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves the sample
+    upward. An orbit is reported only if it is stable. With --law there is a band for the larger exponent, begun without
+    [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 where every motion ends before enough
+    impacts.
     """,
     options=(
         SCENE,
