@@ -98,7 +98,7 @@ def test_no_motion_stays_on_an_unstable_orbit():
     """A lever of 159 kHz over a resting sample, driven by a force: its (1,1) orbit has the multipliers -2.24, -0.26."""
     drive = np.linspace(437.0, 437.3, 80)
     lever, law = afm.Cantilever(159.155, 25.0), afm.ImpactLaw(0.8)
-    scene = afm.Scene(lever, afm.Platform(0.0, 437.676), law, force=afm.Force(1.0, 437.676))
+    scene = afm.Scene(lever, afm.Platform(0.0, 437.676), law, force=afm.ForceDrive(1.0, 437.676))
     scenes = scene_batch(scene, {"force.frequency_khz": drive})
     orbits = jax.vmap(lambda each: afm.single_impact_orbits(each, 1))(scenes)
     slot = np.argmax(np.asarray(orbits.admissible), axis=1)[:, None]
