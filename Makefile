@@ -125,8 +125,10 @@ check: lint types test slow docs ## all that CI runs: format, lint, types, tests
 
 thorough: lint types coverage long mutations bands tapping energies ranks fuzz kills newest ## all of make check with line coverage, long tests, mutation tests, bands, tapping curves, energies of taps, ranks, fuzzing, kills, the newest Python and JAX
 
-bench: $(SETUP) ## impacts per second, next to SciPy
-	$(BIN)/afm-jax bench --out $(OUT)
+BENCH ?= $(if $(BESIDE),--beside '$(BESIDE)')
+
+bench: $(SETUP) ## times on this machine, SciPy beside (ten minutes); writes the table of the page of benchmarks; BESIDE=DIR: another checkout, too
+	$(BIN)/python -m tests.benchmarks $(BENCH)
 
 clean: ## remove the environment, caches and reports
 	rm -rf .venv .venv-newest .venv-oldest report results .pytest_cache .ruff_cache .hypothesis .coverage build dist *.egg-info

@@ -6,17 +6,15 @@ from importlib import import_module
 from typing import Any
 
 
-def run_here(task: str, settings: Mapping[str, Any], *, cores: int) -> Any:
-    """Stand in for `afm_jax.studies.timing.run_in_own_process`; the number of cores is left as it is."""
-    del cores
+def run_here(task: str, settings: Mapping[str, Any]) -> Any:
+    """Stand in for `afm_jax.studies.timing.run_in_own_process`."""
     return _function(task)(**settings)
 
 
 def answered_with(results: Mapping[str, Any]) -> Callable[..., Any]:
     """Return a stand-in that has measured already, by the functions' names; it sees that these take the settings."""
 
-    def run(task: str, settings: Mapping[str, Any], *, cores: int) -> Any:
-        del cores
+    def run(task: str, settings: Mapping[str, Any]) -> Any:
         _ = inspect.signature(_function(task)).bind(**settings)
         return results[task.partition(":")[2]]
 

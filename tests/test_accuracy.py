@@ -1,94 +1,192 @@
-"""The accuracy study: achieved errors are right, and the cheapest setting is the cheapest. No times are judged."""
+"""The accuracy study: its references, its rivals, and the command. No times are judged."""
 
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
-from afm_jax.accuracy.overview import cheapest, impacts, orbits, overview_row
-from afm_jax.cli.accuracy import MAP, OVERVIEW_FULL
+from afm_jax import Cantilever, ForceDrive, ImpactLaw, Platform, Scene, iterate_map, map_jacobian
+from afm_jax.apparatus.surface import surface_of
+from afm_jax.contact.driven import driven_by
+from afm_jax.contact.junction import Phase
+from afm_jax.motion.record import State
+from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import start_of
+from afm_jax.scenefile.presets import contact_scene, preset
+from afm_jax.scenefile.scenefile import save_scene
+from afm_jax.studies import accuracy
 from afm_jax.studies import timing as own_process
-from tests.answers import answer
+from tests import reference_contact as exact
+from tests.answers import answer, table
+from tests.reference_driven_contact import DrivenContact, follow
+from tests.run_here import answered_with, run_here
+
+SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
+START = {"phase_deg": 270.0, "height_nm": 5.0, "velocity_nm_per_us": 60.0}
+FORCED = Scene(
+    Cantilever(90.0, 200.0, 16.8), Platform(0.0, 94.5, -30.0), ImpactLaw(0.95, 60.0), force=ForceDrive(60.0, 94.5)
+)
+
+
+@pytest.fixture(scope="module")
+def course():
+    """Contacts of an independent integration to 12 digits; from this start some of the first twenty-five turn."""
+    return follow(SYSTEM, *SYSTEM.start(**START), contacts=25)
+
+
+def test_the_reference_of_the_map_is_the_closed_form():
+    problem = accuracy.impact_times(6)
+    scene = preset("figure2")
+    _, tips = problem.begin(problem.at)
+    speeds = tips.rate + scene.platform.velocity(tips.time_us)
+    slopes = jax.vmap(lambda time, speed: map_jacobian(scene, time, speed)[0])(tips.time_us, speeds)
+    # eqs. 5 and 7 in float64: a few roundings
+    np.testing.assert_allclose(problem.exact[1], np.asarray(slopes), rtol=1e-11, atol=1e-12)
+    times = [iterate_map(scene, *start, 1).time_us[0] for start in zip(tips.time_us, speeds, strict=True)]
+    np.testing.assert_allclose(problem.exact[0], np.array(times), rtol=0.0, atol=1e-14)
+
+
+def test_the_reference_of_collisions_is_that_of_mpmath():
+    problem = accuracy.rebound_speeds(9)
+    speeds = np.linspace(12.0, 200.0, 9)
+    for place in (0, 4, 8):
+        expected = exact.collision(exact.ContactParameters(), float(speeds[place]), digits=20)
+        # converged to rounding: energies of 100 aJ, of which the slowest tip keeps 12
+        assert problem.exact[0][place] == pytest.approx(float(expected.rebound_speed_nm_per_us), rel=1e-12)
+    assert max(problem.doubt) < 1e-13
 
 
 @pytest.mark.slow
-def test_achieved_errors_are_what_tolerances_and_rounding_allow():
-    few = {"batch": 20, "impacts": 5, "lanes": 2, "repetitions": 1}
-    study = map_accuracy(root_tolerances_us=[1e-2, 1e-13], scipy_tolerances=[1e-9], **few)
-    assert {row["scene"] for row in study["rows"]} == {"regular", "grazing", "order 5"}
-    assert len(study["rows"]) == 3 * (2 * 2 + 1)
-    assert study["reference_error_us"] < 1e-40  # fifty digits
-    for row in study["rows"]:
-        assert set(row) <= set(MAP.columns)
-        error, tolerance = row["error_us"], row["tolerance"]
-        if row["method"] == "next_impact float64":
-            # the tolerance bounds the error; rounding of times up to 30 us and of the gap adds 1e-14 or so
-            assert error <= tolerance + 1e-13, row
-            assert row["impacts_checked"] + row["near_grazing"] == 10
-            # a coarse tolerance is made use of, in the first scene at least
-            assert error > 1e-4 or tolerance < 1e-2 or row["scene"] != "regular", row
-        elif row["method"] == "SciPy DOP853":
-            # 1e-9 relative of 10 nm/us, divided by slow approaches
-            assert (row["missed_impacts"], error < 1e-6) == (0, True)
-        elif tolerance == 1e-13:
-            # float32: times of 1 to 30 us have a rounding of 1e-7 to 4e-6; slow impacts multiply it
-            assert 1e-8 < error < 1e-3, row
+def test_the_reference_of_a_contact_scene_is_that_of_an_independent_integration(course):
+    scene = contact_scene(5.277, 4.0, 0.0)
+    start = State(
+        *(jnp.asarray(part) for part in SYSTEM.start(phase_deg=270.0, height_nm=5.0, velocity_nm_per_us=60.0))
+    )
+    last = course.contacts[2]
+    until = jnp.asarray(last.departure_time_us + 1e-3)
+    found = accuracy.contact_arrival(scene, surface_of(scene), 3, until, accuracy.IN_TIME[0], start)
+    # two contacts multiply rounding and step errors by less than a thousand
+    assert float(found) == pytest.approx(last.arrival_time_us, abs=1e-9)
+
+
+@pytest.mark.parametrize("rival", ["SciPy", pytest.param("Diffrax", marks=pytest.mark.slow)])
+def test_rivals_follow_straight_and_turning_contacts(course, rival: str):
+    scene = contact_scene(5.277, 4.0, 0.0)
+    driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
+    motion = accuracy.EquationOfMotion(scene.cantilever, scene.platform, None, driven)
+    straight = next(contact for contact in course.contacts if contact.junctions == 1)
+    turning = next(contact for contact in course.contacts if contact.junctions != 1)
+    arrivals, rates = (
+        jnp.asarray([getattr(each, name) for each in (straight, turning)])
+        for name in ("arrival_time_us", "approach_speed_nm_per_us")
+    )
+    tips = accuracy.tips_at(Phase.BRIDGE, driven.forms_nm, -rates, arrivals)
+    if rival == "SciPy":
+        programs = accuracy.ScipyPrograms(motion)
+        alone = [jax.tree.map(lambda part, tip=tip: np.asarray(part)[tip], tips) for tip in (0, 1)]
+        ends = [accuracy.by_scipy(programs, programs.vector(motion), tip, 1, 1e-9) for tip in alone]
+        rebounds, left = ([float(getattr(end, name)) for end in ends] for name in ("rate", "time_us"))
+    else:
+        problem = accuracy.rebound_speeds(2)._replace(begin=lambda _: (motion, tips))
+        rebounds, left = (
+            jax.jit(
+                lambda read=read: accuracy.by_diffrax(problem._replace(read=read), jnp.asarray(1e-9), jnp.zeros(2))
+            )()
+            for read in (lambda tip: tip.rate, lambda tip: tip.time_us)
+        )
+    for contact, rebound, departure in zip((straight, turning), rebounds, left, strict=True):
+        # their tolerance, times some tens of steps and the slow parts of a turning contact
+        assert float(rebound) == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-6)
+        assert float(departure) == pytest.approx(contact.departure_time_us, abs=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["forced", "figure9b"])
+def test_law_scenes_are_measured_however_they_are_driven(scene: str, tmp_path: Path):
+    """SciPy and Diffrax know nothing of steady responses and closed forms, and arrive at the same time."""
+    name = scene
+    if scene == "forced":
+        name = str(tmp_path / "forced.toml")
+        save_scene(FORCED, name)
+    found = accuracy.measured(name, contacts=3, quick=True)
+    for row in found["rows"]:
+        assert "reason" not in row
+        coarse = row["setting"] == "root tolerance 0.1 us"
+        # times of 20 us; the slope grows where the tip is slow
+        assert row["error"] < (1.0 if coarse else 1e-4 if row["of"] == "gradient" else 1e-6), row
+    assert {row["method"] for row in found["rows"]} == {"afm-jax", "SciPy DOP853", "Diffrax Dopri8"}
+
+
+def test_a_forced_scene_arrives_when_its_simulation_does():
+    start = start_of(FORCED, None)
+    found = accuracy.law_arrival(FORCED, surface_of(FORCED), 4, jnp.asarray(1e-13), start)
+    times = simulate(FORCED, start, 200.0).contacts.arrival_time_us
+    # the search of both stops at 1e-13 us
+    assert float(found) == pytest.approx(float(times[3]), abs=1e-11)
+
+
+def test_a_tip_with_fewer_contacts_is_refused(tmp_path: Path):
+    path = tmp_path / "captured.toml"
+    save_scene(Scene(Cantilever(90.0, 40.0), Platform(0.5, 174.6, 5.0), ImpactLaw(0.998, 122.0)), path)
+    with pytest.raises(ValueError, match="not as many as 5 contacts"):
+        accuracy.contact_arrivals(str(path), 5)
 
 
 def test_cheapest_is_the_fastest_that_is_good_enough():
-    def row(scene: str, tolerance: float, time: float, error: float | None, method="next_impact float64") -> dict:
-        own = {"scene": scene, "method": method, "tolerance": tolerance}
-        return own | {"microseconds_per_impact": time, "error_us": error}
+    def row(method: str, setting: str, time: float, error: float | None, of: str = "value") -> dict:
+        return {"of": of, "method": method, "setting": setting, "microseconds": time, "error": error}
 
-    rows = [row("a", 1e-2, 1.0, 1e-3), row("a", 1e-8, 2.0, 1e-9), row("b", 1e-2, 1.0, 1e-9), row("b", 1e-8, 3.0, 1e-10)]
-    chosen = cheapest_settings([*rows, row("a", 1e-2, 0.1, 1e-12, "SciPy DOP853")], 1e-8)
-    found = [(one["scene"], one["tolerance"], one["microseconds_per_impact"]) for one in chosen]
-    assert found == [("a", 1e-8, 2.0), ("b", 1e-2, 1.0), ("all", 1e-8, 3.0)]
-    assert [one["method"] for one in cheapest_settings(rows, 1e-12)] == [None, None, None]
-    # an error that could not be measured is not a good one
-    assert cheapest_settings([row("a", 1e-2, 1.0, None)], 1.0)[0]["method"] is None
+    rows = [
+        row("afm-jax", "coarse", 1.0, 1e-5),
+        row("afm-jax", "fine", 2.0, 1e-10),
+        row("SciPy DOP853", "loose", 0.5, 1e-4),
+        row("Diffrax Dopri8", "tight", 9.0, 1e-10),
+        row("Diffrax Dopri8", "gave up", 0.1, None),
+        row("afm-jax", "coarse", 3.0, 1e-3, "gradient"),
+    ]
+    found = [tuple(one.values()) for one in accuracy.cheapest(rows, [1e-3, 1e-9])]
+    assert found == [
+        ("value", 1e-3, "afm-jax, coarse", 1.0, "SciPy DOP853, loose", 0.5),
+        ("value", 1e-9, "afm-jax, fine", 2.0, "Diffrax Dopri8, tight", 9.0),
+        ("gradient", 1e-3, "afm-jax, coarse", 3.0, None, None),
+        ("gradient", 1e-9, None, None, None, None),
+    ]
 
 
 @pytest.mark.slow
-def test_every_integrator_comes_to_the_same_impacts_and_orbit():
-    """All solve one problem: at a tight tolerance each is right, by 50 digits, which are none of them."""
-    rivals = {"SciPy DOP853", "SUNDIALS CVODE Adams", "Diffrax Dopri8 with Event"}
-    few = {"tolerances": [1e-9], "integrators": ["DOP853", "CVODE Adams"], "batch": 4, "repetitions": 1}
-    found = impacts(root_tolerances_us=[1e-13], impacts=3, **few)
-    closed = orbits(**few)
-    assert {row["method"] for row in found["rows"] if not row["own"]} == rivals
-    assert {row["method"] for row in closed["rows"] if not row["own"]} == {f"{one}, shooting" for one in rivals}
-    for row in (*found["rows"], *closed["rows"]):
-        limit = 1e-3 if "float32" in row["method"] else 1e-13 if row["own"] else 1e-6
-        assert row["error"] < limit, row
+@pytest.mark.parametrize("problem", ["map", "collide"])
+def test_achieved_errors_are_what_settings_allow(problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
+    payload = answer(tmp_path, "accuracy", problem, "--quick")
+    errors = {(row["of"], row["method"], row["setting"]): row["error"] for row in payload["rows"]}
+    bounds = {
+        # a root tolerance of 1e-13 us, and times of up to 10 us
+        "map": {"root tolerance 0.1 us": 0.1, "root tolerance 1e-13 us": 1e-13},
+        "collide": {"diffrax, accuracy 1e-05": 1e-5, "collocation, accuracy 1e-11": 1e-11},
+    }[problem]
+    for setting, bound in bounds.items():
+        assert errors["value", "afm-jax", setting] <= bound
+        assert errors["gradient", "afm-jax", setting] <= 10.0 * bound
+    for method in ("SciPy DOP853", "Diffrax Dopri8"):
+        assert 1e-14 < errors["value", method, "tolerance 1e-08"] < 1e-5
+        assert 1e-12 < errors["gradient", method, "tolerance 1e-08"] < 1e-3
+    assert len(table(tmp_path / "accuracy.csv")) == len(payload["rows"])
 
 
-def test_the_cheapest_way_to_an_error_here_and_elsewhere():
+def test_command_tells_all_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     rows = [
-        overview_row("orbits", "single_impact_orbits", "one", 5.0, 1e-14),
-        overview_row("orbits", "SciPy DOP853, shooting", "loose", 1.0, 1e-4),
-        overview_row("orbits", "SciPy DOP853, shooting", "tight", 9.0, 1e-10),
-        overview_row("orbits", "SciPy Radau, shooting", "gave up", 0.1, float("nan")),
+        {"of": of, "method": method, "setting": "a", "microseconds": 1.0, "error": error, "compile_s": 1.0}
+        for of in ("value", "gradient")
+        for method, error in (("afm-jax", 1e-9), ("SciPy DOP853", 1e-5), ("Diffrax Dopri8", 0.0))
     ]
-    keys = ("wanted_error", "own", "other", "other_microseconds")
-    found = [tuple(row[key] for key in keys) for row in cheapest(rows, [1e-3, 1e-9])]
-    assert found == [
-        (1e-3, "single_impact_orbits, one", "SciPy DOP853, shooting, loose", 1.0),
-        (1e-9, "single_impact_orbits, one", "SciPy DOP853, shooting, tight", 9.0),
-    ]
-    assert cheapest(rows, [1e-15])[0]["own"] is None
-
-
-def test_overview_draws_a_panel_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def measured(task: str, settings: dict, *, cores: int) -> dict:
-        del settings, cores
-        problem = task.split(":")[1]
-        told = {"error_of": "time (us)", "reference": "50 digits", "reference_error": 1e-9}
-        rows = [overview_row(problem, "ours", "a", 1.0, 1e-8), overview_row(problem, "SciPy LSODA", "b", 9.0, 0.0)]
-        return {"rows": rows, "references": {problem: told}}
-
-    monkeypatch.setattr(own_process, "run_in_own_process", measured)
-    payload = answer(tmp_path, "accuracy")
-    assert set(payload["references"]) == {task.split(":")[1] for task in OVERVIEW_FULL}
-    assert {row["own"] for row in payload["cheapest"]} == {None, "ours, a"}  # an error of 1e-8 is not one of 1e-9
-    assert {path.name for path in tmp_path.iterdir()} >= {"accuracy.json", "accuracy.png"}
+    rows.append({"of": "value", "method": "SciPy DOP853", "setting": "b", "microseconds": None, "error": None})
+    rows[-1]["reason"] = "gave up"
+    study = {"rows": rows, "value_of": "arrival of contact 10 (us)", "reference": "a finer one"}
+    study |= {"reference_error": 1e-12, "reference_gradient_error": 0.0}
+    monkeypatch.setattr(own_process, "run_in_own_process", answered_with({"measured": study}))
+    payload = answer(tmp_path, "accuracy", "figure9b", "--wanted-error", 1e-7)
+    assert payload["problem"] == "figure9b"
+    assert [row["wanted_error"] for row in payload["cheapest"]] == [1e-11, 1e-9, 1e-7, 1e-6, 1e-3] * 2
+    assert {path.name for path in tmp_path.iterdir()} == {"accuracy.csv", "accuracy.json", "accuracy.png"}

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from afm_jax import Scene, iterate_map
-from afm_jax.bench.problems import regular_scene, scattered_starts
+from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.law import formula_of
 from afm_jax.impact.map import iterate_batch
+from afm_jax.scenefile.presets import preset
 from afm_jax.verify.fifty_digits import derivatives_by_r
 
 IMPACTS = 3
@@ -19,10 +20,17 @@ def with_r(scene: Scene, r: jax.Array) -> Scene:
     return eqx.tree_at(lambda one: one.interaction.r, scene, r)
 
 
+def scattered_starts(scene: Scene, batch: int) -> tuple[jax.Array, jax.Array]:
+    """Return times all over the drive period, and departures at 0.5 to 4 times the platform's top speed."""
+    first, second = evenly_spread(batch).T
+    time = scene.platform.period_us * first
+    return time, scene.platform.velocity(time) + (0.5 + 3.5 * second) * scene.platform.top_speed_nm_per_us
+
+
 @pytest.mark.parametrize(("batch", "block"), [(1, 500), (7, 3), (8, 4)])
 def test_blocks_change_nothing(batch: int, block: int):
     """The restitution differs from row to row."""
-    scene, r = regular_scene().scene, jnp.linspace(0.3, 0.8, batch)
+    scene, r = preset("figure2"), jnp.linspace(0.3, 0.8, batch)
     time, velocity = (np.asarray(part)[:batch] for part in scattered_starts(scene, 8))
     rows = iterate_batch(with_r(scene, r), time, velocity, IMPACTS, block=block)
     alone = [iterate_map(with_r(scene, r[row]), time[row], velocity[row], IMPACTS) for row in range(batch)]
@@ -33,11 +41,11 @@ def test_blocks_change_nothing(batch: int, block: int):
 
 
 def test_forward_and_reverse_derivatives_agree_with_50_digits():
-    scene = regular_scene().scene
+    scene = preset("figure2")
     starts = scattered_starts(scene, 3)
 
     def times(r: jax.Array) -> jax.Array:
-        return iterate_batch(with_r(scene, r), starts.time_us, starts.velocity_nm_per_us, IMPACTS, block=2).time_us
+        return iterate_batch(with_r(scene, r), *starts, IMPACTS, block=2).time_us
 
     r = formula_of(scene).r
     found = np.asarray(jax.jit(times)(r))
@@ -51,6 +59,6 @@ def test_forward_and_reverse_derivatives_agree_with_50_digits():
 
 
 def test_a_parameter_of_another_length_is_named():
-    scene = with_r(regular_scene().scene, jnp.full(3, 0.5))
+    scene = with_r(preset("figure2"), jnp.full(3, 0.5))
     with pytest.raises(ValueError, match=r"shape \(3,\).*match \(2,\)"):
         iterate_batch(scene, jnp.zeros(2), jnp.full(2, 6.0), 1)

@@ -11,7 +11,6 @@ import zarr
 from click.testing import CliRunner
 
 import afm_jax as afm
-from afm_jax.bench.dynamics import orbits_by_numpy
 from afm_jax.cli.main import main
 from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
@@ -20,6 +19,40 @@ from afm_jax.dynamics.starts import bouncing_tips
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 
 FREQUENCY = "platform.reduced_frequency"
+
+
+SEEN = 256
+
+
+def orbits_by_numpy(
+    Omega: float, omega: float, beta: float, sigma: float, r: float, order: int
+) -> list[tuple[float, bool, bool]]:
+    """Return the (1, N) orbits of an undamped law without adhesion: approach speed, admissible, stable (eqs. 5 to 9).
+
+    From the closed flight V' = -V = (1 + r) u/2 and v_p = (1 - r) u/2, with cos and sin of the phase over u.
+    """
+    duration = 2.0 * np.pi * order / omega
+    sine, cosine = np.sin(0.5 * Omega * duration), np.cos(0.5 * Omega * duration)
+    # beta sin(phase) = -v_p/omega, and z_p sin(Omega T/2) = V' cos(Omega T/2)/Omega
+    b = -0.5 * (1.0 - r) / (beta * omega)
+    a1, a0 = 0.5 * (1.0 + r) * cosine / (Omega * beta * sine), -sigma / beta
+    found = []
+    for u in np.roots([a1**2 + b**2, 2.0 * a1 * a0, a0**2 - 1.0]):
+        if abs(u.imag) > 1e-12 or u.real <= 0.0:
+            continue
+        speed = float(u.real)
+        phase = np.arctan2(b * speed, a1 * speed + a0)
+        after, height = 0.5 * (1.0 + r) * speed, sigma + beta * np.cos(phase)
+        flown = np.linspace(0.0, duration, SEEN)[1:-1]
+        path = height * np.cos(Omega * flown) + after / Omega * np.sin(Omega * flown)
+        above = path - sigma - beta * np.cos(phase + omega * flown)
+        turn, moving = Omega * duration, 0.5 * (1.0 - r) * speed
+        # eq. 8 with r^2 (V - v_p)/(V' - v_p) = -r
+        bracket = -moving + moving * np.cos(turn) + (after - moving * np.cos(turn)) * r
+        bracket += beta * omega**2 / Omega * np.cos(phase) * np.sin(turn) * (-r - 1.0)
+        trace = 1.0 + bracket / (moving + after)
+        found.append((speed, bool(above.min() > 0.0), bool(abs(trace) < 1.0 + r**2)))
+    return found
 
 
 def law_scene(reduced: float, r: float = 0.8) -> afm.Scene:

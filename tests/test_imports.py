@@ -23,8 +23,6 @@ ROWS = {
         ("motion",),
         ("dynamics", "scenefile"),
         ("studies", "effects", "sweeps", "verify"),
-        ("bench",),
-        ("accuracy",),
         ("plots",),
         ("cli",),
         ("__main__",),
@@ -37,7 +35,7 @@ ROWS = {
         ("sampling",),
         ("report",),
         ("traces", "calibration", "inversion", "tapping_curves", "experiments", "bulk"),
-        ("benchmark", "examples"),
+        ("examples",),
     ),
 }
 LEVELS = {

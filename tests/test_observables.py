@@ -7,7 +7,14 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, sing
 from afm_jax.apparatus.drives import BaseDrive, Tone
 from afm_jax.apparatus.scene import drive_of
 from afm_jax.motion.follow import LongRun, follow_long
-from afm_jax.motion.observe import OBSERVABLES, MotionWindow, Observables, observe, poincare_section
+from afm_jax.motion.observe import (
+    OBSERVABLES,
+    MotionWindow,
+    Observables,
+    observe,
+    peaks_of_flights,
+    poincare_section,
+)
 from afm_jax.motion.periodic import close_periods
 from afm_jax.motion.settle import find_repetition, find_repetitions, last_fifth, settled
 from afm_jax.motion.simulate import simulate
@@ -258,3 +265,19 @@ def test_velocities_that_alternate_within_rounding_are_one():
     for size, rounding, contacts in ((3e-7, 1e-6, 1), (3e-7, 1e-8, 2), (3e-4, 1e-6, 2)):
         found = find_repetitions(turns, 40.0 * (1.0 + size * sign)[None], tolerance=1e-4, rounding=rounding)
         assert (found.contacts[0], found.periods[0]) == (contacts, contacts)
+
+
+def test_highest_points_are_those_of_the_closed_form():
+    # undamped, from rest position upward: a quarter period later at v/Omega
+    scene = Scene(Cantilever(90.0), Platform(1.0, 180.0, -50.0), ImpactLaw(0.5))
+    omega = float(scene.cantilever.angular_frequency)
+    starts = (np.ones(3), np.zeros(3), np.array([30.0, 30.0, -30.0]))
+    peaks = peaks_of_flights(scene, *starts, np.array([3.0, 6.0, 6.0]))
+    ends = [30.0 / omega * np.sin(omega * 2.0), 30.0 / omega, 0.0]
+    # a last grid of quarter/256^3: rounding
+    np.testing.assert_allclose(peaks, ends, rtol=1e-13, atol=1e-13)
+    # moved with its base by a steady response: far below resonance that is the base's own motion
+    driven = Scene(scene.cantilever, scene.platform, scene.interaction, base=BaseDrive(2.0, 1.0))
+    still = peaks_of_flights(driven, np.zeros(1), np.full(1, 2.0), np.zeros(1), np.full(1, 1000.0))
+    # the response to 1 kHz is larger by (1/90)^2, and leaves a free vibration that small
+    assert still[0] == pytest.approx(2.0, rel=5e-4)

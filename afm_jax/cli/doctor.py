@@ -99,12 +99,12 @@ def time_impacts() -> float:
 
     from afm_jax.impact.map import iterate_batch  # noqa: PLC0415
     from afm_jax.scenefile.presets import preset  # noqa: PLC0415
-    from afm_jax.studies.timing import time_calls  # noqa: PLC0415
+    from afm_jax.studies.timing import best_seconds  # noqa: PLC0415
 
     scene = preset("figure2")
     times, speeds = jax.numpy.linspace(0.0, 5.0, _TIPS), jax.numpy.linspace(50.0, 100.0, _TIPS)
-    calls = time_calls(lambda: iterate_batch(scene, times, speeds, _IMPACTS), repetitions=3)
-    return 1e6 * calls.best_s / (_IMPACTS * _TIPS)
+    seconds = best_seconds(lambda: iterate_batch(scene, times, speeds, _IMPACTS), repetitions=3)
+    return 1e6 * seconds / (_IMPACTS * _TIPS)
 
 
 def _version(name: str) -> str | None:

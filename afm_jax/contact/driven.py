@@ -180,7 +180,7 @@ def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surf
             (wave.angular_frequency**2 - square) * wave.sine + friction * wave.angular_frequency * wave.cosine,
             wave.angular_frequency,
         )
-        for wave in _waves_of(surface)
+        for wave in waves_of(surface)
     )
     ramp = surface.offset_rate_nm_per_us
     mean_push = (-square * surface.offset_nm - friction * ramp, -square * ramp)
@@ -202,7 +202,8 @@ def free_tip(contact: Contact, junction: Junction, mass_ng: Float[Array, "..."])
     )
 
 
-def _waves_of(surface: Platform | Surface) -> tuple[Wave, ...]:
+def waves_of(surface: Platform | Surface) -> tuple[Wave, ...]:
+    """Return the cosines of a surface's motion."""
     if isinstance(surface, Surface):
         return surface.tones
     first = Wave(surface.amplitude_nm, jnp.zeros_like(surface.amplitude_nm), surface.angular_frequency)

@@ -1,6 +1,6 @@
 """How many nodes, iterations and steps an accuracy needs: of free collisions and of driven contacts.
 
-Measured by `afm-jax accuracy collide` and `afm-jax bench --only scenes`.
+Measured by `afm-jax accuracy collide` and `python -m tests.driven_contacts`.
 """
 
 from collections.abc import Mapping

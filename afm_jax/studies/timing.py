@@ -1,8 +1,8 @@
 """Time of a compiled JAX function: compilation apart, several repetitions, the best and the median of them.
 
-A measurement runs in a Python process of its own that may use a stated number of cores: how many cores JAX uses is
-settled before it is imported, and a process that has run other programs is a poor place to measure time in. Settings go
-in as JSON on standard input, results come back as JSON on standard output.
+A measurement runs in a Python process of its own, on one core: how many cores JAX uses is settled before it is
+imported, and a process that has run other programs is a poor place to measure time in. Settings go in as JSON on
+standard input, results come back as JSON on standard output.
 """
 
 import json
@@ -29,22 +29,6 @@ class Timing(NamedTuple):
     median_s: float
 
 
-class Calls(NamedTuple):
-    """Seconds that calls of a function take which compiles in its first, and what the last returns."""
-
-    first_s: float
-    best_s: float
-    """Of the calls after the first."""
-    best_processor_s: float
-    """Processor time of that best call."""
-    result: Any
-
-    @property
-    def compile_s(self) -> float:
-        """Seconds by which the first call took longer: next to nothing if the programs are compiled already."""
-        return max(self.first_s - self.best_s, 0.0)
-
-
 class Compiled(NamedTuple):
     """A function compiled for one kind of arguments, and the seconds that took."""
 
@@ -67,17 +51,14 @@ def time_compiled(compiled: Compiled, *arguments: Any, repetitions: int) -> tupl
     return Timing(compiled.seconds, min(seconds), statistics.median(seconds)), result
 
 
-def time_calls(run: Callable[[], Any], *, repetitions: int) -> Calls:
-    """Call a function once and then some times more, at least once, and return the times and what it computed."""
-    result, seconds, processor = None, [], []
-    for _ in range(1 + max(repetitions, 1)):
-        began, used = time.perf_counter(), os.times()
-        result = jax.block_until_ready(run())
-        now = os.times()
+def best_seconds(run: Callable[[], Any], *, repetitions: int) -> float:
+    """Return the seconds of the quickest of some calls, after a first one that compiles."""
+    seconds = []
+    for _ in range(1 + repetitions):
+        began = time.perf_counter()
+        jax.block_until_ready(run())
         seconds.append(time.perf_counter() - began)
-        processor.append(now.user - used.user + now.system - used.system)
-    best = min(range(1, len(seconds)), key=seconds.__getitem__)
-    return Calls(seconds[0], seconds[best], processor[best], result)
+    return min(seconds[1:])
 
 
 def _seconds(compiled: Compiled, arguments: tuple[Any, ...], calls: int) -> float:
@@ -87,37 +68,34 @@ def _seconds(compiled: Compiled, arguments: tuple[Any, ...], calls: int) -> floa
     return (time.perf_counter() - began) / calls
 
 
-def run_in_own_process(task: str, settings: Mapping[str, Any], *, cores: int) -> Any:
-    """Run a function in a new process and return its result.
+def run_in_own_process(task: str, settings: Mapping[str, Any]) -> Any:
+    """Run a function in a new process and return its result; the process has one core where the system can pin it.
 
     Args:
         task: "module:function"; the function takes the settings as keywords and returns what JSON can carry.
         settings: the function's arguments.
-        cores: 1 pins the process to one core where the system can do that and forbids further threads elsewhere;
-            more give JAX that many CPU devices.
 
     Raises:
-        ValueError: if the process fails; its own message went to standard error.
+        ValueError: if the function refuses its settings, or the process fails; its message went to standard error.
     """
-    flags, threads = os.environ.get("XLA_FLAGS", ""), {}
-    if cores > 1:
-        flags += f" --xla_force_host_platform_device_count={cores}"
-    elif not hasattr(os, "sched_setaffinity"):
-        # XLA reads that; its flags do not bring its threads down to one
-        threads = {"NPROC": "1"}
+    # where nothing pins it, XLA reads that; its flags do not bring its threads down to one
+    threads = {} if hasattr(os, "sched_setaffinity") else {"NPROC": "1"}
     done = subprocess.run(  # noqa: S603
-        [sys.executable, "-m", "afm_jax.studies.timing", task, str(cores)],
+        [sys.executable, "-m", "afm_jax.studies.timing", task],
         input=json.dumps(dict(settings)),
         stdout=subprocess.PIPE,
         text=True,
         check=False,
-        env={**os.environ, **threads, "XLA_FLAGS": flags.strip(), "JAX_PLATFORMS": "cpu"},
+        env={**os.environ, **threads, "JAX_PLATFORMS": "cpu"},
         # an interrupt from the terminal is for the process that waits, and ends this one without a traceback of its own
         process_group=0 if os.name == "posix" else None,
     )
     if done.returncode != 0:
         raise ValueError(f"the measurement in a process of its own ended with exit code {done.returncode}")
-    return json.loads(done.stdout.splitlines()[-1])
+    answer = json.loads(done.stdout.splitlines()[-1])
+    if "refused" in answer:
+        raise ValueError(answer["refused"])
+    return answer["result"]
 
 
 def progress(message: str) -> None:
@@ -128,8 +106,8 @@ def progress(message: str) -> None:
 
 def main() -> None:
     """Run the task named on the command line with settings from standard input."""
-    task, cores = sys.argv[1], int(sys.argv[2])
-    if cores == 1 and hasattr(os, "sched_setaffinity"):
+    task = sys.argv[1]
+    if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     import jax  # noqa: PLC0415
 
@@ -137,8 +115,11 @@ def main() -> None:
     # compile times are part of the result, so none may come from an earlier run
     jax.config.update("jax_enable_compilation_cache", False)  # noqa: FBT003
     module, function = task.split(":")
-    result = getattr(import_module(module), function)(**json.load(sys.stdin))
-    sys.stdout.write(json.dumps(result) + "\n")
+    try:
+        answer = {"result": getattr(import_module(module), function)(**json.load(sys.stdin))}
+    except ValueError as refusal:
+        answer = {"refused": str(refusal)}
+    sys.stdout.write(json.dumps(answer) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,5 @@
 """Commands that check equations, accuracy and the installation."""
 
-from pathlib import Path
-
 import click
 
 from afm_jax.cli.command import Command
@@ -37,34 +35,25 @@ ACCURACY = Command(
     group="check",
     summary="Show error against time, and the cheapest setting for a wanted accuracy.",
     runs="afm_jax.cli.accuracy:accuracy",
-    help="""Show errors against the time they take: of everything in one overview, the map, `collide`, or one scene.
+    help="""Show errors of a value and of its gradient against the time they take, beside SciPy and Diffrax.
 
-    Without an argument: impacts, collisions, driven contacts, orbits, fits and gradients, and general-purpose
-    integrators of SciPy, Diffrax and SUNDIALS (extra `sundials`) beside them; some minutes.
-
-    map: root tolerances in float32 and float64, and SciPy's solve_ivp with events, on three scenes: regular, near
-    grazing with chatter, and of order 5; errors are against 50 digits. collide: Diffrax solvers with fixed and adaptive
-    steps, in the gap and in time, values and derivatives, float32 and float64, SciPy beside them; errors are against a
-    quadrature converged to rounding. SCENE.toml (or a preset's name): settings of the scene's contacts or of its root
-    search against the finest, and the fidelity ladder: what orbit, map and map with delay of the fitted law make of the
-    amplitude. With --out accuracy.csv, accuracy.json, accuracy.png (a scene: ladder.csv too).
+    map: the time of the next impact, by start and velocity; errors are against 50 digits (needs mpmath, extra
+    `verify`). collide: the rebound speed of the paper's contact, by speed and viscosity; errors are against a
+    quadrature converged to rounding. SCENE.toml (or a preset's name): the arrival of one of the first contacts,
+    however the scene is driven, by the start's velocity; errors are against the finest setting. SciPy's DOP853 and
+    Diffrax's Dopri8 follow the same equations phase by phase, each ended by an event. Some minutes. With --out
+    accuracy.csv, accuracy.json and accuracy.png.
     """,
     options=(
         click.argument(
-            "study", required=False, metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide")
+            "study", default="map", metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide")
         ),
         click.option(
-            "--wanted-error-us",
+            "--wanted-error",
             type=Finite(positive=True),
             default=1e-9,
-            help="Error of an impact time for which to find the cheapest setting.",
-        ),
-        click.option(
-            "--accuracy",
-            type=Finite(positive=True),
-            default=1e-9,
-            help="For collide: relative error of the rebound speed (a tenth of the delay's in us) to find the "
-            "cheapest for.",
+            help="Error for which to find the cheapest setting, beside 1e-3, 1e-6, 1e-9 and 1e-11: of times in us, of "
+            "speeds and gradients relative.",
         ),
         click.option(
             "--contacts",
@@ -73,45 +62,6 @@ ACCURACY = Command(
             help="For a scene: the arrival of which contact is compared.",
         ),
         flag("--quick", "Few and small measurements: to see that it works."),
-    ),
-)
-
-
-BENCH = Command(
-    name="bench",
-    group="check",
-    summary="Measure impacts per second, next to SciPy.",
-    runs="afm_jax.cli.bench:bench",
-    help="""Measure impacts per second: next_impact iterated, collide through the contact, driven contacts; and fits.
-
-    The impact map is measured on one core and on all. The same run measures a chaotic scene, derivatives, and SciPy's
-    solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
-    finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
-    to do. Fits of 100 rows are timed as commands, and those of another checkout beside them. With --out bench.csv,
-    bench_contact.csv, bench_scenes.csv, bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
-    """,
-    options=(
-        flag("--quick", "Few and small measurements: to see that it works."),
-        click.option(
-            "--batch",
-            "batches",
-            type=click.IntRange(1, 10_000_000),
-            multiple=True,
-            metavar="N",
-            help="How many tips at once; may be given several times. Default: 1, 100, 10000 and 100000.",
-        ),
-        click.option(
-            "--only",
-            type=click.Choice(["map", "contact", "scenes", "dynamics", "sweep", "fits"]),
-            help="The impact map alone, the contact of free tips, driven contacts, charts, sweeps, or fits from the "
-            "shell.",
-        ),
-        click.option(
-            "--beside",
-            type=click.Path(path_type=Path, file_okay=False, exists=True),
-            metavar="DIR",
-            help="Another checkout of the project: its fits are timed in turn with these.",
-        ),
     ),
 )
 
@@ -131,4 +81,4 @@ DOCTOR = Command(
 )
 
 
-COMMANDS = (ACCURACY, BENCH, DOCTOR, VERIFY)
+COMMANDS = (ACCURACY, DOCTOR, VERIFY)

@@ -1,1 +1,0 @@
-"""What a digit costs: error against computing time of impacts, collisions and scenes."""

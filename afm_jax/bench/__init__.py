@@ -1,1 +1,0 @@
-"""Timings on fixed problems, SciPy beside them."""

@@ -1,0 +1,737 @@
+"""What accuracy costs: error and time of a value and of its gradient, ours beside those of general-purpose integrators.
+
+Three problems: the time of the next impact with a law (`map`), the rebound speed of the paper's contact (`collide`),
+and the arrival of one of the first contacts of any scene. Each is a function of a few parameters, solved with every
+setting of this package, by SciPy's DOP853 with events (gradients by central differences), and by Diffrax's Dopri8 with
+its Event (gradients by differentiation). The two rivals know the equation of motion of each phase
+(`EquationOfMotion`), not that flights have a closed form, nor that a contact can be gone through leg by leg. Errors are
+achieved ones, against a reference that none of the methods is.
+
+Runs in a process of its own on one core (`afm_jax.studies.timing.run_in_own_process`).
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, Int
+from scipy.integrate import solve_ivp
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.compilation_cache import quick_options
+from afm_jax.contact.collide import batch_of
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip, waves_of
+from afm_jax.contact.junction import Phase, find_junction
+from afm_jax.contact.parameters import PAPER
+from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting, Setting
+from afm_jax.dynamics.starts import evenly_spread
+from afm_jax.impact.lasting_impact import speeds_of_impact
+from afm_jax.impact.law import Law
+from afm_jax.impact.map import Departure, Search, follow_impacts, impact_after, iterate_map
+from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.contact_motion import follow_contacts
+from afm_jax.motion.record import ContactKind, State, to_gap
+from afm_jax.motion.start import start_of
+from afm_jax.outcomes import Outcome
+from afm_jax.scenefile.presets import preset, read_named_scene
+from afm_jax.studies.timing import compiled_for, progress, time_compiled
+
+Row = dict[str, Any]
+Parameters = Float[Array, " parameters"]
+Values = Float[Any, " tips"]
+Slopes = Float[Any, "tips parameters"]
+
+_LONGEST_US, _LONGEST_TOUCH_US = 1000.0, 20.0
+"""No flight, and no phase of a contact, of a motion that is compared lasts as long, unless rounding holds the tip."""
+_MOST_PHASES = 100
+"""Of a tip between two crossings."""
+_STEPS_A_PERIOD = 3.0
+"""Steps of a flight in a period of what moves fastest, at least: an event is seen by its signs at their ends."""
+_FEW = 3
+"""Tips that SciPy follows, one after the other."""
+
+
+class Tip(NamedTuple):
+    """A tip at the beginning or the end of a phase; scalars, or arrays of the tips' shape."""
+
+    phase: Int[Array, "..."]
+    x: Float[Array, "..."]
+    """The gap in nm, in the junction the root s of `Driven`."""
+    rate: Float[Array, "..."]
+    """Of the gap, in nm/us."""
+    time_us: Float[Array, "..."]
+    arrived_us: Float[Array, "..."]
+    """When the last flight ended."""
+    crossings: Int[Array, "..."]
+    """How often the tip has arrived at the sample or left it."""
+
+
+class EquationOfMotion(eqx.Module):
+    """The equation of motion of a tip, phase by phase, as a general-purpose integrator is given it.
+
+    Attributes:
+        cantilever: of the flights; None: a free tip that only collides.
+        surface: what the flying tip sees, however it is driven (`surface_of`).
+        law: what an impact does; None: the contact is resolved.
+        driven: the tip in contact; None: there is a law.
+        spans: whether there is a bridge between flight and junction.
+    """
+
+    cantilever: Cantilever | None = None
+    surface: Platform | Surface | None = None
+    law: Law | None = None
+    driven: Driven | None = None
+    spans: bool = eqx.field(static=True, default=True)
+
+    def rates(self, phase: Any, x: Any, rate: Any, time_us: Any) -> tuple[Array, Array, Array]:
+        """Return the rates of gap (or s), gap rate and time by the time (in the junction: fictitious time)."""
+        state = ContactState(x, rate, time_us, jnp.zeros_like(x))
+        found = (x, x, x) if self.driven is None else self.driven.rates(state, jnp.asarray(phase == Phase.JUNCTION))[:3]
+        if self.cantilever is None or self.surface is None:
+            return found
+        height, speed = self.surface.position_and_velocity(time_us)
+        pull = self.cantilever.acceleration(x + height, rate + speed) - self.surface.acceleration(time_us)
+        flight = (rate, pull, jnp.ones_like(x))
+        return jax.tree.map(lambda flying, touching: jnp.where(phase == Phase.DRY, flying, touching), flight, found)
+
+    def levels(self, phase: Any) -> tuple[Array, Array]:
+        """Return where a phase ends: x has fallen to the first, or risen to the second."""
+        never = jnp.asarray(jnp.inf)
+        if self.driven is None:
+            return jnp.zeros(()), never
+        driven = self.driven
+        inward = jnp.where(phase == Phase.BRIDGE, driven.junction.forms_gap_nm, driven.forms_nm)
+        inward = jnp.where(phase == Phase.JUNCTION, driven.solid.fold, inward)
+        return inward, jnp.where(phase == Phase.BRIDGE, driven.breaks_nm, never)
+
+    def after(self, tip: Tip, risen: Bool[Array, ""]) -> Tip:
+        """Return what follows the end of a phase; the rate of a tip that a law captures is NaN."""
+        if self.driven is None:
+            assert self.law is not None  # a law or a contact  # noqa: S101
+            assert self.cantilever is not None  # noqa: S101
+            assert self.surface is not None  # noqa: S101
+            speeds = speeds_of_impact(self.law, -tip.rate, tip.time_us, self.cantilever, self.surface)
+            rebound = jnp.where(speeds.rebound > 0.0, speeds.rebound, jnp.nan)
+            leaves = tip.time_us + speeds.delay
+            return Tip(tip.phase, jnp.zeros_like(rebound), rebound, leaves, tip.time_us, tip.crossings + 2)
+        driven, (down, up) = self.driven, self.levels(tip.phase)
+        flew, pressed = tip.phase == Phase.DRY, tip.phase == Phase.JUNCTION
+        presses = ~risen & (~pressed & ~flew if self.spans else flew)
+        gap = jnp.where(pressed, driven.junction.breaks_gap_nm, jnp.where(risen, up, down))
+        leaves = risen | (pressed & (driven.junction.breaks_gap_nm >= driven.breaks_nm))
+        phase = jnp.where(leaves, Phase.DRY, jnp.where(presses, Phase.JUNCTION, Phase.BRIDGE))
+        return Tip(
+            phase=phase.astype(tip.phase.dtype),
+            x=jnp.where(presses, driven.junction.forms_root, gap),
+            rate=tip.rate,
+            time_us=tip.time_us,
+            arrived_us=jnp.where(flew, tip.time_us, tip.arrived_us),
+            crossings=tip.crossings + (flew | leaves).astype(tip.crossings.dtype),
+        )
+
+
+class AccuracyProblem(NamedTuple):
+    """A value of some tips as a function of parameters; errors are told of value and gradient.
+
+    Attributes:
+        what: the value in words, with its unit.
+        relative: whether the error of the value is relative.
+        at: the parameters.
+        solve: from a setting and the parameters the values.
+        settings: by their names; numbers are arguments of one program, others shape theirs.
+        reference: what errors are taken against, in words.
+        exact: values, and slopes by the parameters, of the reference.
+        doubt: the reference's own errors of value and gradient.
+        begin: from the parameters the motion and the tips that rivals follow.
+        crossings: how far they follow them, and of the last tip...
+        read: ...what the value is.
+        events: impacts or contacts of a tip.
+        options: of the compiler, as users' programs have them.
+    """
+
+    what: str
+    relative: bool
+    at: Parameters
+    solve: Callable[[Any, Parameters], Values]
+    settings: Mapping[str, Any]
+    reference: str
+    exact: tuple[Values, Slopes]
+    doubt: tuple[float, float]
+    begin: Callable[[Parameters], tuple[EquationOfMotion, Tip]]
+    crossings: int
+    read: Callable[[Tip], Any]
+    events: int = 1
+    options: dict[str, Any] | None = None
+
+    def errors(self, values: Any, slopes: Any, tips: Any = slice(None)) -> tuple[float, float]:
+        """Return the largest errors of value and gradient; of a slope relative to its largest among the tips."""
+        exact, exact_slopes = (np.asarray(part)[tips] for part in self.exact)
+        scale = np.abs(exact) if self.relative else 1.0
+        size = np.max(np.abs(exact_slopes), axis=0)
+        value = np.max(np.abs(np.asarray(values) - exact) / scale)
+        return float(value), float(np.max(np.abs(np.asarray(slopes) - exact_slopes) / size))
+
+
+def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[str, Any]:
+    """Measure errors and times of a problem.
+
+    Args:
+        problem: "map", "collide", or a scene's file or preset.
+        contacts: of a scene: the arrival of which contact is compared.
+        quick: few settings, each measured once: to see that it works.
+
+    Returns:
+        `rows` with of ("value" or "gradient"), method, setting, microseconds (of one impact or contact), error,
+        compile_s, and reason where there is no error; `value_of`, what the value is; `reference` and its own errors
+        `reference_error`, `reference_gradient_error`.
+
+    Raises:
+        ValueError: if a scene's tip has fewer contacts, or mpmath is missing (map).
+    """
+    tips, repetitions = (20, 1) if quick else (500, 5)
+    tolerances = {f"tolerance {each:g}": each for each in ((1e-8,) if quick else (1e-4, 1e-6, 1e-8, 1e-10, 1e-12))}
+    problems = {"map": partial(impact_times, tips), "collide": partial(rebound_speeds, tips)}
+    solved = problems.get(problem, partial(contact_arrivals, problem, contacts))()
+    names = list(solved.settings)
+    chosen = {name: solved.settings[name] for name in ((names[0], names[-1]) if quick else names)}
+    rows = [
+        *_compiled_rows(solved, "afm-jax", solved.solve, chosen, repetitions),
+        *_compiled_rows(solved, "Diffrax Dopri8", partial(by_diffrax, solved), tolerances, repetitions),
+        *_scipy_rows(solved, tolerances),
+    ]
+    value, gradient = solved.doubt
+    told = {"reference": solved.reference, "reference_error": value, "reference_gradient_error": gradient}
+    return {"rows": sorted(rows, key=lambda row: row["of"] == "gradient"), "value_of": solved.what, **told}
+
+
+def cheapest(rows: Sequence[Row], wanted: Sequence[float]) -> list[Row]:
+    """Return of value and gradient, for each wanted error, the fastest method of this package and of the others."""
+    table = []
+    for kind in ("value", "gradient"):
+        for error in wanted:
+            good = [row for row in rows if row["of"] == kind and row["error"] is not None and row["error"] <= error]
+            cells: Row = {"of": kind, "wanted_error": error}
+            for name in ("afm_jax", "rival"):
+                own = [row for row in good if row["method"].startswith(RIVALS) == (name == "rival")]
+                best = min(own, key=lambda row: row["microseconds"], default=None)
+                cells[name] = None if best is None else f"{best['method']}, {best['setting']}"
+                cells[f"{name}_microseconds"] = None if best is None else best["microseconds"]
+            table.append(cells)
+    return table
+
+
+RIVALS = ("SciPy", "Diffrax")
+"""How methods that are not this package's begin."""
+
+
+def _row(of: str, method: str, setting: str, seconds: float, error: float, **more: Any) -> Row:
+    known = math.isfinite(error)
+    row = {"of": of, "method": method, "setting": setting, "microseconds": 1e6 * seconds if known else None}
+    reason = {} if known else {"reason": "the tip is captured, or the integrator gave up"}
+    return row | {"error": error if known else None} | reason | more
+
+
+def _compiled_rows(
+    problem: AccuracyProblem,
+    method: str,
+    solve: Callable[[Any, Parameters], Values],
+    settings: Mapping[str, Any],
+    repetitions: int,
+) -> Iterator[Row]:
+    """Give the rows of compiled values and gradients, forwards; settings that are numbers share one program."""
+    events, programs = problem.events * np.asarray(problem.exact[0]).size, []
+    for name, setting in settings.items():
+        progress(f"accuracy: {method}, {name}")
+        number = isinstance(setting, float)
+        arguments = (jnp.asarray(setting), problem.at) if number else (problem.at,)
+        if not (number and programs):
+            value = solve if number else partial(solve, setting)
+            both = value, jax.jacfwd(value, argnums=len(arguments) - 1)
+            programs = [compiled_for(each, *arguments, options=problem.options) for each in both]
+        times, found = zip(*(time_compiled(run, *arguments, repetitions=repetitions) for run in programs), strict=True)
+        for of, timing, error in zip(("value", "gradient"), times, problem.errors(*found), strict=True):
+            yield _row(of, method, name, timing.best_s / events, error, compile_s=timing.compile_s)
+
+
+def _longest_step(motion: EquationOfMotion, phase: Any) -> Array:
+    """Return the longest step in us that sees every end of a flight; infinite in contact."""
+    if motion.surface is None or motion.cantilever is None:
+        return jnp.asarray(jnp.inf)
+    fastest = jnp.maximum(motion.surface.fastest_angular_frequency, motion.cantilever.angular_frequency)
+    return jnp.where(phase == Phase.DRY, 2.0 * jnp.pi / fastest / _STEPS_A_PERIOD, jnp.inf)
+
+
+def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters: Parameters) -> Values:
+    """Return the values of tips that are followed from phase to phase, each ended by Diffrax's Event; NaN if none."""
+    motion, tips = problem.begin(parameters)
+
+    def phase_of(tip: Tip) -> Tip:
+        down, up = motion.levels(tip.phase)
+
+        def falls(t: Any, y: Any, args: Any, **extra: Any) -> Any:
+            del t, args, extra
+            return y[0] - down
+
+        def rises(t: Any, y: Any, args: Any, **extra: Any) -> Any:
+            del t, args, extra
+            return y[0] - up
+
+        def rates(t: Any, y: Any, args: Any) -> Any:
+            del t, args
+            return motion.rates(tip.phase, *y)
+
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(rates),
+            diffrax.Dopri8(),
+            0.0,
+            jnp.where(tip.phase == Phase.DRY, _LONGEST_US, _LONGEST_TOUCH_US),
+            None,
+            (tip.x, tip.rate, tip.time_us),
+            stepsize_controller=diffrax.PIDController(
+                rtol=tolerance, atol=1e-3 * tolerance, dtmax=_longest_step(motion, tip.phase)
+            ),
+            # downwards alone: a tip leaves a surface with a gap of 0
+            event=diffrax.Event([falls, rises], optimistix.Newton(1e-14, 1e-14), direction=[False, True]),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=None,
+            throw=False,
+        )
+        assert solution.ys is not None  # noqa: S101 (for the type checker: the end is saved)
+        met: Any = solution.event_mask
+        x, rate, now = (part[-1] for part in solution.ys)
+        rate = jnp.where(met[0] | met[1], rate, jnp.nan)
+        return motion.after(tip._replace(x=x, rate=rate, time_us=now), met[1])
+
+    def goes_on(state: tuple[Array, Tip]) -> Array:
+        count, tip = state
+        return (tip.crossings < problem.crossings) & jnp.isfinite(tip.rate) & (count < _MOST_PHASES * problem.crossings)
+
+    def next_phase(state: tuple[Array, Tip]) -> tuple[Array, Tip]:
+        return state[0] + 1, phase_of(state[1])
+
+    none = jnp.zeros((), jnp.int32)
+    _, ends = jax.vmap(lambda tip: jax.lax.while_loop(goes_on, next_phase, (none, tip)))(tips)
+    return jnp.where(ends.crossings < problem.crossings, jnp.nan, problem.read(ends))
+
+
+def _scipy_rows(problem: AccuracyProblem, tolerances: Mapping[str, float]) -> Iterator[Row]:
+    """Give DOP853 with events on a few tips one by one; gradients by central differences of a step that suits."""
+    begin = jax.jit(problem.begin)
+    template, starts = begin(problem.at)
+    tips = np.unique(np.linspace(0, starts.x.size - 1, _FEW).astype(int))
+    programs, at = ScipyPrograms(template), np.asarray(problem.at)
+
+    def value(tip: int, parameters: np.ndarray, tolerance: float) -> np.ndarray:
+        motion, starts = begin(jnp.asarray(parameters))
+        start = jax.tree.map(lambda part: np.asarray(part)[tip], starts)
+        vector = jax.block_until_ready(programs.vector(motion))
+        began = time.perf_counter()
+        end = by_scipy(programs, vector, start, problem.crossings, tolerance)
+        return np.array([problem.read(end), time.perf_counter() - began])
+
+    for name, tolerance in tolerances.items():
+        progress(f"accuracy: SciPy DOP853, {name}")
+        step = tolerance ** (1.0 / 3.0)
+        places = np.concatenate([at[None], at + step * np.eye(at.size), at - step * np.eye(at.size)])
+        try:
+            # once for the programs
+            value(tips[0], at, tolerance)
+            found = np.array([[value(tip, place, tolerance) for place in places] for tip in tips])
+        except ValueError as failure:
+            yield from (
+                _row(of, "SciPy DOP853", name, math.nan, math.nan, reason=str(failure)) for of in ("value", "gradient")
+            )
+            continue
+        values, seconds = np.moveaxis(found, -1, 0)
+        slopes = (values[:, 1 : 1 + at.size] - values[:, 1 + at.size :]) / (2.0 * step)
+        spent = np.mean(seconds[:, 0]), np.mean(np.sum(seconds[:, 1:], axis=1))
+        for of, each, error in zip(
+            ("value", "gradient"), spent, problem.errors(values[:, 0], slopes, tips), strict=True
+        ):
+            yield _row(of, "SciPy DOP853", name, float(each) / problem.events, error)
+
+
+class ScipyPrograms:
+    """What SciPy calls, compiled once: functions of a motion's numbers in a vector."""
+
+    def __init__(self, template: EquationOfMotion):
+        """Take the structure of a motion; its numbers are an argument of the programs."""
+        numbers, rest = eqx.partition(template, eqx.is_inexact_array)
+        _, unravel = ravel_pytree(numbers)
+
+        def of(vector: Array) -> EquationOfMotion:
+            return eqx.combine(unravel(vector), rest)
+
+        self.after = jax.jit(lambda vector, tip, risen: of(vector).after(tip, risen))
+        self.levels = jax.jit(lambda vector, phase: of(vector).levels(phase))
+        self.flight = jax.jit(lambda vector: _flight_numbers(of(vector)))
+        self.rates = {
+            phase: jax.jit(lambda vector, y, phase=phase: jnp.stack(of(vector).rates(phase, *y)))
+            for phase in (Phase.BRIDGE, Phase.JUNCTION)
+        }
+
+    @staticmethod
+    def vector(motion: EquationOfMotion) -> Array:
+        """Return the numbers of a motion."""
+        return ravel_pytree(eqx.filter(motion, eqx.is_inexact_array))[0]
+
+
+def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
+    """Return Omega^2, Omega/Q, the longest step, offset and ramp of the surface, and its cosines as rows."""
+    cantilever, surface = motion.cantilever, motion.surface
+    assert cantilever is not None  # it flies  # noqa: S101
+    assert surface is not None  # noqa: S101
+    waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in waves_of(surface)])
+    own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, Phase.DRY)
+    return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
+
+
+def by_scipy(programs: ScipyPrograms, vector: Array, tip: Tip, crossings: int, tolerance: float) -> Tip:
+    """Follow a tip from phase to phase, each ended by an event of `solve_ivp`.
+
+    Args:
+        programs: of motions like this one.
+        vector: this motion's numbers (`ScipyPrograms.vector`).
+        tip: at the beginning of a phase.
+        crossings: how often it arrives at the sample or leaves it.
+        tolerance: relative; the absolute one is a thousandth of it.
+
+    Raises:
+        ValueError: if a phase has no end, or a law captures the tip.
+    """
+    for _ in range(_MOST_PHASES * crossings):
+        if tip.crossings >= crossings:
+            return tip
+        down, up = (float(level) for level in programs.levels(vector, tip.phase))
+        through = _flown_by_scipy if int(tip.phase) == Phase.DRY else _touched_by_scipy
+        risen, ended = through(programs, vector, tip, (down, up), tolerance)
+        tip = jax.tree.map(np.asarray, programs.after(vector, ended, risen))
+        if not np.isfinite(tip.rate):
+            raise ValueError(f"the sample captures the tip that arrives at {float(tip.arrived_us):.6g} us")
+    raise ValueError(f"the sample holds the tip that arrives at {float(tip.arrived_us):.6g} us")
+
+
+def _touched_by_scipy(
+    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
+) -> tuple[np.ndarray, Tip]:
+    """Return whether a phase of a contact ends at the gap that the tip rises to, and the tip there."""
+    rates, (down, up) = programs.rates[Phase(int(tip.phase))], levels
+    ends: list[Any] = [lambda _, y: y[0] - down]
+    ends += [lambda _, y: y[0] - up] if math.isfinite(up) else []
+    for event, direction in zip(ends, (-1.0, 1.0), strict=False):
+        vars(event).update(terminal=True, direction=direction)
+    state = [float(tip.x), float(tip.rate), float(tip.time_us)]
+    met, _, (_, rate, now) = _to_event(lambda _, y: np.asarray(rates(vector, y)), state, ends, tolerance)
+    return np.asarray(met == 1), tip._replace(rate=np.asarray(rate), time_us=np.asarray(now))
+
+
+def _flown_by_scipy(
+    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
+) -> tuple[np.ndarray, Tip]:
+    """Return that the tip has fallen, and the tip at the end of its flight: in the lab, in plain numbers."""
+    *numbers, rows = programs.flight(vector)
+    square, friction, longest, offset, ramp = (float(number) for number in numbers)
+    waves, start = np.asarray(rows).tolist(), float(tip.time_us)
+
+    def height(now: float) -> float:
+        moved = sum(c * math.cos(omega * now) + s * math.sin(omega * now) for c, s, omega in waves)
+        return offset + ramp * now + moved
+
+    def speed(now: float) -> float:
+        return ramp + sum(o * (s * math.cos(o * now) - c * math.sin(o * now)) for c, s, o in waves)
+
+    def gap(flown: float, y: Any) -> float:
+        return y[0] - height(start + flown) - levels[0]
+
+    def rates(_: float, y: Any) -> tuple[float, float]:
+        return y[1], -square * y[0] - friction * y[1]
+
+    vars(gap).update(terminal=True, direction=-1.0)
+    state = [float(tip.x) + height(start), float(tip.rate) + speed(start)]
+    _, flown, (_, velocity) = _to_event(rates, state, [gap], tolerance, (_LONGEST_US, longest))
+    rate = velocity - speed(start + flown)
+    return np.zeros((), bool), tip._replace(rate=np.asarray(rate), time_us=np.asarray(start + flown))
+
+
+def _to_event(
+    rates: Callable[[float, Any], Any],
+    state: list[float],
+    events: list[Any],
+    tolerance: float,
+    longest: tuple[float, float] = (_LONGEST_TOUCH_US, np.inf),
+) -> tuple[int, float, np.ndarray]:
+    """Return which event ends a phase, when, and the state there; `longest` are the phase's length and its steps'.
+
+    Raises:
+        ValueError: if none does.
+    """
+    # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
+    with np.errstate(all="ignore"):
+        path = solve_ivp(
+            rates,
+            (0.0, longest[0]),
+            state,
+            method="DOP853",
+            rtol=tolerance,
+            atol=1e-3 * tolerance,
+            max_step=longest[1],
+            events=events,
+        )
+    if path.status != 1:
+        raise ValueError(f"SciPy ended without an event: {path.message}")
+    met = next(place for place, times in enumerate(path.t_events) if len(times))
+    return met, float(path.t_events[met][0]), path.y_events[met][0]
+
+
+_ROOT_TOLERANCES_US = (1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-13)
+"""Of the search for an impact, the last one its default."""
+
+
+def impact_times(tips: int) -> AccuracyProblem:
+    """Return the time of the next impact, by the time and the velocity of departures around figure 2's (1,1) orbit."""
+    scene = preset("figure2")
+    orbits = jax.jit(single_impact_orbits)(scene, 1)
+    stable = int(np.argmax(np.asarray(orbits.exists & orbits.admissible & orbits.stable)))
+    first, second = evenly_spread(tips).T - 0.5
+    starts = orbits.phase_rad[stable] / scene.platform.angular_frequency + 0.1 * first * scene.platform.period_us
+    speeds = orbits.velocity_after_nm_per_us[stable] * (1.0 + 0.4 * second)
+
+    def solve(tolerance: Any, parameters: Parameters) -> Values:
+        def one(start: Array, speed: Array) -> Array:
+            return iterate_map(scene, start, speed, 1, root_tolerance_us=tolerance).arrival_time_us[0]
+
+        return jax.vmap(one)(starts + parameters[0], speeds + parameters[1])
+
+    def begin(parameters: Parameters) -> tuple[EquationOfMotion, Tip]:
+        now = starts + parameters[0]
+        rate = speeds + parameters[1] - scene.platform.velocity(now)
+        motion = EquationOfMotion(scene.cantilever, scene.platform, scene.interaction)
+        return motion, tips_at(Phase.DRY, jnp.zeros_like(rate), rate, now)
+
+    at = jnp.zeros(2)
+    guesses = jax.jit(solve)(_ROOT_TOLERANCES_US[-1], at)
+    return AccuracyProblem(
+        what="time of the next impact (us)",
+        relative=False,
+        at=at,
+        solve=solve,
+        settings={f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US},
+        reference="50 digits",
+        exact=_fifty_digits(scene, starts, speeds, guesses),
+        doubt=(1e-45, 1e-20),
+        begin=begin,
+        crossings=1,
+        read=lambda tip: tip.arrived_us,
+    )
+
+
+def tips_at(phase: Phase, x: Any, rate: Any, now: Any) -> Tip:
+    """Return tips at the beginning of a phase, as many as there are gap rates."""
+    rate = jnp.asarray(rate)
+    like = partial(jnp.broadcast_to, shape=rate.shape)
+    start = like(jnp.asarray(now, rate.dtype))
+    none = jnp.zeros(rate.shape, jnp.int32)
+    return Tip(none + jnp.int32(phase), like(x), rate, start, start, none)
+
+
+def _fifty_digits(scene: Scene, starts: Values, speeds: Values, guesses: Values) -> tuple[Values, Slopes]:
+    """Return times of the next impact of an undamped tip and their slopes by start and velocity, from 50 digits.
+
+    The gap is z_1 cos(Omega (t - t_1)) + v_1/Omega sin(Omega (t - t_1)) - sigma - beta cos(omega t) (eqs. 2 to 4).
+
+    Raises:
+        ValueError: if mpmath is not installed.
+    """
+    try:
+        mp: Any = import_module("mpmath").mp
+    except ModuleNotFoundError:
+        raise ValueError("mpmath is not installed; add it with: pip install 'afm-jax[verify]'") from None
+    platform = scene.platform
+    numbers = (scene.cantilever.angular_frequency, platform.angular_frequency, platform.amplitude_nm)
+    with mp.workdps(50):
+        free, omega, beta, sigma = (mp.mpf(float(each)) for each in (*numbers, platform.offset_nm))
+
+        def gap(now: Any, begun: Any, speed: Any) -> Any:
+            flown = free * (now - begun)
+            left = sigma + beta * mp.cos(omega * begun)
+            return left * mp.cos(flown) + speed / free * mp.sin(flown) - sigma - beta * mp.cos(omega * now)
+
+        def exact(*tip: Array) -> list[float]:
+            guess, *place = (mp.mpf(float(part)) for part in tip)
+            root = mp.findroot(lambda now: gap(now, *place), guess)
+            closing, *others = (mp.diff(gap, (root, *place), order) for order in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+            return [float(root), *(float(-other / closing) for other in others)]
+
+        rows = np.array([exact(*tip) for tip in zip(guesses, starts, speeds, strict=True)])
+    return rows[:, 0], rows[:, 1:]
+
+
+_SPEEDS_NM_PER_US = (12.0, 200.0)
+_QUADRATURES = (Setting("collocation", 40, 40, 48, iterations=14), Setting("collocation", 32, 32, 40, iterations=12))
+"""Converged to rounding (the tests compare it with 20 digits), and a coarser one that shows how far."""
+
+
+def rebound_speeds(tips: int) -> AccuracyProblem:
+    """Return the rebound speed of the paper's contact, by logarithms of approach speed and viscosity."""
+    speeds = jnp.linspace(*_SPEEDS_NM_PER_US, tips)
+
+    def contact_at(parameters: Parameters) -> Contact:
+        return Contact.paper(viscosity_pa_s=PAPER["viscosity_pa_s"] * jnp.exp(parameters[1]))
+
+    def solve(setting: Setting, parameters: Parameters) -> Values:
+        found = batch_of(contact_at(parameters), 1.0, speeds * jnp.exp(parameters[0]), setting)
+        return found.rebound_speed_nm_per_us
+
+    def begin(parameters: Parameters) -> tuple[EquationOfMotion, Tip]:
+        contact = contact_at(parameters)
+        driven = free_tip(contact, find_junction(contact), jnp.ones(()))
+        rate = -speeds * jnp.exp(parameters[0])
+        return EquationOfMotion(driven=driven), tips_at(Phase.BRIDGE, driven.forms_nm, rate, 0.0)
+
+    at = jnp.zeros(2)
+    exact, coarser = (_value_and_slopes(partial(solve, setting), at) for setting in _QUADRATURES)
+    problem = AccuracyProblem(
+        what="rebound speed (relative)",
+        relative=True,
+        at=at,
+        solve=solve,
+        settings={
+            f"{method}, accuracy {level:g}": setting
+            for method, levels in SETTINGS.items()
+            for level, setting in levels.items()
+        },
+        reference="a quadrature converged to rounding",
+        exact=exact,
+        doubt=(0.0, 0.0),
+        begin=begin,
+        crossings=1,
+        read=lambda tip: tip.rate,
+    )
+    return problem._replace(doubt=problem.errors(*coarser))
+
+
+def _value_and_slopes(function: Callable[[Parameters], Values], at: Parameters) -> tuple[Values, Slopes]:
+    """Return values and slopes, by programs that compile quickly: they are not timed."""
+    options = quick_options(0)
+    both = [compiled_for(each, at, options=options).run(at) for each in (function, jax.jacfwd(function))]
+    return np.asarray(both[0]), np.asarray(both[1])
+
+
+IN_TIME = (DrivenSetting(None, 12.0, 400), DrivenSetting(None, 9.0, 300))
+"""References of contacts in time, in fine steps: the better one first."""
+_BEYOND_US = 1e-3
+_FLIGHT_STEPS = 100_000
+
+
+def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
+    """Return the arrival of one of the first contacts of a scene, by the velocity at the start.
+
+    Raises:
+        ValueError: if the tip is free, or has fewer contacts.
+    """
+    read = read_named_scene(name)
+    scene = read.scene
+    if scene.interaction is None:
+        raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")
+    start = start_of(scene, read.start)
+    world = surface_of(scene)
+    surface = world[0]
+    contact: Any = scene.interaction
+    law = contact if isinstance(contact, Law) else None
+    driven = None if law is not None else driven_by(contact, scene.cantilever, surface)
+    if law is not None:
+        arrival = partial(law_arrival, scene, world, contacts)
+        settings: Mapping[str, Any] = {f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US}
+        references, reference = (1e-15, 1e-14), "root tolerance 1e-15 us"
+    else:
+        longest = start.time_us + _LONGEST_US * contacts
+        followed = follow_contacts(scene, *world, start, longest, max_contacts=contacts, setting=IN_TIME[0])
+        # no longer than until the last of them has left
+        until = followed.contacts.departure_time_us[contacts - 1] + _BEYOND_US
+        until = jnp.where(jnp.isfinite(until), until, start.time_us)
+        arrival = partial(contact_arrival, scene, world, contacts, until)
+        settings = {f"accuracy {level:g}": setting for level, setting in DRIVEN_SETTINGS.items()}
+        references, reference = IN_TIME, "every contact in time, in fine steps"
+
+    def solve(setting: Any, parameters: Parameters) -> Values:
+        return arrival(setting, start._replace(velocity_nm_per_us=start.velocity_nm_per_us + parameters[0]))[None]
+
+    def begin(parameters: Parameters) -> tuple[EquationOfMotion, Tip]:
+        faster = start._replace(velocity_nm_per_us=start.velocity_nm_per_us + parameters[0])
+        gap, rate = _gap_of(world, faster)
+        spans = law is not None or contact.spans
+        motion = EquationOfMotion(scene.cantilever, surface, law, driven, spans)
+        return motion, tips_at(Phase.DRY, gap[None], rate[None], faster.time_us)
+
+    at = jnp.zeros(1)
+    exact, coarser = (_value_and_slopes(partial(solve, setting), at) for setting in references)
+    if not np.isfinite(exact[0]).all():
+        raise ValueError(
+            f"{name}: the tip has not as many as {contacts} contacts before it is held or flies on: lower --contacts, "
+            "or start elsewhere"
+        )
+    problem = AccuracyProblem(
+        what=f"arrival of contact {contacts} (us)",
+        relative=False,
+        at=at,
+        solve=solve,
+        settings=settings,
+        reference=reference,
+        exact=exact,
+        doubt=(0.0, 0.0),
+        begin=begin,
+        crossings=2 * contacts - 1,
+        read=lambda tip: tip.arrived_us,
+        events=contacts,
+        options=quick_options(),
+    )
+    return problem._replace(doubt=problem.errors(*coarser))
+
+
+World = tuple[Platform | Surface, Surface | None]
+"""The surface that the free tip sees, and its steady response to base and force."""
+
+
+def _gap_of(world: World, start: State) -> tuple[Array, Array]:
+    """Return gap and gap rate of a start; one that lies on the surface but for rounding lies on it."""
+    gap, rate = to_gap(*world, start)
+    return jnp.where(jnp.abs(gap) < 1e-9, 0.0, gap), rate
+
+
+def law_arrival(scene: Scene, world: World, contacts: int, tolerance: Any, start: State) -> Array:
+    """Return when a tip arrives at an impact with a law; NaN if it is captured, or flies on, before."""
+    surface = world[0]
+    seen = eqx.tree_at(lambda parts: parts.platform, scene, surface)
+    gap, rate = _gap_of(world, start)
+    leaving = Departure(start.time_us, gap, rate + surface.velocity(start.time_us))
+    first = impact_after(seen, leaving, Search(_FLIGHT_STEPS, tolerance, from_above=True))
+    good, arrived = first.outcome == Outcome.IMPACT, first.arrival_time_us
+    if contacts > 1:
+        after = Departure(first.time_us, None, first.velocity_after_nm_per_us)
+        finest = jnp.asarray(tolerance)
+        rows = follow_impacts(seen, after, finest, impacts=contacts - 1, max_steps=_FLIGHT_STEPS)
+        good, arrived = jnp.all(rows.outcome[:-1] == Outcome.IMPACT) & good, rows.arrival_time_us[-1]
+    return jnp.where(good & jnp.isfinite(arrived), arrived, jnp.nan)
+
+
+def contact_arrival(
+    scene: Scene, world: World, contacts: int, until: Array, setting: DrivenSetting, start: State
+) -> Array:
+    """Return when a tip arrives at a resolved contact; NaN if it has not left it again by a time."""
+    found = follow_contacts(scene, *world, start, until, max_contacts=contacts, setting=setting).contacts
+    left = found.kind[contacts - 1] == ContactKind.IMPACT
+    return jnp.where(left, found.arrival_time_us[contacts - 1], jnp.nan)
