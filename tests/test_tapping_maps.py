@@ -303,7 +303,7 @@ def written(folder: Path, kind: str) -> list[Path]:
     elif kind == "npy":
         np.save(path, np.stack([amplitude, lag]))
     elif kind == "csv":
-        np.savetxt(path, amplitude, delimiter=",")
+        np.savetxt(path, amplitude, delimiter=",", header="amplitude in nm\n")
         np.savetxt(phase, lag, delimiter=",")
         return [path, phase]
     else:

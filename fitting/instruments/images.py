@@ -30,7 +30,7 @@ from fitting.instruments.recording import (
     refuse_other_modes,
     unit_named,
 )
-from fitting.tables.csv_text import NUMBER, TableError, read_bytes
+from fitting.tables.csv_text import TableError, read_bytes
 
 _ROLES = {
     "lockin_amplitude_nm": (r"(lock-?in[_ ])?amp(?![a-z]* ?2).*", "nm"),
@@ -38,6 +38,8 @@ _ROLES = {
 }
 """What channels of amplitude and phase are called (no case; those of a second mode are Amplitude2 and Phase2), and the
 unit of one that says none."""
+_ROWS_OF_NUMBERS = re.compile(rb"(\xef\xbb\xbf)?(#[^\n]*\n|\s)*([-+.\d]|nan\b)", re.IGNORECASE)
+"""How text of numbers begins, below comments."""
 _PATIENCE_S = 60.0
 """That Gwyddion's program may take for a file; an image takes it less than a second."""
 
@@ -170,7 +172,7 @@ def _images(path: str | Path) -> _Images:
             return _of_numpy(np.load(io.BytesIO(data), allow_pickle=False), name)
         if is_igor(data):
             return _of_igor(*igor_wave(data, name), name)
-        if NUMBER.match(data[:100].decode("latin-1").lstrip("\ufeff# \t")):
+        if _ROWS_OF_NUMBERS.match(data):
             return _of_text(data.decode("utf-8-sig"), name)
         return _of_others(Path(path), name)
 
@@ -184,7 +186,11 @@ def _of_numpy(loaded: Any, name: str) -> _Images:
     arrays = dict(loaded) if hasattr(loaded, "files") else dict(zip(("amplitude", "phase"), loaded, strict=False))
     endings = {key: key.rpartition("_")[2].lower() for key in arrays}
     units = {key: next((unit for unit in UNITS if unit.lower() == ending), "") for key, ending in endings.items()}
-    channels = {printable(key): (array, units[key]) for key, array in arrays.items() if np.ndim(array) == 2}
+    channels = {
+        printable(key): (array, units[key])
+        for key, array in arrays.items()
+        if array.ndim == 2 and array.dtype.kind in "fiu"
+    }
     if not channels:
         raise TableError(f"{name}: holds no array of two dimensions (rows, columns)")
     return _Images(channels)
@@ -222,7 +228,8 @@ def _of_others(path: Path, name: str) -> _Images:
     before = system.getrlimit(system.RLIMIT_FSIZE) if system else (0, 0)
     try:
         if system:
-            system.setrlimit(system.RLIMIT_FSIZE, (LARGEST_BYTES, before[1]))
+            lowest = min(limit for limit in (LARGEST_BYTES, *before) if limit >= 0)
+            system.setrlimit(system.RLIMIT_FSIZE, (lowest, before[1]))
         # an absolute path cannot be taken for an option
         found = package.load(path.resolve(), timeout=_PATIENCE_S).channels.values()
     except package.GwyddionPyError as error:
