@@ -410,7 +410,7 @@ READ = Command(
     number comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
     fit`; of a file of several curves one table each, TABLE_1.csv and so on. Repeated and unordered heights become bins.
     Curves that must not be used (a free amplitude that jumps) are refused by name, and the exit code is 3. Package
-    extra for .ibw: `pip install 'afm-jax[instruments]'`.
+    extra for .ibw and .gwy: `pip install 'afm-jax[instruments]'`.
     """,
     options=(
         click.argument("file", metavar="FILE", type=click.Path(path_type=Path)),
