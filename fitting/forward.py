@@ -21,10 +21,10 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
 from afm_jax.checks import is_traced
-from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.closure import (
+    COARSE,
     Coordinates,
     OrbitPlace,
     OrbitProblem,
@@ -33,9 +33,9 @@ from afm_jax.impact.closure import (
     follow_root,
     harmless_coordinate,
 )
-from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
+from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
-from afm_jax.impact.orbits import SteadyOrbits, amplitudes, is_steady, steady_orbits, usual_scan
+from afm_jax.impact.orbits import SteadyOrbits, amplitudes, is_steady, steady_orbits
 from afm_jax.solve.lanes import compiled_quickly, filled, in_blocks
 from fitting.models import Measurement, Problem, Rows
 
@@ -53,7 +53,7 @@ class Branch(NamedTuple):
     slopes: Float[Array, "5 2"] | None
 
 
-AnyImpact = Law | TabulatedImpact | PulledImpact
+AnyImpact = Law | TabulatedImpact
 
 
 def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> AnyImpact:
@@ -62,8 +62,6 @@ def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Pro
         return problem.law(values, measurement.fixed)
     chosen = {name: value for name, value in problem.known(values).items() if name in problem.own}
     contact = Contact.paper(effects=problem.effects, **(measurement.fixed | chosen))
-    if measurement.pulls is not None:
-        return tapped(contact, measurement.cantilever, measurement.pulls)
     return tabulated(contact, measurement.cantilever.mass_ng)
 
 
@@ -85,8 +83,6 @@ def orbit_problem(
         ratio = row.drive_frequency_khz / cantilever.frequency_khz
         amplitude = height_of_free_deflection(amplitude, ratio, cantilever.quality_factor)
     offset = row.offset_nm + problem.nuisance(values, "offset_origin_nm")
-    if isinstance(impact, PulledImpact):
-        offset = offset + impact.plane_nm
     return OrbitProblem(
         cantilever, Platform(amplitude, row.drive_frequency_khz, offset), impact, jnp.asarray(row.order)
     )
@@ -213,9 +209,9 @@ def nothing_shown(row: Rows) -> Float[Array, " k"]:
 
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
-TAPPED, SEARCHED, SOLVED = 32, 128, 1024
-"""Pairs of a set and a row that one program takes: of taps; of other impacts that last; and of instantaneous ones, of
-which a pair takes a hundredth of the time."""
+SEARCHED, SOLVED = 128, 1024
+"""Pairs of a set and a row that one program takes: of impacts that last, and of instantaneous ones, of which a pair
+takes a hundredth of the time."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
 
@@ -350,10 +346,6 @@ def impact_slopes(
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     # -1: a larger loss, or epsilon, is a smaller squared speed; of a series the constant term is changed
-    if isinstance(impacts.impact, PulledImpact):
-        both = 0, slice(None), 0
-        squares, times = along(lambda i: i.taps.terms, -1.0, *both, 0), along(lambda i: i.taps.terms, 1.0, *both, 1)
-        return ImpactSlopes(squares[0], times[0])
     if isinstance(impacts.impact, TabulatedImpact):
         return ImpactSlopes(along(lambda i: i.loss, -1.0, 0)[0], along(lambda i: i.time, 1.0, 0)[0])
     by_square, _ = along(lambda i: i.epsilon, -1.0)
@@ -443,9 +435,7 @@ def _calls_for_impacts(
         measurement, points = measurement.of_drive(problem.drive), batch[:, 0]
     # an impact knows no rows: one program for tables of every size
     rowless = measurement._replace(rows=jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows))
-    # a table of taps takes long, and a fit mostly asks for one: each by itself
-    parts = [points[i : i + 1] for i in range(len(values))] if problem.pulled else [points]
-    return batch, [(part, rowless, problem) for part in parts]
+    return batch, [(points, rowless, problem)]
 
 
 def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:
@@ -465,7 +455,7 @@ def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem
 
 
 def _lanes(problem: Problem) -> int:
-    return TAPPED if problem.pulled else SEARCHED if problem.lasting else SOLVED
+    return SEARCHED if problem.lasting else SOLVED
 
 
 class _Pairs(NamedTuple):
@@ -644,7 +634,7 @@ def search_pairs(lanes: Lanes, problem: Problem) -> Coordinates:
 
     def one(point: Float[Array, " p"], impact, row: Rows) -> Coordinates:
         orbit = orbit_problem(point, impact, row, lanes.measurement, problem)
-        return coordinates_of_roots(orbit, usual_scan(orbit))
+        return coordinates_of_roots(orbit, COARSE)
 
     return lanes.each(one)
 
@@ -771,18 +761,8 @@ class Free(NamedTuple):
 
 @compiled_quickly(level=0)
 def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
-    """Return what an impact does to free tips; coordinates of taps are taken for those of free ones."""
-    if isinstance(impact, PulledImpact):
-        impact = impact.free
+    """Return what an impact does to free tips."""
     speeds = jax.vmap(impact.speeds)(coordinate)
     just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
     hertz = impact.hertz_contact
     return Free(speeds, hertz.time(speeds.approach), impact.lowest, just_above, hertz.length_nm)
-
-
-@compiled_quickly()
-def times_of_taps(
-    impact: PulledImpact, approach_speed: Float[Array, " n"], pull: Float[Array, " n"]
-) -> Float[Array, " n"]:
-    """Return how long taps last, in us."""
-    return jax.vmap(impact.tap)(approach_speed, pull).speeds.delay

@@ -29,6 +29,7 @@ from fitting.parameters import (
     name_of_table,
     parameter_called,
 )
+from fitting.tables.csv_text import TableError, printable
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, check_quality_factor
 
@@ -68,13 +69,6 @@ def _unbounded(parameter: Parameter, coordinate: Numbers) -> Numbers:
     return np.exp(coordinate)
 
 
-def left_open(parameter: Parameter, value: float) -> float:
-    """Return the standard error of a value of which nothing is known but its range."""
-    even = parameter.sign or parameter.width
-    reach = parameter.highest - parameter.lowest if even else value * np.log(parameter.highest / parameter.lowest)
-    return float(reach / np.sqrt(12.0))
-
-
 @dataclass(frozen=True)
 class Problem:
     """What is fitted: the model's parameters, then nuisances; which effects a contact has, and what is driven."""
@@ -93,11 +87,6 @@ class Problem:
     def parameters(self) -> tuple[Parameter, ...]:
         """The parameters in the order of every vector."""
         return tuple(parameter_called(name) for name in self.names)
-
-    @property
-    def pulled(self) -> bool:
-        """Whether impacts are those of a contact under a bent lever."""
-        return self.model == "contact" and self.tapping
 
     @property
     def lasting(self) -> bool:
@@ -155,18 +144,6 @@ class Problem:
             known.get("free_frequency_khz", measured.frequency_khz),
             known.get("quality_factor", measured.quality_factor),
             measured.mass_ng,
-        )
-
-    def known_by_range(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """Return the inverse variances of values of which nothing is known but their range; 0 of what needs data.
-
-        Parameters of a contact under a bent lever may stay open: its law does not hang on each of them.
-        """
-        return np.array(
-            [
-                left_open(parameter, value) ** -2.0 if self.pulled and name in self.own else 0.0
-                for name, parameter, value in zip(self.names, self.parameters, values, strict=True)
-            ]
         )
 
     def nuisance(self, values: Float[Array, " p"], name: str) -> Float[Array, ""]:
@@ -245,7 +222,6 @@ class Measurement(NamedTuple):
         constraint_value: what is known of each parameter beforehand, shape (p,).
         constraint_error: its standard error, infinite where nothing is known.
         fixed: values of the model's parameters that are not fitted, by name; of a contact those not the paper's.
-        pulls: weakest and strongest of the bent lever in nm/us^2, where a driven tip meets a contact; None elsewhere.
         joint: where the rows are of several tables: which parameters are whose; no compiled program takes it.
     """
 
@@ -254,7 +230,6 @@ class Measurement(NamedTuple):
     constraint_value: Float[AnyArray, " p"]
     constraint_error: Float[AnyArray, " p"]
     fixed: dict[str, Float[AnyArray, ""]]
-    pulls: Float[AnyArray, " 2"] | None = None
     joint: Joint | None = None
 
     def of_drive(self, drive: str) -> "Measurement":
@@ -263,7 +238,7 @@ class Measurement(NamedTuple):
         chosen = np.array(self.joint.drives)[self.rows.table] == drive
         rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.rows._replace(table=None))
         count = len(self.joint.problem.names)
-        return Measurement(rows, self.cantilever, np.ones(count), np.full(count, np.inf), self.fixed, self.pulls)
+        return Measurement(rows, self.cantilever, np.ones(count), np.full(count, np.inf), self.fixed)
 
 
 def constraints_of(
@@ -338,7 +313,7 @@ def task_of(
         return _joint_task(table, model, share, constraints, **options)
     known = _known_of(table, model, constraints)
     problem = problem_of(table, model, constraints=known, **options)
-    return Task(known, problem, measurement_of(table, problem, known, held_values(problem, fixed)))
+    return Task(known, problem, measurement_of(table, problem, known, fixed))
 
 
 def _known_of(
@@ -365,12 +340,35 @@ def problem_of(
 
     Raises:
         ValueError: if there is no such model or parameter, or a constraint is impossible.
+        TableError: if a contact is to be fitted to a tip that is driven near resonance.
     """
+    if model == "contact" and table.tapping:
+        _check_above_resonance(table)
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = constraints_of(table, constraints)
     check_constraints(known, model, own, table.drive)
     nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
     return Problem(model, own + nuisances, tuple(effects), table.drive)
+
+
+_LEAST_RATIO = 1.01
+"""Drive over free frequency from which taps may be fast and brief enough for a free tip's collisions."""
+
+
+def _check_above_resonance(table: AmplitudeTable) -> None:
+    """Check that a driven tip meets the sample as a free one would, but for corrections.
+
+    Raises:
+        TableError: if a row is driven on resonance or below it, where lever and drive turn the tip round.
+    """
+    ratio = table.drive_frequency_khz / table.free_frequency_khz
+    row = int(np.argmin(ratio))
+    if ratio[row] < _LEAST_RATIO:
+        raise TableError(
+            f"{printable(table.source)}, line {table.lines[row]}: driven at {ratio[row]:.3f} of the free frequency, "
+            "where lever and drive turn the tip round: no contact can be fitted to that. Such a curve gives the energy "
+            "of a tap: `afm-jax tapping CURVE`; for the contact drive 3 to 10 % above resonance"
+        )
 
 
 def check_constraints(
@@ -415,7 +413,6 @@ def _joint_task(
     Raises:
         ValueError: if there is no such nuisance to share, or the tables contradict each other on it.
     """
-    _check_levers(tables, model)
     each = [_known_of(table, model, constraints) for table in tables.tables]
     there = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
     shared = _shared(share, there)
@@ -437,7 +434,7 @@ def _joint_task(
     drives = tuple(table.drive for table in tables.tables)
     problem = Problem(model, tuple(names), tuple(options["effects"]), tables.drive)
     alone = replace(problem, names=local, drive=drives[0])
-    parts = [measurement_of(table, alone, known, held_values(alone, options["fixed"])) for table in tables.tables]
+    parts = [measurement_of(table, alone, known, options["fixed"]) for table in tables.tables]
     joint = Joint(alone, tuple(part.cantilever for part in parts), drives, place, held)
     return Task(known, problem, joint_measurement(tables, parts, problem, joint, known))
 
@@ -486,31 +483,6 @@ def _shared(share: Sequence[str], there: Sequence[str]) -> list[str]:
         if name not in (*there, "all"):
             raise ValueError(f"`share` names {name}, but no table gives it with an error; state it, or leave it out")
     return [name for name in there if "all" in share or name in share]
-
-
-_ONE_LEVER = 0.01
-"""Share by which the frequencies of levers may differ that taps of one are those of the others."""
-
-
-def _check_levers(tables: SeveralTables, model: str) -> None:
-    """Check that one table of taps serves all tables, where the model asks for it.
-
-    Raises:
-        ValueError: if it does not.
-    """
-    if model != "contact" or not any(table.tapping for table in tables.tables):
-        return
-    if not tables.tapping:
-        raise ValueError(
-            "the model 'contact' takes tables of a driven cantilever (# drive = force or base) or of a driven sample, "
-            "not both at a time: fit each kind by itself"
-        )
-    frequencies = [table.free_frequency_khz for table in tables.tables]
-    if max(frequencies) > (1.0 + _ONE_LEVER) * min(frequencies):
-        raise ValueError(
-            "the model 'contact' takes tables of driven cantilevers of one free frequency at a time, but there are "
-            f"{min(frequencies):g} and {max(frequencies):g} kHz: fit each cantilever by itself"
-        )
 
 
 def _check_shared(tables: SeveralTables, each: Sequence[dict[str, tuple[float, float]]], shared: Sequence[str]) -> None:
@@ -563,28 +535,7 @@ def measurement_of(
         constraint_value=value,
         constraint_error=error,
         fixed=held,
-        pulls=_pulls(rows, cantilever) if problem.pulled else None,
     )
-
-
-_PULL_ROOM, _PULL_ROOM_NM = 1.15, 1.0
-"""By how much a table of pulls goes beyond those of the rows, which shift with heights and calibrations: the strongest
-as a share, the weakest as a length that the lever is bent by."""
-
-
-def _pulls(rows: Rows, cantilever: Cantilever) -> Float[np.ndarray, " 2"]:
-    """Return the weakest and the strongest pull of spring and drive at the sample that the rows have, in nm/us^2.
-
-    Above resonance the drive pushes a tip that meets the sample near the bottom of its free swing away from it, one
-    that does so near the top towards it: there may be no pull.
-    """
-    ratio = np.asarray(rows.drive_frequency_khz) / float(cantilever.frequency_khz)
-    push = np.maximum(ratio**2 - 1.0, 0.0) * np.asarray(rows.drive_amplitude_nm)
-    hits = np.asarray(rows.measured).any(axis=1) & ~rows.free
-    pull = np.where(hits, -np.asarray(rows.offset_nm), 0.0)
-    strongest = _PULL_ROOM * np.max(pull + np.where(hits, push, 0.0), initial=1.0)
-    weakest = np.min(np.where(hits, pull - BRIDGE_NM - push, np.inf), initial=strongest) - _PULL_ROOM_NM
-    return float(cantilever.angular_frequency) ** 2 * np.array([weakest, strongest])
 
 
 def _constraint_columns(
@@ -629,11 +580,7 @@ def joint_measurement(
     for unread in (rows.measured, rows.no_orbit):
         unread[tables.rows :] = False
     value, error = _constraint_columns(problem, known)
-    whole_measurement = parts[0]._replace(rows=rows, constraint_value=value, constraint_error=error, joint=joint)
-    if not problem.pulled:
-        return whole_measurement
-    pulls = np.array([part.pulls for part in parts])
-    return whole_measurement._replace(pulls=np.array([pulls.min(), pulls.max()]))
+    return parts[0]._replace(rows=rows, constraint_value=value, constraint_error=error, joint=joint)
 
 
 def rows_of(table: AmplitudeTable) -> Rows:
@@ -795,10 +742,3 @@ def held_of(
         for name, known in CONTACT_PARAMETER.items()
         if name not in own and not idle_without(name, effects)
     )
-
-
-def held_values(problem: Problem, fixed: Mapping[str, float] | None) -> dict[str, float]:
-    """Return the values at which parameters are held: of taps on a contact all that they are varied about."""
-    if not problem.pulled:
-        return dict(fixed or {})
-    return {one.name: one.value for one in held_of(problem.own, problem.effects, fixed or {}, {})}

@@ -67,10 +67,10 @@ class LawSystem:
     def release(self, time: float, until: float) -> float:
         """Return when a tip at rest is let go; infinite if not before the end."""
         times = np.arange(time, until, 0.01)
-        pulled = np.flatnonzero([self.push(t) < 0.0 for t in times])
-        if not pulled.size:
+        lifted = np.flatnonzero([self.push(t) < 0.0 for t in times])
+        if not lifted.size:
             return np.inf
-        first = int(pulled[0])
+        first = int(lifted[0])
         return time if first == 0 else self.turns(float(times[first - 1]), float(times[first]))
 
     def turns(self, low: float, high: float) -> float:

@@ -214,9 +214,12 @@ def test_a_resting_and_a_driven_tip_graze_where_they_must():
     free = continue_orbits(driven, 1, given, impacts=0)
     assert only(free, "grazing") == pytest.approx([-size], abs=1e-8)
     assert float(free.special[0].reading.peak_amplitude_nm) == pytest.approx(size, rel=1e-9)
-    # the orbit of one impact begins there, with a speed of 0
-    one = continue_orbits(driven, 1, given)
+    # the orbit of one impact begins there, with a speed of 0: one border, whatever tells it
+    one = continue_orbits(driven, 1, given, second=ParameterRange("force.amplitude_nn", 0.06, 0.12))
     assert only(one, "grazing") == pytest.approx([-size], abs=1e-8)
+    (curve,) = (curve for curve in one.curves if curve.kind == "grazing")
+    np.testing.assert_allclose(curve.parameter, -size / 0.08 * curve.second, atol=1e-7)
+    assert "grazing_grazing" not in {meeting.kind for meeting in curve.meetings}
 
 
 @pytest.mark.slow

@@ -112,11 +112,11 @@ def test_outliers_hardly_move_a_robust_fit_and_are_named(table, plain):
     amplitude, error = amplitudes_and_errors(table)
     amplitude[[5, 30, 60], [0, 1, 0]] *= [1.3, 0.75, 1.5]
     spoilt = table_with(table, amplitude, error)
-    pulled, robust = fit(spoilt, model="law"), fit(spoilt, model="law", robust=True)
+    plainly, robust = fit(spoilt, model="law"), fit(spoilt, model="law", robust=True)
     shift = np.abs(values_of(robust) - values_of(plain)) / standard_errors_of(plain)
     assert shift.max() < 1.0
-    assert shift.max() < np.abs(values_of(pulled) - values_of(plain)).max()
-    assert (pulled.valid, robust.valid, np.isnan(robust.p_value)) == (False, True, True)
+    assert shift.max() < np.abs(values_of(plainly) - values_of(plain)).max()
+    assert (plainly.valid, robust.valid, np.isnan(robust.p_value)) == (False, True, True)
     (said,) = [warning for warning in robust.warnings if "Robust loss" in warning]
     named = ", ".join(str(int(spoilt.lines[row])) for row in (5, 30, 60))
     assert f"outliers: lines {named}" in said

@@ -87,17 +87,6 @@ def test_what_is_said_of_a_quality_factor_that_is_fitted_along(value, words, whe
     assert_said(evidence(parameters=made_fit("law").parameters | along, correlations=np.eye(3)), words, where)
 
 
-@pytest.mark.parametrize(("tapped", "open_ones", "refused"), [(True, 1, False), (True, 2, True), (False, 1, True)])
-def test_what_taps_do_not_determine_is_named_and_no_reason_to_refuse(tapped: bool, open_ones: int, refused: bool):  # noqa: FBT001
-    names = ("modulus_gpa", "relative_humidity")
-    known = {name: made_parameter(name, 1.0) for name in names}
-    for name in names[:open_ones]:
-        known[name] = dataclasses.replace(known[name], interval95=(None, None), undetermined=True)
-    reasons, warnings = judge_fit(evidence(parameters=known, correlations=np.eye(2), tapped=tapped))
-    assert any("modulus_gpa" in reason for reason in reasons) is refused
-    assert any(said.startswith("Not determined by these taps: modulus_gpa,") for said in warnings) is not refused
-
-
 def test_a_row_without_an_orbit_where_the_model_has_one_is_named():
     unseen = np.array([0.0, 0.0, 1.0, 0.0])
     amplitude = np.where(unseen > 0.0, np.nan, 50.0)

@@ -160,14 +160,6 @@ def test_what_tables_cannot_share_is_said(changes: dict, options: dict, message:
         fit([made_table(source="a.csv"), made_table(source="b.csv", **changes)], **options)
 
 
-def test_taps_of_several_tables_are_of_one_lever():
-    tapping = read_table("fitting/examples/tapping_contact.csv")
-    with pytest.raises(ValueError, match="or of a driven sample, not both at a time"):
-        fit([tapping, made_table(mass_ng=tapping.mass_ng)], "contact")
-    with pytest.raises(ValueError, match="of one free frequency at a time, but there are 90 and 95 kHz"):
-        fit([tapping, dataclasses.replace(tapping, free_frequency_khz=95.0)], "contact")
-
-
 def made_joint() -> FitResult:
     """Return a fit of two tables."""
     both = SeveralTables((made_table(source="a.csv"), made_table(source="b.csv", mass_ng=1.001)))

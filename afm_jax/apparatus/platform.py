@@ -50,16 +50,6 @@ class SurfaceMotion(NamedTuple):
         """Third derivative of the height by time, in nm/us^3."""
         return self._sum(-(part.angular_frequency**2) * part.velocity for part in self.oscillations)
 
-    @property
-    def snap(self) -> Float[Array, "..."]:
-        """Fourth derivative of the height by time, in nm/us^4."""
-        return self._sum(part.angular_frequency**4 * part.position for part in self.oscillations)
-
-    @property
-    def crackle(self) -> Float[Array, "..."]:
-        """Fifth derivative of the height by time, in nm/us^5."""
-        return self._sum(part.angular_frequency**4 * part.velocity for part in self.oscillations)
-
     def _sum(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
         first, *others = [*parts] or [jnp.zeros_like(self.ramped_nm)]
         return sum(others, start=first)

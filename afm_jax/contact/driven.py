@@ -78,10 +78,6 @@ class Driven(NamedTuple):
     """The junction's elastic contact."""
     drive: Drive | None
     """None: a free tip over a sample at rest."""
-    pull: Float[Array, "..."] | None = None
-    """What a bent lever without drive makes of D'' at gap 0, away from the sample, in nm/us^2; None: a free tip."""
-    lever_n_per_m: Float[Array, "..."] | None = None
-    """Its stiffness; None: it has none."""
 
     @property
     def ends_nm(self) -> Float[Array, "..."]:
@@ -117,22 +113,10 @@ class Driven(NamedTuple):
             return force * self.inverse_mass
         return force * self.inverse_mass + self.drive.cantilever.acceleration(gap, rate) + self.drive.push(time_us)
 
-    @property
-    def lever_stiffness_n_per_m(self) -> Float[Array, "..."] | float:
-        """Stiffness of the bent lever, 0 where there is none."""
-        return 0.0 if self.lever_n_per_m is None else self.lever_n_per_m
-
-    def pulled_aj(self, start_nm: Float[Array, "..."], end_nm: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the energy in aJ that a bent lever gives on the way between two gaps."""
-        if self.pull is None:
-            return jnp.zeros(())
-        force = self.mass_ng * self.pull - 0.5 * self.lever_stiffness_n_per_m * (start_nm + end_nm)
-        return force * (end_nm - start_nm)
-
     def potential(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the potential energy in aJ at a gap in nm in the bridge, that of the spring included."""
         if self.drive is None:
-            return self.bridge.potential(gap) - self.pulled_aj(jnp.zeros(()), gap)
+            return self.bridge.potential(gap)
         return self.bridge.potential(gap) + 0.5 * self.drive.cantilever.stiffness_n_per_m * gap * gap
 
     def gap_of_root(self, s: Float[Array, "..."]) -> Float[Array, "..."]:

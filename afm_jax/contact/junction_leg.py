@@ -25,9 +25,6 @@ from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.contact.settings import QuickSetting
 from afm_jax.solve.quadrature import mean_matrix, nodes_along
 
-_TURNS = 6
-"""Steps of Newton's method to the turning point under a pull."""
-
 
 class JunctionWay(NamedTuple):
     """What the way of a free tip through the junction ends with."""
@@ -38,14 +35,10 @@ class JunctionWay(NamedTuple):
     """Time in the junction; meaningless where the energy is not positive."""
     deepest_gap_nm: Float[Array, "..."]
     """Gap at the turning point, negative where the tip indents the sample."""
-    gap_nm_us: Float[Array, "..."]
-    """Integral of the gap over time."""
-    action: Float[Array, "..."]
-    """Integral of the squared speed over time, in nm^2/us."""
 
 
 def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: int) -> JunctionWay:
-    """Return the way of a free tip, or of one under a steady pull, from the formation of the junction to its breaking.
+    """Return the way of a free tip from the formation of the junction to its breaking.
 
     Args:
         tip: the tip, without drive.
@@ -58,35 +51,12 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
     turn = turning_root(solid, level)
     leaving = energy_aj - tip.elastic_aj
     points, weights, _ = nodes_along(nodes, turn)
-    if tip.pull is not None:
-        leaving, pull = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm), tip.pull
-
-        # in a loop, for copies take long to compile
-        def improve(_, turn):
-            return _turn_under(tip, form, level, _mean_pull(tip, pull, form, turn), turn)
-
-        turn = lax.fori_loop(0, _TURNS, improve, turn)
     # both ways go from the inner root to the turning point; one that forms at the fold passes the rest both ways, too
     inner, rests = (0.5 * turn, 2.0) if solid.reversible else (form, 1.0)
     at = _Half(tip, inner).along(turn, points)
-    inside = _sums(weights, at.time_slope, tip.gap_of_root(at.s), at.y * at.over_y)
-    outside = _to_fold(tip, inner, jnp.maximum(leaving, 0.0) / unit, nodes)
-    time, gap, action = (2.0 * one + rests * other for one, other in zip(inside, outside, strict=True))
-    return JunctionWay(leaving, time, tip.gap_of_root(turn), gap, action)
-
-
-def _sums(weights: Array, time_slope: Array, gap: Array, speed: Array) -> tuple[Array, Array, Array]:
-    """Return the integrals over time of 1, of the gap and of the squared speed."""
-    time, below, action = (
-        jnp.tensordot(weights, time_slope * part, axes=1) for part in (jnp.ones_like(time_slope), gap, speed**2)
-    )
-    return time, below, action
-
-
-def _mean_pull(tip: Driven, pull: Array, s: Array, turn: Array) -> Array:
-    """Return the mean of g between s and the turning point under a bent lever, whose pull is linear in the gap."""
-    middle = 0.5 * (tip.gap_of_root(s) + tip.gap_of_root(turn))
-    return pull - tip.lever_stiffness_n_per_m * tip.inverse_mass * middle
+    inside = jnp.tensordot(weights, at.time_slope, axes=1)
+    outside = _time_to_fold(tip, inner, jnp.maximum(leaving, 0.0) / unit, nodes)
+    return JunctionWay(leaving, 2.0 * inside + rests * outside, tip.gap_of_root(turn))
 
 
 class Stretch(NamedTuple):
@@ -199,7 +169,7 @@ class _Half(NamedTuple):
     pressing: bool = True
 
     def along(self, turn: Array, points: Array, means: Array | None = None) -> _Along:
-        """Return the points at nodes of y, under means of g; None: those of a steady pull, if there is one."""
+        """Return the points at nodes of y, under means of g; None: under none."""
         apart = turn > self.end
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, turn - self.end, 1.0)), 0.0)
         twice = 2.0 * self.driven.solid.depth_scale_nm
@@ -207,8 +177,6 @@ class _Half(NamedTuple):
         s = turn - y * y
         work_slope, depth_slope = self.driven.solid.mean_slopes(turn, s)
         square = _unit(self.driven) * work_slope
-        if means is None and self.driven.pull is not None:
-            means = _mean_pull(self.driven, self.driven.pull, s, turn)
         if means is not None:
             square = square + twice * depth_slope * means
         over_y, slope = jnp.sqrt(square), self.driven.solid.depth_slope(s)
@@ -275,10 +243,8 @@ def _turn_under(driven: Driven, form: Array, level: Array, mean: Array, turn: Ar
     return turn - excess / (solid.depth_slope(turn) * (unit * solid.load(turn) + twice * mean))
 
 
-def _to_fold(
-    tip: Driven, start: Float[Array, "..."], leaving: Float[Array, "..."], nodes: int
-) -> tuple[Array, Array, Array]:
-    """Return time and integrals between the fold, left with a kinetic energy in the unit of the work, and s = start."""
+def _time_to_fold(tip: Driven, start: Float[Array, "..."], leaving: Float[Array, "..."], nodes: int) -> Array:
+    """Return the time between the fold, left with a kinetic energy in the unit of the work, and s = start."""
     points, weights, _ = nodes_along(nodes, leaving)
     solid = tip.solid
     fold, width = solid.fold, solid.width(leaving)
@@ -287,11 +253,8 @@ def _to_fold(
     grown = jnp.exp(reach * points)
     s = fold + 0.5 * width * (grown - 1.0 / grown)
     kinetic = leaving + (solid.work(fold) - solid.work(s))
-    if tip.pull is not None:
-        pulled = tip.pulled_aj(tip.gap_of_root(s), tip.junction.breaks_gap_nm)
-        kinetic = kinetic - pulled / solid.energy_scale_aj
     moving = kinetic > 0.0
     rate = jnp.sqrt(jnp.where(moving, kinetic, 1.0))
     time_slope = jnp.where(moving, solid.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
-    scale = _speed_scale(tip)
-    return _sums(weights, reach * time_slope * (tip.solid.depth_scale_nm / scale), tip.gap_of_root(s), scale * rate)
+    scale = tip.solid.depth_scale_nm / _speed_scale(tip)
+    return jnp.tensordot(weights, reach * time_slope * scale, axes=1)

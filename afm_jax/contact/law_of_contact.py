@@ -8,7 +8,7 @@ The delay is what the straight paths in and out, extrapolated to gap 0, leave be
 
     lag   the time that the tip spends in the solid junction: what its finite stiffness needs to turn the tip round;
     lead  what the straight paths take from the bridge's formation to gap 0 and from there to the end of contact, less
-          the time that the tip needs for these ways outside the junction: it is pulled in, and on the way out still
+          the time that the tip needs for these ways outside the junction: it is drawn in, and on the way out still
           has the energy that hysteresis takes only later.
 
 For the last table a collision is followed against time, from the speed with which the tip leaves to the one with which
@@ -617,8 +617,8 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
     tip = free_tip(contact, junction, mass_ng)
     outer = tip.ends_nm
     taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
-    pulled = tip.potential(outer) - tip.potential(junction.breaks_gap_nm)
-    scale = jnp.sqrt(2.0 * jnp.maximum(pulled, 0.25 * taken) / mass_ng)
+    drawn = tip.potential(outer) - tip.potential(junction.breaks_gap_nm)
+    scale = jnp.sqrt(2.0 * jnp.maximum(drawn, 0.25 * taken) / mass_ng)
     highest = FARTHEST * jnp.sqrt(2.0 * taken / mass_ng)
     excess = scale * jnp.sinh(stretched(highest / scale) * jnp.asarray(_PLACES))
     # the root of 0 has no derivative

@@ -246,8 +246,10 @@ def _special_curve(kind: str, curve: FollowedCurve, family: LoopFamily) -> Speci
         for test in others:
             root = root_on(leg, tested_by(test, family), family)
             if root is not None:
-                name = f"{kind}_{_kind_of(test, root[1], family)}"
-                meetings.append(Meeting(name, *(low + width * root[1].point[-2:]).tolist()))
+                other = _kind_of(test, root[1], family)
+                # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
+                if other != kind:
+                    meetings.append(Meeting(f"{kind}_{other}", *(low + width * root[1].point[-2:]).tolist()))
         if family.test == FOLD:
             root = root_on(leg, _cusp_function(leg), family)
             if root is not None:

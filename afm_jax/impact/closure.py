@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever, Propagator
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.impact.lasting_impact import PulledImpact, corrected, middle_of_contact, speeds_of_lasting_impact
+from afm_jax.impact.lasting_impact import corrected, middle_of_contact, speeds_of_lasting_impact
 from afm_jax.impact.law import Impact, ImpactLaw, Speeds
 from afm_jax.solve.newton import Newton, newton
 from afm_jax.solve.polynomial_roots import real_roots
@@ -346,17 +346,12 @@ class Scan(NamedTuple):
     """Turning points without one that are searched for a pair of roots."""
     slots: int
     """Roots there is room for."""
-    within: int = 0
-    """Coordinates at which an interval with a change of sign is evaluated again, `points/crossings`; 0: at none."""
 
 
 FINE = Scan(8192, 1e-7, 1e5, crossings=16, turns=6, slots=16)
 """Some 680 points to the decade: for whoever asks for all orbits."""
 COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
 """Some 70 to the decade: for fits, which search a hundred thousand times."""
-TAPPED = Scan(192, 1e-2, 3.0, crossings=6, turns=2, slots=6, within=32)
-"""Of taps, each of which takes long to evaluate, and none of which is much faster than the drive. From light to hard
-ones the condition jumps: to either side of that there may be an orbit, and between neighbours of the scan both."""
 
 
 class OrbitRoots(NamedTuple):
@@ -462,45 +457,20 @@ class _Samples(NamedTuple):
 def _scanned_roots(problem: OrbitProblem, scan: Scan) -> Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
-    coarse, fine = _sampled_twice(grid, problem, scan) if scan.within else (_sampled(grid, problem),) * 2
-    coarse_crossing, crossing = _changes(coarse), _changes(fine)
-    if scan.within:
-        # from one interval to the next there is nothing
-        inside = np.arange(1, scan.points) % scan.within != 0
-        exists = _inside(coarse_crossing, scan)[1]
-        crossing = crossing & inside & jnp.repeat(exists, scan.within)[1:]
-    root, exists = _narrowed(_crossings(crossing, fine, scan), _dips(coarse, scan), problem)
+    samples = _sampled(grid, problem)
+    crossing = _changes(samples)
+    root, exists = _narrowed(_crossings(crossing, samples, scan), _dips(samples, scan), problem)
     # the fastest ones if there are too many
     fastest = jnp.argsort(jnp.where(exists, -root, jnp.inf))[: scan.slots]
     order = fastest[jnp.argsort(jnp.where(exists[fastest], root[fastest], jnp.inf))]
-    most = jnp.maximum(jnp.sum(coarse_crossing), jnp.sum(crossing))
-    complete = (most <= scan.crossings) & (jnp.sum(exists) <= scan.slots)
+    complete = (jnp.sum(crossing) <= scan.crossings) & (jnp.sum(exists) <= scan.slots)
     return Coordinates(root[order], exists[order], complete)
 
 
 def _sampled(grid: Float[Array, " points"], problem: OrbitProblem) -> _Samples:
     """Return the residual at coordinates."""
-    speeds, system = jax.vmap(closure, in_axes=(0, None))(grid, problem)
-    value = jax.vmap(lambda system: system.residual)(system)
-    if isinstance(problem.impact, PulledImpact):
-        # a bent lever pulls the tip out of the bridge
-        return _Samples(grid, value, jnp.abs(speeds.delay) < 0.5 * problem.platform.period_us)
+    value = jax.vmap(lambda coordinate: closure(coordinate, problem)[1].residual)(grid)
     return _Samples(grid, value, jax.vmap(_brief, in_axes=(0, None))(grid, problem))
-
-
-def _sampled_twice(grid: Float[Array, " points"], problem: OrbitProblem, scan: Scan) -> tuple[_Samples, _Samples]:
-    """Return the residual on a grid, and within the intervals where it changes its sign, one after the other."""
-
-    def again(_, state):
-        grid, _, last = state
-        here = _sampled(grid, problem)
-        at, _ = _inside(_changes(here), scan)
-        fraction = jnp.linspace(0.0, 1.0, scan.within)
-        return (grid[at, None] + fraction * (grid[at + 1] - grid[at])[:, None]).ravel(), last, here
-
-    # a loop, because the residual is compiled for every use of it
-    nothing = _Samples(grid, jnp.zeros_like(grid), jnp.zeros(grid.shape, bool))
-    return lax.fori_loop(0, 2, again, (grid, nothing, nothing))[1:]
 
 
 def _changes(samples: _Samples) -> Bool[Array, " intervals"]:

@@ -29,15 +29,11 @@ the capture speed.
 
 `speeds_of_impact` is what map, orbits, simulation and fits ask, for any impact and the time of its arrival;
 `delay_before` reads an impact backwards from its end. At the end of the file stand the impacts of a resolved contact,
-which orbits and predictions take in place of a law: collisions of a free tip (`TabulatedImpact`) and taps of a bent
-lever, which contain their pull (`PulledImpact`), as Chebyshev series.
+which orbits and predictions take in place of a law: collisions of a free tip (`TabulatedImpact`), as Chebyshev series.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -56,16 +52,13 @@ USUAL_LEAD = 1.3
 
 
 class Middle(NamedTuple):
-    """Acceleration g of the tip relative to the platform at mid contact, in nm/us^2, and its time derivatives.
+    """Acceleration g of the tip relative to the platform at mid contact, in nm/us^2, and its time derivative.
 
-    g is positive away from the sample. ``change`` (j of the equations), ``bend``, ``twist``: its first, second and
-    third derivative, in nm/us^3, nm/us^4 and nm/us^5.
+    g is positive away from the sample. ``change`` (j of the equations): its derivative, in nm/us^3.
     """
 
     acceleration: Float[Array, ""]
     change: Float[Array, ""]
-    bend: Float[Array, ""] | float = 0.0
-    twist: Float[Array, ""] | float = 0.0
 
 
 def speeds_of_impact(
@@ -130,11 +123,9 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
         free: speeds and delay of the free tip on a sample at rest.
         middle: accelerations at mid contact.
         cantilever: its spring and its damping by the air.
-        impact: for its Hertz time, lead and lengths; taps of a bent lever correct themselves.
+        impact: for its Hertz time, lead and lengths.
     """
     u, w = free.approach, free.rebound
-    if isinstance(impact, PulledImpact):
-        return impact.during(u, middle, cantilever).speeds
     pull, hertz = middle.acceleration, impact.hertz_contact
     raised, length = hertz.raised_nm, hertz.length_nm
     # contact begins at the solid's surface, which the tip reaches from gap 0 under the pull
@@ -150,22 +141,16 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
 
 
 def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_us: Float[Array, "..."]) -> Middle:
-    """Return the acceleration of the tip relative to the surface at mid contact (nm/us^2), and its time derivatives.
+    """Return the acceleration of the tip relative to the surface at mid contact (nm/us^2), and its time derivative.
 
     Args:
         cantilever: pulls at the tip by its spring and through the air.
         surface: moves.
         time_us: mid contact, half a delay after the arrival.
     """
-    motion, pulled = surface.motion(time_us), cantilever.acceleration
+    motion, of_lever = surface.motion(time_us), cantilever.acceleration
     position, velocity, acceleration = motion.position, motion.velocity, motion.acceleration
-    jerk, snap, crackle = motion.jerk, motion.snap, motion.crackle
-    return Middle(
-        pulled(position, velocity) - acceleration,
-        pulled(velocity, acceleration) - jerk,
-        pulled(acceleration, jerk) - snap,
-        pulled(jerk, snap) - crackle,
-    )
+    return Middle(of_lever(position, velocity) - acceleration, of_lever(velocity, acceleration) - motion.jerk)
 
 
 AIR = 10.0 / 9.0
@@ -482,74 +467,6 @@ def _rebound(u: Float[Array, "..."], loss: Float[Array, "..."]) -> Float[Array, 
     return jnp.sqrt(jnp.maximum(u * u - loss, 1e-6))
 
 
-class Taps(eqx.Module):
-    """Taps (collisions of a tip on a bent lever) as Chebyshev series over approach speed and over ln(g + more).
-
-    g is the lever's pull away from the sample. There are three kinds: 0, light taps, which the bridge turns round
-    before a junction forms; 1, hard taps; 2, hard taps where the pull is weaker than the weakest of kind 1, or a push.
-
-    Attributes:
-        terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, kinds, terms, 6).
-        low: squared speed in nm^2/us^2 where they begin, coefficients of shape (pulls, kinds).
-        high: where they end, coefficients of shape (pulls, kinds): of light taps the squared speed, of hard ones
-            asinh(sqrt(u^2 - low)/scale).
-        gaps: ratio of the largest to the smallest gap at which light taps turn.
-        scale: speed of the hard ones' variable, in nm/us.
-        pulls: weakest and strongest pull in nm/us^2, shape (2, kinds).
-        more: what is added to pulls before their logarithms are taken, shape (kinds,).
-    """
-
-    terms: Float[Array, "..."]
-    low: Float[Array, "..."]
-    high: Float[Array, "..."]
-    gaps: Float[Array, ""]
-    scale: Float[Array, ""]
-    pulls: Float[Array, "..."]
-    more: Float[Array, "..."]
-
-    def at(self, pull: Float[Array, ""]) -> "Taps":
-        """Return the series over the speed alone, at a pull."""
-        weakest, strongest = self.pulls
-        held = jnp.clip(pull, weakest, strongest)
-        first, last = weakest + self.more, strongest + self.more
-        far = 2.0 * jnp.log((held + self.more) / first) / jnp.log(last / first) - 1.0
-        weights = polynomials(far, self.low.shape[0])
-        columns = ("terms", "low", "high")
-        return replace(self, **{name: jnp.einsum("kp,pk...->k...", weights, getattr(self, name)) for name in columns})
-
-    def place(self, square: Float[Array, "..."]) -> Float[Array, " kinds"]:
-        """Return where squared speeds, one or one a kind, lie in the series, -1 to 1; of a table at one pull."""
-        # light ones by the gap where they turn, which is about linear in ln of what is left to the nearest
-        square = jnp.broadcast_to(square, self.low.shape)
-        left = jnp.clip((self.high[0] - square[0]) / (self.high[0] - self.low[0]), 0.0, 1.0)
-        turned = 1.0 - 2.0 * jnp.log1p((self.gaps - 1.0) * left) / jnp.log(self.gaps)
-        hard, low = square[1:], self.low[1:]
-        beyond = hard > low
-        v = jnp.sqrt(jnp.where(beyond, hard - low, 1.0)) / self.scale
-        return jnp.append(turned, jnp.where(beyond, 2.0 * stretched(v) / self.high[1:] - 1.0, -1.0))
-
-    def holds(self, square: Float[Array, ""], pull: Float[Array, ""]) -> Bool[Array, " kinds"]:
-        """Say whether there are taps of each kind at a squared speed and a pull; of a table at that pull."""
-        beside = _BESIDE * jnp.abs(self.pulls)
-        first, end = self.pulls[0] - beside[0], self.pulls[1] + beside[1]
-        # the two tables of hard ones meet where both are exact
-        inside = (pull >= first.at[1].set(self.pulls[0, 1])) & (pull <= end.at[2].set(self.pulls[0, 1]))
-        # next to the first hard tap the last light one holds
-        last = jnp.where(self.low[1] < _NEXT * self.high[0], jnp.maximum(self.low[1], self.high[0]), self.high[0])
-        end = jnp.append(square <= last, self.place(square)[1:] <= 1.0)
-        return inside & (square >= self.low) & end
-
-
-_NEXT = 1.02
-"""Squared speed of the first hard tap over that of the last light one up to which there is none between."""
-_BESIDE = 0.02
-"""Fraction of a table's pulls by which a pull may lie outside them."""
-_PEAKED = 1.65
-"""Depth of a tap over its mean depth: between those of a parabola and of a triangle."""
-_NOWHERE_US = 1e3
-"""Added to the delay where the table has no tap, so that no orbit closes there, in us."""
-
-
 def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... count"]:
     """Return Chebyshev's polynomials of the degrees 0 to count - 1 at places, held in [-1, 1]."""
     place = jnp.clip(place, -1.0, 1.0)
@@ -561,107 +478,6 @@ def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... cou
     first = jnp.ones_like(place)
     _, rest = lax.scan(step, (place, first), None, length=count - 1, unroll=_WRITTEN_OUT)
     return jnp.moveaxis(jnp.concatenate([first[None], rest]), 0, -1)
-
-
-class Tap(NamedTuple):
-    """What a tap does: speeds (nm/us) and time (us) at the plane, the gap where the bridge breaks.
-
-    ``area``, in nm us: time integral of the depth below the plane; ``action``, in nm^2/us: that of the squared speed;
-    ``late``, in us: by how much the mean time of the depth is behind the middle of the tap; ``spread``, in us^2: the
-    mean square of that time.
-    """
-
-    speeds: Speeds
-    area: Float[Array, "..."]
-    action: Float[Array, "..."]
-    late: Float[Array, "..."]
-    spread: Float[Array, "..."]
-
-
-class PulledImpact(Impact):
-    """Taps, light and hard, of a tip on a bent lever (`contact.bent_lever`); the coordinate is the speed at the plane.
-
-    Attributes:
-        taps: those under a pull.
-        free: collisions of a free tip, at gap 0.
-        plane_nm: gap of the plane, where the bridge breaks.
-    """
-
-    taps: Taps
-    free: TabulatedImpact
-    plane_nm: Float[Array, ""]
-
-    @property
-    def lowest(self) -> Float[Array, ""]:
-        """Approach speed in nm/us below which there are no taps: half the capture speed of a free tip."""
-        return 0.5 * self.free.lowest
-
-    @property
-    def reach(self) -> Float[Array, ""]:
-        """Distance in nm/us from the lowest speed over which adhesion counts: the capture speed of a free tip."""
-        return self.free.lowest
-
-    @property
-    def hertz_contact(self) -> HertzContact:
-        """The Hertz contact of a free tip, without lead and height: time counts the bridge, the depth is tabulated."""
-        none = jnp.zeros_like(self.plane_nm)
-        return self.free.hertz_contact._replace(lead_nm=none, raised_nm=none)
-
-    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
-        """Return speeds and time of a tap under a middling pull, or of the next that there is."""
-        return self._nearest_tap(coordinate, jnp.sqrt(self.taps.pulls[0, 1] * self.taps.pulls[1, 1]))[0].speeds
-
-    def tap(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> Tap:
-        """Return a tap; one that does not exist has a time that no orbit has."""
-        tap, exists = self._nearest_tap(approach_speed, pull)
-        never = jnp.where(exists, 0.0, _NOWHERE_US * (1.0 + approach_speed))
-        return tap._replace(speeds=tap.speeds._replace(delay=tap.speeds.delay + never))
-
-    def during(self, approach_speed: Float[Array, ""], middle: Middle, cantilever: Cantilever) -> Tap:
-        """Return a tap while the pull changes, in air.
-
-        All counts to first order. What is odd about the middle of the tap, and the air, change the squared speed by
-        G = 2 (change area + twist spread area/2 - (Omega/Q) action): the table is read at u_in^2 + G/2, half way, and
-        G/2 is added to the squared rebound speed. What is even, bend t^2/2, shifts the ends: with h half the time,
-        h' its slope by the speed and paths that move apart evenly outside the turn, the time grows by
-        -bend h^3 (h'/3 - h (g h' - 1)/(12 u)), and the area by the depth times that, less bend h^5/10.
-        """
-
-        def gained(tap: Tap) -> Array:
-            change = middle.change + 0.5 * middle.twist * tap.spread
-            return 2.0 * (change * tap.area - 2.0 * cantilever.decay_rate * tap.action)
-
-        pull, square = middle.acceleration, approach_speed**2
-
-        def evaluate(_, state):
-            """Return the tap of a speed with its slope, and the speed that it says the mean one is."""
-            speed = state[0]
-            tap, slope = jax.jvp(lambda u: self.tap(u, pull), (speed,), (jnp.ones_like(speed),))
-            mean = jnp.maximum(square + 0.5 * gained(tap), (0.1 * approach_speed) ** 2)
-            return jnp.sqrt(mean), speed, tap, slope
-
-        # a loop, because the program is compiled for every use of it
-        nothing = Tap(Speeds(*(jnp.zeros_like(square),) * 3), *(jnp.zeros_like(square),) * 4)
-        _, speed, tap, slope = lax.fori_loop(0, 2, evaluate, (approach_speed, approach_speed, nothing, nothing))
-        mean = speed**2
-        half, steep = 0.5 * tap.speeds.delay, 0.5 * slope.speeds.delay
-        longer = -middle.bend * half**3 * (steep / 3.0 - half * (pull * steep - 1.0) / (12.0 * speed))
-        longer = jnp.clip(longer, -0.2 * half, 0.2 * half)
-        deepest = _PEAKED * tap.area / tap.speeds.delay
-        left = tap.speeds.rebound**2 - mean + square + gained(tap)
-        rebound = jnp.sqrt(jnp.maximum(left, (0.1 * tap.speeds.rebound) ** 2))
-        area = tap.area + deepest * longer - 0.1 * middle.bend * half**5
-        return tap._replace(speeds=Speeds(approach_speed, rebound, tap.speeds.delay + longer), area=area)
-
-    def _nearest_tap(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> tuple[Tap, Bool[Array, ""]]:
-        """Return a tap, or the next that there is, and whether it exists."""
-        square = approach_speed**2
-        taps = self.taps.at(pull)
-        is_light, *is_hard = taps.holds(square, pull)
-        parts = jnp.einsum("kn,knc->kc", polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
-        loss, time, *others = jnp.where(is_hard[0], parts[1], jnp.where(is_hard[1], parts[2], parts[0]))
-        rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
-        return Tap(Speeds(approach_speed, rebound, time), *others), is_hard[0] | is_hard[1] | is_light
 
 
 def chebyshev_sum(coefficients: Float[Array, " terms"], place: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -109,7 +109,7 @@ class Impact(eqx.Module):
     """What an impact does to a free tip on a sample at rest, as functions of one coordinate.
 
     The coordinate grows with the approach speed. An impact is a `Law`, or a resolved contact as series
-    (`TabulatedImpact`, `PulledImpact`). What platform, spring and air change while it lasts is in
+    (`TabulatedImpact`). What platform, spring and air change while it lasts is in
     `afm_jax.impact.lasting_impact`.
     """
 

@@ -23,10 +23,8 @@ from afm_jax.apparatus.surface import FreeFrame, Surface, Wave, free_frame, size
 from afm_jax.checks import as_argument, checked, is_traced, require_float64
 from afm_jax.impact.closure import (
     COARSE,
-    TAPPED,
     OrbitPlace,
     OrbitProblem,
-    Scan,
     closing_residual,
     closure,
     find_roots,
@@ -36,7 +34,7 @@ from afm_jax.impact.closure import (
 )
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import PulledImpact, crawls, depth_of_impact, middle_of_contact
+from afm_jax.impact.lasting_impact import crawls, depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Impact, ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
@@ -356,15 +354,10 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     A delayed closing condition is scanned coarsely: orbits close to each other or to capture may be missed.
     """
     problem = lax.stop_gradient(problem)
-    roots = find_roots(problem, usual_scan(problem))
+    roots = find_roots(problem, COARSE)
     judged = jax.vmap(is_steady, in_axes=(0, 0, 0, None))
     steady, readings = judged(roots.place, roots.found, roots.slopes, problem)
     return SteadyOrbits(roots.place, steady, roots.near_fold, readings, roots.slopes)
-
-
-def usual_scan(problem: OrbitProblem) -> Scan:
-    """Return the scan of searches that are made again and again, as fits make them."""
-    return TAPPED if isinstance(problem.impact, PulledImpact) else COARSE
 
 
 def is_steady(
@@ -465,21 +458,15 @@ def _lockin(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return lock-in amplitude in nm and phase in degrees of the free motion, at omega/N or at the drive's omega."""
     cantilever, platform, impact, order = problem
-    depth, late = 0.0, 0.0
+    depth = 0.0
     if impact.lasts:
         # in contact the tip is below the platform's rest surface by the indentation
         approach, delay = state.speeds.approach, state.speeds.delay
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
         nu = platform.angular_frequency / (1.0 if at_drive else order)
-        if isinstance(impact, PulledImpact):
-            tap = impact.during(approach, middle, cantilever)
-            # mean of cos(nu t) weighted by the depth, t from mid tap, to fourth order; that one as of a parabola
-            depth = tap.area * (1.0 - 0.5 * nu**2 * tap.spread + (nu * delay) ** 4 / 4480.0)
-            late = tap.late
-        else:
-            depth = depth_of_impact(impact, approach, middle, cantilever, nu)
-    below = {"indentation": depth, "late_us": late}
-    return lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, at_drive=at_drive, **below)
+        depth = depth_of_impact(impact, approach, middle, cantilever, nu)
+    flight, how = state.flight, {"delayed": impact.delayed, "at_drive": at_drive}
+    return lockin(cantilever, platform, flight, order, indentation=depth, **how)
 
 
 def trace_and_determinant(
@@ -572,7 +559,7 @@ def highest_of_sum(
     return at(lax.stop_gradient(top))[0]
 
 
-def lockin(  # noqa: PLR0913
+def lockin(
     cantilever: Cantilever,
     platform: Platform,
     flight: FlightEnds,
@@ -580,7 +567,6 @@ def lockin(  # noqa: PLR0913
     *,
     delayed: bool,
     indentation: ArrayLike = 0.0,
-    late_us: ArrayLike = 0.0,
     at_drive: bool = False,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return lock-in amplitude in nm and phase in degrees of an orbit at its response frequency omega/N, or omega.
@@ -600,7 +586,6 @@ def lockin(  # noqa: PLR0913
         order: N, drive periods between impacts.
         delayed: whether there is a delay between the flight's end and the next start.
         indentation: time integral, over the delay, of the depth below the platform, in nm us.
-        late_us: by how much that depth's mean time is behind the middle of the delay.
         at_drive: read at the drive's omega instead of omega/N.
     """
     period = as_argument(order) * platform.period_us
@@ -621,7 +606,7 @@ def lockin(  # noqa: PLR0913
     if delayed:
         next_start_us = flight.start_us + period
         integral = integral + _platform_integral(platform, nu, end_us, next_start_us)
-        integral = integral - indentation * _turned_back(nu, 0.5 * (end_us + next_start_us) + late_us)
+        integral = integral - indentation * _turned_back(nu, 0.5 * (end_us + next_start_us))
     cosine, sine = 2.0 / period * integral
     phase = within_turn(jnp.rad2deg(jnp.arctan2(sine, cosine)), 360.0 / turns)
     return jnp.sqrt(cosine**2 + sine**2), phase

@@ -310,32 +310,32 @@ def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""
         until_us: end of the search.
 
     Returns:
-        The release, its time with implicit derivatives. A tip that is pulled from the beginning is let go at once.
+        The release, its time with implicit derivatives. A tip that is lifted from the beginning is let go at once.
     """
     still, begin, until = lax.stop_gradient((bed, from_us, until_us))
     resolution = 4.0 * jnp.finfo(begin.dtype).eps
     bend, shortest = still.push_bend, _SHORTEST_PULL / still.fastest
 
     def searching(state):
-        time, pulled, steps = state
-        return ~pulled & (time < until) & (steps < _MAX_STEPS)
+        time, lifted, steps = state
+        return ~lifted & (time < until) & (steps < _MAX_STEPS)
 
     def advance(state):
         time, _, steps = state
         push, rate = still.push_and_rate(time)
         step = jnp.where(push > 0.0, time_above(push, rate, bend), 0.0)
         met = step <= jnp.maximum(DEFAULT_ROOT_TOLERANCE_US, resolution * jnp.abs(time))
-        pulled = met & ((rate < -bend * shortest) | (push < -bend * shortest**2))
-        step = jnp.where(met & ~pulled, shortest, step)
-        return time + jnp.maximum(step, still.time_pressed(time)), pulled, steps + 1
+        lifted = met & ((rate < -bend * shortest) | (push < -bend * shortest**2))
+        step = jnp.where(met & ~lifted, shortest, step)
+        return time + jnp.maximum(step, still.time_pressed(time)), lifted, steps + 1
 
     none = jnp.zeros_like(begin, dtype=bool)
-    time, pulled, steps = lax.while_loop(searching, advance, (begin, none, jnp.zeros_like(begin, dtype=jnp.int32)))
-    happens = pulled & (time < until)
+    time, lifted, steps = lax.while_loop(searching, advance, (begin, none, jnp.zeros_like(begin, dtype=jnp.int32)))
+    happens = lifted & (time < until)
     at_once = still.push(begin) < -bend * shortest**2
     root = implicit_root(_push_at, jnp.where(happens, time, until), bed)
     when = jnp.where(happens, jnp.where(at_once, from_us, root), until_us)
-    return Release(happens, when, ~pulled & (time < until) & (steps >= _MAX_STEPS))
+    return Release(happens, when, ~lifted & (time < until) & (steps >= _MAX_STEPS))
 
 
 def take_off(

@@ -569,9 +569,9 @@ def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> comp
     depth = 0.0
     if law.lasts:
         cantilever, (surface, _) = motion.scene.cantilever, surface_of(motion.scene)
-        pulled = middle_of_contact(cantilever, surface, jnp.asarray(middle[impacts]))
+        at_middle = middle_of_contact(cantilever, surface, jnp.asarray(middle[impacts]))
         approach = jnp.asarray(rows.approach_speed_nm_per_us)[impacts]
-        depth = np.asarray(depth_of_impact(law, approach, pulled, cantilever, angular_frequency))
+        depth = np.asarray(depth_of_impact(law, approach, at_middle, cantilever, angular_frequency))
     total = -np.sum(depth * np.exp(-1j * angular_frequency * middle[impacts]))
     early = impacts[departure[impacts] < arrival[impacts]]
     return complex(total) + (_integral_of_overlaps(motion, early, angular_frequency) if early.size else 0j)

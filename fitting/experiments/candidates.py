@@ -138,7 +138,7 @@ LEFT_OUT = {
     "fold": "near a fold, where the orbit ends and has no derivative",
     "unsure": "no single steady orbit for some of the values that the prior, or a law's own misfit, allows",
     "too large": "amplitudes above what the instrument takes",
-    "inaccurate": "impacts too slow, or too strongly pulled, for the model: a fit excludes such rows",
+    "inaccurate": "impacts too slow, or under too strong a pull, for the model: a fit excludes such rows",
 }
 """Why a drive is no candidate, in words."""
 

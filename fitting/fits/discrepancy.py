@@ -15,17 +15,16 @@ step after the fit (`fitting.fits.step`). With the approach speed u and the rebo
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import PAPER
 from afm_jax.solve.lanes import compiled_quickly
-from fitting.fits.objective import Objective
 from fitting.models import Held, Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
@@ -54,15 +53,13 @@ _CORRECTIONS = 1.5
 class HeldEffect(NamedTuple):
     """What one standard error of a held parameter does to the squared rebound speed and to the delay.
 
-    In nm^2/us^2 and us, at logarithms of approach speeds in nm/us. ``readings``: what it does to the readings'
-    residuals; None: as the law says.
+    In nm^2/us^2 and us, at logarithms of approach speeds in nm/us.
     """
 
     held: Held
     log_speed: Float[np.ndarray, " n"]
     square: Float[np.ndarray, " n"]
     late: Float[np.ndarray, " n"]
-    readings: Float[np.ndarray, " readings"] | None = None
 
     def at(self, speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2 n"]:
         """Return both at approach speeds in nm/us."""
@@ -118,39 +115,6 @@ def effects_of_held(
                 found.append(HeldEffect(one, np.log(u[there]), change[0, there], change[1, there]))
                 break
     return tuple(found)
-
-
-def seen_in_taps(
-    effects: tuple[HeldEffect, ...], objective: Objective, values: Float[np.ndarray, " p"]
-) -> tuple[HeldEffect, ...]:
-    """Return the effects of held parameters with what they do to the readings of taps, which no law of speeds says.
-
-    Args:
-        effects: of the parameters on the law.
-        objective: the fit's, following its orbits.
-        values: the fitted ones.
-    """
-
-    def misfit(fixed: Mapping[str, Any]) -> tuple[Float[np.ndarray, "rows k"], Bool[np.ndarray, " rows"]]:
-        there = Objective(objective.measurement._replace(fixed=dict(fixed)), objective.problem, near=objective.near)
-        linear = there.at_values(values[None])
-        return there.misfit(linear), np.asarray(linear.prediction.orbits)[0] > 0
-
-    known = objective.measurement.fixed
-    (here, found), seen = misfit(known), []
-    for one in effects:
-        low, high = PARAMETERS[one.held.name].lowest, PARAMETERS[one.held.name].highest
-        for part in (_PARTS[1], -_PARTS[1]):
-            moved = float(np.clip(one.held.value + part * one.held.error, low, high)) - one.held.value
-            if moved == 0.0:
-                continue
-            there, left = misfit(known | {one.held.name: np.asarray(one.held.value + moved)})
-            # a row whose orbit is lost on the way says nothing
-            change = np.where((found & left)[:, None], (there - here) * one.held.error / moved, 0.0)
-            if np.isfinite(change).all():
-                seen.append(one._replace(readings=change.ravel()))
-                break
-    return tuple(seen)
 
 
 @compiled_quickly(static_argnames="effects")
@@ -234,15 +198,6 @@ class ModelDiscrepancy:
         if self.held:
             unknown = np.concatenate([unknown, np.stack([one.at(u) for one in self.held], axis=2)], axis=2)
         return Columns(known, drag, _stacked(square, late, u.size), unknown)
-
-    def fixed_after(self, unknowns: Float[np.ndarray, " m"], fixed: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of a contact's parameters after a step of a fit of taps that holds them at others."""
-        moved = {}
-        # of taps there are no other unknowns of the law
-        for one, unknown in zip(self.held, unknowns, strict=False):
-            ends = PARAMETERS[one.held.name].lowest, PARAMETERS[one.held.name].highest
-            moved[one.held.name] = np.asarray(np.clip(one.held.value + one.held.error * unknown, *ends))
-        return dict(fixed) | moved
 
     def _unknown(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]):
         """Return columns of the squared speed and of the delay, for unknowns of unit variance."""

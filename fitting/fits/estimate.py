@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.solve.lanes import compiled_quickly
-from fitting.fits.discrepancy import ModelDiscrepancy, effects_of_held, seen_in_taps, with_runs
+from fitting.fits.discrepancy import ModelDiscrepancy, effects_of_held, with_runs
 from fitting.fits.intervals import Convergence, at_bound, check_minimum, covariance
 from fitting.fits.law_after import (
     LAW_POINTS,
@@ -242,7 +242,7 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
         return _predicted_after(at, steps, discrepancy)
 
     part = descending_part(system, predicted)
-    if at.problem.lasting and not at.problem.pulled:
+    if at.problem.lasting:
         part = settled_step(part, system, predicted)
     return _after_step(estimate, part, discrepancy, system)
 
@@ -330,11 +330,9 @@ def _discrepancy_of(at: AtMinimum, rows: StepRows) -> tuple[ModelDiscrepancy, St
     if problem.model == "contact":
         held = tuple(Held(*one) for one in at.settings.get("held", ()))
         effects = effects_of_held(held, values, problem.effects, mass, discrepancy.speeds)
-        if problem.pulled:
-            effects = seen_in_taps(effects, at.objective, at.values)
         discrepancy = replace(discrepancy, held=effects)
     system = system_of(rows, discrepancy, at.free)
-    if not problem.lasting or problem.pulled or at.scattering:
+    if not problem.lasting or at.scattering:
         return discrepancy, system, None
     before = beside = longest_run(rows, system)
     residual = system.step().residual.reshape(rows.measurement_error.shape)
@@ -411,13 +409,12 @@ def _predicted_after(at: AtMinimum, parts: list[LinearStep], discrepancy: ModelD
     """Return what the laws after parts of the step predict, with the instrument after it."""
     measurement, problem = at.objective.measurement, at.problem
     values = np.array([part.values[: len(problem.names)] for part in parts])
-    if problem.pulled or not problem.lasting:
-        # taps are no law of the free tip's speed, and instantaneous laws have no discrepancy
+    if not problem.lasting:
+        # instantaneous laws have no discrepancy
         shape = measurement.rows.measured.shape
         predictions = []
-        for point, part in zip(values, parts, strict=True):
-            there = measurement._replace(fixed=discrepancy.fixed_after(part.unknown, measurement.fixed))
-            plain = Objective(there, problem, near=at.objective.near).at_values(point[None])
+        for point in values:
+            plain = Objective(measurement, problem, near=at.objective.near).at_values(point[None])
             misfit = plain.residual[:, : shape[0] * shape[1]].reshape(1, *shape)
             predictions.append(Predicted(misfit, plain.prediction))
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *predictions)
@@ -457,7 +454,7 @@ def programs_of_laws(
         table_of_law(speeds, 0.9 * speeds, late, **known, errors=errors).to_dict()
 
     programs: list[Callable[[], object]] = [with_errors]
-    if problem.lasting and not problem.pulled:
+    if problem.lasting:
         programs.insert(0, predicted)
     if problem.model != "contact":
         # that of a contact takes its table, which takes long to compute

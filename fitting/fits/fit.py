@@ -24,7 +24,7 @@ from fitting.fits.estimate import (
     hanging_on_held,
     programs_of_laws,
 )
-from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED, Interval, profile_intervals, within_range
+from fitting.fits.intervals import UNEXPLAINED, Interval, profile_intervals, within_range
 from fitting.fits.law_after import holding, speed_range
 from fitting.fits.minimum import minimum_with_model_errors, rescale_errors, settle, starts, untabulated
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest, warm_up_steps
@@ -265,7 +265,6 @@ def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
         contact_share=estimate.contact_share,
         refused=at.found.refused,
         contact=problem.model == "contact",
-        tapped=problem.pulled,
         pulls=() if estimate.tables is None else tuple(pull.p_value for pull in estimate.tables.pulls),
         scattering=estimate.tables is not None and estimate.tables.between is not None,
         run=(0.0, 0.0) if estimate.runs is None else (estimate.runs.before, estimate.runs.beside),
@@ -309,18 +308,15 @@ def _parameters(
     moved = ~at.free | ~np.isfinite(resolution) | (np.abs(at.values - at.found.minimum.start) > 1e-3 * resolution)
     parameters = {}
     for i, (name, interval) in enumerate(zip(problem.names, intervals, strict=True)):
-        # of a contact under a bent lever a parameter may be anything within its range
-        searched = (interval.reason or "").count(END_OF_RANGE) == 2
-        anything = problem.pulled and name in problem.own and searched
         parameters[name] = FittedParameter(
             value=float(estimate.values[i]),
             unit=parameter_called(name).unit,
-            standard_error=float(errors[i]) if at.free[i] and not anything and np.isfinite(errors[i]) else None,
+            standard_error=float(errors[i]) if at.free[i] and np.isfinite(errors[i]) else None,
             interval95=(interval.low, interval.high),
             interval_reason=interval.reason,
-            undetermined=anything or not np.isfinite(estimate.covariance[i, i]),
+            undetermined=not np.isfinite(estimate.covariance[i, i]),
             at_bound=not bool(at.free[i]),
-            did_not_move=not (moved[i] or anything or name in at.constraints),
+            did_not_move=not (moved[i] or name in at.constraints),
             constraint=at.constraints.get(name),
         )
     return parameters

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.least_squares import Box, Searches, covariance_of, descended
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.objective import PLAIN, Objective
-from fitting.models import Problem, coordinate_of
-from fitting.parameters import Parameter, is_nuisance, is_of_one_table
+from fitting.models import coordinate_of
+from fitting.parameters import Parameter, is_of_one_table
 
 CHI2_95 = 3.841458820694124
 """95 % quantile of chi2 with one degree of freedom."""
@@ -71,7 +71,7 @@ def profile_intervals(
     covariance: Float[np.ndarray, "p p"],
     chi2: float,
 ) -> list[Interval]:
-    """Return the 95 % profile interval of every parameter; Wald's of nuisances of one of several tables, and of taps.
+    """Return the 95 % profile interval of every parameter; Wald's of nuisances of one of several tables.
 
     Args:
         objective: chi2 of a table and a model.
@@ -85,7 +85,7 @@ def profile_intervals(
         _Side(index, direction, here, _followers(objective, values, covariance, index, direction))
         for index in range(len(values))
         for direction in (-1.0, 1.0)
-        if np.isfinite(errors[index]) and not _by_its_error(objective.problem, objective.problem.names[index])
+        if np.isfinite(errors[index]) and not is_of_one_table(objective.problem.names[index])
     ]
     for _ in range(_OUTER_STEPS):
         active = [side for side in sides if side.end is None and side.reason is None]
@@ -97,15 +97,10 @@ def profile_intervals(
     # it has a Gaussian constraint, and there are as many as tables
     return [
         within_range(objective.problem.parameters[index], Interval(*ends[index]))
-        if np.isfinite(errors[index]) and _by_its_error(objective.problem, name)
+        if np.isfinite(errors[index]) and is_of_one_table(name)
         else _interval(sides, index)
         for index, name in enumerate(objective.problem.names)
     ]
-
-
-def _by_its_error(problem: Problem, name: str) -> bool:
-    """Say whether a nuisance is one of many, or of taps, each look at which takes long."""
-    return is_of_one_table(name) or (problem.pulled and is_nuisance(name))
 
 
 def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: float) -> None:
@@ -189,11 +184,6 @@ class Places:
         """Return the optimiser's coordinates of places."""
         columns = zip(self.objective.problem.parameters, np.moveaxis(places, -1, 0), strict=True)
         return np.stack([coordinate_of(p, place) if p.sign else place for p, place in columns], axis=-1)
-
-    def known_by_range(self, coordinates: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
-        """Return the inverse variances of places of which nothing is known but their range."""
-        values, slopes = self.objective.problem.values_and_slopes(coordinates)
-        return self.objective.problem.known_by_range(values) * np.where(self.by_value, 1.0, slopes) ** 2
 
     def look(self, places: Float[np.ndarray, "sets p"], some: Int[np.ndarray, " sets"]) -> Searches:  # noqa: ARG002
         """Return chi2, the residuals and their Jacobian by the places."""
@@ -294,9 +284,9 @@ def covariance(
 
 
 def _fisher(objective: Objective, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
-    """Return the Fisher matrix of the parameters' values, with what ranges say where data may leave them open."""
+    """Return the Fisher matrix of the parameters' values."""
     jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
-    return jacobian.T @ jacobian + np.diag(objective.problem.known_by_range(values))
+    return jacobian.T @ jacobian
 
 
 def check_minimum(
@@ -316,9 +306,7 @@ def check_minimum(
     # a point that is no minimum, at an unknown distance from one
     adrift = partial(Convergence, converged=False, gradient=np.inf, estimated_distance=np.inf, outward=outward)
     _, jacobian = objective.linearise(coordinates[None])
-    values, slopes = objective.problem.values_and_slopes(coordinates)
-    known = np.diag((objective.problem.known_by_range(values) * slopes**2)[free])
-    fisher = jacobian[0][:, free].T @ jacobian[0][:, free] + known
+    fisher = jacobian[0][:, free].T @ jacobian[0][:, free]
     if not np.all(np.isfinite(fisher)):
         reason = "the slopes of the residuals are not finite where the search ended"
         return adrift(hessian_eigenvalues=[], reason=reason)
@@ -333,7 +321,7 @@ def check_minimum(
     hessian = (slope[1 : count + 1] - slope[count + 1 :]) / (2.0 * _STEP)
     if not np.all(np.isfinite(hessian)) or not np.all(np.isfinite(slope[0])):
         return adrift(hessian_eigenvalues=[], reason="chi2 has no finite curvature where the search ended")
-    hessian = 0.5 * (hessian + hessian.T) + scale.T @ known @ scale
+    hessian = 0.5 * (hessian + hessian.T)
     eigenvalues = np.linalg.eigvalsh(hessian)
     distance = float(slope[0] @ np.linalg.solve(hessian, slope[0])) if eigenvalues[0] > 0 else float("inf")
     converged = bool(eigenvalues[0] > 0 and distance < _ENOUGH and outward)

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.impact.lasting_impact import PulledImpact
 from afm_jax.impact.law import Law
 from afm_jax.solve.lanes import compiled_quickly, filled
 from afm_jax.units import TWO_SIDED_95
@@ -144,7 +143,6 @@ def law_and_slope(
             capture = jnp.full((2, 1), impact.capture_speed_nm_per_us)
             leaving = jnp.stack([impact.rebound_speed(speeds), impact.collision_delay(speeds)])
             return jnp.concatenate([leaving, capture], axis=1)
-        impact = impact.free if isinstance(impact, PulledImpact) else impact
         leaving = jax.vmap(impact.speeds)(speeds)
         # below the table the contact captures
         free = speeds > impact.lowest

@@ -26,7 +26,7 @@ from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.intervals import Places
 from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, Polished, lowest, polish
-from fitting.forward import Linearised, free_impacts, impact_at, times_of_taps
+from fitting.forward import Linearised, free_impacts, impact_at
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, tip_work
 from fitting.parameters import PARAMETERS, Parameter
 
@@ -121,17 +121,14 @@ def minimise(objective: Objective) -> Minimum:
     if common is not None:
         return _with_own_nuisances(objective, minimise(common))
     points = starts(objective.problem, objective.measurement)
-    pulled = objective.problem.pulled
-    scout = _thinned(objective, ROWS_PER_PROGRAM // (1 + pulled)) if objective.problem.lasting else objective
-    best = np.argsort(scout.screen(points), kind="stable")[: _FEW_STARTS if pulled else BATCH]
+    scout = _thinned(objective, ROWS_PER_PROGRAM) if objective.problem.lasting else objective
+    best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
     first = objective.problem.coordinates(points[best])
     if not objective.problem.lasting:
         return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates, points[best])
     found = settle(objective, _whole(objective, _scouted(scout, first), points[best]))
     lost = lost_rows(objective, objective.problem.values(found.coordinates))
-    # of taps some may be lost: they are set aside
-    seen = np.asarray(objective.measurement.rows.measured).any(axis=1)
-    back = recovered(objective, found.coordinates, lost) if lost.sum() > pulled * _MOST_IRREGULAR * seen.sum() else None
+    back = recovered(objective, found.coordinates, lost) if lost.any() else None
     if back is None:
         return found
     other = settle(objective, replace(found, coordinates=back))
@@ -201,19 +198,16 @@ _MOST_STEPS = 150
 def _plainly(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Polished:
     """Polish plainly, then with damped steps between bounds where that has not arrived.
 
-    A loss close to 0 has no curvature by its coordinate, and what taps tell lies in narrow valleys that end at bounds:
-    damped steps alone go along these. What taps leave open moves no farther at once than its range lets it.
+    A loss close to 0 has no curvature by its coordinate: damped steps go there.
     """
-    polished = None if objective.problem.pulled else polish(objective, starts, PLAIN, settled=FINE)
-    begin = starts if polished is None else polished.coordinates
+    polished = polish(objective, starts, PLAIN, settled=FINE)
     places = Places(objective)
-    here = places.of_values(objective.problem.values(begin))
-    known = places.known_by_range(begin[0])
-    box = Box(places.lowest, places.highest, np.zeros(here.shape, dtype=bool), known=known)
+    here = places.of_values(objective.problem.values(polished.coordinates))
+    box = Box(places.lowest, places.highest, np.zeros(here.shape, dtype=bool))
     end = descended(places.look, places.look(here, np.arange(len(here))), box, settled=FINE, most=_MOST_STEPS)
     found = Polished(places.coordinates(end.place), end.chi2, 0)
     # the last digits stay
-    return found if polished is None or np.any(end.chi2 < polished.objective - FINE) else polished
+    return found if np.any(end.chi2 < polished.objective - FINE) else polished
 
 
 def _polished(
@@ -275,11 +269,7 @@ _GRID_PER_PARAMETER = {1: 96, 2: 16}
 
 
 _SPREAD_POINTS = 64
-"""Points of a low-discrepancy sequence, where a grid would have too many; half as many of taps, which take long."""
-
-
-_FEW_STARTS = 4
-"""Of these, how many are polished of taps."""
+"""Points of a low-discrepancy sequence, where a grid would have too many."""
 
 
 def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
@@ -299,7 +289,7 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
         mesh = np.meshgrid(*(started(name, np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
         columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
     else:
-        places = _spread(_SPREAD_POINTS // (1 + problem.pulled), len(own))
+        places = _spread(_SPREAD_POINTS, len(own))
         columns = {name: started(name, place) for name, place in zip(own, places.T, strict=True)}
     count = len(columns[own[0]])
     known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
@@ -420,12 +410,6 @@ TAPPED, IN_FRAME = 0.0012, 1e-4
 parameters do not make up for (full contacts of tips of 12, 20 and 100 nm, 3 and 10 % above resonance)."""
 
 
-_OF_TAPS, _LONG_TAPS = 7e-4, 230.0
-"""Error of amplitudes of taps that leaves their phases the 0.005 degrees by which full simulations differ; and, where
-the lever hardly pulls, over the eighth power of the share of a period that a tap lasts: four contacts have 0.03 degrees
-at 0.27 and 0.4 at 0.34."""
-
-
 DELAY_US = 1.5e-4
 """Error of the delay law in us."""
 
@@ -443,7 +427,7 @@ _CRAWLING, _MOST_LOST = 2.5, 0.05
 the share of those without at most: that close to where orbits end, a hair of the law decides whether there is one."""
 
 
-_PULLED = 1.2
+_BY_LEVER = 1.2
 """Pull times Hertz time over the approach speed from which the rows of a driven tip are set aside. Six full contacts
 3 % above resonance are predicted as well there as under little pull."""
 
@@ -459,13 +443,10 @@ _TURNED = 0.125
 TOO_SLOW = "too slow for a law of impacts"
 
 
-TOO_PULLED = "under too strong a pull of the lever (more than 1.2 times what turns the tip round)"
+TOO_BENT = "under too strong a pull of the lever (more than 1.2 times what turns the tip round)"
 
 
 IRREGULAR = "not one a period"
-
-
-NO_TAPS = "not steady taps, one a period, of the fitted contact"
 
 
 ATTRACTED = "none: the sample only draws the tip"
@@ -492,8 +473,6 @@ def model_errors_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Mo
 
 def _model_errors_of_part(objective: Objective, values: Float[np.ndarray, " p"]) -> ModelErrors:
     """Return the model errors of every row of one instrument."""
-    if objective.problem.pulled:
-        return _model_errors_of_taps(objective, values)
     rows = objective.measurement.rows
     impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
@@ -509,8 +488,8 @@ def _model_errors_of_part(objective: Objective, values: Float[np.ndarray, " p"])
     slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
     reasons = np.where(slow, TOO_SLOW, "").astype(object)
     if tapping:
-        pulled = np.asarray(prediction.pull_nm_per_us2)[0] * tips.hertz_time
-        reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
+        by_lever = np.asarray(prediction.pull_nm_per_us2)[0] * tips.hertz_time
+        reasons[exists & (by_lever > _BY_LEVER * approach)] = TOO_BENT
         reasons[_irregular(objective, exists)] = IRREGULAR
         reasons[free] = ""
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
@@ -523,21 +502,6 @@ def _model_errors_of_part(objective: Objective, values: Float[np.ndarray, " p"])
     if tapping:
         error, slow_error = (np.where(free, 0.0, part) for part in (error, slow_error))
     return ModelErrors(error, slow_error, reasons)
-
-
-def _model_errors_of_taps(objective: Objective, values: Float[np.ndarray, " p"]) -> ModelErrors:
-    """Return the model errors of rows of a contact under a bent lever, which pulls the slowest tips free."""
-    rows = objective.measurement.rows
-    prediction = jax.tree.map(lambda part: np.asarray(part)[0], objective.at_values(values[None]).prediction)
-    exists = prediction.orbits > 0
-    reasons = np.where(_irregular(objective, exists) & ~np.asarray(rows.free), NO_TAPS, "").astype(object)
-    impact: Any = impact_at(values, objective.measurement, objective.problem).impact
-    time = times_of_taps(impact, prediction.approach_speed_nm_per_us, prediction.pull_nm_per_us2)
-    hardly = exists & (prediction.pull_nm_per_us2 < np.asarray(impact.taps.pulls)[0, 1])
-    share = np.minimum(np.where(hardly, time, 0.0) * np.asarray(rows.drive_frequency_khz) * 1e-3, 0.5)
-    error = _OF_TAPS + _LONG_TAPS * share**8 + np.where(exists, _frame_error(rows), 0.0)
-    error = np.where(rows.free, 0.0, error)
-    return ModelErrors(error, error, reasons)
 
 
 def _frame_error(rows: Rows) -> Float[np.ndarray, " rows"]:
@@ -567,7 +531,7 @@ def untabulated(
     objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
 ) -> Bool[np.ndarray, " rows"]:
     """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
-    if objective.problem.model != "contact" or objective.problem.pulled:
+    if objective.problem.model != "contact":
         return np.zeros(approach.shape, dtype=bool)
     from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR  # noqa: PLC0415  # for contacts alone
 

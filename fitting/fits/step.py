@@ -301,22 +301,14 @@ def system_of(rows: StepRows, discrepancy: ModelDiscrepancy, free: Bool[np.ndarr
     residual[:size] += amplitudes(columns.known)
     jacobian = np.zeros((residual.size + len(priors), len(names)))
     jacobian[: residual.size, :known] = rows.jacobian
-    # the last rows of residual and Jacobian are the parameters' constraints; a parameter that may stay open and has
-    # none gets a prior as wide as its range, centred where the fit ended
-    place = residual.size - known + np.arange(known), np.arange(known)
-    jacobian[place] = np.where(jacobian[place] == 0.0, np.sqrt(problem.known_by_range(values)), jacobian[place])
     if "viscous_loss" in problem.names:
         jacobian[:size, problem.names.index("viscous_loss")] += amplitudes(columns.drag)
     jacobian[:size, known:] = amplitudes(columns.shape)
     jacobian[residual.size :, known:] = np.diag([1.0 / error for _, error in priors.values()])
     residual = np.append(residual, np.zeros(len(priors)))
     of_law = amplitudes(columns.unknown)
-    for place, effect in enumerate(discrepancy.held, start=of_law.shape[1] - len(discrepancy.held)):
-        if effect.readings is not None:
-            of_law[:, place] = effect.readings
     unknown = [of_law]
-    # taps have been through the pull, and what they lack of its change is in the rows' errors
-    if problem.lasting and not problem.pulled:
+    if problem.lasting:
         parts = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
         unknown.append(amplitudes(remainders(*parts, tapping=problem.tapping)))
     parameters = StepParameters(

@@ -21,7 +21,7 @@ from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
 from fitting.fits.result import NO_MASS, FittedParameter, FittedRows
 from fitting.models import Held
-from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, is_nuisance, name_of_table, parameter_called
+from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import ERRORS_OF_REPEATS, AmplitudeTable
 
@@ -45,12 +45,8 @@ _LONG_CONTACT = 0.2
 """Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
 _REFUSED = (
     "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
-    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude, or fit the contact's own "
-    'parameters (`model="contact"`), which needs no law.'
-)
-_NO_TAPS = (
-    "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what is known of "
-    'it (`fixed={"tip_radius_nm": 20}`, for example), or leave out rows that are not one impact a period.'
+    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude. The energy of a tap needs "
+    "no law: `afm-jax tapping CURVE`."
 )
 _AT_BOUND = 0.005
 
@@ -80,8 +76,6 @@ class Evidence:
     """Hardly a row is left that a law of impacts can be read off."""
     contact: bool = False
     """Whether a contact was fitted."""
-    tapped: bool = False
-    """Whether a contact's own taps were fitted, not a law."""
     pulls: tuple[float, ...] = ()
     """Of several tables, the probability that each one's law is that of the others."""
     scattering: bool = False
@@ -105,23 +99,12 @@ class Evidence:
     """Which readings of a table follow its rows, whose order nothing says, by the table's label."""
 
     @property
-    def refusal(self) -> str:
-        """Why hardly a row is one that the model can be read off."""
-        return _NO_TAPS if self.tapped else _REFUSED
-
-    @property
     def undetermined(self) -> list[str]:
         """Names of the parameters that the data do not determine, not even to first order."""
         return [name for name, parameter in self.parameters.items() if parameter.undetermined]
 
     @property
-    def may_stay_open(self) -> bool:
-        """Whether what is not determined need not be: of a contact's taps, unless nothing is."""
-        law = [name for name in self.parameters if not is_nuisance(name)]
-        return self.tapped and any(not self.parameters[name].undetermined for name in law)
-
-    @property
-    def pulled(self) -> dict[str, float]:
+    def contradictions(self) -> dict[str, float]:
         """How far each parameter is from what was measured of it otherwise, in standard errors of that."""
         known = {name: (p.value, *p.constraint) for name, p in self.parameters.items() if p.constraint is not None}
         return {name: (value - given) / error for name, (value, given, error) in known.items()}
@@ -144,7 +127,7 @@ class Evidence:
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
     """Return what makes a fit invalid, and its warnings; each a sentence."""
-    return [evidence.refusal] if evidence.refused else judge(REASONS, evidence), judge(WARNINGS, evidence)
+    return [_REFUSED] if evidence.refused else judge(REASONS, evidence), judge(WARNINGS, evidence)
 
 
 def misfits(evidence: Evidence) -> list[str]:
@@ -152,7 +135,7 @@ def misfits(evidence: Evidence) -> list[str]:
 
     The parameters' errors and intervals are not looked at.
     """
-    return [evidence.refusal] if evidence.refused else judge(MISFITS, evidence)
+    return [_REFUSED] if evidence.refused else judge(MISFITS, evidence)
 
 
 def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
@@ -208,7 +191,7 @@ def _one_sided(evidence: Evidence) -> list[str]:
 
 def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
     """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
-    residual, pulls = evidence.rows.residual, evidence.pulled
+    residual, pulls = evidence.rows.residual, evidence.contradictions
     inside = residual[np.abs(residual) <= OUTLIER]
     freedom = inside.size + len(pulls) - len(evidence.parameters)
     chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
@@ -223,7 +206,7 @@ def _pull_in_words(evidence: Evidence, name: str, pull: float) -> str:
 
 def _contradicted(evidence: Evidence) -> list[str]:
     """Return by how much scaled amplitudes contradict what is known beforehand, taken together, in words."""
-    pulls = evidence.pulled
+    pulls = evidence.contradictions
     if evidence.error_scale is None or not pulls:
         return []
     improbable = chi2_tail(sum(pull**2 for pull in pulls.values()), len(pulls)) < IMPROBABLE
@@ -232,7 +215,7 @@ def _contradicted(evidence: Evidence) -> list[str]:
 
 def _torn(evidence: Evidence) -> list[str]:
     """Return what the amplitudes contradict of what was measured otherwise, in words."""
-    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.pulled.items() if abs(pull) > TORN]
+    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.contradictions.items() if abs(pull) > TORN]
     return ["; ".join(torn)] if torn else []
 
 
@@ -418,15 +401,8 @@ def _open_ones(evidence: Evidence) -> list[str]:
 
 def _not_identified(evidence: Evidence) -> list[str]:
     """Return the parameters that the data do not determine and must, with what to measure, in words."""
-    names = [] if evidence.may_stay_open else evidence.undetermined
+    names = evidence.undetermined
     return [f"{' and '.join(names)}; {_advice(names)}"] if names else []
-
-
-def _may_be_anything(evidence: Evidence) -> list[str]:
-    """Return the parameters that taps leave open, in words; nothing where the model does not explain the data."""
-    names = evidence.undetermined if evidence.may_stay_open and not misfits(evidence) else []
-    said = f"{' and '.join(names)}, anything within their ranges explains them, and the law's band takes that in"
-    return [f"{said}; {_advice(names)}"] if names else []
 
 
 def _advice(names: list[str]) -> str:
@@ -626,9 +602,8 @@ WARNINGS: Rules[Evidence] = (
     ),
     Rule(_repeat_warnings, "{case}"),
     Rule(lambda e: _disagreeing(e) if e.scattering else [], "Far from the mean law even for this scatter: {case}."),
-    Rule(_may_be_anything, "Not determined by these taps: {case}."),
     Rule(
-        lambda e: [_pull_in_words(e, name, by) for name, by in e.pulled.items() if PULLED < abs(by) <= TORN],
+        lambda e: [_pull_in_words(e, name, by) for name, by in e.contradictions.items() if PULLED < abs(by) <= TORN],
         "{case}: check it, the loss depends on it.",
     ),
     Rule(_limits, "{case}."),

@@ -51,7 +51,7 @@ def test_a_start_that_hardly_leaves_the_platform(rebound: float):
     compare(p, *leaving(p, 0.3, rebound), slopes=1e-9 + 1e-16 / rebound**2)
 
 
-def test_a_tip_laid_on_a_platform_that_pushes_rests_and_one_that_is_pulled_leaves():
+def test_a_tip_laid_on_a_platform_that_pushes_rests_and_one_that_is_lifted_leaves():
     # where the platform lies below rest the spring pulls the tip off: z = -2 cos(Omega t), back after a whole period
     scene = Scene(Cantilever(90.0), Platform(0.0, 181.8, -2.0), ImpactLaw(1.0))
     leaves = simulate(scene, state(0.0, -2.0, 0.0), 15.0, max_contacts=8)

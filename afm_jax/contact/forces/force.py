@@ -193,7 +193,7 @@ class ElasticCurve(eqx.Module):
 
     @abc.abstractmethod
     def root_of_depth(self, normalised_depth: ArrayLike) -> Float[Array, "..."]:
-        """Return s of the branch that is stable when pulled; below the depth of the fold that of the fold."""
+        """Return s of the branch that is stable under a pull; below the depth of the fold that of the fold."""
 
     @property
     @abc.abstractmethod

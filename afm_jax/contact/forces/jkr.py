@@ -18,7 +18,7 @@ from afm_jax.contact.parameters import DEFAULTS
 SLOPE = 2.0 * math.sqrt(6.0) / 3.0
 """The linear coefficient of the depth: Delta = s^4 - SLOPE s."""
 FOLD = 6.0 ** (-1.0 / 6.0)
-"""s at which the contact breaks when it is pulled: d Delta/ds = 0."""
+"""s at which the contact breaks under a pull: d Delta/ds = 0."""
 FOLD_DEPTH = -3.0 * 6.0 ** (-2.0 / 3.0)
 """Delta at the fold."""
 
@@ -60,7 +60,7 @@ def cube_of_load(normalised_load: ArrayLike) -> Float[Array, "..."]:
 
 
 def root_of_depth(normalised_depth: ArrayLike) -> Float[Array, "..."]:
-    """Return the s of the branch that is stable when pulled, for Delta >= -3 6^(-2/3); below it that of the fold.
+    """Return the s of the branch that is stable under a pull, for Delta >= -3 6^(-2/3); below it that of the fold.
 
     The quartic s^4 - q s - Delta = 0 is split into two quadratics by the one positive root y of y^3 + Delta y = 1/3.
     """
@@ -99,7 +99,7 @@ class JkrCurve(ElasticCurve):
         return work(s)
 
     def root_of_depth(self, normalised_depth: ArrayLike) -> Float[Array, "..."]:
-        """Return s of the branch that is stable when pulled; below the depth of the fold that of the fold."""
+        """Return s of the branch that is stable under a pull; below the depth of the fold that of the fold."""
         return root_of_depth(normalised_depth)
 
     @property
@@ -178,11 +178,11 @@ class Jkr(Parameters):
 
     @property
     def pull_off_depth_nm(self) -> Float[Array, "..."]:
-        """The depth, negative, at which the contact breaks when it is pulled, in nm."""
+        """The depth, negative, at which the contact breaks under a pull, in nm."""
         return FOLD_DEPTH * self.depth_scale_nm
 
     def force(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return the force on the tip in nN at a depth in nm, on the branch that is stable when pulled (eq. 15).
+        """Return the force on the tip in nN at a depth in nm, on the branch that is stable under a pull (eq. 15).
 
         The depth counts into the sample; below `pull_off_depth_nm` there is no contact and the value at the fold is
         returned.
