@@ -247,5 +247,6 @@ def table_of(
         "spring_constant_n_per_m": stiffness,
         "spring_constant_error_n_per_m": stated.stiffness * stiffness,
         "calibration": {"tip_calibration": (1.0, 1e-6)},
+        "phase_sense": "lag",
     }
     return AmplitudeTable(**(own | also))

@@ -362,6 +362,21 @@ def test_eight_columns_without_a_head_become_bins_with_the_scatter_in_them(tmp_p
         assert 0.8 < np.sqrt(np.mean(off**2)) < 1.25
 
 
+@pytest.mark.parametrize("padding", ["0", "nan", ""])
+def test_a_shorter_way_is_padded_and_its_padding_no_rows(tmp_path: Path, padding: str):
+    made = [line.split() for line in raw_curve(600, drift=0.0).text.split("\n") if line.strip() and line[0] != "#"]
+    columns = np.array(made, dtype=object)
+    # approach and retract stand side by side, the retract is 150 rows shorter
+    columns[450:, 1::2] = padding
+    text = "\n".join("\t".join(row) for row in columns.tolist()) + "\n"
+    (curve,) = read_curves(saved(tmp_path, text), columns=EIGHT, **LEVER)
+    (whole,) = read_curves(saved(tmp_path, raw_curve(600, drift=0.0).text), columns=EIGHT, **LEVER)
+    assert curve.valid, curve.reasons
+    assert [int(np.sum(curve.branch == name)) for name in ("approach", "retract")] == [600, 450]
+    retract = given(curve.amplitude)[curve.branch == "retract"]
+    np.testing.assert_array_equal(retract, given(whole.amplitude)[whole.branch == "retract"][:450])
+
+
 def test_bins_of_a_width_asked_for_and_of_equal_heights(tmp_path: Path):
     made = raw_curve(1200)
     path = saved(tmp_path, made.text)
@@ -461,6 +476,36 @@ def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, whole, capfd: py
         assert "\n" not in fault
         assert all(np.all(np.isfinite(curve.offset_nm)) for curve in curves)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("head", "channel", "said"),
+    [
+        ("# ImagingMode: PFM Mode\n", "Defl (V)", "mode 'PFM Mode'"),
+        ("# mode = bimodal\n", "Defl (V)", "mode 'bimodal'"),
+        ("# Operating mode = Lateral Force\n", "Defl (V)", "mode 'Lateral Force'"),
+        ("# mode = FM\n", "Defl (V)", "mode 'FM'"),
+        ("", "Amp2 (V)", "channel 'Amp2'"),
+        ("", "Lateral Amplitude (V)", "channel 'Lateral Amplitude'"),
+        ("# ImagingMode: AC Mode\n", "Defl (V)", ""),
+        ("# mode = Intermittent contact\n", "Defl (V)", ""),
+    ],
+)
+def test_files_that_say_another_mode_are_refused_by_name(tmp_path: Path, head: str, channel: str, said: str):
+    columns = {"Z (nm)": OFFSET, "Amp (nm)": AMPLITUDE, "Phase (deg)": LAG, channel: LAG}
+    path = saved(tmp_path, head + separated(columns))
+    if not said:
+        assert read_curve(path).valid
+        return
+    with pytest.raises(TableError, match=f"{said}.*amplitude modulation"):
+        read_curve(path)
+
+
+@pytest.mark.xfail(strict=True, reason="the results: a curve that was read is a table of `tapping`")
+def test_a_curve_that_was_read_leads_to_tapping():
+    import fitting  # noqa: PLC0415
+
+    assert fitting.tapping(read_curve(EXAMPLE, **OPTIONS), law=False).valid
 
 
 # ---- the command

@@ -243,7 +243,7 @@ def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
     table = made_curve()
     assert table.phase_lag_deg is not None
     lag = table.phase_lag_deg
-    known = replace(table, calibration=table.calibration | {"phase_zero_deg": (0.0, 1.0)})
+    known = replace(table, calibration=table.calibration | {"phase_zero_deg": (0.0, 1.0)}, phase_sense="")
     wanted = tapping(known, law=False)
     for other, said in ((-lag, "the phase leads"), (lag - 90.0, "zero is -90 degrees off")):
         found = tapping(replace(known, phase_lag_deg=other), law=False)

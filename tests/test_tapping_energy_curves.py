@@ -73,7 +73,7 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     assert "changes along the curve" in tapping_summary(result)
 
 
-def test_energies_that_grow_along_a_branch_are_no_single_energy_with_the_frequency_pulled():
+def test_energies_that_grow_along_a_branch_are_no_single_energy_with_the_frequency_moved():
     ratio = np.linspace(0.9, 0.3, 150)
     truth = curve_of_energy(GRAPHITE, ratio, np.linspace(9.0, 12.0, 150), np.ones(150, bool))
     result = tapping(table_of(GRAPHITE, truth, Stated(**SHARP), np.random.default_rng(0), free_rows=30), law=False)

@@ -161,7 +161,7 @@ def _refuse_reading(path: Path, options: dict[str, Any]) -> None:
         click.UsageError: naming the first of them.
     """
     for name in ("curve", *READING_OPTIONS):
-        if name not in _OF_TABLES and options[name] not in {None, ""}:
+        if name not in {*_OF_TABLES, "phase_sense"} and options[name] not in {None, ""}:
             raise click.UsageError(
                 f"{option_of(name)} is for an instrument's file; {path} is a table, which says that itself"
             )
@@ -175,6 +175,8 @@ def _given(table: AmplitudeTable, options: dict[str, Any]) -> AmplitudeTable:
         if options[option] is not None
         for name, number in zip(value_and_error, options[option], strict=True)
     }
+    if options["phase_sense"] is not None:
+        table = replace(table, phase_sense=options["phase_sense"])
     if stated and stated.get("spring_constant_n_per_m", table.spring_constant_n_per_m) is not None:
         # what spring constant and frequency make it
         stated["mass_ng"] = None

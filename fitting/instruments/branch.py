@@ -14,6 +14,8 @@ _PARTS = 20
 """Blocks that the rows in front of the contact are looked at in."""
 _FLAT, _FLAT_DEG = 0.005, 1.0
 """What blocks of the free tip may differ by: of the amplitude, and in degrees."""
+_TURNS_DEG = 3.0
+"""Change of the lag with which a change of the amplitude is that of first contact."""
 _WAVERS = 3.0
 """Scatter of blocks, over that of their noise, from which the free amplitude is not flat."""
 _SLOPING = 0.01
@@ -104,9 +106,10 @@ def look_at(
     if free.sum() < _FEWEST:
         free = np.arange(len(values)) < max(first, 1)
     change = _change(offset, values)
-    jump = _jump(values[free]) if change is None else None
+    lag = None if lag_deg is None else lag_deg[order][free]
+    jump = _jump(values[free], lag) if change is None else None
     if jump is None:
-        free &= np.arange(len(values)) < _plateau_end(values[free], None if lag_deg is None else lag_deg[order][free])
+        free &= np.arange(len(values)) < _plateau_end(values[free], lag)
     rows = values[free]
     mask = np.zeros(len(values), dtype=bool)
     mask[order] = free
@@ -135,6 +138,10 @@ def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " ro
         leaves = np.flatnonzero(away[first:] & np.append(away[first + 1 :], True))
         if leaves.size:
             until = min(until, ends[first + int(leaves[0])] - size)
+        # of the last block single rows may be in contact
+        limit = max(flat, 5.0 * _scatter(column[: ends[first - 1]]))
+        while until > rows // 2 and abs(column[until - 1] - far) > limit:
+            until -= 1
     return until
 
 
@@ -272,8 +279,11 @@ def _onset(
     return float(offset[part].mean() + (level - values[part].mean()) / slope.value)
 
 
-def _jump(values: Float[np.ndarray, " rows"]) -> tuple[float, float] | None:
-    """Return the levels on both sides of the split of the rows whose means differ most, if that is a jump."""
+def _jump(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " rows"] | None) -> tuple[float, float] | None:
+    """Return the levels on both sides of the split of the rows whose means differ most, if that is a jump.
+
+    A tip that comes into contact goes on losing amplitude, and its lag changes, too.
+    """
     rows = len(values)
     if rows < 2 * _FEWEST:
         return None
@@ -284,6 +294,13 @@ def _jump(values: Float[np.ndarray, " rows"]) -> tuple[float, float] | None:
     single = float(np.median(np.abs(np.diff(values)))) / 0.954
     error = single * np.sqrt(1.0 / counts[most] + 1.0 / (rows - counts[most]))
     low, high = float(before[most]), float(after[most])
+    behind = values[counts[most] :]
+    falls = len(behind) * abs(float(np.polyfit(np.arange(len(behind)), behind, 1)[0]))
+    turn = 0.0
+    if lag is not None:
+        turn = float(np.percentile(np.abs(lag[counts[most] :] - np.median(lag[: counts[most]])), 75.0))
+    if falls > 0.5 * abs(high - low) or turn > _TURNS_DEG:
+        return None
     # a drift spreads over the rows, a jump happens between two of them
     near = values[max(counts[most] - 10, 0) : counts[most]].mean(), values[counts[most] : counts[most] + 10].mean()
     sudden = abs(near[1] - near[0]) > 0.5 * abs(high - low)

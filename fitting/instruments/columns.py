@@ -157,8 +157,8 @@ def _side_by_side(recording: Recording, used: list[str]) -> list[int]:
 
 
 def _ended(columns: dict[str, Float[np.ndarray, " rows"]]) -> dict[str, Float[np.ndarray, " rows"]]:
-    """Return columns without the rows at their end in which nothing stands: one way may be shorter than the other."""
-    there = np.any([np.isfinite(numbers) for numbers in columns.values()], axis=0)
+    """Return columns without the rows at their end that hold nothing, or zeros alone: padding of a shorter way."""
+    there = np.any([np.isfinite(numbers) & (numbers != 0.0) for numbers in columns.values()], axis=0)
     rows = int(np.flatnonzero(there)[-1]) + 1 if there.any() else 0
     return {name: numbers[:rows] for name, numbers in columns.items()}
 
@@ -189,7 +189,10 @@ def turns_of(height: Float[np.ndarray, " rows"]) -> list[int]:
 
 
 def _parted(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Recording:
-    """Return a recording with the curves of a height that goes to and fro several times as curves of their own."""
+    """Return a recording without padding, the curves of a height that goes to and fro as curves of their own."""
+    whole = tuple(replace(segment, channels=_ended(segment.channels)) for segment in recording.segments)
+    if all(np.size(next(iter(segment.channels.values()))) for segment in whole):
+        recording = replace(recording, segments=whole)
     if any(segment.branch for segment in recording.segments):
         return recording
     patterns = ROLES["offset_nm"][1]

@@ -24,8 +24,16 @@ from fitting.instruments.bins import Binned, binned, faults_of_order, usual_widt
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import ROLES, ColumnSource, example_of_columns, laid_out, parse_columns, turns_of
 from fitting.instruments.formats import read_recording
-from fitting.instruments.lag import free_lag_deg, sense_of
-from fitting.instruments.recording import ASSUMED_RESONANCE, UNITS, Known, Recording, Segment, given_numbers
+from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, sense_of_phase
+from fitting.instruments.recording import (
+    ASSUMED_RESONANCE,
+    UNITS,
+    Known,
+    Recording,
+    Segment,
+    given_numbers,
+    refuse_other_modes,
+)
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 
@@ -138,6 +146,7 @@ def read_curves(
     *,
     columns: str | Mapping[str, ColumnSource] = "",
     drive: str | None = None,
+    phase_sense: str | None = None,
     bin_nm: float | None = None,
     **numbers: Any,
 ) -> list[MeasuredCurve]:
@@ -148,6 +157,8 @@ def read_curves(
         columns: which channel becomes which column, as `parse_columns` takes it or returns it, where names and units
             do not tell; `offset_nm=1/2` where approach and retract are two channels.
         drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: taken as "base", and said.
+        phase_sense: "lag" of a phase that grows as the tip lags more, "lead" of its opposite; None: told by the curve
+            where it can. A factor of the phase in `columns` says that it is a lag then.
         bin_nm: width of the bins of height in the table of a curve, 0 to merge equal heights only; None: rows as they
             are, or where heights repeat or are not in order bins of five rows or a 200th of a branch.
         numbers: what the file does not say, or says wrongly: the keys of `OPTIONS`, each a number or a pair with its
@@ -159,6 +170,8 @@ def read_curves(
     """
     if drive not in {None, "base", "force"}:
         raise ValueError(f"`drive` must be base or force, but is {drive!r}")
+    if phase_sense not in {None, *SENSES}:
+        raise ValueError(f"`phase_sense` must be {' or '.join(SENSES)}, but is {phase_sense!r}")
     if bin_nm is not None and not 0.0 <= bin_nm < np.inf:
         raise ValueError(f"`bin_nm` must be finite and not below 0, but is {bin_nm!r}")
     of_slope = numbers.get("nm_per_volt") == "slope"
@@ -182,15 +195,25 @@ def read_curves(
     for place in places:
         segments = [segment for segment in recording.segments if segment.curve == place]
         curve = _joined(recording, segments, wanted, known, len(places))
+        if curve.amplitude is not None:
+            _check_mode(recording)
         said = {role for role, source in wanted.items() if source.factor is not None}
         curve = _turned(curve) if "offset_nm" not in said and _runs_away(curve) else curve
         curve = curve if stated else _renamed(curve)
-        judged = _judged(curve, of_slope=of_slope, sign_given="phase_lag_deg" in said)
+        sense = phase_sense or ("lag" if "phase_lag_deg" in said else "")
+        judged = _judged(curve, of_slope=of_slope, stated_sense=sense)
         curves.append(_binning(judged, bin_nm))
     return curves
 
 
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
+
+
+_OTHER_CHANNELS = re.compile(
+    r"(amp(litude)?|pha?(se?)?)[ _-]*2\b.*|.*\b(lateral|torsion\w*|friction|pfm|piezo\w*|second (eigen)?mode)\b.*",
+    re.IGNORECASE,
+)
+"""Channels of modes in which amplitude and phase are not those of one flexural mode that taps."""
 
 
 def _refuse_others(recording: Recording) -> None:
@@ -199,6 +222,21 @@ def _refuse_others(recording: Recording) -> None:
         raise TableError(f"{recording.source}: holds a thermal spectrum, not a curve; `afm-jax calibrate` fits it")
     if any(name.startswith(("Frequency Shift", "Frequency")) for name in recording.channels):
         raise TableError(f"{recording.source}: holds a resonance sweep, not a curve; `afm-jax calibrate` fits it")
+
+
+def _check_mode(recording: Recording) -> None:
+    """Check that a file with amplitudes, where it says in which mode it was recorded, says tapping.
+
+    Raises:
+        TableError: with the name of the mode, or of the channel that tells it.
+    """
+    refuse_other_modes(recording.settings, recording.source)
+    channel = next((name for name in recording.channels if _OTHER_CHANNELS.fullmatch(name)), None)
+    if channel is not None:
+        raise TableError(
+            f"{recording.source}: holds a channel {channel!r}, which is none of amplitude modulation (tapping) of one "
+            "mode; its amplitude and phase tell no energy of a tap"
+        )
 
 
 def _joined(
@@ -418,7 +456,7 @@ _ASSUMED_ORIGIN_NM = 1.0
 """Error of an origin read off the curve: attraction moves the contact by about so much."""
 
 
-def _judged(curve: MeasuredCurve, *, of_slope: bool, sign_given: bool) -> MeasuredCurve:
+def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> MeasuredCurve:
     """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
     amplitude = curve.amplitude
     if amplitude is None:
@@ -438,9 +476,9 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, sign_given: bool) -> Measur
     known = curve.known | _free_amplitude(curve, looks)
     curve = replace(curve, known=_with_errors(replace(curve, known=known), looks))
     curve = _with_origin(curve, looks)
-    curve = _with_zero_of_phase(curve, sign_given=sign_given)
+    curve = _with_sense_of_phase(curve, looks, stated_sense)
     missing = [key for key in _NEEDED if _is_missing(curve, key)] + [key for key in _WANTED if key not in curve.known]
-    notes = (*curve.notes, *_free_notes(looks), *_scale_notes(curve), *_phase_notes(curve))
+    notes = (*curve.notes, *_free_notes(looks), *_scale_notes(curve), *_phase_notes(curve, stated_sense))
     return replace(curve, notes=notes, missing=tuple(missing))
 
 
@@ -577,45 +615,74 @@ _RADIANS_DEG = 30.0
 """How near to the free tip's lag its phase, taken for radians, must be to be told as such."""
 
 
-def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCurve:
+def _with_sense_of_phase(curve: MeasuredCurve, looks: Mapping[str, BranchLook], stated: str) -> MeasuredCurve:
     """Return the curve with sign and zero of the phase such that free rows lag as frequency and Q say, where known.
 
     Raises:
         TableError: if the phases are radians.
     """
-    phase, numbers = curve.phase_lag_deg, [curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz")]
-    quality_factor = curve.number("quality_factor")
-    if phase is None or None in numbers or quality_factor is None or not curve.free.any():
+    phase, readings = curve.phase_lag_deg, _phase_readings(curve, looks)
+    if phase is None:
         return curve
-    ratio = numbers[0] / numbers[1]  # type: ignore[operator]
-    lag = float(free_lag_deg(str(curve.known["drive"].value), ratio, quality_factor))
-    free = phase[curve.free]
+    if readings is None or not curve.free.any():
+        # frequency and Q, which tell the zero, are not known
+        sign = SENSES.get(stated, 1.0)
+        return replace(curve, phase_lag_deg=sign * phase, known=curve.known | _known_sense(stated))
+    lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
-    if np.nanmax(np.abs(phase)) < 2.0 * np.pi and abs(np.rad2deg(abs(level)) - lag) < _RADIANS_DEG:
+    near = abs(np.rad2deg(abs(level)) - lag) < _RADIANS_DEG < lag
+    if near and np.nanmax(np.abs(phase)) < 2.0 * np.pi and abs(np.rad2deg(level)) > 0.5 * lag:
         raise TableError(
             f"{printable(curve.source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "
             'degrees: it is in radians; say `columns="phase_lag_deg=CHANNEL:rad"`'
         )
-    error = float(np.hypot(max(scatter, 0.01), _error_of_lag(curve)))
+    of_lever = [
+        0.5 * (changed(1.0 + error).free_lag_deg[0] - changed(1.0 - error).free_lag_deg[0])
+        for changed, error in (
+            (lambda by: readings._replace(frequency_ratio=readings.frequency_ratio * by), readings.frequency_error),
+            (lambda by: readings._replace(quality_factor=readings.quality_factor * by), readings.quality_error),
+        )
+    ]
+    error = float(np.linalg.norm([max(scatter, 0.01), *of_lever]))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
-    sense = sense_of(level, lag, sign_given=sign_given)
-    known = curve.known | {"phase_zero_deg": Known(sense.zero_deg, "deg", how, error)}
-    notes = (*curve.notes, sense.note) if sense.note else curve.notes
+    sense = sense_of_phase(readings, stated)
+    known = curve.known | _known_sense(stated) | {"phase_zero_deg": Known(sense.zero_deg, "deg", how, error)}
+    notes = (*curve.notes, *sense.notes, *((f"Sign: {sense.reason}.",) if sense.reason else ()))
     return replace(curve, phase_lag_deg=sense.lag_deg(phase), known=known, notes=notes)
 
 
-def _error_of_lag(curve: MeasuredCurve) -> float:
-    """Return the standard error of the free tip's lag in degrees, from those of its frequency and quality factor."""
-    decisive = ("free_frequency_khz", "quality_factor")
-    at = {key: float(curve.known[key].value) for key in ("drive_frequency_khz", *decisive)}
+def _known_sense(stated: str) -> dict[str, Known]:
+    """Return that the phase was stated to be a lag or a lead; as the curve keeps it, it is a lag."""
+    return {"phase_sense": Known("lag", "", f"option: the file's phase is a {stated}")} if stated else {}
 
-    def lag(**changed: float) -> float:
-        drive, free, quality_factor = (at | changed).values()
-        return float(free_lag_deg(str(curve.known["drive"].value), drive / free, quality_factor))
 
-    errors = {key: curve.known[key].error or USUAL_ERRORS[key] * at[key] for key in decisive}
-    parts = [0.5 * (lag(**{key: at[key] + error}) - lag(**{key: at[key] - error})) for key, error in errors.items()]
-    return float(np.linalg.norm(parts))
+def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> PhaseReadings | None:
+    """Return what of a curve says which sense its phase has; None where frequency or Q are not known."""
+    drive, free, quality = (curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz", "quality_factor"))
+    if curve.phase_lag_deg is None or curve.amplitude is None or drive is None or free is None or quality is None:
+        return None
+
+    def relative_error(key: str) -> float:
+        error = curve.known[key].error
+        return USUAL_ERRORS[key] if error is None else error / float(curve.known[key].value)
+
+    ones = np.ones(len(curve.offset_nm))
+    level = float(np.mean([look.level for look in looks.values()]))
+    noise = max((look.noise for look in looks.values() if np.isfinite(look.noise)), default=0.0)
+    here = [np.flatnonzero(curve.branch == branch) for branch in looks]
+    return PhaseReadings(
+        drive=str(curve.known["drive"].value),
+        frequency_ratio=drive / free * ones,
+        frequency_error=relative_error("free_frequency_khz"),
+        quality_factor=quality,
+        quality_error=relative_error("quality_factor"),
+        ratio=curve.amplitude / level,
+        ratio_error=(noise / level or 0.01) * ones,
+        phase_deg=curve.phase_lag_deg,
+        phase_error_deg=float(curve.known["phase_error_deg"].value) * ones,
+        free=curve.free,
+        ways=[rows[np.argsort(curve.offset_nm[rows], kind="stable")] for rows in here],
+    )
 
 
 def _is_missing(curve: MeasuredCurve, key: str) -> bool:
@@ -656,36 +723,17 @@ def _scale_notes(curve: MeasuredCurve) -> list[str]:
     return []
 
 
-def _phase_notes(curve: MeasuredCurve) -> list[str]:
-    """Say which sign of the phase was taken, and whether the energy of a tap contradicts it."""
-    phase, amplitude, free = curve.phase_lag_deg, curve.amplitude, curve.number("free_amplitude_nm")
-    if phase is None or amplitude is None:
-        return ["There is no phase: the energy of a tap has an upper bound only."] if amplitude is not None else []
-    turned = any(note.startswith("Sign: the free tip") for note in curve.notes)
-    taken = 'Sign: a larger phase is taken as a larger lag; if it leads, `columns="phase_lag_deg=CHANNEL:-1"`.'
-    notes = [] if turned else [taken]
-    zero = curve.known.get("phase_zero_deg")
-    if zero is None:
-        notes.append("Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it.")
-        return notes
-    near = ~curve.free & (amplitude < 0.98 * (free or 0.0))
-    ratio = float(curve.known["drive_frequency_khz"].value) / float(curve.known["free_frequency_khz"].value)
-    quality_factor = float(curve.known["quality_factor"].value)
-    if near.any() and free is not None and abs(ratio - 1.0) > 0.005 and curve.known["drive"].value == "force":
-        response = abs(1.0 - ratio**2 + 1j * ratio / quality_factor)
-        lag = float(free_lag_deg("force", ratio, quality_factor))
-        lost = [
-            float(
-                np.median(
-                    free * response * np.sin(np.deg2rad(lag + way * (phase[near] - lag)))
-                    - ratio * amplitude[near] / quality_factor
-                )
-            )
-            for way in (1.0, -1.0)
-        ]
-        if lost[0] < 0.0 < lost[1]:
-            notes.append("Sign: with this sign of the phase taps would give energy away; turn it round (:-1).")
-    return notes
+def _phase_notes(curve: MeasuredCurve, stated: str) -> list[str]:
+    """Say what of the phase is not known."""
+    if curve.phase_lag_deg is None or curve.amplitude is None:
+        return (
+            ["There is no phase: the energy of a tap has an upper bound only."] if curve.amplitude is not None else []
+        )
+    if "phase_zero_deg" in curve.known:
+        return []
+    sign = [] if stated else [f"Sign: a larger phase is taken as a larger lag; {SENSE_OPTION} says which it is."]
+    zero = "Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it."
+    return [*sign, zero]
 
 
 def table_text(curve: MeasuredCurve) -> str:
@@ -769,6 +817,9 @@ def _setting_lines(curve: MeasuredCurve) -> list[str]:
         known = curve.known.get(key)
         if known is not None and known.error:
             lines.append(f"# {key} = 0 +- {known.error!r}")
+    if curve.phase_lag_deg is not None:
+        # the zero was set by the free rows: it says nothing of the sign
+        lines.append(f"# phase_sense = {'lag' if 'phase_sense' in curve.known else 'either'}")
     scale = curve.known.get("nm_per_volt")
     if scale is not None and scale.error and not isinstance(scale.value, str):
         lines.append(f"# tip_calibration = 1 +- {scale.error / scale.value!r}")

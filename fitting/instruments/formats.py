@@ -179,6 +179,7 @@ def parse_neasnom(data: bytes, name: str) -> Recording:
         known_from(header, _NEASNOM_KEYS),
         away=("Z",),
         remarks=("The columns carry no units: heights are taken in m, amplitudes in nm, phases in rad.",),
+        settings=header,
     )
 
 
@@ -230,7 +231,7 @@ def parse_wsxm(data: bytes, name: str) -> Recording:
         )
     # without an image of the excitation frequency its offset is no frequency
     found = known_from(header, _WSXM_KEYS)
-    return Recording("WSxM curves", name, tuple(segments), units, found)
+    return Recording("WSxM curves", name, tuple(segments), units, found, settings=header)
 
 
 def _wsxm_header(data: bytes, start: int, name: str) -> tuple[dict[str, str], int]:
@@ -289,7 +290,7 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
             warm[0] + 273.15, "K", "header: Cantilever temperature, taken in degrees Celsius"
         )
     segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
-    return Recording("NanoSurf .nid", name, segments, units, known)
+    return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
 
 
 def _nid_sections(text: str) -> tuple[list[tuple[str, dict[str, str]]], dict[str, str]]:
@@ -348,7 +349,8 @@ def parse_nanonis_text(data: bytes, name: str) -> Recording:
         "Oscillation Control>Center Frequency (Hz)": ("drive_frequency_khz", "Hz"),
         "f0 (Hz)": ("free_frequency_khz", "Hz"),
     }
-    return Recording("Nanonis text", name, tuple(segments), units, known_from(header, keys), away=("Z rel", "Z"))
+    known = known_from(header, keys)
+    return Recording("Nanonis text", name, tuple(segments), units, known, away=("Z rel", "Z"), settings=header)
 
 
 def _name_and_unit(text: str) -> tuple[str, str]:
@@ -402,7 +404,7 @@ def parse_separated(data: bytes, name: str) -> Recording:
     native = {"frequency": "kHz", "stiffness": "N/m", "length": "nm", "sensitivity": "nm/V"}
     keys = {key: (key, native.get(quantity, "")) for key, quantity in HEADER_KEYS.items() if key != "temperature_k"}
     segments = _by_branch(body, titles, {plain: columns[title] for title, plain, _ in named})
-    return Recording("separated text", name, segments, units, known_from(settings, keys))
+    return Recording("separated text", name, segments, units, known_from(settings, keys), settings=settings)
 
 
 def _beside_decimal_commas(line: str) -> str | None:
@@ -516,7 +518,7 @@ def parse_igor(data: bytes, name: str) -> Recording:
         raise cut_off(name, f"{numbers.shape[1]} channels, but {len(labels)} names")
     units = {label: _IGOR_UNITS.get(label.lower(), "") for label in labels}
     columns = dict(zip(labels, numbers.T.copy(), strict=True))
-    return Recording("Igor .ibw ramp", name, tuple(_igor_segments(header, columns)), units, known)
+    return Recording("Igor .ibw ramp", name, tuple(_igor_segments(header, columns)), units, known, settings=header)
 
 
 def _igor_points(data: bytes) -> int:

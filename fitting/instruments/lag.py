@@ -1,13 +1,44 @@
-"""The lag of the tip behind its drive, out of a phase with an instrument's own sign and zero."""
+"""The lag of the tip behind its drive, out of a phase with an instrument's own sign and zero.
 
+Some instruments store the lag, others its negative, others either of them less the free tip's. Read with the wrong sign
+a curve has other energies: with Delta how far a row lags behind the free tip, a its amplitude over the free one, and
+gamma = 1 - s^2 + i s/Q, a force on the tip that shakes the cantilever gives in each period, over pi k A0^2,
+
+    e = Im(gamma (a exp(i Delta) - a^2)) = a ((s/Q) (cos Delta - a) + (1 - s^2) sin Delta)
+
+to the sample, so that the sign matters off resonance and hardly on it. What decides is physics: no tap gives energy
+away, so that the sign with which many would is the wrong one. On resonance the order of the branches may decide, for
+attraction reaches farther than repulsion. A statement of the caller (`phase_sense`) stands above both.
+"""
+
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Complex, Float
 
 Numbers = float | Float[np.ndarray, "..."]
+Rows = Float[np.ndarray, " rows"]
+SENSES = {"lag": 1.0, "lead": -1.0}
+"""What a phase may be stated to be, and the sign with which it becomes a lag."""
+LEAST_RATIO = 0.1
+"""Of the free amplitude: below it the sample holds the tip, and the phase is that of anything."""
+_SURE = 4.0
+"""Standard errors below zero from which an energy is impossible."""
+_FEWEST, _SHARE = 3, 0.05
+"""Rows from which energies below zero speak against a sign, and share of the taps from which against both."""
+_MORE = 5.0
+"""How many times more rows must contradict the one sign than the other."""
+_TOLERANCE_DEG = 0.5
+"""What phases may drift by along a curve."""
+_UNKNOWN_DEG = 90.0
+"""Error of a zero of the phase that nothing tells."""
+_CLEAR_DEG = 1.0
+"""Departure from the free tip's phase, beyond errors, that says on which side a row is."""
+_ON_RESONANCE = 0.5
+"""Of 1/Q: least |1 - s^2| off resonance, where the sign of the phase decides on energies."""
 _NEAR_DEG = 20.0
-"""How near to a lag of the opposite sign the free tip's phase must be to be told as one."""
+"""How near to a lag of the opposite sign the free tip's phase must be to be taken for one, on resonance."""
 
 
 def free_lag_deg(drive: str, frequency_ratio: Numbers, quality_factor: Numbers) -> Float[np.ndarray, "..."]:
@@ -24,42 +55,273 @@ def free_lag_deg(drive: str, frequency_ratio: Numbers, quality_factor: Numbers) 
     return np.asarray(np.rad2deg(lag))
 
 
-class PhaseSense(NamedTuple):
-    """How a phase becomes a lag: lag = sign (phase - zero_deg), and a sentence about it, empty where nothing is odd."""
+def turned(degrees: Numbers) -> Float[np.ndarray, "..."]:
+    """Return angles between -180 and 180 degrees."""
+    return np.asarray((degrees + 180.0) % 360.0 - 180.0)
 
-    sign: float
-    zero_deg: float
-    note: str
+
+class PhaseReadings(NamedTuple):
+    """Amplitudes and phases as read, of a curve or an image, and what is known of lever and drive; arrays (rows,).
+
+    Attributes:
+        drive: "force" or "base".
+        frequency_ratio: s, drive over free frequency.
+        frequency_error: relative standard error of s.
+        quality_factor: Q.
+        quality_error: relative standard error of Q.
+        ratio: amplitude over that of the free tip.
+        ratio_error: its standard error.
+        phase_deg: as read; NaN where there is none.
+        phase_error_deg: its standard error.
+        free: rows of the free tip.
+        ways: rows of one drive on one way, the farthest from the sample first; empty where heights are not known.
+        zero: of the phase and its standard error, if that is known apart from the free tip.
+    """
+
+    drive: str
+    frequency_ratio: Rows
+    frequency_error: float
+    quality_factor: float
+    quality_error: float
+    ratio: Rows
+    ratio_error: Rows
+    phase_deg: Rows
+    phase_error_deg: Rows
+    free: Bool[np.ndarray, " rows"]
+    ways: Sequence[np.ndarray] = ()
+    zero: tuple[float, float] | None = None
+
+    @property
+    def free_lag_deg(self) -> Rows:
+        """What frequency and Q say that the free tip's lag is."""
+        return free_lag_deg(self.drive, self.frequency_ratio, self.quality_factor)
+
+    @property
+    def seen_free(self) -> Bool[np.ndarray, " rows"]:
+        """Rows of the free tip that have a phase."""
+        return self.free & np.isfinite(self.phase_deg)
+
+    @property
+    def known_zero(self) -> bool:
+        """Whether the free tip, or a statement, tells the zero of the phase."""
+        return bool(self.seen_free.any()) or self.zero is not None
+
+    def zero_deg(self, sign: float) -> Rows:
+        """Return what the phase reads where the lag is 0: of each frequency by its free rows, else by all of them."""
+        off = self.phase_deg - sign * self.free_lag_deg
+        zero = np.full(len(off), 0.0 if self.zero is None else self.zero[0])
+        if self.seen_free.any():
+            zero[:] = _mean_angle(off[self.seen_free])
+        for s in np.unique(self.frequency_ratio[self.seen_free]):
+            here = self.frequency_ratio == s
+            zero[here] = _mean_angle(off[here & self.seen_free])
+        return zero
+
+    def behind_deg(self, sign: float) -> Rows:
+        """Return how far each row lags behind the free tip, the phase taken with a sign."""
+        return turned(sign * (self.phase_deg - self.zero_deg(sign)) - self.free_lag_deg)
+
+    def energy(self, behind_deg: Rows) -> Rows:
+        """Return the first harmonic's energy of a tap over pi k A0^2, of rows that lag so far behind the free tip.
+
+        It is what the tap takes and what the air takes at the harmonics, so that it is above zero. Under a base the
+        deflection is read, D = Z + gamma A0 = -A0 (1 - gamma) a exp(-i Delta).
+        """
+        gamma = self._gamma
+        phasor = self.ratio * np.exp(1j * np.deg2rad(behind_deg))
+        of_height = np.imag(gamma * (phasor - self.ratio**2))
+        if self.drive != "base":
+            return of_height
+        of_base = np.imag((1.0 - gamma) * (1.0 - np.conj(phasor)))
+        return np.abs(1.0 - gamma) ** 2 * of_height + np.abs(gamma) ** 2 * of_base
+
+    @property
+    def _gamma(self) -> Complex[np.ndarray, " rows"]:
+        s = self.frequency_ratio
+        return 1.0 - s**2 + 1j * s / self.quality_factor
+
+    @property
+    def detuning(self) -> float:
+        """The largest factor of a sin Delta in the energy, all that hangs on the sign: 1 - s^2 under a force."""
+        gamma = self._gamma
+        factor = np.real(gamma)
+        if self.drive == "base":
+            factor = np.abs(1.0 - gamma) ** 2 * factor + np.abs(gamma) ** 2 * np.real(1.0 - gamma)
+        return float(np.abs(factor).max())
+
+    @property
+    def on_resonance(self) -> bool:
+        """Whether the energies of all rows hardly depend on the sign."""
+        return bool(self.detuning <= _ON_RESONANCE / self.quality_factor)
+
+    def giving_energy_away(self, sign: float) -> int:
+        """Return how many rows have energies below zero beyond all errors, the phase taken with a sign."""
+        behind = self.behind_deg(sign)
+        start = self.energy(behind)
+        lag_error = np.hypot(self.phase_error_deg, _TOLERANCE_DEG)
+        if not self.seen_free.any():
+            lag_error = np.hypot(lag_error, _UNKNOWN_DEG if self.zero is None else self.zero[1])
+        moved = (
+            self._replace(ratio=self.ratio + self.ratio_error).energy(behind),
+            self.energy(behind + lag_error),
+            self._replace(frequency_ratio=self.frequency_ratio * (1.0 + self.frequency_error)).energy(behind),
+            self._replace(quality_factor=self.quality_factor * (1.0 + self.quality_error)).energy(behind),
+        )
+        error = np.linalg.norm([other - start for other in moved], axis=0)
+        with np.errstate(invalid="ignore"):
+            return int(np.sum((start < -_SURE * error) & (self.ratio > LEAST_RATIO)))
+
+    def sign_by_energy(self) -> float | None:
+        """Return the sign with which taps take energy where they would give it away with the other.
+
+        0: with both signs many would; None: the energies do not tell.
+        """
+        taps = np.sum(np.isfinite(self.phase_deg) & (self.ratio > LEAST_RATIO) & ~self.free)
+        against = {sign: self.giving_energy_away(sign) for sign in (1.0, -1.0)}
+        for sign, count in against.items():
+            if against[-sign] >= _FEWEST and against[-sign] > _MORE * count:
+                return sign
+        return 0.0 if min(against.values()) >= max(_FEWEST, _SHARE * float(taps)) else None
+
+    def sign_by_order(self) -> float | None:
+        """Return the sign with which the tip is attracted before it is repelled; None where no order shows.
+
+        Attraction lags behind the free tip and reaches farther than repulsion: on each way that has both, the outer
+        stretch of rows is the attractive one.
+        """
+        found = set()
+        for way in self.ways if self.known_zero else ():
+            rows = way[(self.ratio[way] > LEAST_RATIO) & np.isfinite(self.phase_deg[way]) & ~self.free[way]]
+            behind = self.behind_deg(1.0)[rows]
+            clear = np.abs(behind) > np.maximum(_SURE * self.phase_error_deg[rows], _CLEAR_DEG)
+            sides = np.sign(behind[clear])
+            stretches = np.split(sides, np.flatnonzero(np.diff(sides)) + 1)
+            long = [float(part[0]) for part in stretches if len(part) >= _FEWEST]
+            # a stretch that is interrupted by a few rows is one
+            order = [side for k, side in enumerate(long) if k == 0 or side != long[k - 1]]
+            if len(order) == 2:
+                found.add(order[0])
+        return found.pop() if len(found) == 1 else None
+
+    def sign_by_zero(self) -> float | None:
+        """Return the sign with which alone the free tip reads its lag about the zero that is stated; else None."""
+        if self.zero is None or not self.seen_free.any():
+            return None
+        value, error = self.zero
+        off = {sign: abs(turned(np.median(self.zero_deg(sign)) - value)) for sign in (1.0, -1.0)}
+        near = [sign for sign, degrees in off.items() if degrees < _SURE * np.hypot(error, _TOLERANCE_DEG)]
+        return near[0] if len(near) == 1 else None
+
+
+def _mean_angle(degrees: Rows) -> float:
+    """Return the median of angles that may differ by whole turns."""
+    first = float(degrees[0])
+    return float(turned(first + np.median(turned(degrees - first))))
+
+
+class PhaseSense(NamedTuple):
+    """How a phase becomes a lag, lag = sign (phase - zero_deg), and how sign and zero are known.
+
+    Attributes:
+        sign: 1 of a lag, -1 of a phase that leads.
+        zero_deg: what the phase reads where the lag is 0, in the median of the rows.
+        origin: of the sign: "stated", "energy" or "order" (the curve decides), "zero" (that of the phase is stated),
+            "assumed" (on resonance, where energies hardly depend on it) or "unknown".
+        notes: sentences about sign and zero.
+        reason: why no energy is known, naming what decides; empty where one is.
+    """
+
+    sign: float = 1.0
+    zero_deg: float = 0.0
+    origin: str = "stated"
+    notes: tuple[str, ...] = ()
+    reason: str = ""
+
+    @property
+    def assumed(self) -> bool:
+        """Whether attractive and repulsive may be exchanged."""
+        return self.origin in {"assumed", "unknown"}
 
     def lag_deg(self, phase_deg: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the lag of a phase."""
         return self.sign * (phase_deg - self.zero_deg)
 
 
-def sense_of(free_phase_deg: float, free_lag: float, *, sign_given: bool = False) -> PhaseSense:
-    """Return sign and zero of a phase from what the free tip reads and what its lag is.
+AS_STATED = PhaseSense()
+"""A phase that is a lag."""
+SENSE_OPTION = '`phase_sense="lag|lead"`'
+"""What says the sign; the command line writes it as its own option."""
 
-    A free tip that reads the opposite of its lag (-90 degrees for 90) is of a phase that leads; one that reads another
-    number has a zero of its own, and its sign is taken as it is.
+
+def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
+    """Return sign and zero of a phase: as stated, else as the readings decide, else assumed on resonance or unknown.
 
     Args:
-        free_phase_deg: reading of the free tip.
-        free_lag: what frequency and Q give.
-        sign_given: whether the caller said the sign.
+        readings: amplitudes and phases, as read.
+        stated: "lag" or "lead"; empty or "either": not known.
     """
-    opposite = (free_phase_deg + free_lag + 180.0) % 360.0 - 180.0
-    if not sign_given and abs(opposite) < _NEAR_DEG and abs(free_lag) > _NEAR_DEG:
-        note = (
-            f"Sign: the free tip reads {free_phase_deg:.1f} deg where its lag is {free_lag:.1f}: the phase leads, and "
-            "was taken with the opposite sign."
+    by_energy = readings.sign_by_energy() if readings.known_zero else None
+    decided = {
+        "stated": SENSES.get(stated),
+        "energy": by_energy or None,
+        "zero": None if readings.on_resonance else readings.sign_by_zero(),
+        "order": readings.sign_by_order() if readings.on_resonance else None,
+    }
+    origin = next((name for name, sign in decided.items() if sign is not None), "")
+    sign = decided.get(origin)
+    if sign is None:
+        origin = "assumed" if readings.on_resonance else "unknown"
+        off = [abs(float(np.median(turned(readings.zero_deg(one))))) for one in (1.0, -1.0)]
+        sign = -1.0 if off[1] < _NEAR_DEG < off[0] else 1.0
+    zero = float(np.median(readings.zero_deg(sign)))
+    reason = _reason(by_energy, sign, origin, readings)
+    return PhaseSense(sign, zero, origin, _notes(readings, sign, origin, zero), reason)
+
+
+def _reason(by_energy: float | None, sign: float, origin: str, readings: PhaseReadings) -> str:
+    """Return why no energy is known of a phase that is taken with a sign; empty where one is."""
+    if by_energy == 0.0:
+        return (
+            "with either sign of the phase taps would give energy away: frequency, Q, the drive (force or base) or the "
+            "phase is wrong"
         )
-        return PhaseSense(-1.0, free_phase_deg + free_lag, note)
-    zero = free_phase_deg - free_lag
-    quarters = round(zero / 90.0)
-    note = ""
-    if quarters % 4 and abs(zero - 90.0 * quarters) < _NEAR_DEG:
-        note = (
-            f"Zero: the free tip reads {free_phase_deg:.1f} deg where its lag is {free_lag:.1f}: the instrument's zero "
-            f"is {90 * quarters:+d} degrees off, and was set by the free tip."
+    if by_energy is not None and by_energy != sign:
+        word, rows = ("lag" if sign > 0.0 else "lead"), readings.giving_energy_away(sign)
+        return (
+            f"the phase was said to {word}, but {rows} taps would give energy away then, and with the other sign they "
+            f"do not: {SENSE_OPTION}"
         )
-    return PhaseSense(1.0, zero, note)
+    if origin == "unknown":
+        return (
+            "off resonance energies depend on the sign of the phase, and the curve does not tell whether it lags or "
+            f"leads: say {SENSE_OPTION}"
+        )
+    return ""
+
+
+_HOW = {
+    "energy": "with the other sign taps would give energy away",
+    "order": "attraction reaches farther than repulsion",
+    "zero": "only so it fits the zero that is stated",
+}
+
+
+def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -> tuple[str, ...]:
+    """Return what is to be said of sign and zero."""
+    free, leads = readings.seen_free, sign < 0.0
+    reads = "no row of the free tip has a phase"
+    if free.any():
+        lag = float(np.median(readings.free_lag_deg[free]))
+        reads = f"the free tip reads {turned(zero_deg + sign * lag):.1f} deg where its lag is {lag:.1f}"
+    notes = []
+    if origin in {"assumed", "unknown"}:
+        both = "with the other sign energies are nearly the same, and attractive is repulsive; " * (origin == "assumed")
+        taken = f"the phase {'leads' if leads else 'lags'}, which is assumed"
+        notes.append(f"Sign: {reads}: {taken}; {both}say {SENSE_OPTION}.")
+    elif leads and origin != "stated":
+        notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and was taken with the opposite sign.")
+    quarters = round(zero_deg / 90.0)
+    if quarters and abs(turned(zero_deg - 90.0 * quarters)) < _NEAR_DEG:
+        off = f"the instrument's zero is {90 * quarters:+d} degrees off"
+        notes.append(f"Zero: {reads}: {off}, and was set by the free tip.")
+    return tuple(notes)

@@ -97,6 +97,7 @@ class Recording:
         known: what the header says, by this package's keys.
         away: channels that grow with the distance between tip and sample; other heights grow towards the tip.
         remarks: what a reader should know of the format.
+        settings: what the header says, as the file spells it.
     """
 
     format: str
@@ -106,6 +107,7 @@ class Recording:
     known: dict[str, Known] = field(default_factory=dict)
     away: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    settings: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def channels(self) -> list[str]:

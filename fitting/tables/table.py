@@ -32,7 +32,9 @@ A cantilever that is driven itself over a sample at rest (a tapping or amplitude
 is the default. ``free_amplitude_nm`` is the amplitude of the free tip, ``offset_nm`` the sample's height over the tip's
 rest position, ``phase_lag_deg`` how far the response lags behind the drive; under ``base`` free and lock-in amplitude
 are those of the deflection, the lag is behind the base. ``order`` may be left out (1), ``retract`` marks by 1 the rows
-of the retract, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known.
+of the retract, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known. ``#
+phase_sense = lag`` says that ``phase_lag_deg`` is a lag for sure, ``lead`` that it is a phase that leads, ``either``
+that its sign is not known and its zero that of the free tip; without that line the curve decides where it can.
 """
 
 import os
@@ -82,6 +84,7 @@ SETTINGS = {
     for setting in (
         FileSetting("drive", "force", choices=("sample", "force", "base")),
         FileSetting("rows", "in order of time", choices=("in order of time",)),
+        FileSetting("phase_sense", "lag", choices=("lag", "lead", "either")),
         FileSetting("free_frequency_khz", "90", unit="kHz", error="maybe"),
         FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe", none=True),
         FileSetting("mass_ng", unit="ng"),
@@ -93,6 +96,7 @@ SETTINGS = {
     )
 }
 DRIVES = SETTINGS["drive"].choices
+PHASE_SENSES = SETTINGS["phase_sense"].choices
 CALIBRATION = tuple(key for key, setting in SETTINGS.items() if setting.error == "always")
 """Keys that must have an error: without one there is nothing uncertain about them."""
 
@@ -121,6 +125,7 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> dict[str,
     header: dict[str, Any] = {
         "drive": "" if np.isnan(drive) else DRIVES[int(drive)],
         "rows_in_order_of_time": "rows" in settings,
+        "phase_sense": PHASE_SENSES[int(settings["phase_sense"][0])] if "phase_sense" in settings else "",
         "free_frequency_khz": float("nan"),
         "calibration": {key: (settings[key][0], settings[key][1] or 0.0) for key in CALIBRATION if key in settings},
         "remarks": remarks,
@@ -440,6 +445,7 @@ class AmplitudeTable(Result):
         calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm`` and
             ``phase_zero_deg``, as far as they are uncertain.
         rows_in_order_of_time: whether the rows stand in the order in which they were measured.
+        phase_sense: of ``phase_lag_deg``: "lag" or "lead" as stated, "either": not known; "": nothing is stated.
         source: path of the file as it was given.
         lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file, or
             if as many are not given.
@@ -474,6 +480,7 @@ class AmplitudeTable(Result):
     spring_constant_error_n_per_m: float | None = None
     calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
     rows_in_order_of_time: bool = False
+    phase_sense: str = ""
     source: str = "table in memory"
     lines: Int[np.ndarray, " lines"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     remarks: tuple[str, ...] = ()
@@ -486,6 +493,8 @@ class AmplitudeTable(Result):
         if self.drive not in FORMS:
             faults.add(f"drive must be one of {', '.join(FORMS)}, but is {self.drive!r}")
             faults.raise_any()
+        if self.phase_sense not in {"", *PHASE_SENSES}:
+            faults.add(f"phase_sense must be one of {', '.join(PHASE_SENSES)}, but is {self.phase_sense!r}")
         columns = columns_of(self)
         if self.drive != "sample" and np.size(self.order) == 0:
             columns["order"] = np.ones(rows)
@@ -789,6 +798,7 @@ def csv_of(table: AmplitudeTable) -> str:
             lines.append(_setting_line(name, value, error))
     lines += [_setting_line(name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration]
     lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
+    lines += [f"# phase_sense = {table.phase_sense}"] if table.phase_sense else []
     lines += [f"# {remark}" for remark in table.remarks]
     names = [name for name in table.form.names if getattr(table, name) is not None]
     if table.tapping and np.all(table.order == 1):

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from fitting.instruments.lag import free_lag_deg
+from fitting.instruments.lag import AS_STATED, PhaseSense, free_lag_deg
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
 
@@ -69,7 +69,7 @@ class TappingCurve:
         harmonic_amplitudes_nm: amplitudes at multiples of the drive's frequency, by multiple.
         lines: where each row stands in its file.
         time: place of each row in the order of measurement, from -1/2 to 1/2; None: that order is not known.
-        phase_note: how the sign or the zero of the phase was told from the free rows, if that was odd.
+        phase: sign and zero of the phase as read, and how they are known.
         assumed: what of the instrument was given without an error: it has a usual one (`USUAL_ERRORS`).
     """
 
@@ -96,7 +96,7 @@ class TappingCurve:
     harmonic_amplitudes_nm: dict[int, Rows] = field(default_factory=dict)
     lines: Int[np.ndarray, " rows"]
     time: Rows | None = None
-    phase_note: str = ""
+    phase: PhaseSense = AS_STATED
     assumed: tuple[str, ...] = ()
 
     @property

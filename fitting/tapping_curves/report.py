@@ -246,12 +246,11 @@ def _speeds(result: Tapping) -> list[ReportSection]:
     here = np.isfinite(u)
     if not here.any():
         return [ReportSection("Speeds of the impacts", [Text("Impact speeds: known to 25 % or better in no row.")])]
-    many = found.in_capture_speeds[here]
+    many = found.in_capture_speeds[here & np.isfinite(found.in_capture_speeds)]
+    in_capture = f" ({many.min():.2g} to {many.max():.2g} capture speeds)" if len(many) else ""
     known = percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))
     speeds = f"{u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows"
-    lines = [
-        f"Impact speeds: {speeds} ({many.min():.2g} to {many.max():.2g} capture speeds), known to {known} in the median"
-    ]
+    lines = [f"Impact speeds: {speeds}{in_capture}, known to {known} in the median"]
     for one in result.laws_of_energies:
         values = ", ".join(f"{name} {with_error(*pair)}" for name, pair in one.parameters.items())
         lines.append(

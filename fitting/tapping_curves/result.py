@@ -340,7 +340,12 @@ class Tapping(Result):
         return {} if self.functions is None else differences_of_ways(self.branches, self.functions)
 
     def in_unit(self, text: str) -> str:
-        """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant."""
+        """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant.
+
+        Where the sign of the phase is assumed, attractive and repulsive may be exchanged, and are marked by `?`.
+        """
+        if self.curve.phase.assumed:
+            text = re.sub(r"\b(attractive|repulsive)\b(?!\?)", r"\1?", text)
         return re.sub(r"\baJ\b(?! over)", "nm^2", text) if self.curve.over_spring_constant else text
 
     def keyed(self, payload: Any) -> Any:
@@ -521,6 +526,7 @@ class Tapping(Result):
                 "plain_energy_aj": self.plain_energy,
                 "epsilon_nm2_per_us2": self.epsilon,
                 **self._named("energy_by_speed", "assumptions"),
+                "phase_sense": {**self.curve.phase._asdict(), "assumed": self.curve.phase.assumed},
                 "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
                 "branches": self._branches(),
                 **self._fits(),

@@ -10,7 +10,7 @@ from afm_jax.checks import checked
 from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
-from fitting.instruments.lag import sense_of
+from fitting.instruments.lag import AS_STATED, PhaseReadings, PhaseSense, sense_of_phase, turned
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
 from fitting.tapping_curves.branches import (
@@ -22,6 +22,7 @@ from fitting.tapping_curves.branches import (
     rough_rows,
     side_of,
     smooth_stretches,
+    ways,
 )
 from fitting.tapping_curves.curve import (
     HARMONICS_FACTOR,
@@ -36,7 +37,7 @@ from fitting.tapping_curves.curve import (
 )
 from fitting.tapping_curves.energy import Energies, energies, largest_energies, noise_of, virial_noise_of
 from fitting.tapping_curves.energy_curve import FEWEST_ROWS, branches_of
-from fitting.tapping_curves.energy_fit import EnergyFit, fit_energy, plain_instrument, turned, usual_drifts
+from fitting.tapping_curves.energy_fit import EnergyFit, fit_energy, plain_instrument, usual_drifts
 from fitting.tapping_curves.result import EnergyGroup, MeasuredSpeeds, Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
 
@@ -70,10 +71,22 @@ def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale
             the free tip's lag is none that frequency and Q allow.
     """
     table = as_table(table)
-    table, note = _with_sense_of_phase(table)
-    curve = _with_zero_of_free_rows(replace(curve_of(table), phase_note=note))
+    table, sense = with_sense_of_phase(table)
+    curve = _with_zero_of_free_rows(replace(curve_of(table), phase=sense))
+    if sense.origin == "assumed":
+        curve = replace(curve, free_frequency_khz=_for_both_signs(curve))
     result = _energies(table, curve, scale_errors=scale_errors)
     return with_law(result, model) if law and result.law_allowed else result
+
+
+def _for_both_signs(curve: TappingCurve) -> Given:
+    """Return the free frequency with an error that holds the energies of both signs of the phase.
+
+    They differ as by a change of f0 that takes 1 - s^2 to its opposite.
+    """
+    frequency = curve.free_frequency_khz
+    detuning = _phase_readings(curve, np.zeros(curve.rows, bool)).detuning
+    return frequency._replace(error=float(np.hypot(frequency.error, detuning * frequency.value)))
 
 
 def curve_of(table: AmplitudeTable) -> TappingCurve:
@@ -87,6 +100,12 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         raise TableError(
             f"{name}: is a table of a sample that moves; say '# drive = force' (or base) where the cantilever is "
             "driven, or use `afm-jax fit`"
+        )
+    ratio = table.drive_frequency_khz / table.free_frequency_khz
+    if not 1.0 / _FARTHEST < ratio.min() <= ratio.max() < _FARTHEST:
+        raise TableError(
+            f"{name}: driven at {ratio.max():.3g} times the free frequency, as a higher mode is, or in another unit; "
+            "energies are told of a lever that is driven near its first resonance"
         )
     quality = np.nan_to_num(table.quality_factor or 0.0)
     if not quality:
@@ -141,48 +160,86 @@ def _lever_of(table: AmplitudeTable, quality_factor: float) -> dict[str, Any]:
     }
 
 
+_FARTHEST = 2.0
+"""Drive over free frequency, or the inverse, from which another mode is driven."""
 _BEYOND_DEG = 20.0
 """How far beyond its range a lag must be to be refused: zero and noise may take it a little beyond."""
 _OFF_DEG = 30.0
 """What the free tip's lag may be off by: zeros and frequencies are known better."""
 
 
-def _with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, str]:
-    """Return a table whose free rows lag as frequency and Q say, up to a small zero, and what was done to its phases.
+def _phase_readings(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> PhaseReadings:
+    """Return what of a curve says which sense its phase has."""
+    frequency, quality, level = curve.free_frequency_khz, curve.quality_factor, curve.free_amplitude_nm
+    zero = curve.phase_zero_deg
+    return PhaseReadings(
+        drive=curve.drive,
+        frequency_ratio=curve.drive_frequency_khz / frequency.value,
+        frequency_error=frequency.error / frequency.value,
+        quality_factor=quality.value,
+        quality_error=quality.error / quality.value,
+        ratio=curve.amplitude_nm / level,
+        ratio_error=np.hypot(curve.amplitude_error_nm / level, curve.free_amplitude_error),
+        phase_deg=curve.lag_deg,
+        phase_error_deg=curve.lag_error_deg,
+        free=free,
+        ways=ways(curve),
+        zero=None if zero is None else (zero.value, zero.error),
+    )
+
+
+def with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, PhaseSense]:
+    """Return a table whose phases are lags, which of the free tip are those of frequency and Q up to a small zero.
 
     Raises:
         TableError: if the phases are radians, or the zero that is stated is none of the free rows.
     """
     curve = curve_of(table)
-    lag = table.phase_lag_deg
-    free = free_rows(curve) & np.isfinite(curve.lag_deg)
-    if lag is None or not free.any():
-        return table, ""
-    zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
-    expected = lag_of_free_tip(curve, Instrument(curve.free_frequency_khz.value, curve.quality_factor.value))[free]
-    read = curve.lag_deg[free] - zero
-    off = float(np.median(read - expected))
-    off = float(turned(np.array([off]))[0])
-    middle, wanted = float(np.median(read)), float(np.median(expected))
-    name = printable(table.source)
-    if abs(off) < _OFF_DEG:
-        _check_range(curve, zero + off, name)
-        return table, ""
-    if np.nanmax(np.abs(lag)) < 2.0 * np.pi and abs(np.rad2deg(middle) - wanted) < _OFF_DEG:
+    lag, name = table.phase_lag_deg, printable(table.source)
+    if lag is None or not curve.has_phase:
+        return table, AS_STATED
+    readings = _phase_readings(curve, free_rows(curve))
+    if table.phase_sense == "either":
+        # a zero that was set by the free tip says nothing of the sign
+        readings = readings._replace(zero=None)
+    sense = sense_of_phase(readings, table.phase_sense)
+    stated = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
+    off = float(turned(np.array([sense.zero_deg - stated]))[0])
+    far = abs(off) > _OFF_DEG
+    if far:
+        _check_zero(curve, readings, stated, off)
+    zero = sense.zero_deg if far else 0.0
+    known = {key: pair for key, pair in table.calibration.items() if key != "phase_zero_deg"}
+    if curve.phase_zero_deg is not None and not far and not sense.assumed:
+        # of a phase that leads the zero turns, too
+        known["phase_zero_deg"] = (sense.sign * stated, curve.phase_zero_deg.error)
+    word = "either" if sense.assumed else "lag"
+    table = replace(table, phase_lag_deg=sense.sign * (lag - zero), calibration=known, phase_sense=word)
+    if not sense.reason:
+        _check_range(curve_of(table), 0.0 if far else sense.sign * sense.zero_deg, name)
+    return table, sense
+
+
+def _check_zero(curve: TappingCurve, readings: PhaseReadings, stated: float, off: float) -> None:
+    """Check a phase whose free rows are far from their lag, by as much as `off` degrees.
+
+    Raises:
+        TableError: if it is in radians, or not off by right angles though its zero is stated.
+    """
+    seen, name = readings.seen_free, printable(curve.source)
+    if not seen.any():
+        return
+    middle, wanted = float(np.median(curve.lag_deg[seen] - stated)), float(np.median(readings.free_lag_deg[seen]))
+    if np.nanmax(np.abs(curve.lag_deg)) < 2.0 * np.pi and abs(np.rad2deg(abs(middle)) - wanted) < _OFF_DEG:
         raise TableError(
             f"{name}: phase_lag_deg is {middle:.3g} where the tip is free and lags by {wanted:.1f} degrees: write "
             "degrees, not radians"
         )
-    sense = sense_of(middle, wanted)
-    if sense.note:
-        # a zero that is stated keeps what it is known to
-        return replace(table, phase_lag_deg=sense.lag_deg(lag - zero) + zero), sense.note
-    if curve.phase_zero_deg is None:
-        return table, f"Zero: the free tip reads {middle:.1f} deg where its lag is {wanted:.1f}; it sets the zero."
-    raise TableError(
-        f"{name}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: out of the range of "
-        "'# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the phase"
-    )
+    if curve.phase_zero_deg is not None and abs(off - 90.0 * round(off / 90.0)) > _BEYOND_DEG:
+        raise TableError(
+            f"{name}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: out of the range of "
+            "'# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the phase"
+        )
 
 
 def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
@@ -465,6 +522,8 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
             "the speed of its impacts cannot be determined from this curve: it depends on the origin of heights and "
             "on the calibration more finely than these are known"
         )
+    elif not np.isfinite(in_capture).any():
+        what = "its capture speed is not known, for no energy of a tap is"
     elif np.nanmax(in_capture) < _SLOWEST:
         what = f"its impacts are slow, {np.nanmax(in_capture):.2g} times the capture speed at most"
     elif not (np.abs(pull[known]) < _PULLED).any():
@@ -473,8 +532,7 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
         what = (
             f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
         )
-    contact = "; the contact's own parameters need no law: afm-jax fit CURVE --model contact"
-    return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}{contact}"
+    return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}"
 
 
 def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:

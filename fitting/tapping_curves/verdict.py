@@ -160,6 +160,7 @@ def _undetermined(e: Any) -> list[str]:
 
 REASONS: Rules[Any] = [
     (
+        Rule(lambda e: [e.curve.phase.reason] if e.curve.phase.reason else [], "{case}"),
         Rule(
             lambda e: not e.curve.has_phase and e.bound_aj is not None,
             "without a phase the curve gives no more than an upper bound of the energy of a tap",
@@ -247,7 +248,7 @@ ASSUMPTIONS: Rules[Any] = [
         ),
         Rule(lambda _: True, "phase and free amplitude drift evenly along the rows, usually by 3 degrees and 2 %"),
     ),
-    Rule(lambda e: bool(e.curve.phase_note), "{e.curve.phase_note}"),
+    Rule(lambda e: list(e.curve.phase.notes), "{case}"),
     Rule(lambda e: [_lag(e)] if e.curve.has_phase else [], "{case}"),
     Rule(
         lambda e: not e.curve.harmonic_amplitudes_nm,

@@ -374,6 +374,12 @@ READING = (
         "magnetic).",
     ),
     click.option(
+        "--phase-sense",
+        type=click.Choice(["lag", "lead"]),
+        help="Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the curve "
+        "decides where it can.",
+    ),
+    click.option(
         "--nm-per-volt",
         type=NmPerVolt(),
         metavar="NM|slope",
@@ -392,6 +398,7 @@ READING = (
 READING_OPTIONS = (
     "columns",
     "drive",
+    "phase_sense",
     "nm_per_volt",
     "bin_nm",
     *(name.replace("-", "_") for name, _, _ in _READING_NUMBERS),
