@@ -18,7 +18,6 @@ from afm_jax.checks import float32_allowed
 from afm_jax.contact.collide import collide, collisions
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.time_course import time_course
-from afm_jax.effects.study import study_effects
 from afm_jax.impact import map as poincare
 from afm_jax.impact import orbits as orbits_module
 from afm_jax.impact.jacobian import map_jacobian
@@ -27,6 +26,7 @@ from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import state
+from afm_jax.studies.effects import study_effects
 from tests.package_scenes import bouncing, stacked
 
 TIME, VELOCITY = 4.0, 60.0

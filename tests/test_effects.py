@@ -3,16 +3,17 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, save_scene
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.effects.scene_effects import effects_in
-from afm_jax.effects.study import Change, Programs, Reduction, study_effects
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.start import start_of
+from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import start_of, state
 from afm_jax.scenefile.scenefile import read_scene
+from afm_jax.studies.effects import Change, EffectStudy, effects_in, study_effects
 from tests.answers import answer, table
 
 PLAIN_DELAY, LASTING_DELAY = (CollisionDelay(0.206, 5.64, 0.726, corrections=lasts) for lasts in (False, True))
@@ -46,11 +47,6 @@ def by_name(study) -> dict[str, Any]:
     return {report.effect.name: report for report in study.effects}
 
 
-def reduction_of(study) -> Reduction:
-    assert study.reduction is not None
-    return study.reduction
-
-
 def amplitudes(change: Change) -> np.ndarray:
     """Return the changes of peak and lock-in amplitude; NaN for none, which equals nothing."""
     return np.array([change.peak_amplitude, change.lockin_amplitude], dtype=float)
@@ -64,20 +60,15 @@ def test_what_happens_while_an_impact_lasts_is_an_effect_of_its_delay():
     scene, plain = law_scene(), law_scene(WITHOUT["delay_corrections"])
     known = {effect.name: effect for effect in effects_in(scene)}
     effect, instantaneous = known["delay_corrections"], known["delay"].without(scene)
-    assert (effect.is_zero, effect.required) == (False, None)
+    assert effect.required is None
     assert eqx.tree_equal(effect.without(scene), plain)
     assert eqx.tree_equal(effect.without(instantaneous), instantaneous)
     assert "delay_corrections" not in [other.name for other in effects_in(plain)]
 
 
 @pytest.fixture(scope="module")
-def programs():
-    return Programs()
-
-
-@pytest.fixture(scope="module")
-def law_study(programs):
-    return study_effects(law_scene(), accuracy=ACCURACY, programs=programs)
+def law_study():
+    return study_effects(law_scene(), accuracy=ACCURACY)
 
 
 @pytest.mark.slow
@@ -95,7 +86,7 @@ def test_leaving_an_effect_of_a_law_out_changes_what_the_closed_form_says(law_st
 
 @pytest.mark.slow
 def test_what_a_law_does_not_need_is_known_from_the_closed_form(law_study):
-    reports, reduction = by_name(law_study), reduction_of(law_study)
+    reports, reduction = by_name(law_study), law_study.reduction
     expected = orbit_of(reduction.scene) / orbit_of(law_scene()) - 1.0
     np.testing.assert_allclose(amplitudes(reduction.change), expected[:2], rtol=1e-5, atol=1e-7)
     assert set(reduction.left_out) == {"delay_corrections", "viscous_loss", "restitution"}
@@ -109,20 +100,20 @@ def test_what_a_law_does_not_need_is_known_from_the_closed_form(law_study):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("quality_factor", "needed"), [(40.0, True), (1e6, False)])
-def test_air_damping_is_needed_near_resonance_unless_there_is_nearly_none(programs, quality_factor, needed):
+def test_air_damping_is_needed_near_resonance_unless_there_is_nearly_none(quality_factor, needed):
     # lossy impacts, so that the motion settles without air too
     scene = law_scene(ImpactLaw(0.9, 1.0), quality_factor)
-    study = study_effects(scene, accuracy=0.01, only=["air_damping"], programs=programs)
+    study = study_effects(scene, accuracy=0.01, only=["air_damping"])
     bare = orbit_of(law_scene(ImpactLaw(0.9, 1.0), None)) / orbit_of(scene) - 1.0
     change = by_name(study)["air_damping"].change
     # as above
     np.testing.assert_allclose(amplitudes(change), bare[:2], rtol=1e-5, atol=1e-7)
-    assert ("air_damping" in reduction_of(study).left_out) is not needed
+    assert ("air_damping" in study.reduction.left_out) is not needed
 
 
-def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response(programs):
+def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response():
     scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 90.0, -100.0), None, force=ForceDrive(0.1, 90.0))
-    study = study_effects(scene, accuracy=0.01, programs=programs)
+    study = study_effects(scene, accuracy=0.01)
     air, drive = (by_name(study)[name] for name in ("air_damping", "force_drive"))
     assert (air.change.peak_amplitude, air.cost) == (None, None)
     assert "free frequency" in air.reason
@@ -131,19 +122,19 @@ def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response(progr
     expected = 0.1 * 40.0 / float(scene.cantilever.stiffness_n_per_m)
     assert study.observed.reading is not None
     np.testing.assert_allclose(study.observed.reading.peak_amplitude_nm, expected, rtol=1e-6)
-    assert reduction_of(study).left_out == ()
+    assert study.reduction.left_out == ()
 
 
 @pytest.mark.slow
-def test_a_second_frequency_is_compared_over_the_last_fifth(programs):
+def test_a_second_frequency_is_compared_over_the_last_fifth():
     platform = Platform(4.0, 181.8, 0.0, 0.0, Tone(1e-7, 47.0))
     scene = Scene(Cantilever(90.0, 40.0), platform, LAW)
-    study = study_effects(scene, accuracy=0.01, duration_us=400.0, only=["second_frequency"], programs=programs)
+    study = study_effects(scene, accuracy=0.01, duration_us=400.0, only=["second_frequency"])
     report = by_name(study)["second_frequency"]
     assert study.observed.orbit is None
     assert 0.0 < size_of(report.change) < 1e-5
-    assert reduction_of(study).left_out == ("second_frequency",)
-    assert reduction_of(study).scene.platform.second is None
+    assert study.reduction.left_out == ("second_frequency",)
+    assert study.reduction.scene.platform.second is None
 
 
 def test_all_effects_are_named():
@@ -155,38 +146,57 @@ def test_all_effects_are_named():
         *("capillary", "structural", "core", "viscous", "jkr", "air_damping", "ramp"),
         *("second_frequency", "base_drive", "base_second_frequency", "force_drive"),
     }
-    assert {name for name, effect in effects.items() if effect.is_zero} == {"structural", "base_second_frequency"}
     assert {name for name, effect in effects.items() if effect.required} == {"core", "jkr"}
     assert effects["base_drive"].without(scene).base is None
     assert effects["force_drive"].without(scene).force is None
     assert "capillary" not in effects["capillary"].without(scene).interaction.effects
 
 
-def contact_study(programs: Programs, viscosity_pa_s: float, only: list[str]):
+def test_a_scene_pays_only_for_its_effects():
+    """A left-out effect is absent from the program, which has fewer operations; a number of a law is in its formula.
+
+    Forces of a contact: `test_contact_effects_cost`.
+    """
+
+    def operations(scene: Scene) -> float:
+        begin = state(0.3, float(scene.platform.position(0.3)) + 10.0, 60.0)
+        program = jax.jit(lambda one: simulate(one, begin, 10.0, max_contacts=8)).lower(scene)
+        return (program.cost_analysis() or {})["flops"]
+
+    platform = Platform(4.0, 181.8, 0.0, 1e-3, Tone(1.0, 47.0))
+    base = BaseDrive(0.1, 90.0, 0.0, Tone(1.0, 33.0))
+    scene = Scene(Cantilever(90.0, 40.0), platform, LAW, base)
+    whole = operations(scene)
+    known = {effect.name: effect for effect in effects_in(scene)}
+    assert operations(known["adhesion"].without(scene)) == whole
+    for name in ("delay", "base_second_frequency"):
+        assert operations(known[name].without(scene)) < whole
+
+
+def contact_study(viscosity_pa_s: float, only: list[str]) -> EffectStudy:
     contact = Contact.paper(structural_amplitude_n_per_m=0.0, viscosity_pa_s=viscosity_pa_s)
     scene = Scene(Cantilever(90.0, 40.0), DRIVE, contact)
-    return study_effects(scene, start_of(scene, START), accuracy=0.01, only=only, programs=programs)
+    return study_effects(scene, start_of(scene, START), accuracy=0.01, only=only)
 
 
 @pytest.mark.slow
-def test_forces_of_no_or_hardly_any_strength_are_dropped_and_those_of_the_junction_required(programs):
-    study = contact_study(programs, 1e-9, ["structural", "core", "viscous", "jkr"])
-    reports, reduction = by_name(study), reduction_of(study)
-    assert reports["structural"].effect.is_zero
+def test_forces_of_no_or_hardly_any_strength_are_dropped_and_those_of_the_junction_required():
+    study = contact_study(1e-9, ["structural", "core", "viscous", "jkr"])
+    reports, reduction = by_name(study), study.reduction
     # two programs for one motion: rounding, and the accuracy of 1e-9 to which the orbit is closed
     assert size_of(reports["structural"].change) < 1e-7
     assert size_of(reports["viscous"].change) < 1e-4
     assert set(reduction.left_out) == {"structural", "viscous"}
     assert reduction.scene.interaction.effects == ("capillary", "core", "jkr")
     for cost in (reports["structural"].cost, reduction.cost):
-        assert cost.program.operations < study.cost.program.operations
+        assert cost != study.cost
     for name in ("core", "jkr"):
         assert reports[name].reason.startswith("required: ")
         assert (reports[name].change.of_amplitude, reports[name].cost) == (None, None)
     # ten times the viscosity of water is needed
-    study = contact_study(programs, 1e-2, ["viscous"])
+    study = contact_study(1e-2, ["viscous"])
     assert size_of(by_name(study)["viscous"].change) > 0.01
-    assert reduction_of(study).left_out == ()
+    assert study.reduction.left_out == ()
 
 
 @pytest.mark.slow

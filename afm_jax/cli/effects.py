@@ -4,10 +4,9 @@ from pathlib import Path
 
 from afm_jax.cli.command import NamedScene, Output, picture_of
 from afm_jax.cli.session import Session
-from afm_jax.effects.effect_table import EffectTable
-from afm_jax.effects.study import study_effects
 from afm_jax.motion.start import default_start, start_of
-from afm_jax.scenefile.scenefile import as_in_file, save_scene
+from afm_jax.scenefile.scenefile import as_in_file, save_scene, scene_tables
+from afm_jax.studies.effects import study_effects
 
 
 def effects(
@@ -20,28 +19,28 @@ def effects(
     write: Path | None,
 ) -> Output:
     """Return what each effect of a scene changes and costs; with ``write`` save the scene without the others."""
-    with session.working(
-        "simulating with and without each effect (every program compiles for some seconds)", "scenes"
-    ) as report:
-        start = scene.start or as_in_file(scene.scene, default_start(scene.scene))
+    start = scene.start or as_in_file(scene.scene, default_start(scene.scene))
+    chosen = None if only is None else [name.strip() for name in only.split(",")]
+    what = "simulating with and without each effect (every program compiles for some seconds)"
+    with session.working(what, "scenes") as report:
         study = study_effects(
             scene.scene,
             start_of(scene.scene, start),
-            duration_us=duration_us,
             accuracy=accuracy,
-            only=None if only is None else [name.strip() for name in only.split(",")],
+            duration_us=duration_us,
+            only=chosen,
             report=report,
         )
-    table = EffectTable(study)
-    told = table.to_dict() | {"start": start._asdict()}
-    if write is not None and study.reduction is not None:
+    reduced = {"scene": scene_tables(study.reduction.scene), "file": write}
+    payload = study.to_dict() | {"start": start._asdict()}
+    payload["reduced"] |= reduced
+    if write is not None:
         save_scene(study.reduction.scene, write, start=start)
         session.note(f"wrote {write}")
-        told["reduced"] = {**told["reduced"], "file": write}
     return Output(
-        payload=told,
-        text=table.printed(),
-        tables=table.tables(),
-        files={"effects.png": picture_of("effects:effects_figure", table)},
+        payload=payload,
+        text=study.printed(),
+        tables=study.tables(),
+        files={"effects.png": picture_of("effects:effects_figure", study)},
         json_file="effects.json",
     )

@@ -1,1 +1,1 @@
-"""Equations 5 to 8 against automatic differentiation and fifty digits."""
+"""The equations with fifty digits."""

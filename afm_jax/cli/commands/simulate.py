@@ -189,8 +189,8 @@ EFFECTS = Command(
     Each effect is left out, absent from the program, and the steady motion compared with that of the full scene: peak
     and lock-in amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the
     scene's default one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared.
-    Costs are processor time of a drive period and operations of the compiled program. With --out effects.csv,
-    effects.json and effects.png.
+    Costs are times to compute a drive period, the median of several runs. With --out effects.csv, effects.json and
+    effects.png.
     """,
     options=(
         SCENE,

@@ -1,0 +1,538 @@
+"""What each effect of a scene changes and costs, and which effects a wanted accuracy does not need.
+
+An effect is left out: it is absent from the compiled program, not multiplied by zero. The scene without it is followed
+from the same start, and its steady orbit (where nothing repeats, the last fifth of the duration) is read as that of the
+full scene is. What the two readings differ by is what the effect changes; what the programs' times differ by is what
+it costs.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
+from afm_jax.checks import require_float64
+from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.compilation_cache import quick_options
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.parameters import WHY_REQUIRED
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.motion.follow import follow_in_pieces, joined, why_over
+from afm_jax.motion.observe import MotionWindow
+from afm_jax.motion.periodic import Orbit, follow_to_orbit, why_impossible
+from afm_jax.motion.record import Simulation, State
+from afm_jax.motion.settle import last_fifth
+from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import default_start
+from afm_jax.motion.trajectory import dense_path
+from afm_jax.results import Result
+from afm_jax.studies.timing import Compiled, compiled_for, time_compiled
+from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
+from afm_jax.words import counted, known
+
+PERIODS_AT_MOST = 400.0
+"""Drive periods after which a motion that has not settled is given up."""
+_PERIODS_AT_ONCE = 50.0
+"""Drive periods that are simulated at a time where nothing settles, and that are timed."""
+_REPETITIONS = 7
+_ROWS = 1024
+"""Contacts there is room for in one piece of a motion."""
+
+
+class SceneEffect(NamedTuple):
+    """One effect of a scene."""
+
+    name: str
+    sentence: str
+    without: Callable[[Scene], Scene]
+    """The scene without it; nothing of it is left in the compiled program, unless it is a number of the impact law."""
+    required: str | None = None
+    """Why the scene cannot do without it; None: it can be left out."""
+
+
+_OF_CONTACTS = {
+    "capillary": "capillary attraction of the liquid bridge",
+    "structural": "structural repulsion of the confined liquid",
+    "core": "core repulsion",
+    "van_der_waals": "van der Waals attraction",
+    "viscous": "viscous force of the liquid bridge",
+    "jkr": "solid junction (JKR)",
+    "dmt": "solid contact (DMT)",
+    "hertz": "solid contact (Hertz)",
+}
+_OF_LAWS = (
+    ("restitution", "loss in proportion to the energy, r below 1", "r", 1.0),
+    ("adhesion", "loss by adhesion", "epsilon", 0.0),
+    ("viscous_loss", "loss in proportion to the speed", "viscous_loss", 0.0),
+)
+"""Name, meaning, number of the law, and its value without the effect."""
+_AMPLITUDES = {"platform": "amplitude_nm", "base": "amplitude_nm", "force": "amplitude_nn"}
+
+
+def effects_in(scene: Scene) -> list[SceneEffect]:
+    """Return all effects that a scene has: those of its interaction first, then the air, then how it is driven."""
+    interaction = scene.interaction
+    effects: list[SceneEffect] = []
+    if isinstance(interaction, Contact):
+        effects += map(_of_contact, interaction.effects)
+    elif isinstance(interaction, ImpactLaw):
+        effects += [
+            SceneEffect(name, sentence, _putting(jnp.asarray(neutral), "interaction", number))
+            for name, sentence, number, neutral in _OF_LAWS
+        ]
+        if interaction.delay is not None:
+            effects.append(SceneEffect("delay", "collision delay", _putting(None, "interaction", "delay")))
+        if interaction.lasts:
+            lasting = "what moving sample, spring and air change while an impact lasts"
+            effects.append(SceneEffect("delay_corrections", lasting, _without_corrections))
+    if scene.cantilever.quality_factor is not None:
+        without_air = _putting(None, "cantilever", "quality_factor")
+        effects.append(SceneEffect("air_damping", "air damping of the cantilever", without_air))
+    return effects + list(_of_drives(scene))
+
+
+def _putting(value: Any, *path: str) -> Callable[[Scene], Scene]:
+    """Return the function that puts something in the place of a part of a scene, which may be None there."""
+
+    def part(scene: Any) -> Any:
+        for name in path:
+            scene = getattr(scene, name)
+        return scene
+
+    return lambda scene: eqx.tree_at(part, scene, value, is_leaf=lambda leaf: leaf is None)
+
+
+def _of_contact(name: str) -> SceneEffect:
+    def without(scene: Scene) -> Scene:
+        terms = scene.interaction.forces.terms
+        # forces are the first of the effects, in their order
+        kept = tuple(term for term, own in zip(terms, scene.interaction.effects, strict=False) if own != name)
+        return eqx.tree_at(lambda one: one.interaction.forces.terms, scene, kept)
+
+    return SceneEffect(name, _OF_CONTACTS.get(name, f"force {name}"), without, WHY_REQUIRED.get(name))
+
+
+def _without_corrections(scene: Scene) -> Scene:
+    delay = scene.interaction.delay
+    return scene if delay is None else _putting(replace(delay, corrections=False), "interaction", "delay")(scene)
+
+
+def _of_drives(scene: Scene) -> Iterator[SceneEffect]:
+    """Yield the ramp, second frequencies, and the drives of base and tip."""
+    if scene.platform.offset_rate_nm_per_us != 0.0:
+        without = _putting(jnp.asarray(0.0), "platform", "offset_rate_nm_per_us")
+        yield SceneEffect("ramp", "slow ramp of the offset", without)
+    driven = {name: getattr(scene, name) for name in _AMPLITUDES if getattr(scene, name) is not None}
+    moving = [name for name, drive in driven.items() if getattr(drive, _AMPLITUDES[name]) != 0.0]
+    for name, drive in driven.items():
+        if drive.second is not None:
+            own = "second_frequency" if name == "platform" else f"{name}_second_frequency"
+            yield SceneEffect(own, f"second frequency of the {name}", _putting(None, name, "second"))
+        if name != "platform":
+            sentence = "motion of the cantilever's base" if name == "base" else "force on the tip"
+            only = "it is the scene's only drive" if moving == [name] else None
+            yield SceneEffect(f"{name}_drive", sentence, _putting(None, name), only)
+
+
+# --- what is compared -------------------------------------------------------------------------------------------------
+
+
+class Change(NamedTuple):
+    """What changes, relative to the full scene; the phase in degrees; None: not a number."""
+
+    peak_amplitude: float | None = None
+    lockin_amplitude: float | None = None
+    lockin_phase_deg: float | None = None
+    energy_per_impact: float | None = None
+
+    @property
+    def of_amplitude(self) -> float | None:
+        """The larger of the two amplitudes' changes, without its sign."""
+        if self.peak_amplitude is None or self.lockin_amplitude is None:
+            return None
+        return max(abs(self.peak_amplitude), abs(self.lockin_amplitude))
+
+
+class Cost(NamedTuple):
+    """What following a scene for a drive period takes, in us: the median of several runs."""
+
+    time_us: float
+    noise_us: float
+    """By which the median lies above the quickest run."""
+
+
+class Reading(NamedTuple):
+    """What a motion shows in a window of time, in a few numbers."""
+
+    peak_amplitude_nm: float
+    """Largest height above the rest position."""
+    lockin_amplitude_nm: float
+    """2/T |integral z exp(-i omega t)| at the frequency of the response."""
+    lockin_phase_deg: float
+    """In [0, 360)."""
+    energy_per_impact_aj: float | None
+    """None without impacts."""
+    impacts: int
+
+
+class Observed(NamedTuple):
+    """What a scene shows; without a reading the reason says why."""
+
+    scene: Scene
+    reading: Reading | None
+    reason: str | None = None
+    orbit: Orbit | None = None
+
+
+class EffectReport(NamedTuple):
+    """One effect: what leaving it out changes and saves."""
+
+    effect: SceneEffect
+    change: Change
+    reason: str | None
+    """Why there is no change to tell: the effect is required, or nothing steady is left without it."""
+    cost: Cost | None
+    """Of the scene without it; None without a motion to time."""
+
+
+class Reduction(NamedTuple):
+    """What the wanted accuracy of the amplitude does not need."""
+
+    left_out: tuple[str, ...]
+    change: Change
+    """Of all of them together, simulated."""
+    scene: Scene
+    cost: Cost | None
+
+
+@dataclass(frozen=True)
+class EffectStudy:
+    """All effects of a scene, and which of them an accuracy of the amplitudes does not need."""
+
+    observed: Observed
+    frequency_khz: float
+    """At which the lock-in reads."""
+    cost: Cost | None
+    effects: list[EffectReport]
+    accuracy: float
+    reduction: Reduction
+
+    text, plot = Result.text, Result.plot
+    _picture = "afm_jax.plots.effects:effects_figure"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax effects`."""
+        return self._object
+
+    @cached_property
+    def _object(self) -> dict[str, Any]:
+        reading, orbit, reduction = self.observed.reading, self.observed.orbit, self.reduction
+        assert reading is not None  # a study has one  # noqa: S101
+        return {
+            "compared": "steady orbits" if orbit is not None else "last fifth of the duration",
+            "full": {
+                **reading._asdict(),
+                "lockin_frequency_khz": self.frequency_khz,
+                "drive_periods": None if orbit is None else orbit.periods,
+                "time_us_per_period": self.cost and self.cost.time_us,
+            },
+            "effects": [self._effect(report) for report in self.effects],
+            "accuracy": self.accuracy,
+            "not_needed": list(reduction.left_out),
+            "joint_change": reduction.change._asdict(),
+            "reduced": {"time_us_per_period": reduction.cost and reduction.cost.time_us},
+        }
+
+    def _effect(self, report: EffectReport) -> dict[str, Any]:
+        name, sentence, _, required = report.effect
+        full, cost = self.cost, report.cost
+        saved, noise = None, None
+        if full is not None and cost is not None:
+            saved = full.time_us - cost.time_us
+            noise = math.hypot(full.noise_us, cost.noise_us)
+        return {
+            "name": name,
+            "description": sentence,
+            "required": required is not None,
+            "needed": name not in self.reduction.left_out,
+            "change": report.change._asdict(),
+            "reason": report.reason,
+            "time_us_per_period": cost and cost.time_us,
+            "saved_time_us_per_period": saved,
+            "saved_time_noise_us": noise,
+        }
+
+    def printed(self) -> list[str | Table]:
+        """Return what `afm-jax effects` prints: the full scene, a table of effects, and which are not needed."""
+        cells: dict[str, Cell] = {
+            "effect": "name",
+            "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
+            "lock-in\nchange": lambda effect: _percent(effect["change"]["lockin_amplitude"]),
+            "phase\ndeg": lambda effect: known(effect["change"]["lockin_phase_deg"]),
+            "loss/impact\nchange": lambda effect: _percent(effect["change"]["energy_per_impact"]),
+            "time\nus/period": "time_us_per_period:.4g",
+            "saved": _saved,
+            "": _remark,
+        }
+        table = printed_table("Without the effect", cells, self.to_dict()["effects"])
+        return [self._of_full(), table, *self._sentences()]
+
+    def _of_full(self) -> str:
+        full = self.to_dict()["full"]
+        motion = f"no steady orbit, {full['impacts']} impacts in the last fifth of the duration"
+        if full["drive_periods"] is not None:
+            periods = counted(full["drive_periods"], "drive period")
+            motion = f"steady orbit, {counted(full['impacts'], 'impact')} in {periods}"
+        lost = full["energy_per_impact_aj"]
+        lockin = f"lock-in at {full['lockin_frequency_khz']:.6g} kHz {full['lockin_amplitude_nm']:.5g} nm"
+        return (
+            f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, {lockin} "
+            f"at {full['lockin_phase_deg']:.4g} deg{f', {lost:.4g} aJ lost per impact' if lost is not None else ''}; "
+            f"{known(full['time_us_per_period'], '.4g')} us to compute a drive period."
+        )
+
+    def _sentences(self) -> Iterator[str]:
+        for report in self.effects:
+            if report.reason is not None:
+                where = "" if report.effect.required else "without it: "
+                yield f"{report.effect.name}: {where}{report.reason}."
+        wanted, reduction = f"For amplitudes to {100.0 * self.accuracy:g} %", self.reduction
+        if not reduction.left_out:
+            yield f"{wanted} every effect that can be left out is needed."
+            return
+        yield (
+            f"{wanted} these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes "
+            f"by {_percent(reduction.change.peak_amplitude)}, the lock-in amplitude by "
+            f"{_percent(reduction.change.lockin_amplitude)}; "
+            f"{known(reduction.cost and reduction.cost.time_us, '.4g')} us per drive period."
+        )
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of effects.csv, a row an effect."""
+        effects = self.to_dict()["effects"]
+        names = ("name", "description", "required", "needed", *(f"change_{name}" for name in Change._fields))
+        rows = [
+            {**effect, **{f"change_{name}": value for name, value in effect["change"].items()}} for effect in effects
+        ]
+        return {"effects.csv": columns_of(rows, (*names, *_TIMES, "reason"))}
+
+
+_TIMES = ("time_us_per_period", "saved_time_us_per_period", "saved_time_noise_us")
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:+z.3g} %"
+
+
+def _saved(effect: dict[str, Any]) -> str:
+    saved = effect["saved_time_us_per_period"]
+    return "within timing noise" if saved and abs(saved) <= effect["saved_time_noise_us"] else known(saved)
+
+
+def _remark(effect: dict[str, Any]) -> str:
+    if effect["required"]:
+        return "required"
+    if effect["change"]["peak_amplitude"] is None:
+        return "no steady motion"
+    return "" if effect["needed"] else "not needed"
+
+
+# --- the study --------------------------------------------------------------------------------------------------------
+
+
+def study_effects(
+    scene: Scene,
+    start: State | None = None,
+    *,
+    accuracy: float = 0.01,
+    duration_us: float | None = None,
+    only: Sequence[str] | None = None,
+    report: Callable[[int, int], object] = lambda *_: None,
+) -> EffectStudy:
+    """Return what each effect of a scene changes and costs.
+
+    Args:
+        scene: one scene.
+        start: where every motion begins, that of the scenes without an effect too; None: the scene's default.
+        accuracy: relative accuracy of the amplitudes that is wanted.
+        duration_us: how long to follow it at most; None: 400 drive periods.
+        only: names of the effects to look at; None: all.
+        report: told how many of how many scenes, with and without an effect, are done.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
+        ValueError: if the scene itself has no motion to compare with, an effect of `only` is not in the scene, or the
+            accuracy or the duration is not positive.
+    """
+    require_float64(scene)
+    if not 0.0 < accuracy < 1.0:
+        raise ValueError(f"`accuracy` must be between 0 and 1, but is {accuracy!r}")
+    if duration_us is not None and not duration_us > 0.0:
+        raise ValueError(f"`duration_us` must be positive, but is {duration_us!r}")
+    effects = _chosen(effects_in(scene), only)
+    view = _View(scene, start, duration_us)
+    full = view.observed(scene)
+    if view.settles and full.reading is None and (full.reason or "").startswith("nothing repeats"):
+        view.settles = False
+        full = view.observed(scene)
+    if full.reading is None:
+        raise ValueError(f"the scene has no motion to compare with: {full.reason}; give it another start")
+    cost = view.cost(full)
+    reports = []
+    for number, effect in enumerate(effects):
+        report(number + 1, len(effects) + 2)
+        if effect.required is not None:
+            reports.append(EffectReport(effect, Change(), f"required: {effect.required}", None))
+            continue
+        without = view.observed(effect.without(scene))
+        change, reason = view.change(full, without)
+        reports.append(EffectReport(effect, change, reason, view.cost(without)))
+    report(len(effects) + 1, len(effects) + 2)
+    reduction = _reduced(view, full, reports, accuracy)
+    return EffectStudy(full, view.lockin_frequency(full) / RAD_PER_US_PER_KHZ, cost, reports, accuracy, reduction)
+
+
+def _chosen(effects: list[SceneEffect], only: Sequence[str] | None) -> list[SceneEffect]:
+    names = [effect.name for effect in effects]
+    for name in only or ():
+        if name not in names:
+            raise ValueError(f"the scene has no effect {name!r}; it has {', '.join(names) or 'none'}")
+    return [effect for effect in effects if only is None or effect.name in only]
+
+
+def _reduced(view: "_View", full: Observed, reports: list[EffectReport], accuracy: float) -> Reduction:
+    """Leave out effects from the smallest on, as long as all together change the amplitudes by less."""
+    sizes = [(report.change.of_amplitude, report.effect) for report in reports]
+    candidates = sorted(((size, effect) for size, effect in sizes if size is not None), key=lambda each: each[0])
+    reduced, left_out, change = full, [], Change(0.0, 0.0, 0.0, 0.0)
+    for size, effect in candidates:
+        smaller = view.observed(effect.without(reduced.scene)) if size < accuracy else full._replace(reading=None)
+        joint, _ = view.change(full, smaller)
+        if joint.of_amplitude is not None and joint.of_amplitude < accuracy:
+            reduced, change = smaller, joint
+            left_out.append(effect.name)
+    return Reduction(tuple(left_out), change, reduced.scene, view.cost(reduced))
+
+
+class _View:
+    """How scenes are compared: all from one start, over one duration, with one reference; their compiled programs."""
+
+    def __init__(self, scene: Scene, start: State | None, duration_us: float | None) -> None:
+        """Take what the full scene says."""
+        self.drive: DrivePeriod = drive_of(scene)
+        self.settles = self.drive.aperiodic is None
+        self.start = default_start(scene) if start is None else start
+        self.duration_us = PERIODS_AT_MOST * self.drive.period_us if duration_us is None else duration_us
+        self._compiled: dict[Any, Compiled] = {}
+        self._costs: dict[Any, Cost] = {}
+
+    def observed(self, scene: Scene) -> Observed:
+        """Return what a scene shows: its steady orbit, or the end of the duration if the full scene has none."""
+        run = partial(self._run, scene)
+        if self.settles:
+            aperiodic = drive_of(scene).aperiodic
+            if aperiodic is not None:
+                return Observed(scene, None, aperiodic)
+            orbit, reason = follow_to_orbit(scene, self.start, self.duration_us, run)
+            if orbit is None:
+                return Observed(scene, None, reason)
+            begin = float(orbit.start.time_us)
+            found = Observed(scene, None, None, orbit)
+            window = begin, begin + orbit.period_us
+            return found._replace(reading=_read(scene, orbit.motion, window, self.lockin_frequency(found)))
+        first, reason, pieces = float(self.start.time_us), why_impossible(scene), []
+        if reason is not None:
+            return Observed(scene, None, reason)
+        end, piece_us = first + self.duration_us, _PERIODS_AT_ONCE * drive_of(scene).period_us
+        for piece in follow_in_pieces(scene, self.start, end, run, piece_us=piece_us):
+            reason = why_over(piece)
+            if reason is not None:
+                return Observed(scene, None, reason)
+            pieces = [*(done for done in pieces if done.goes_on), piece]
+        window = last_fifth(first, end, self.drive)
+        reading = _read(scene, joined(pieces), (window.from_us, window.to_us), self.drive.angular_frequency)
+        return Observed(scene, reading)
+
+    def lockin_frequency(self, observed: Observed) -> float:
+        """Return the angular frequency that a lock-in reads, in rad/us: the drive's over the `_periods_read`."""
+        return self.drive.angular_frequency / _periods_read(observed)
+
+    def change(self, full: Observed, without: Observed) -> tuple[Change, str | None]:
+        """Return what changed, and what there is to say."""
+        before, after = full.reading, without.reading
+        if before is None or after is None:
+            return Change(), without.reason
+        # which of the N equivalent periods is locked is unknown
+        turn = 360.0 / _periods_read(full)
+        phase = (after.lockin_phase_deg - before.lockin_phase_deg + 0.5 * turn) % turn - 0.5 * turn
+        lost, lost_after = before.energy_per_impact_aj, after.energy_per_impact_aj
+        change = Change(
+            after.peak_amplitude_nm / before.peak_amplitude_nm - 1.0,
+            after.lockin_amplitude_nm / before.lockin_amplitude_nm - 1.0,
+            phase,
+            lost_after / lost - 1.0 if lost and lost_after is not None else None,
+        )
+        kinds = [None if one.orbit is None else (one.orbit.impacts, one.orbit.periods) for one in (full, without)]
+        if kinds[0] == kinds[1]:
+            return change, None
+        reason = f"another orbit: {kinds[1]} instead of {kinds[0]} (impacts, drive periods)"
+        return change._replace(lockin_phase_deg=None), reason
+
+    def cost(self, observed: Observed) -> Cost | None:
+        """Return what following a scene costs, its steady orbit if there is one; one program has one cost."""
+        if observed.reading is None:
+            return None
+        structure = jax.tree.structure(observed.scene)
+        if structure not in self._costs:
+            start = self.start if observed.orbit is None else observed.orbit.start
+            duration = min(_PERIODS_AT_ONCE * self.drive.period_us, self.duration_us)
+            program, arguments = self._program(observed.scene, start, duration)
+            timing, _ = time_compiled(program, *arguments, repetitions=_REPETITIONS)
+            scale = 1e6 * self.drive.period_us / duration
+            self._costs[structure] = Cost(scale * timing.median_s, scale * (timing.median_s - timing.best_s))
+        return self._costs[structure]
+
+    def _run(self, scene: Scene, start: State, duration_us: float) -> Simulation:
+        program, arguments = self._program(scene, start, duration_us)
+        return program.run(*arguments)
+
+    def _program(self, scene: Scene, start: State, duration_us: float) -> tuple[Compiled, tuple[Any, ...]]:
+        """Return `simulate`, compiled once for every choice of effects; numbers change without compiling again."""
+        arguments = (scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float))
+        structure = jax.tree.structure(scene)
+        if structure not in self._compiled:
+            follow = partial(simulate, max_contacts=_ROWS)
+            self._compiled[structure] = compiled_for(follow, *arguments, options=quick_options())
+        return self._compiled[structure], arguments
+
+
+def _periods_read(observed: Observed) -> int:
+    """Return how many drive periods a period of what the lock-in reads has.
+
+    Those of the orbit where the sample drives; one where base or force do, as every lock-in reads their frequency, and
+    where no orbit is steady.
+    """
+    scene, orbit = observed.scene, observed.orbit
+    return 1 if orbit is None or scene.base is not None or scene.force is not None else orbit.periods
+
+
+def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
+    """Return a reading, a smooth function of a simulation's numbers: contacts, short, are not integrated once more."""
+    motion = MotionWindow(dense_path(scene, simulation, *window, integrated=False), *window)
+    value = motion.height.lockin(angular_frequency)
+    lost = motion.rows.energy_lost_aj[motion.begun]
+    return Reading(
+        peak_amplitude_nm=motion.height.largest,
+        lockin_amplitude_nm=float(abs(value)),
+        lockin_phase_deg=float(within_turn(np.degrees(np.angle(value)), 360.0)),
+        energy_per_impact_aj=float(lost.mean()) if lost.size else None,
+        impacts=int(lost.size),
+    )
