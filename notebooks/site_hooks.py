@@ -48,7 +48,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made or kept outside the folder of pages."""
     with warnings.catch_warnings(), ThreadPoolExecutor(available_cores()) as pool:
         warnings.simplefilter("ignore")  # Jupyter's own; threads cannot do so one by one
-        places = dict(zip((path.name for path in NOTEBOOKS), pool.map(kept, NOTEBOOKS), strict=True))
+        # from the end: the longest, the paper's figures, begins first
+        backwards = NOTEBOOKS[::-1]
+        places = dict(zip((path.name for path in backwards), pool.map(kept, backwards), strict=True))
     pictures = {name: first_picture(place) for name, place in places.items()}
     for name, place in places.items():
         files.append(File(f"gallery/{name}", str(place.parent.parent), config.site_dir, config.use_directory_urls))
