@@ -650,14 +650,14 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     start = start_of(scene, read.start)
     world = surface_of(scene)
     surface = world[0]
-    contact: Any = scene.interaction
-    law = contact if isinstance(contact, Law) else None
-    driven = None if law is not None else driven_by(contact, scene.cantilever, surface)
-    if law is not None:
+    law, driven, spans = None, None, True
+    if isinstance(scene.interaction, Law):
+        law = scene.interaction
         arrival = partial(law_arrival, scene, world, contacts)
         settings: Mapping[str, Any] = {f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US}
         references, reference = (1e-15, 1e-14), "root tolerance 1e-15 us"
     else:
+        driven, spans = driven_by(scene.interaction, scene.cantilever, surface), scene.interaction.spans
         longest = start.time_us + _LONGEST_US * contacts
         followed = follow_contacts(scene, *world, start, longest, max_contacts=contacts, setting=IN_TIME[0])
         # no longer than until the last of them has left
@@ -673,7 +673,6 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     def begin(parameters: Parameters) -> tuple[EquationOfMotion, Tip]:
         faster = start._replace(velocity_nm_per_us=start.velocity_nm_per_us + parameters[0])
         gap, rate = _gap_of(world, faster)
-        spans = law is not None or contact.spans
         motion = EquationOfMotion(scene.cantilever, surface, law, driven, spans)
         return motion, tips_at(Phase.DRY, gap[None], rate[None], faster.time_us)
 
