@@ -28,9 +28,6 @@ from fitting.instruments.curve import read_curve as read_curve
 from fitting.instruments.curve import read_curves as read_curves
 from fitting.inversion.invert import invert as invert
 from fitting.inversion.result import Inversion as Inversion
-from fitting.sampling.bootstrap import Bootstrap as Bootstrap
-from fitting.sampling.bootstrap import bootstrap as bootstrap
-from fitting.sampling.inference_data import write_inference_data as write_inference_data
 from fitting.sampling.posterior import posterior as posterior
 from fitting.sampling.posterior_result import Posterior as Posterior
 from fitting.simulated.experiment import SimulatedExperiment as SimulatedExperiment

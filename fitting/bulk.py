@@ -22,7 +22,7 @@ from fitting.fits.fit import fit
 from fitting.fits.result import FitResult
 from fitting.models import problem_of
 from fitting.parameters import PARAMETERS
-from fitting.sampling.bootstrap import require_valid
+from fitting.sampling.refit import require_valid
 from fitting.tables.table import AMPLITUDES, MEASURED, AmplitudeTable, check_quality_factor, read_table
 
 if TYPE_CHECKING:

@@ -27,8 +27,8 @@ import fitting.examples
 from fitting import fit, posterior, read_table
 from fitting.fits.law_after import root_of
 from fitting.fits.objective import Objective
-from fitting.sampling.bootstrap import DataSets, Refit, fit_data_sets, shifts
-from fitting.sampling.inference_data import densities, noise_of, posterior_draws, refit_of_rows
+from fitting.sampling.refit import Refit
+from tests.batched_refit import DataSets, densities, fit_data_sets, noise_of, posterior_draws, refit_of_rows, shifts
 
 TABLES = (
     ("amplitudes_law.csv", "law"),

@@ -15,7 +15,8 @@ from fitting.fits.intervals import profile_intervals
 from fitting.fits.minimum import model_errors_of, with_inflated_errors
 from fitting.fits.objective import Objective
 from fitting.models import Problem, measurement_of
-from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, draw_data, fit_data_sets
+from fitting.sampling.refit import Refit
+from tests.batched_refit import BatchFit, DataSets, draw_data, fit_data_sets
 from tests.fit_tables import example_amplitudes, rows, simulated
 
 pytestmark = pytest.mark.slow

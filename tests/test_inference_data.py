@@ -1,14 +1,12 @@
-"""The file for ArviZ against another program's amplitudes; ranks of true values in posteriors."""
-
-from pathlib import Path
+"""Likelihoods of a posterior's draws against another program's amplitudes; ranks of true values in posteriors."""
 
 import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
 from afm_jax.impact.law import ImpactLaw
-from fitting import posterior, write_inference_data
-from fitting.sampling.inference_data import densities, noise_of, posterior_draws, refit_of_rows
+from fitting import posterior
+from tests.batched_refit import densities, noise_of, posterior_draws, refit_of_rows
 from tests.coverage_of_ranks import calibrate_ranks
 from tests.fit_tables import fit_of_every_fourth, steady_amplitudes
 
@@ -65,20 +63,3 @@ def test_a_right_posterior_is_not_complained_of(believed):
     assert ranks.p_value > 0.05
     assert ranks.gaussian_p_value > 0.05
     assert ranks.failed == 0
-
-
-@pytest.mark.filterwarnings("ignore::FutureWarning:arviz", "ignore:Estimated shape parameter of Pareto")
-def test_arviz_reads_the_file_and_predicts_each_row_by_the_others(believed, tmp_path: Path):
-    arviz = pytest.importorskip("arviz", reason="ArviZ is an extra")
-    result, found = believed
-    path = tmp_path / "posterior.nc"
-    write_inference_data(result, found, path)
-    data = arviz.from_netcdf(path)
-    groups = {"posterior", "sample_stats", "log_likelihood", "posterior_predictive", "observed_data"}
-    # a DataTree since ArviZ 1
-    assert groups <= set(data.children if hasattr(data, "children") else data.groups())
-    assert np.asarray(data.observed_data["peak_amplitude_nm"]) == pytest.approx(result.table.peak_amplitude_nm)
-    loo = arviz.loo(data, pointwise=True)
-    assert np.asarray(loo.pareto_k).shape == (result.table.rows,)
-    # rows that the law explains: as many effective parameters as there are, give or take the scatter of the rows
-    assert 1.0 < (loo.p if hasattr(loo, "p") else loo.p_loo) < 6.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fitting.sampling.bootstrap import objective_of
+from fitting.sampling.refit import objective_of
 from tests.fit_tables import fit_of_every_fourth, standard_errors_of, values_of
 
 pytestmark = pytest.mark.slow

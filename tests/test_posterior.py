@@ -10,9 +10,9 @@ from scipy.integrate import quad
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, posterior
-from fitting.sampling.bootstrap import objective_of, standard_covariance
 from fitting.sampling.posterior import log_density_of, space_around
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
+from fitting.sampling.refit import objective_of, standard_covariance
 from tests.fit_tables import (
     amplitudes_and_errors,
     example_amplitudes,

@@ -12,7 +12,6 @@ from fitting.fits.result import FitResult
 from fitting.report.html import fit_page
 from fitting.report.plots import law_figure, rows_figure, speed_figure
 from fitting.report.words import band_width, interval_in_words
-from fitting.sampling.bootstrap import Bootstrap
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
 from tests.html_pages import first_screen, formulas, read_page, section_of, table_of, words_of
 from tests.made_fits import SPEEDS, VALUES, made_fit, made_parameter, made_table
@@ -172,12 +171,11 @@ def test_other_models_and_samples_are_shown():
     rows = [row | {"model": "law", "chi2": 5.0}, row | {"model": "viscous", "chi2": 7.25}]
     models = Comparison(rows, "The data do not tell r < 1 from viscous loss.", {})
     drawn = np.linspace(0.9, 0.99, 41)[:, None] * [1.0, 70.0]
-    boot = Bootstrap(("r", "epsilon"), np.array([0.95, 60.0]), drawn, 2, 1234)
     chains = PosteriorChains(drawn[None], np.array([1.31, np.nan]), np.array([50.0, 60.0]), 0, 77)
     found = posterior_of_chains(chains, ("r", "epsilon"), ())
-    root = read_page(page_of(made_fit("law"), comparison=models, bootstrap=boot, posterior=found))
+    root = read_page(page_of(made_fit("law"), comparison=models, posterior=found))
     assert models.verdict in first_screen(root)
     assert [row[1] for row in table_of(root, "Models of")] == ["chi2", "5", "7.25"]
-    ours, others = section_of(root, "bootstrap"), section_of(root, "posterior")
-    assert table_of(ours, "By parameter")[1][3] == "0.90225 to 0.98775"
-    assert ["Not converged" in words_of(part) for part in (ours, others)] == [False, True]
+    sampled = section_of(root, "posterior")
+    assert table_of(sampled, "By parameter")[1][3] == "0.90225 to 0.98775"
+    assert "Not converged" in words_of(sampled)

@@ -40,7 +40,7 @@ PARAMETERS = {"BaseDrive", "Cantilever", "CollisionDelay", "Contact", "ForceDriv
 PARAMETERS |= {"TabulatedLaw", "Tone"}
 """What a simulation is made of, and scene files hold."""
 ROOT = Path(__file__).parent.parent
-DRAWN_BELOW = {"Bootstrap", "Comparison", "Continuation", "Design", "FitResult", "Inversion", "LockinResult"}
+DRAWN_BELOW = {"Comparison", "Continuation", "Design", "FitResult", "Inversion", "LockinResult"}
 DRAWN_BELOW |= {"StabilityChart"}
 DRAWN_ELSEWHERE = {"Basins", "ContactDelay", "Posterior", "Sweep", "Tapping", "TappingMap"}
 """What is drawn in its own way, from parts that belong together: these are made by computations."""
@@ -282,7 +282,6 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
     prior = fitting.prior_of_values("law", free_frequency_khz=90.0, quality_factor=40.0)
     size = {"orders": (1,), "amplitudes_nm": (2.0, 4.0), "offsets_nm": (0.0,), "detunings": (0.98, 1.0)}
     fitted: Any = example_fit()
-    samples = np.random.default_rng(3).normal(size=(50, 2))
     computed: list[Any] = [
         afm.single_impact_orbits(scene, 1),
         afm.stability_chart(plane, x_values=np.array([0.9, 1.0, 1.01]), y_values=np.array([3.0, 4.0]), last_order=1),
@@ -291,7 +290,6 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         fitting.invert(fitting.read_table(EXAMPLE)),
         fitting.design(prior, fitting.drive_grid(**size, free_frequency_khz=90.0), points=2),
         Comparison([{"model": "law"}], "one only", {"law": fitted}),
-        fitting.Bootstrap(("r", "epsilon"), np.zeros(2), samples, failures=0, seed=3),
         fitting.lockin(*noisy_bounce(1)[:2], 181.8, 1),
     ]
     assert {type(record).__name__ for record in computed} >= DRAWN_BELOW

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from afm_jax.cli.command import Output, later
-from afm_jax.cli.session import Session, prepare_folder
+from afm_jax.cli.session import Session
 from afm_jax.cli.values import example_path, tables_with
 from afm_jax.words import text_table
 from fitting.fits.comparison import compare, rivals
@@ -13,8 +13,6 @@ from fitting.fits.estimate import Found
 from fitting.fits.fit import find_fit, summarise_in_units
 from fitting.fits.result import FitResult
 from fitting.report.report import summary, write_report
-from fitting.sampling.bootstrap import bootstrap
-from fitting.sampling.inference_data import require_netcdf, write_inference_data
 from fitting.sampling.posterior import posterior, require_blackjax
 from fitting.tables.several import SeveralTables
 
@@ -31,10 +29,6 @@ def fit(
     **options: Any,
 ) -> Output:
     """Return the fit of one law to tables, with what was asked for besides; with ``each`` a fit of every table."""
-    if options["arviz"] is not None:
-        prepare_folder(options["arviz"].absolute().parent)
-        require_netcdf()
-        options["posterior"] = True
     if options["posterior"]:
         require_blackjax()
     read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
@@ -61,21 +55,14 @@ def _extras(
 ) -> tuple[dict[str, Any], Exception | None]:
     """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
-    for name in ("bootstrap", "posterior", "arviz"):
-        if options[name] and not result.valid:
-            session.note(f"no {name}: the fit is not valid")
+    if options["posterior"] and not result.valid:
+        session.note("no posterior: the fit is not valid")
     try:
         if options["comparing"]:
             extras["comparison"] = _comparison(session, found, result, settings)
-        if options["bootstrap"] and result.valid:
-            with session.working(f"fitting {options['bootstrap']} synthetic tables"):
-                extras["bootstrap"] = bootstrap(result, samples=options["bootstrap"], seed=options["seed"])
         if options["posterior"] and result.valid:
             with session.working("sampling the posterior"):
                 extras["posterior"] = posterior(result, seed=options["seed"])
-        if options["arviz"] and result.valid:
-            write_inference_data(result, extras["posterior"], options["arviz"], seed=options["seed"])
-            session.note(f"wrote {options['arviz']}")
     except Exception as error:  # noqa: BLE001
         return extras, error
     return extras, None
@@ -94,7 +81,7 @@ def _comparison(session: Session, found: Found, result: FitResult, settings: dic
 
 
 def _words(name: str, extra: Any) -> str:
-    """Return a comparison, a bootstrap or a posterior as text."""
+    """Return a comparison or a posterior as text."""
     if name == "comparison":
         cells = [
             [
@@ -112,8 +99,6 @@ def _words(name: str, extra: Any) -> str:
         return "\n".join(["", head, *lines, f"  {extra.verdict}"])
     intervals = {key: found["interval95"] for key, found in extra.to_dict()["parameters"].items()}
     head = "95 % credible intervals (posterior, flat priors):"
-    if name == "bootstrap":
-        head = f"95 % intervals of {len(extra.samples)} synthetic tables (bootstrap):"
     lines = text_table(
         ["parameter", "from", "to"], [[key, *(f"{e:.6g}" for e in ends)] for key, ends in intervals.items()]
     )

@@ -85,25 +85,16 @@ def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
     Raises:
         click.UsageError: if not.
     """
-    for option in ("share", "hierarchical"):
-        if options[option] and (len(tables) < 2 or options["each"]):
-            raise click.UsageError(f"--{option} is about several tables that are fitted together; leave it out")
+    if options["share"] and (len(tables) < 2 or options["each"]):
+        raise click.UsageError("--share is about several tables that are fitted together; leave it out")
     if options["workers"] is not None and not options["each"]:
         raise click.UsageError("--workers is about several tables: add --each")
-    alone = {
-        "--example": "example",
-        "--compare": "comparing",
-        "--bootstrap": "bootstrap",
-        "--posterior": "posterior",
-        "--arviz": "arviz",
-    }
+    alone = {"--example": "example", "--compare": "comparing", "--posterior": "posterior"}
     for option, name in alone.items():
         if options["each"] and options[name]:
             raise click.UsageError(f"{option} is about one table: leave --each out")
         if len(tables) > 1 and options[name] and option != "--compare":
             raise click.UsageError(f"{option} is about one table: give one, or leave it out")
-    if options["comparing"] and options["hierarchical"]:
-        raise click.UsageError("--compare is about tables that have one law: leave --hierarchical out")
 
 
 def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -118,7 +109,7 @@ def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
     settings: dict[str, Any] = {
         "scale_errors": options["scale_errors"],
         "robust": options["robust"],
-        **{name: options[name] for name in ("share", "hierarchical") if options.get(name)},
+        **({"share": options["share"]} if options.get("share") else {}),
         "constraints": dict(options["constraints"]),
         "free": free,
         "fixed": fixed,

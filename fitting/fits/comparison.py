@@ -88,8 +88,6 @@ def compare(
     require_float64()
     if len(set(models)) < 2:
         raise ValueError("comparing needs at least two different models")
-    if options.get("hierarchical"):
-        raise ValueError("models are compared where all tables have one law: leave `hierarchical=True` out")
     for model in models:
         of_model = _options_of(model, options)
         free = of_model.get("free")

@@ -30,7 +30,7 @@ from fitting.fits.law_after import (
 from fitting.fits.minimum import ATTRACTED, Minimum, ModelErrors
 from fitting.fits.objective import ROBUST, Objective, soft_square
 from fitting.fits.result import FittedRows, table_of_law
-from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
+from fitting.fits.several import Pull, parts_of, pulls_of
 from fitting.fits.step import (
     PARTS_AT_ONCE,
     Descended,
@@ -117,11 +117,6 @@ class AtMinimum(NamedTuple):
         return dict(self.settings["constraints"])
 
     @property
-    def scattering(self) -> bool:
-        """Whether the laws of several tables may differ from table to table."""
-        return bool(self.settings.get("hierarchical"))
-
-    @property
     def data(self) -> int:
         """How many numbers are compared: readings, rows without orbit, and what is known beforehand."""
         rows = self.found.objective.measurement.rows
@@ -172,7 +167,7 @@ class FitEstimate(NamedTuple):
     stuck: tuple[float, float] | None = None
     runs: "Runs | None" = None
     contact_share: float = 0.0
-    tables: "TablesCompared | None" = None
+    tables: list[Pull] | None = None
 
     @property
     def law(self) -> ModelLaw:
@@ -202,22 +197,6 @@ class Runs(NamedTuple):
     residual: Float[np.ndarray, "rows k"]
 
 
-class TablesCompared(NamedTuple):
-    """What several tables that were fitted together say of one another.
-
-    Attributes:
-        pulls: of each on the law.
-        between: the scatter of the law's free parameters; None: laws do not scatter, or it is not determined.
-        departures: of each table's law from the mean; None likewise.
-        departing: how residuals change with departures of the most likely size, and of a cautious one; none likewise.
-    """
-
-    pulls: list[Pull]
-    between: Between | None = None
-    departures: Float[np.ndarray, "tables l"] | None = None
-    departing: tuple[Float[np.ndarray, "readings m"], ...] = ()
-
-
 def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstimate:
     """Return the law, values and errors that a minimum stands for, with the model discrepancy where impacts last."""
     at = at_minimum(table, found)
@@ -231,11 +210,7 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
     # Hertz time in us times the drive's frequency in kHz; 1e-3 makes it a share of the period
     contact_share = float(np.max(1e-3 * rows.hertz_time[: used.size][used] * table.drive_frequency_khz[used]))
     estimate = estimate._replace(system=system, runs=runs, tables=tables, contact_share=contact_share)
-    if tables is not None and tables.departing:
-        # where laws scatter between tables: values by the most likely scatter, covariance by the cautious one
-        likely, cautious = tables.departing
-        system = replace(system.with_unknowns(likely), stated=system.with_unknowns(cautious).covariance)
-    elif not at.problem.lasting:
+    if not at.problem.lasting:
         return estimate
 
     def predicted(steps: list[LinearStep]) -> Predicted:
@@ -332,7 +307,7 @@ def _discrepancy_of(at: AtMinimum, rows: StepRows) -> tuple[ModelDiscrepancy, St
         effects = effects_of_held(held, values, problem.effects, mass, discrepancy.speeds)
         discrepancy = replace(discrepancy, held=effects)
     system = system_of(rows, discrepancy, at.free)
-    if not problem.lasting or at.scattering:
+    if not problem.lasting:
         return discrepancy, system, None
     before = beside = longest_run(rows, system)
     residual = system.step().residual.reshape(rows.measurement_error.shape)
@@ -343,24 +318,13 @@ def _discrepancy_of(at: AtMinimum, rows: StepRows) -> tuple[ModelDiscrepancy, St
     return discrepancy, system, Runs(before, beside, residual)
 
 
-def _compare_tables(at: AtMinimum, system: StepSystem) -> TablesCompared | None:
-    """Return the pulls of several tables on the law and the scatter of their laws; None of one table."""
+def _compare_tables(at: AtMinimum, system: StepSystem) -> list[Pull] | None:
+    """Return the pulls of several tables on the law; None of one table."""
     measurement = at.found.objective.measurement
     joint, table = measurement.joint, measurement.rows.table
     if joint is None or table is None:
         return None
-    own = len(at.problem.own)
-    parts = parts_of(system, table, joint.place, own)
-    if not at.scattering:
-        return TablesCompared(pulls_of(parts))
-    unit = departures_of(system, table, parts.law, np.ones(parts.law.size))
-    between = scatter_between(parts_of(system, table, joint.place, own, unit))
-    if not np.isfinite(between.value).all():
-        return TablesCompared(pulls_of(parts))
-    departing = tuple(departures_of(system, table, parts.law, size) for size in (between.value, between.cautious))
-    parts = parts_of(system, table, joint.place, own, departing[0])
-    departed = parts.solved()[1][-departing[0].shape[1] :].reshape(len(joint.drives), -1)
-    return TablesCompared(pulls_of(parts), between, departed * between.value, departing)
+    return pulls_of(parts_of(system, table, joint.place, len(at.problem.own)))
 
 
 def _after_step(

@@ -33,7 +33,6 @@ from fitting.fits.result import (
     FittedParameter,
     FittedTable,
     Loss,
-    Scatter,
     law_with_band,
     loss_of,
 )
@@ -52,7 +51,6 @@ def fit(  # noqa: PLR0913
     model: str = "law",
     *,
     share: Sequence[str] = (),
-    hierarchical: bool = False,
     scale_errors: bool = False,
     free: Sequence[str] | None = None,
     fixed: dict[str, float] | None = None,
@@ -71,8 +69,6 @@ def fit(  # noqa: PLR0913
             each instantaneous or with "+delay", the collision delay; or "contact", physical parameters of the resolved
             contact. On resonance, where a tapping curve determines no impact law, "contact" still can be fitted.
         share: nuisances that several tables have in common, by name; "all": every one.
-        hierarchical: let the laws of several tables scatter around a mean, each parameter by a standard deviation that
-            is fitted too: the values are then means.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
             freedom (the error of Q stays); the result is valid only if the scale is believable and what is left of the
             amplitudes random (see `verdict`).
@@ -101,7 +97,6 @@ def fit(  # noqa: PLR0913
         whole,
         model,
         share=share,
-        hierarchical=hierarchical,
         scale_errors=scale_errors,
         free=free,
         fixed=fixed,
@@ -133,7 +128,6 @@ def find_fit(  # noqa: PLR0913
     model: str,
     *,
     share: Sequence[str] = (),
-    hierarchical: bool = False,
     scale_errors: bool = False,
     free: Sequence[str] | None = None,
     fixed: dict[str, float] | None = None,
@@ -147,10 +141,8 @@ def find_fit(  # noqa: PLR0913
     if model == "contact":
         own = model_parameters(model, None if free is None else tuple(free), fixed)
         fixed, constraints, errors = split_held(own, fixed, constraints)
-    if isinstance(table, AmplitudeTable):
-        for name, asked in (("share", share), ("hierarchical", hierarchical)):
-            if asked:
-                raise ValueError(f"`{name}` is about several tables: leave it out, or give more than one")
+    if isinstance(table, AmplitudeTable) and share:
+        raise ValueError("`share` is about several tables: leave it out, or give more than one")
     known, problem, measurement = task_of(
         table, model, share=share, free=free, fixed=fixed, constraints=constraints, effects=effects
     )
@@ -181,7 +173,7 @@ def find_fit(  # noqa: PLR0913
         "held": held_of(problem.own, tuple(effects), fixed or {}, errors) if model == "contact" else (),
     }
     if isinstance(table, SeveralTables):
-        settings |= {"share": list(share), "hierarchical": hierarchical}
+        settings["share"] = list(share)
     return Found(stated, objective, minimum, model_errors, settings, refused)
 
 
@@ -265,8 +257,7 @@ def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
         contact_share=estimate.contact_share,
         refused=at.found.refused,
         contact=problem.model == "contact",
-        pulls=() if estimate.tables is None else tuple(pull.p_value for pull in estimate.tables.pulls),
-        scattering=estimate.tables is not None and estimate.tables.between is not None,
+        pulls=tuple(pull.p_value for pull in estimate.tables or ()),
         run=(0.0, 0.0) if estimate.runs is None else (estimate.runs.before, estimate.runs.beside),
         short=0.0 if discrepancy is None else discrepancy.short,
         held=() if discrepancy is None else tuple(effect.held for effect in discrepancy.held),
@@ -374,19 +365,7 @@ def result_of(estimate: FitEstimate, other: FitEstimate | None, evidence: Eviden
         settings=at.settings,
         versions={name: version_of(name) for name in _PACKAGES},
         tables=_fitted_tables(estimate, evidence.parameters),
-        scatter=_scatter(estimate) if explained else {},
     )
-
-
-def _scatter(estimate: FitEstimate) -> dict[str, Scatter]:
-    """Return the scatter of the law's parameters between tables; nothing where laws do not scatter."""
-    if estimate.tables is None or estimate.tables.between is None:
-        return {}
-    value, low, high, _ = estimate.tables.between
-    return {
-        name: Scatter(float(value[i]), (float(low[i]), _or_none(high[i])), parameter_called(name).unit)
-        for i, name in enumerate(estimate.at.free_law)
-    }
 
 
 def _fitted_tables(estimate: FitEstimate, parameters: dict[str, FittedParameter]) -> tuple[FittedTable, ...]:
@@ -395,9 +374,8 @@ def _fitted_tables(estimate: FitEstimate, parameters: dict[str, FittedParameter]
     if not isinstance(table, SeveralTables):
         return ()
     pulls = [Pull(np.nan, np.nan, np.full(len(law), np.nan), np.nan)] * len(table.labels)
-    departures = None
     if estimate.tables is not None:
-        pulls, departures = estimate.tables.pulls, estimate.tables.departures
+        pulls = estimate.tables
     fitted = []
     for t, (member, label, pull) in enumerate(zip(table.tables, table.labels, pulls, strict=True)):
         mine = table.number == t
@@ -414,7 +392,6 @@ def _fitted_tables(estimate: FitEstimate, parameters: dict[str, FittedParameter]
                 p_value=_or_none(pull.p_value),
                 pulls={name: _or_none(size) for name, size in zip(law, pull.pulls, strict=True)},
                 nuisances={name: parameters[key] for name, key in nuisances.items() if key in parameters},
-                departures={} if departures is None else dict(zip(law, departures[t].tolist(), strict=True)),
             )
         )
     return tuple(fitted)

@@ -109,14 +109,13 @@ class FittedTable:
         name: what it is called.
         rows: how many it has.
         used: how many of them count.
-        chi2: of its readings, of what is known of its own nuisances, and of its law's departure.
+        chi2: of its readings, of what is known of its own nuisances.
         readings: how many there are.
         pull: how far its law is from that of the others, as standard deviations of a single Gaussian number; None where
             they do not determine it.
         p_value: probability of a larger pull if all have the same law.
         pulls: by how much it moves each parameter of the law, in standard deviations of that.
         nuisances: its own, as `FitResult.parameters`.
-        departures: of its law from the mean, by parameter; empty where all have one law.
     """
 
     source: str
@@ -129,22 +128,6 @@ class FittedTable:
     p_value: float | None
     pulls: dict[str, float | None]
     nuisances: dict[str, FittedParameter]
-    departures: dict[str, float]
-
-
-@dataclass(frozen=True)
-class Scatter:
-    """Standard deviation of a parameter of the law between tables.
-
-    Attributes:
-        value: which has the largest restricted likelihood.
-        interval95: from its profile; the upper end is None where the tables set none.
-        unit: of both.
-    """
-
-    value: float
-    interval95: tuple[float, float | None]
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -285,7 +268,6 @@ class FitResult(Result):
         table: the table that was fitted, or all of several.
         tables: of several: each one's rows, chi2, pull on the law, and what it has to itself; `parameters` are then
             those that all have in common.
-        scatter: of the law's parameters between tables where it was asked for; `parameters` are then means.
         settings: every option of the fit.
         versions: of the packages that computed it.
     """
@@ -310,7 +292,6 @@ class FitResult(Result):
     versions: dict[str, str] = field(default_factory=dict)
     loss: Loss | None = None
     tables: tuple[FittedTable, ...] = ()
-    scatter: dict[str, Scatter] = field(default_factory=dict)
 
     @property
     def repeats(self) -> RepeatedReadings | None:
@@ -342,14 +323,7 @@ class FitResult(Result):
             "settings": plain(self.settings),
             "repeats": None if (repeats := self.repeats) is None else plain(asdict(repeats)),
             "versions": self.versions,
-        } | (
-            {
-                "tables": [plain(asdict(table)) for table in self.tables],
-                "scatter": {name: plain(asdict(one)) for name, one in self.scatter.items()} or None,
-            }
-            if self.tables
-            else {}
-        )
+        } | ({"tables": [plain(asdict(table)) for table in self.tables]} if self.tables else {})
 
 
 @compiled_quickly(level=0)

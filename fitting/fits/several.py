@@ -1,15 +1,10 @@
-"""What several tables fitted together say of one another: each one's pull on the law, and the scatter between them.
+"""What several tables fitted together say of one another: each one's pull on the law.
 
 The fit is linearised at its minimum. What all tables have in common is the law, shared nuisances and what the model
-leaves out; what a table has to itself are its own nuisances and, where laws scatter, its law's departure from the mean.
-Each part of the normal equations is then of one table, which can be left out.
-
-The departures are Gaussian, each parameter of the law with a standard deviation of its own between tables. These
-maximise the restricted likelihood (REML): that of the residuals after all parameters were integrated out (Patterson and
-Thompson 1971).
+leaves out; what a table has to itself are its own nuisances. Each part of the normal equations is then of one table,
+which can be left out.
 """
 
-from collections.abc import Callable
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -17,8 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import chi2_tail, covariance_of
-from afm_jax.solve.derivatives import bracketed_root
-from fitting.fits.intervals import CHI2_95
 from fitting.fits.step import StepSystem
 
 _LEAST_SHARE = 1e-9
@@ -59,11 +52,7 @@ class Parts(NamedTuple):
 
 
 def parts_of(
-    system: StepSystem,
-    table: Int[np.ndarray, " rows"],
-    place: Int[np.ndarray, "tables p"],
-    own: int,
-    departing: Float[np.ndarray, "readings m"] | None = None,
+    system: StepSystem, table: Int[np.ndarray, " rows"], place: Int[np.ndarray, "tables p"], own: int
 ) -> Parts:
     """Return the normal equations of a fit to several tables, part by part.
 
@@ -72,25 +61,20 @@ def parts_of(
         table: which each row is of.
         place: of each table's parameters, as of `Joint`.
         own: how many parameters the law has; they come first.
-        departing: how the readings' residuals change with the departures, as of `departures_of`.
     """
     size, count, tables, free = system.unknown.shape[0], system.jacobian.shape[1], len(place), system.parameters.free
     of = np.repeat(table, size // len(table))
     holders = np.array([np.isin(np.arange(count), row) for row in place])
     owner = np.where(holders.sum(axis=0) == 1, np.argmax(holders, axis=0), tables)
-    unknown, owners = [system.unknown], [owner, np.full(system.unknown.shape[1], tables)]
-    if departing is not None:
-        unknown.append(departing)
-        owners.append(np.repeat(np.arange(tables), departing.shape[1] // tables))
-    whole = np.zeros((len(system.residual), count + sum(block.shape[1] for block in unknown)))
+    whole = np.zeros((len(system.residual), count + system.unknown.shape[1]))
     whole[:, :count] = system.jacobian * free
-    whole[:size, count:] = np.concatenate(unknown, axis=1)
+    whole[:size, count:] = system.unknown
     white = _whitened(system, np.column_stack([system.residual, whole]), len(table))
     # after the readings: rows without orbit, and what is known of each parameter and shape
     part = np.concatenate([of, table, owner])
     blocks = [white[part == t] for t in range(tables + 1)]
     matrix = np.array([block[:, 1:].T @ block[:, 1:] for block in blocks])
-    owned = np.concatenate(owners)
+    owned = np.append(owner, np.full(system.unknown.shape[1], tables))
     prior = np.append(np.flatnonzero(~free), np.arange(count, owned.size))
     matrix[owned[prior], prior, prior] += 1.0
     return Parts(
@@ -100,26 +84,6 @@ def parts_of(
         own=owned == np.arange(tables)[:, None],
         law=np.flatnonzero(free[:own]),
     )
-
-
-def departures_of(
-    system: StepSystem,
-    table: Int[np.ndarray, " rows"],
-    law: Int[np.ndarray, " l"],
-    scatter: Float[np.ndarray, " l"],
-) -> Float[np.ndarray, "readings m"]:
-    """Return how the readings' residuals change with the departures of every table's law, of unit variance each.
-
-    Args:
-        system: the fit.
-        table: which each row is of.
-        law: places of the law's free parameters.
-        scatter: their standard deviations between tables.
-    """
-    size = system.unknown.shape[0]
-    of = np.repeat(table, size // len(table))
-    slope = system.jacobian[:size, law] * scatter
-    return np.concatenate([slope * (of == t)[:, None] for t in range(int(table.max()) + 1)], axis=1)
 
 
 def _whitened(system: StepSystem, columns: Float[np.ndarray, "n m"], rows: int) -> Float[np.ndarray, "n m"]:
@@ -180,93 +144,3 @@ def pulls_of(parts: Parts) -> list[Pull]:
         pull = -NormalDist().inv_cdf(0.5 * p_value) if p_value > 0.0 else float(np.sqrt(square))
         found.append(Pull(pull, p_value, pulls, chi2))
     return found
-
-
-class Between(NamedTuple):
-    """The scatter of each free parameter of the law between tables.
-
-    Attributes:
-        value: which has the largest restricted likelihood.
-        low: lower end of the 95 % interval.
-        high: its upper end, infinite where it is open.
-        cautious: with which errors are stated: a standard error larger. A few tables alone say how much they scatter,
-            and with the most likely scatter the intervals of the mean are too short.
-    """
-
-    value: Float[np.ndarray, " l"]
-    low: Float[np.ndarray, " l"]
-    high: Float[np.ndarray, " l"]
-    cautious: Float[np.ndarray, " l"]
-
-
-_FIRST = 0.3, 1.0, 3.0
-_LARGEST = 1e6
-"""Scatters that are tried first, and the largest, in standard errors of one table's parameter."""
-
-
-def scatter_between(parts: Parts) -> Between:
-    """Return the scatter of the law's parameters between tables.
-
-    Args:
-        parts: with departures that have the parameters' units.
-    """
-    from scipy.optimize import minimize  # noqa: PLC0415 (half a second that most fits do not need)
-
-    count, tables = parts.law.size, len(parts.own)
-    matrix, vector = parts.matrix.sum(axis=0), parts.vector.sum(axis=0)
-    first = matrix.shape[0] - count * tables
-    unit = np.sqrt(np.diag(covariance_of(matrix[:first, :first]))[parts.law] * tables)
-    if not np.all(np.isfinite(unit)):
-        return Between(*np.full((4, count), np.nan))
-    # all but the departures are integrated out once and for all
-    scale = np.append(1.0 / np.sqrt(np.maximum(np.diag(matrix)[:first], 1e-300)), np.tile(unit, tables))
-    matrix = matrix * np.outer(scale, scale) - np.diag(np.append(np.zeros(first), np.tile(unit**2, tables)))
-    vector = vector * scale
-    gain = np.linalg.lstsq(
-        matrix[:first, :first], np.column_stack([matrix[:first, first:], vector[:first]]), rcond=None
-    )[0]
-    fisher = matrix[first:, first:] - matrix[first:, :first] @ gain[:, :-1]
-    pushed = vector[first:] - matrix[first:, :first] @ gain[:, -1]
-
-    def criterion(scatter: Float[np.ndarray, " l"]) -> tuple[float, Float[np.ndarray, " l"]]:
-        """Return -2 log of the restricted likelihood, but for a constant, and its gradient."""
-        s = np.tile(scatter, tables)
-        inner = s[:, None] * fisher * s + np.eye(s.size)
-        inverse = np.linalg.inv(inner)
-        likely = inverse @ (s * pushed)
-        turned = fisher @ (s * likely)
-        slope = 2.0 * (np.einsum("ij,j,ji->i", fisher, s, inverse) - likely * (pushed - turned))
-        value = np.linalg.slogdet(inner)[1] - (s * pushed) @ likely
-        return float(value), slope.reshape(tables, count).sum(axis=0)
-
-    def lowest(start: Float[np.ndarray, " l"], held: dict[int, float]) -> tuple[float, Float[np.ndarray, " l"]]:
-        """Return the minimum with some scatters held, and where it is."""
-        ends = [(held[i], held[i]) if i in held else (0.0, _LARGEST) for i in range(count)]
-        begin = np.clip(start, *np.array(ends).T)
-        found = minimize(criterion, begin, jac=True, bounds=ends, method="L-BFGS-B", options={"ftol": 1e-10})
-        return float(found.fun), found.x
-
-    least, best = min((lowest(np.full(count, start), {}) for start in _FIRST), key=lambda found: found[0])
-    ends = np.zeros((3, count))
-    for i in range(count):
-
-        def rise(value: float, i: int = i) -> float:
-            return lowest(best, {i: value})[0] - least
-
-        ends[0, i] = _crossing(lambda value: rise(value) - CHI2_95, best[i], 0.0) if best[i] > 0.0 else 0.0
-        ends[1, i] = _crossing(lambda value: rise(value) - CHI2_95, best[i], np.inf)
-        ends[2, i] = _crossing(lambda value: rise(value) - 1.0, best[i], np.inf)
-    ends[2] = np.where(np.isfinite(ends[2]), ends[2], best)
-    return Between(best * unit, *(ends * unit))
-
-
-def _crossing(above: Callable[[float], float], inside: float, last: float) -> float:
-    """Return where a function becomes positive between a place where it is not and the last one, or that."""
-    far = last
-    if last > inside:
-        far = max(2.0 * inside, 1.0)
-        while far < _LARGEST and above(far) < 0.0:
-            far *= 2.0
-    if far >= _LARGEST or above(far) < 0.0:
-        return last
-    return bracketed_root(above, inside, far, tolerance=1e-4)

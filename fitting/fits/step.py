@@ -169,7 +169,6 @@ class StepSystem:
         noise: covariance of the readings' residuals, of each row by itself.
         parameters: what moves.
         of_law: how many of the unknowns are coefficients of the law's discrepancy; the others belong to the rows.
-        stated: the covariance of the parameters that steps state; None: their own.
     """
 
     residual: Float[np.ndarray, " n"]
@@ -178,11 +177,6 @@ class StepSystem:
     noise: Float[np.ndarray, "readings readings"]
     parameters: StepParameters
     of_law: int = 0
-    stated: Float[np.ndarray, "k k"] | None = None
-
-    def with_unknowns(self, more: Float[np.ndarray, "readings m"]) -> "StepSystem":
-        """Return the system with further unknowns of unit variance, which belong to the rows."""
-        return replace(self, unknown=np.concatenate([self.unknown, more], axis=1))
 
     def without(self, place: int) -> "StepSystem":
         """Return the system without one of the unknowns of the law."""
@@ -236,7 +230,7 @@ class StepSystem:
             names=names,
             values=begin + change,
             change=change,
-            covariance=self.covariance if self.stated is None else self.stated,
+            covariance=self.covariance,
             chi2=float(np.sum((white + self.slope @ change) ** 2)),
             residual=left[:size] + self.unknown @ likely,
             unknown=likely,

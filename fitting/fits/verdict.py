@@ -78,8 +78,6 @@ class Evidence:
     """Whether a contact was fitted."""
     pulls: tuple[float, ...] = ()
     """Of several tables, the probability that each one's law is that of the others."""
-    scattering: bool = False
-    """Laws were allowed to differ from table to table."""
     run: tuple[float, float] = (0.0, 0.0)
     """Standard deviations by which residuals run together over the speed, and by which beside the discrepancy added."""
     unwidened: Float[np.ndarray, "rows k"] | None = None
@@ -91,8 +89,8 @@ class Evidence:
     short: float = 0.0
     """Share of the loss by which the model discrepancy of short range was added for that."""
     independent_residual: Float[np.ndarray, "rows k"] | None = None
-    """Residuals without what is common to rows: the most likely remainders of corrections, and departures of tables;
-    None: those of the rows."""
+    """Residuals without what is common to rows: the most likely remainders of corrections; None: those of
+    the rows."""
     stuck: tuple[float, float] | None = None
     """chi2 that no part of the step with the model discrepancy lowers, and what the step takes it to to first order."""
     courses: dict[str, list[str]] = field(default_factory=dict)
@@ -174,14 +172,14 @@ def correlation_excess(residual: Float[np.ndarray, "rows k"]) -> float:
 def _one_sided(evidence: Evidence) -> list[str]:
     """Return that some rows are off to one side: chance gives as large residuals of either sign.
 
-    A robust fit is for such rows, and those of tables whose laws scatter about the predicted one are off together.
+    A robust fit is for such rows.
     """
     residual = evidence.rows.residual if evidence.unwidened is None else evidence.unwidened
     count = np.isfinite(residual).sum(axis=1)
     of_row = np.nansum(residual, axis=1) / np.sqrt(np.maximum(count, 1))
     rows = int((count > 0).sum())
     excess = float(np.sum(of_row**3) / np.sqrt(15.0 * max(rows, 1)))
-    if rows <= _FEWEST_NEIGHBOURS or abs(excess) < _ONE_SIDED or evidence.robust or evidence.scattering:
+    if rows <= _FEWEST_NEIGHBOURS or abs(excess) < _ONE_SIDED or evidence.robust:
         return []
     far = np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)]
     side = "above" if excess > 0.0 else "below"
@@ -577,9 +575,8 @@ REASONS: Rules[Evidence] = (
         "Either that is wrong, or the model makes up for what it lacks.",
     ),
     Rule(
-        lambda e: [] if e.scattering else _disagreeing(e),
-        "The tables do not have one law: {case}; look at what is different there, leave it out, or let laws differ "
-        "from table to table (`hierarchical=True`).",
+        _disagreeing,
+        "The tables do not have one law: {case}; look at what is different there, or leave it out.",
     ),
     Rule(lambda e: e.freedom <= 0, "As many parameters as amplitudes: the goodness of fit cannot be judged."),
     Rule(_open_ones, "{case}."),
@@ -601,7 +598,6 @@ WARNINGS: Rules[Evidence] = (
         "Amplitudes are {case:.2g} nm in the median: were they written in micrometres for nanometres?",
     ),
     Rule(_repeat_warnings, "{case}"),
-    Rule(lambda e: _disagreeing(e) if e.scattering else [], "Far from the mean law even for this scatter: {case}."),
     Rule(
         lambda e: [_pull_in_words(e, name, by) for name, by in e.contradictions.items() if PULLED < abs(by) <= TORN],
         "{case}: check it, the loss depends on it.",

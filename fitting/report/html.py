@@ -37,12 +37,10 @@ from fitting.report.words import (
     parting_in_words,
     remarks_on,
     rounded_values,
-    scatter_in_words,
     tables_in_words,
     trust_in_words,
     value_in_words,
 )
-from fitting.sampling.bootstrap import Bootstrap
 from fitting.sampling.posterior_result import Posterior
 from fitting.tables.table import AmplitudeTable
 
@@ -77,7 +75,6 @@ def fit_page(
     pictures: Sequence[bytes],
     *,
     comparison: Comparison | None = None,
-    bootstrap: Bootstrap | None = None,
     posterior: Posterior | None = None,
 ) -> str:
     """Return the page; it is well-formed XML too.
@@ -86,7 +83,6 @@ def fit_page(
         result: the fit.
         pictures: SVG files of the rows, the law, and the residuals over the speed.
         comparison: other models of the same table, or None.
-        bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.
     """
     tables = _tables(result)
@@ -99,8 +95,7 @@ def fit_page(
         ReportSection("Correlations", [_correlations(result)]),
         *([ReportSection("Tables", tables, "Tables")] if tables else []),
         *([] if comparison is None else [_compared(comparison)]),
-        *([] if bootstrap is None else [_sampled("Bootstrap", bootstrap)]),
-        *([] if posterior is None else [_sampled("Posterior", posterior)]),
+        *([] if posterior is None else [_sampled(posterior)]),
         ReportSection("Rows", [_rows(result)], "Rows"),
         ReportSection("Minimum", [_minimum(result)]),
         ReportSection("Inputs", [part for table in result.table.tables for part in _input(table)], "Inputs"),
@@ -189,11 +184,11 @@ def _what_the_data_say(result: FitResult) -> Table:
 
 
 def _tables(result: FitResult) -> list[Table]:
-    """Return pulls of several tables, what each has to itself, and the scatter between them; nothing of one."""
+    """Return pulls of several tables, and what each has to itself; nothing of one."""
     if not result.tables:
         return []
-    captions = (PULLS, "Scatter of the law between tables", "What each table has to itself")
-    found = zip(captions, (tables_in_words(result), scatter_in_words(result), nuisances_in_words(result)), strict=True)
+    captions = (PULLS, "What each table has to itself")
+    found = zip(captions, (tables_in_words(result), nuisances_in_words(result)), strict=True)
     return [Table(caption, head, rows, words=("95 % interval", "unit")) for caption, (head, rows) in found if rows]
 
 
@@ -276,27 +271,24 @@ def _compared(comparison: Comparison) -> ReportSection:
     return ReportSection("Comparison of models", [Text(comparison.verdict), table], "Comparison of models")
 
 
-def _sampled(title: str, sampled: Bootstrap | Posterior) -> ReportSection:
-    """Return what a bootstrap or a posterior found: a row for each parameter, and everything else by name.
-
-    Args:
-        title: the section's heading.
-        sampled: what was found.
-    """
-    found = sampled.to_dict()
-    by_parameter, chains = found.pop("parameters"), found.pop("chains", {})
-    diagnostics = {name: chains.pop(name) for name in ("r_hat", "effective_samples") if name in chains}
+def _sampled(posterior: Posterior) -> ReportSection:
+    """Return the posterior: a row for each parameter, and everything else by name."""
+    found = posterior.to_dict()
+    by_parameter, chains = found.pop("parameters"), found.pop("chains")
+    diagnostics = {name: chains.pop(name) for name in ("r_hat", "effective_samples")}
     rows = [
         [name, *map(_cell, (*columns.values(), *(each[name] for each in diagnostics.values())))]
         for name, columns in by_parameter.items()
     ]
     head = ["parameter", *map(_title, (*next(iter(by_parameter.values())), *diagnostics))]
     others = found | {f"chains {name}": value for name, value in chains.items()}
-    others = {_title(name): value for name, value in others.items() if name != "correlations"}
+    others = {_title(name): value for name, value in others.items()}
     parts: list[Part] = []
-    if found.get("converged") is False:
+    if not posterior.converged:
         parts.append(Text(Markup("<strong>Not converged: do not use these numbers.</strong>")))
-    return ReportSection(title, [*parts, Table("By parameter", head, rows), pairs("Besides", ("", "value"), others)])
+    return ReportSection(
+        "Posterior", [*parts, Table("By parameter", head, rows), pairs("Besides", ("", "value"), others)]
+    )
 
 
 def _title(name: str) -> str:

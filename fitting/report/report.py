@@ -23,11 +23,9 @@ from fitting.report.words import (
     parting_in_words,
     repeats_in_words,
     rows_in_words,
-    scatter_in_words,
     tables_in_words,
     value_in_words,
 )
-from fitting.sampling.bootstrap import Bootstrap
 from fitting.sampling.posterior_result import Posterior
 from fitting.tables.several import SeveralTables
 
@@ -95,13 +93,13 @@ def _goodness_line(result: FitResult) -> str:
 
 
 def _table_sections(result: FitResult) -> list[ReportSection]:
-    """Return each of several tables' pull, what it has to itself, the scatter of laws, and what an impact takes."""
+    """Return each of several tables' pull, what it has to itself, and what an impact takes."""
     sections = []
     if result.tables:
         sections.append(ReportSection("Tables", [Table("", *tables_in_words(result)), Text(f"  {PULLS}.")]))
-        for head, rows in (scatter_in_words(result), nuisances_in_words(result)):
-            if rows:
-                sections.append(ReportSection("Tables", [Table("", head, rows, words=(head[1], head[-1]))]))
+        head, rows = nuisances_in_words(result)
+        if rows:
+            sections.append(ReportSection("Tables", [Table("", head, rows, words=(head[1], head[-1]))]))
     losses = losses_in_words(result) if result.valid else []
     if losses:
         head = ["what an impact takes", "95 % interval"]
@@ -164,7 +162,6 @@ def write_report(
     write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None],
     *,
     comparison: Comparison | None = None,
-    bootstrap: Bootstrap | None = None,
     posterior: Posterior | None = None,
 ) -> list[Path]:
     """Write fit.html, fit.txt, fit.json, fit.png, the law as law.csv and the table fit_rows.csv into a folder.
@@ -174,7 +171,6 @@ def write_report(
         folder: an existing folder; files of these names are replaced.
         write_table: called with a file name, records and columns for each CSV file.
         comparison: other models of the same table, for fit.html.
-        bootstrap: intervals from synthetic data sets, for fit.html.
         posterior: credible intervals, for fit.html.
 
     Returns:
@@ -188,7 +184,7 @@ def write_report(
     from fitting.report.plots import fit_pictures  # noqa: PLC0415
 
     picture, *pictures = fit_pictures(result)
-    page = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
+    page = fit_page(result, pictures, comparison=comparison, posterior=posterior)
     written = write_report_files(folder, "fit", text=summary(result), data=saved(result), picture=picture, page=page)
     records = row_records(result)
     write_table("fit_rows.csv", records, tuple(records[0]))

@@ -96,27 +96,13 @@ PULLS = (
 
 def nuisances_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
     """Return what each of several tables has to itself: the names of columns, and rows."""
-    departing = any(one.departures for one in result.tables)
     head = ["table", "of its own", "value", "95 % interval", "given"]
     rows = []
     for one in result.tables:
         for name, parameter in one.nuisances.items():
             given = "-" if parameter.constraint is None else "{:g} +- {:g}".format(*parameter.constraint)
             rows.append([one.name, name, value_in_words(parameter), interval_in_words(parameter), given])
-        if departing:
-            apart = ((name, by + 0.0) for name, by in one.departures.items())
-            rows += [[one.name, f"{name}, from the mean", f"{by:+.3g}", "", ""] for name, by in apart]
     return head, rows
-
-
-def scatter_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
-    """Return the scatter of the law between tables: the names of columns, and rows; none where it was not asked for."""
-    rows = []
-    for name, one in result.scatter.items():
-        low, high = one.interval95
-        ends = f"> {low:.3g}" if high is None else f"{low:.3g} to {high:.3g}" if low else f"< {high:.3g}"
-        rows.append([name, f"{one.value:.3g}", ends, one.unit])
-    return ["scatter between tables", "standard deviation", "95 % interval", "unit"], rows
 
 
 def formulas(result: FitResult) -> list[str]:

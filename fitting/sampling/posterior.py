@@ -21,8 +21,8 @@ from fitting.fits.result import FitResult
 from fitting.forward import Lanes, impacts_of, linearised
 from fitting.models import Measurement, Problem
 from fitting.parameters import Parameter
-from fitting.sampling.bootstrap import Refit, compact, objective_of, require_valid, standard_covariance
 from fitting.sampling.posterior_result import Posterior, PosteriorChains, posterior_of_chains
+from fitting.sampling.refit import Refit, compact, objective_of, require_valid, standard_covariance
 
 FEWEST_SAMPLES = 100
 CHAINS = 4
@@ -237,7 +237,7 @@ def log_density_of(refit: Refit, covariance: Float[np.ndarray, "p p"], log_unifo
     """Return the log density of a fit's posterior, in the space that is scaled by its covariance.
 
     Args:
-        refit: the fit, from `fitting.sampling.bootstrap.objective_of`; its orbits are followed.
+        refit: the fit, from `fitting.sampling.refit.objective_of`; its orbits are followed.
         covariance: of its values.
         log_uniform: parameters whose prior is flat in the logarithm of their loss.
 

@@ -37,7 +37,7 @@ class PosteriorChains:
     statistics: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-@public_result(picture="fitting.report.pair_plots:posterior_figure")
+@public_result()
 @dataclass(frozen=True, eq=False)
 class Posterior(Result):
     """The posterior of a fit's parameters.

@@ -36,7 +36,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "basins_of_attraction": lambda: afm.basins_of_attraction(bouncing(), columns=2, rows=2),
     "bifurcation_diagram": lambda: afm.bifurcation_diagram(bouncing(), "platform.amplitude_nm", np.array([1.0, 2.0])),
-    "bootstrap": lambda: fitting.bootstrap(fitting.fit(fitting.read_table(TABLE))),
     "calibrate": lambda: fitting.calibrate(fitting.read_sweep(EXAMPLES / "real" / "thermal_nanosurf.nid")),
     "compare": lambda: fitting.compare(fitting.read_table(TABLE)),
     "contact_orbits": lambda: afm.contact_orbits(_contact(), 1, 1),
@@ -82,7 +81,7 @@ NO_NUMBERS = {
     *("load", "load_law", "load_scene", "save_law", "save_scene", "scene_family", "use_cache", "trajectory"),
     *("prior_of_values", "design", "drive_grid", "equipartition", "fit_each", "lockin", "posterior", "read_curve"),
     *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "sensitivity", "tapping_map"),
-    *("tapping_together", "table_of_curve", "write_inference_data", "write_table"),
+    *("tapping_together", "table_of_curve", "write_table"),
 }
 
 

@@ -233,19 +233,7 @@ FIT = Command(
             "--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have."
         ),
         flag("--compare", "Fit the rival models too and say what the table can tell.", into="comparing"),
-        click.option(
-            "--bootstrap",
-            type=click.IntRange(min=50, max=100_000),
-            metavar="SAMPLES",
-            help="Intervals by refitting this many synthetic tables, too.",
-        ),
         flag("--posterior", "Credible intervals, too, by the no-U-turn sampler (extra `nuts`)."),
-        click.option(
-            "--arviz",
-            metavar="FILE.nc",
-            type=click.Path(path_type=Path, dir_okay=False),
-            help="Write the posterior for ArviZ (with --posterior; extras `arviz` and `nuts`).",
-        ),
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the random numbers."),
         click.option(
             "--share",
@@ -254,7 +242,6 @@ FIT = Command(
             help="Of several tables: nuisances (of --constrain) that all have in common, or all; left out, each has "
             "its own.",
         ),
-        flag("--hierarchical", "Let the laws of several tables scatter around their mean, and say how much."),
         flag("--example", "Fit the bundled table instead of a file."),
         flag("--each", "Fit each of several tables by itself; with --out what is done is kept."),
         click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes for --each, by Dask."),

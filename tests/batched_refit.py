@@ -1,95 +1,127 @@
-"""A posterior as a netCDF file in ArviZ's layout: a group each for draws, predictions, likelihoods and readings.
+"""Many synthetic tables of one fit, fitted at once, and densities of its posterior: for studies of coverage and ranks.
 
-ArviZ computes leave-one-out, Pareto k by row and predictive checks of it.
+A data set enters the residuals only as a shift: (predicted - measured_k)/error = (predicted - measured)/error +
+(measured - measured_k)/error. One compiled program therefore serves all of them, and since every fit starts at the same
+values, the first linearisation serves all of them too.
 """
 
-import importlib
-import importlib.util
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import kve
+from scipy.stats import genhyperbolic
 
-from afm_jax.checks import checked
-from afm_jax.version import __version__
-from afm_jax.whole_files import write_whole
-from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
+from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
+from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square, softened
 from fitting.fits.result import FitResult
 from fitting.models import Problem
-from fitting.sampling.bootstrap import Refit, objective_of, plain, telling_rows
 from fitting.sampling.posterior_result import Posterior
+from fitting.sampling.refit import Refit, objective_of, telling_rows
 
 DRAWS = 250
-"""Draws of each chain that are written, evenly spaced."""
-READINGS = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_deg")
+"""Draws of each chain that are taken, evenly spaced."""
+_STEPS = 40
+_SETTLED = 1e-6
+"""Estimated distance of chi2 to its minimum at which a data set is done: values within a thousandth of an error."""
 
 
-def require_netcdf() -> Any:
-    """Return xarray, which writes such files.
+class DataSets(NamedTuple):
+    """Readings of shape (sets, rows, k), and the measured values of the constrained parameters, shape (sets, p)."""
 
-    Raises:
-        ModuleNotFoundError: if it or h5netcdf is not installed.
+    amplitude_nm: Float[np.ndarray, "sets rows k"]
+    constraint_value: Float[np.ndarray, "sets p"]
+
+
+class BatchFit(NamedTuple):
+    """The fits of several data sets.
+
+    Attributes:
+        values: of the parameters.
+        chi2: there; with a robust loss the soft sum.
+        covariance: Fisher's, infinite where a direction is not determined.
+        converged: the estimated distance to the minimum is small.
     """
-    for package in ("xarray", "h5netcdf"):
-        if importlib.util.find_spec(package) is None:
-            raise ModuleNotFoundError(
-                f"a file for ArviZ needs the package {package}: pip install 'afm-jax[arviz]'", name=package
-            )
-    return importlib.import_module("xarray")
+
+    values: Float[np.ndarray, "sets p"]
+    chi2: Float[np.ndarray, " sets"]
+    covariance: Float[np.ndarray, "sets p p"]
+    converged: Bool[np.ndarray, " sets"]
 
 
-@checked
-def write_inference_data(result: FitResult, found: Posterior, path: str | Path, *, seed: int = 0) -> None:
-    """Write a posterior for ArviZ: `arviz.from_netcdf(path)` reads it.
+def draw_data(refit: Refit, sets: int, random: np.random.Generator) -> DataSets:
+    """Return data sets as they would have been measured if the fitted values were the truth.
 
-    The groups are posterior, sample_stats, log_likelihood (of each row's readings together), posterior_predictive and
-    observed_data; rows are named by their lines in the table's file.
+    Amplitudes scatter about the fitted ones by the rows' errors, and constraints, which are measurements as well, about
+    the fitted parameters by theirs.
 
     Args:
-        result: from `fitting.fit`.
-        found: its posterior, from `fitting.posterior`.
-        path: of the file.
-        seed: of the replicated noise.
-
-    Raises:
-        ModuleNotFoundError: if xarray or h5netcdf is not installed (extra `arviz`).
-        OSError: if the file cannot be written.
+        refit: the fit, from `fitting.sampling.refit.objective_of`.
+        sets: how many.
+        random: the generator that is drawn from.
     """
-    xarray = require_netcdf()
-    draws = posterior_draws(result, found, seed=seed)
-    lines, draw = result.table.lines[draws.rows], ("chain", "draw")
-    steps = {name: np.arange(size) for name, size in zip(draw, draws.values.shape, strict=False)}
-    predictive, observed, places = {}, {}, {}
-    for kind, name in enumerate(READINGS[: draws.measured.shape[1]]):
-        read = np.isfinite(draws.measured[:, kind])
-        if read.any():
-            place = f"{name}_line"
-            places[place] = lines[read]
-            predictive[name] = (*draw, place), draws.replicated[:, :, read, kind]
-            observed[name] = place, draws.measured[read, kind]
-    chains = {name: (draw, column) for name, column in draws.statistics.items()}
-    groups = {
-        "posterior": ({name: (draw, draws.values[..., i]) for i, name in enumerate(draws.names)}, steps),
-        "sample_stats": (chains, steps),
-        "log_likelihood": ({"readings": ((*draw, "line"), draws.log_likelihood)}, steps | {"line": lines}),
-        "posterior_predictive": (predictive, steps | places),
-        "observed_data": (observed, places),
-    }
-    about = {
-        "inference_library": "afm-jax",
-        "inference_library_version": __version__,
-        "model": result.model,
-        "table": result.table.source,
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / "whole.nc"
-        for group, (variables, coordinates) in groups.items():
-            data = xarray.Dataset(variables, coords=coordinates, attrs=about)
-            data.to_netcdf(whole, group=group, mode="a" if whole.exists() else "w", engine="h5netcdf")
-        write_whole(path, whole.read_bytes(), named_by_user=True)
+    objective, values = refit
+    rows, constraint = objective.measurement.rows, objective.measurement.constraint_error
+    predicted = np.asarray(objective.at_values(values[None]).prediction.amplitude_nm)[0]
+    errors = np.where(np.asarray(rows.measured), np.asarray(rows.error_nm), 0.0)
+    known = np.where(np.isfinite(np.asarray(constraint)), np.asarray(constraint), 0.0)
+    return DataSets(
+        amplitude_nm=predicted + errors * random.normal(size=(sets, *errors.shape)),
+        constraint_value=values + known * random.normal(size=(sets, known.size)),
+    )
+
+
+def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
+    """Fit every data set by damped Gauss-Newton steps (Levenberg, Marquardt) from the fit's values.
+
+    Args:
+        refit: the fit that the data sets resemble; its orbits are followed.
+        data: from `draw_data`.
+
+    Returns:
+        The fits. A parameter at an end of its range is held there while chi2 falls towards the outside.
+    """
+    objective, sets = refit.objective, len(data.amplitude_nm)
+    shift = shifts(objective, data)
+    start = np.broadcast_to(refit.values, (1, refit.values.size))
+    one = plain(objective).at_values(start)
+    residual = np.asarray(one.residual) + shift
+    jacobian = np.repeat(np.asarray(one.jacobian), sets, axis=0)
+    start = _searches(objective, np.repeat(start, sets, axis=0), residual, jacobian)
+
+    def look(values: Float[np.ndarray, "some p"], some: Int[np.ndarray, " some"]) -> Searches:
+        found = plain(objective).at_values(values)
+        return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
+
+    lowest, highest = objective.problem.ends
+    box = Box(lowest, highest, np.zeros((sets, refit.values.size), dtype=bool))
+    end = descended(look, start, box, settled=_SETTLED, most=_STEPS)
+    normal = np.einsum("snp,snq->spq", end.jacobian, end.jacobian)
+    return BatchFit(end.place, end.chi2, whole_covariance_of(normal), distance(end, box) <= _SETTLED)
+
+
+def shifts(objective: Objective, data: DataSets) -> Float[np.ndarray, "sets n"]:
+    """Return what each data set adds to the residuals of the table itself."""
+    rows, known = objective.measurement.rows, objective.measurement
+    weight = np.where(np.asarray(rows.measured), 1.0 / np.asarray(rows.error_nm), 0.0)
+    amplitudes = weight * (np.asarray(rows.amplitude_nm) - data.amplitude_nm)
+    constraints = (np.asarray(known.constraint_value) - data.constraint_value) / np.asarray(known.constraint_error)
+    sets, count = amplitudes.shape[:2]
+    return np.concatenate([amplitudes.reshape(sets, -1), np.zeros((sets, count)), constraints], axis=1)
+
+
+def plain(objective: Objective) -> Objective:
+    """Return the objective without its soft loss, which is applied after the shift."""
+    return Objective(objective.measurement, objective.problem, near=objective.near)
+
+
+def _searches(objective: Objective, values, residual, jacobian) -> Searches:
+    """Return the searches with the loss applied: residuals whose squares add up to it."""
+    if objective.robust:
+        residual, slope = softened(residual)
+        jacobian = jacobian * slope[:, :, None]
+    return Searches(values, residual, jacobian, np.sum(residual**2, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +215,6 @@ def densities(
         log_uniform: as the posterior's.
         shift: what other readings add to the residuals, of all sets or of each.
     """
-    from scipy.special import kve  # noqa: PLC0415 (most fits need no SciPy)
-
     prediction = plain(objective).at_values(values)
     rows, predicted = objective.measurement.rows, np.asarray(prediction.prediction.amplitude_nm)
     residual = np.asarray(prediction.residual) + shift
@@ -218,8 +248,6 @@ def noise_of(objective: Objective, sets: int, random: np.random.Generator) -> Fl
     shape: Any = (sets, *used.shape)
     standard = random.normal(size=shape)
     if objective.robust:
-        from scipy.stats import genhyperbolic  # noqa: PLC0415 (most fits need no SciPy)
-
         # e^(-s^2 sqrt(1 + x^2/s^2)), with s the softness
         standard = genhyperbolic(1.0, ROBUST**2, 0.0, scale=ROBUST).rvs(size=shape, random_state=random)
     return np.where(used, np.asarray(rows.error_nm), 0.0) * standard

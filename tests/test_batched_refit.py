@@ -1,13 +1,12 @@
-"""The bootstrap: synthetic data as they are meant, fitted as tables are, errors as the Fisher information has them."""
-
-import dataclasses
+"""Many synthetic tables fitted at once: data as they are meant, fits as of tables, errors of the Fisher information."""
 
 import numpy as np
 import pytest
 
 from afm_jax.impact.law import ImpactLaw
-from fitting import bootstrap, fit
-from fitting.sampling.bootstrap import DataSets, compact, draw_data, fit_data_sets, objective_of
+from fitting import fit
+from fitting.sampling.refit import compact, objective_of
+from tests.batched_refit import DataSets, draw_data, fit_data_sets
 from tests.fit_tables import (
     example_amplitudes,
     example_fit,
@@ -27,11 +26,6 @@ SAMPLES = 200
 @pytest.fixture(scope="module")
 def result():
     return fit_of_every_fourth()
-
-
-@pytest.fixture(scope="module")
-def boot(result):
-    return bootstrap(result, SAMPLES, seed=4)
 
 
 @pytest.mark.parametrize("robust", [False, True])
@@ -81,24 +75,21 @@ def test_the_tables_own_data_give_the_fit(result):
     np.testing.assert_allclose(apart, 0.0, atol=2e-3)
 
 
-def test_errors_agree_with_the_fisher_information(result, boot):
-    assert boot.failures == 0
-    assert boot.samples.shape == (SAMPLES, 3)
+def test_errors_agree_with_the_fisher_information(result):
+    refit = compact(objective_of(result))
+    found = fit_data_sets(refit, draw_data(refit, SAMPLES, np.random.default_rng(4)))
+    assert found.converged.all()
     # four standard errors of a width: this problem is close to linear
-    tolerance = 4.0 / np.sqrt(2 * SAMPLES)
-    assert list(boot.standard_error.values()) == pytest.approx(standard_errors_of(result), rel=tolerance)
-    for name, parameter in result.parameters.items():
-        value, error = parameter.value, parameter.standard_error
-        assert abs(boot.bias[name]) < 4.0 * error / np.sqrt(SAMPLES)
-        # a 2.5 % quantile of 200 draws scatters by 0.19 errors
-        low, high = boot.interval95[name]
-        assert (low, high) == pytest.approx(parameter.interval95, abs=4.0 * 0.19 * error)
-        assert boot.basic_interval95[name] == pytest.approx((2 * value - high, 2 * value - low), rel=1e-12)
-    assert boot.correlations == pytest.approx(result.correlations, abs=4.0 / np.sqrt(SAMPLES))
-
-
-def test_the_seed_decides(result, boot):
-    assert np.array_equal(bootstrap(result, SAMPLES, seed=4).samples, boot.samples)
+    errors, tolerance = standard_errors_of(result), 4.0 / np.sqrt(2 * SAMPLES)
+    assert found.values.std(axis=0, ddof=1) == pytest.approx(errors, rel=tolerance)
+    off = found.values.mean(axis=0) - values_of(result)
+    np.testing.assert_array_less(np.abs(off), 4.0 * np.asarray(errors) / np.sqrt(SAMPLES))
+    # a 2.5 % quantile of 200 draws scatters by 0.19 errors
+    ends = np.quantile(found.values, [0.025, 0.975], axis=0).T
+    stated = np.array([parameter.interval95 for parameter in result.parameters.values()])
+    np.testing.assert_array_less(np.abs(ends - stated), 4.0 * 0.19 * np.asarray(errors)[:, None])
+    correlations = np.corrcoef(found.values.T)
+    assert correlations == pytest.approx(result.correlations, abs=4.0 / np.sqrt(SAMPLES))
 
 
 def test_a_parameter_at_its_bound_stays_inside():
@@ -112,8 +103,3 @@ def test_a_parameter_at_its_bound_stays_inside():
     assert epsilon.min() == 0.0
     # half of the noise would want it negative; four binomial standard deviations
     assert abs(np.mean(epsilon < 1e-2) - 0.5) < 4.0 * np.sqrt(0.25 / SAMPLES)
-
-
-def test_wrong_calls_are_refused_in_one_line(result):
-    with pytest.raises(ValueError, match=r"the fit of the model 'law' is not valid \(why not\); mend it first"):
-        bootstrap(dataclasses.replace(result, valid=False, reasons=["why not"]))
