@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw
+from afm_jax.impact.law import ImpactLaw
 from fitting import design, drive_grid, fit, prior_of_values
 from fitting.experiments.candidates import candidates_of
 from fitting.experiments.prior import Prior, prior_of_fit
@@ -39,35 +39,6 @@ def drives() -> Drives:
 @pytest.fixture(scope="module")
 def of_law(drives) -> Design:
     return design(law_prior(), drives, points=5, noise=NOISE)
-
-
-def test_a_law_is_believed_as_its_closest_formula():
-    u = np.geomspace(12.0, 300.0, 12)
-    w = np.sqrt((0.95 * u) ** 2 - 60.0)
-    covariance = np.array([[4e-8, 2e-5], [2e-5, 0.25]])
-    # u_out changes with r and epsilon, which change with two independent unknowns
-    changes = np.linalg.cholesky(covariance).T @ np.stack([0.95 * u**2 / w, -0.5 / w])
-    law = TabulatedLaw.with_errors(u, w, rebound_changes=changes, mass_ng=2.0, origin="a test")
-    found = prior_of_values("law", free_frequency_khz=90.0, quality_factor=40.0, law=law)
-    np.testing.assert_allclose(found.values, [0.95, 60.0], rtol=1e-9)
-    np.testing.assert_allclose(np.linalg.inv(found.information), covariance, rtol=0.02)
-    assert found.mass_ng == 2.0
-    # what is given counts more; of what the law does not tell the paper's is taken
-    found = prior_of_values("law+delay", free_frequency_khz=90.0, law=law, values={"r": 0.9})
-    assert found.values[0] == 0.9
-    assert "taken from the paper's contact: delay_hertz, delay_lead_nm, delay_offset_nm" in found.notes[1]
-    # a formula is a law, too; one that no member is meets it as far as it says
-    wet = ImpactLaw(1.0, 114.0, 0.48, CollisionDelay(0.2, 5.6, 0.7))
-    found = prior_of_values("viscous+delay", free_frequency_khz=90.0, law=wet)
-    np.testing.assert_allclose(found.values, [114.0, 0.48, 0.2, 5.6, 0.7], rtol=1e-6)
-    found = prior_of_values("law", free_frequency_khz=90.0, law=wet)
-    u = np.geomspace(1.05 * float(wet.capture_speed_nm_per_us), 500.0, 1000)
-    other = ImpactLaw(*found.values).rebound_speed(u)
-    off = 100.0 * np.abs(np.asarray(other / wet.rebound_speed(u)) - 1.0).max()
-    # two digits are told
-    assert float(found.notes[0].split("at most ")[1].split(" %")[0]) == pytest.approx(off, rel=0.05)
-    with pytest.raises(ValueError, match=r"the law is that of a tip of 2 ng, but the cantilever's `mass_ng` is 1"):
-        prior_of_values("law", free_frequency_khz=90.0, mass_ng=1.0, law=law)
 
 
 POINT = np.array([LAW["r"], LAW["epsilon"], QUALITY_FACTOR[0]])

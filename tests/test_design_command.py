@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from afm_jax.cli.design_prior import prior_of_options
 from afm_jax.cli.main import main
-from fitting import fit, read_table, write_table
+from fitting import fit, read_table
 from tests.answers import answer as answer_of
 from tests.answers import table as records
 from tests.fit_tables import EXAMPLE, rows
@@ -83,15 +83,15 @@ def test_a_saved_fit_is_added_to(tmp_path):
     assert after < before
 
 
-def test_a_measured_table_is_fitted_first(tmp_path):
+def test_what_was_measured_is_not_planned_again(tmp_path):
     table = rows(read_table(EXAMPLE), slice(0, 20))
-    path = tmp_path / "table.csv"
-    write_table(table, path)
+    path = tmp_path / "fit.json"
+    path.write_text(json.dumps(fit(table, "law").to_dict()), encoding="utf-8")
     columns = (table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
     frequency, drive, offset = (float(np.asarray(column)[0]) for column in columns)
     heights = f"{offset},{offset + 0.125}"
     grid = ("--orders", table.order[0], "--frequencies-khz", frequency, "--drive-nm", drive, "--offsets-nm", heights)
-    found = run("--measured", path, "--model", "law", *grid, "--points", 1, "--json")
+    found = run("--fit", path, *grid, "--points", 1, "--json")
     assert found.exit_code == 0, found.stderr
     answer = strictly(found.stdout)
     assert answer["prior"]["rows_measured"] == 20
@@ -110,6 +110,6 @@ def test_nothing_to_measure_is_not_valid():
 
 def test_what_is_held_is_not_forecast():
     options = {"model": "full", "uncertainty": 0.1, "free_frequency_khz": (90.0, None), "fixed": (("r", 0.9),)}
-    prior = prior_of_options(options, 0.01)
+    prior = prior_of_options(options)
     assert prior.problem.names == ("epsilon", "viscous_loss")
     assert prior.fixed == {"r": 0.9}

@@ -31,7 +31,7 @@ def planned(  # noqa: PLR0913
 ) -> Output:
     """Return the drives to measure next, of all combinations of the lists, and what they will determine."""
     with session.working("forecasting (the first run compiles for some seconds)"):
-        prior = prior_of_options(options, noise)
+        prior = prior_of_options(options)
         chosen = _with_defaults(options, tapping=prior.problem.tapping)
         drives = drive_grid(
             orders=chosen["orders"],

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.fit_options import Fixed, checked_model, named_parameter
-from afm_jax.cli.values import Finite, ValueAndError, example_path, option_of
+from afm_jax.cli.values import Finite, ValueAndError, option_of
 from afm_jax.whole_files import in_callers_words
 from fitting.parameters import DELAY, DRIFT_NAMES, LAW, MODELS, NUISANCES, PARAMETERS
 
 if TYPE_CHECKING:
-    from afm_jax.impact.law import TabulatedLaw
     from fitting.experiments.prior import Prior
 
 _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
@@ -21,23 +20,16 @@ _REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; n
 _NUISANCES = tuple(nuisance for nuisance in NUISANCES if nuisance.name not in DRIFT_NAMES)
 _NUISANCE_NAMES = tuple(nuisance.name for nuisance in _NUISANCES)
 _BELONG = ("mass_ng", "spring_constant_n_per_m", "free", "fixed", "value", *_LAW, *_NUISANCE_NAMES)
-"""What says the law and the cantilever, where no file does."""
-
-
-def _file(name: str, metavar: str, text: str) -> Any:
-    return click.option(f"--{name}", type=click.Path(path_type=Path), metavar=metavar, help=text)
+"""What says the law and the cantilever, where no fit does."""
 
 
 PRIOR_OPTIONS = (
-    _file(
-        "law",
-        "FILE",
-        "A law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: the model's formula that "
-        "is closest to it is planned with. A fit.json is what --fit is.",
+    click.option(
+        "--fit",
+        type=click.Path(path_type=Path),
+        metavar="JSON",
+        help="A fit to add to, as `afm-jax fit --json` writes it, or its folder.",
     ),
-    _file("fit", "JSON", "A fit to add to, as `afm-jax fit --json` writes it."),
-    click.option("--example", is_flag=True, help="Add to the bundled table: --measured with it, --model law."),
-    _file("measured", "CSV", "An amplitude table to add to: it is fitted first."),
     click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
     click.option(
         "--spring-constant-n-per-m", type=Finite(), metavar="X", help="Or its spring constant, whose mass is k/Omega^2."
@@ -46,7 +38,7 @@ PRIOR_OPTIONS = (
     click.option(
         "--drive",
         type=click.Choice(("sample", "force", "base")),
-        help="What is driven: the sample, or the cantilever itself; else the sample, or as measured.",
+        help="What is driven: the sample, or the cantilever itself; else the sample.",
     ),
     click.option(
         "--fix", "fixed", type=Fixed(), multiple=True, metavar="NAME=X", help="A parameter that is not fitted."
@@ -75,71 +67,37 @@ PRIOR_OPTIONS = (
 """What is known before: `prior_of_options` takes what a call says of them."""
 
 
-def check_prior(options: dict[str, Any]) -> None:
-    """Put the bundled table in the place of --example.
-
-    Raises:
-        click.UsageError: if another table is named, too.
-    """
-    if options.pop("example"):
-        if options["measured"] is not None:
-            raise click.UsageError("--measured and --example both name a table; give one of them")
-        options |= {"measured": example_path(), "model": options["model"] or "law"}
-
-
-def prior_of_options(options: Mapping[str, Any], noise: float) -> "Prior":
+def prior_of_options(options: Mapping[str, Any]) -> "Prior":
     """Return the prior that the options describe.
 
     Args:
         options: what a call says of `PRIOR_OPTIONS`; what it does not say may be absent.
-        noise: relative error of amplitudes of a measured table that has none of its own.
 
     Raises:
         click.UsageError: if they contradict each other, or say nothing of the cantilever.
-        ValueError: if a value is impossible, or a file cannot be read.
+        ValueError: if a value is impossible, or the file cannot be read.
     """
     given = {name: options[name] for name in _BELONG if options.get(name) not in (None, ())}
-    files = {name: options[name] for name in ("fit", "measured", "law") if options.get(name) is not None}
-    if len(files) > 1:
-        first, second, *_ = map(option_of, files)
-        raise click.UsageError(f"{first} and {second} both say what is known; give one of them")
-    if not files:
+    path = options.get("fit")
+    if path is None:
         return _from_values(options, given)
-    ((source, path),) = files.items()
-    if source == "law":
-        from afm_jax.scenefile.law_files import law_and_fit  # noqa: PLC0415
-
-        law, found = law_and_fit(path)
-        if not found:
-            return _from_values(options, given, law)
-        path = path / "fit.json" if path.is_dir() else path
     for name in (*given, *(["drive"] if options.get("drive") is not None else [])):
-        if source != "measured" or name not in {"free", "fixed"}:
-            said = f"`{name}` is what `{source}=...` says already; leave one of them out"
-            raise click.UsageError(in_callers_words(said))
-    from fitting.experiments.prior import prior_of_fit, read_prior  # noqa: PLC0415
+        said = f"`{name}` is what `fit=...` says already; leave one of them out"
+        raise click.UsageError(in_callers_words(said))
+    from fitting.experiments.prior import read_prior  # noqa: PLC0415
 
-    uncertainty, model = options["uncertainty"], options.get("model")
-    if source != "measured":
-        prior, _ = read_prior(path, uncertainty)
-        if model not in (None, prior.problem.model):
-            raise click.UsageError(f"{path} is a fit of the model {prior.problem.model}, not {model}")
-        return prior
-    from fitting.fits.fit import fit  # noqa: PLC0415
-    from fitting.tables.table import read_table  # noqa: PLC0415
-
-    table = read_table(path, noise=noise)
-    free, fixed = _names(given), dict(given.get("fixed", ()))
-    return prior_of_fit(fit(table, model or "law+delay", free=free, fixed=fixed), uncertainty)
+    prior, _ = read_prior(path / "fit.json" if path.is_dir() else path, options["uncertainty"])
+    if options.get("model") not in (None, prior.problem.model):
+        raise click.UsageError(f"{path} is a fit of the model {prior.problem.model}, not {options['model']}")
+    return prior
 
 
-def _from_values(options: Mapping[str, Any], given: Mapping[str, Any], law: "TabulatedLaw | None" = None) -> "Prior":
+def _from_values(options: Mapping[str, Any], given: Mapping[str, Any]) -> "Prior":
     from fitting.experiments.prior import prior_of_values  # noqa: PLC0415
 
-    usual = "law+delay" if law is None or law.delayed else "law"
-    model, free = options.get("model") or usual, _names(given)
+    model, free = options.get("model") or "law+delay", _names(given)
     if "free_frequency_khz" not in given:
-        raise click.UsageError("give --free-frequency-khz (and --quality-factor), or --fit or --measured")
+        raise click.UsageError("give --free-frequency-khz (and --quality-factor), or --fit")
     quality_factor, _ = given.get("quality_factor", (None, None))
     fixed, contact = dict(given.get("fixed", ())), dict(given.get("value", ()))
     own = checked_model(model, free, fixed)
@@ -159,7 +117,6 @@ def _from_values(options: Mapping[str, Any], given: Mapping[str, Any], law: "Tab
         fixed=fixed | {name: value for name, value in contact.items() if name not in own},
         uncertainty=options["uncertainty"],
         drive=options.get("drive") or "sample",
-        law=law,
     )
 
 

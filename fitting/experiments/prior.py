@@ -7,24 +7,20 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.apparatus.cantilever import Cantilever, mass_of
-from afm_jax.apparatus.scene import check_mass
+from afm_jax.apparatus.cantilever import mass_of
 from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw, closest_delay, law_of_dict
+from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
-from fitting.fits.law_after import closest_loss, nearness, rebound_by_formula
 from fitting.fits.result import FitResult
 from fitting.models import Problem, check_constraints
 from fitting.parameters import (
-    DELAY_NAMES,
     MODELS,
     NUISANCE_NAMES,
     PARAMETERS,
@@ -64,7 +60,7 @@ class Prior(Result):
         measured: drives that were measured already, rows of order, frequency, amplitude, offset.
         source: where the prior comes from, in words.
         notes: what a reader of the design should know of it; a sentence each.
-        law: that the values are the closest formula's to; None: they were given.
+        law: of the fit, whose closest formula has these values; None: they were given.
     """
 
     problem: Problem
@@ -79,7 +75,7 @@ class Prior(Result):
     measured: Float[np.ndarray, "rows 4"] = field(default_factory=lambda: np.zeros((0, 4)))
     source: str = "values given"
     notes: tuple[str, ...] = ()
-    law: ImpactLaw | TabulatedLaw | None = None
+    law: TabulatedLaw | None = None
 
     def draws(self, count: int, *, least: float = 0.0) -> Float[np.ndarray, "count p"]:
         """Return values that are as likely as the prior is uncertain, the prior ones first; seeded.
@@ -124,7 +120,6 @@ def prior_of_values(  # noqa: PLR0913
     effects: Sequence[str] = EFFECTS,
     uncertainty: float = UNCERTAINTY,
     drive: str = "sample",
-    law: ImpactLaw | TabulatedLaw | None = None,
 ) -> Prior:
     """Return a prior made of values, before anything was measured.
 
@@ -142,12 +137,9 @@ def prior_of_values(  # noqa: PLR0913
         effects: for "contact": the effects there are.
         uncertainty: how far the values may be off, relative (0.1 stands for 10 %).
         drive: what is driven: "sample", "force" (on the tip) or "base".
-        law: of a contact or measured, from `load_law`: parameters without a value are those of the model's formula
-            closest to it, and its errors are known of them.
 
     Raises:
-        ValueError: if a name or value is impossible, the model has no formula that could be close to a law, or the law
-            is that of a tip of another mass.
+        ValueError: if a name or value is impossible.
     """
     check_drive(drive)
     for name, value, allowed in (
@@ -168,26 +160,13 @@ def prior_of_values(  # noqa: PLR0913
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
     if spring_constant_n_per_m is not None:
         mass_ng = float(mass_of(free_frequency_khz, mass_ng, spring_constant_n_per_m))
-    closest = _Closest({}, np.zeros((0, 0)), ())
-    if law is not None:
-        if mass_ng is None:
-            mass_ng = None if (of_law := getattr(law, "mass_ng", None)) is None else float(of_law)
-        else:
-            check_mass(law, Cantilever(free_frequency_khz, None, mass_ng))
-        closest = _closest_to(law, model, dict(fixed or {}))
-    assumed = [name for name in own if name not in given and name not in known and name not in closest.values]
+    assumed = [name for name in own if name not in given and name not in known]
     start = (
         paper_values(model, 1.0 if mass_ng is None else mass_ng)
-        | closest.values
         | {name: value for name, (value, _) in known.items()}
         | given
     )
     information = np.diag([known[name][1] ** -2.0 if name in known else 0.0 for name in problem.names])
-    places = [problem.names.index(name) if name not in given else -1 for name in closest.values]
-    told = np.flatnonzero(np.array(places, int) >= 0)
-    if closest.information.size and told.size:
-        among = np.array(places)[told]
-        information[np.ix_(among, among)] += closest.information[np.ix_(told, told)]
     return Prior(
         problem=problem,
         values=checked_values(problem, start),
@@ -198,81 +177,9 @@ def prior_of_values(  # noqa: PLR0913
         fixed=dict(fixed or {}),
         uncertainty=uncertainty,
         constraints=known,
-        source=_source(law, assumed),
-        notes=closest.notes + _assumptions(assumed, quality_factor, known),
-        law=law,
+        source="values assumed" if assumed else "values given",
+        notes=_assumptions(assumed, quality_factor, known),
     )
-
-
-def _source(law: Law | None, assumed: list[str]) -> str:
-    if law is None:
-        return "values assumed" if assumed else "values given"
-    origin = law.origin.text if isinstance(law, TabulatedLaw) else ""
-    return f"a law ({origin})" if origin else "a law"
-
-
-class _Closest(NamedTuple):
-    """A model's formula closest to a law: its values, the information that the law's errors leave, what to know."""
-
-    values: dict[str, float]
-    information: Float[np.ndarray, "p p"]
-    notes: tuple[str, ...]
-
-
-_LAW_POINTS = 60
-_FASTEST_NM_PER_US = 500.0
-"""Up to which a formula is compared with another one."""
-
-
-def _closest_to(law: Law, model: str, fixed: Mapping[str, float]) -> _Closest:
-    """Return the formula of a model closest to a law over the speeds that it is known for, as u_out is to be close.
-
-    Raises:
-        ValueError: if the model has no formula.
-    """
-    if model == "contact":
-        raise ValueError("a law says nothing of a contact's parameters: choose another model, such as law+delay")
-    slowest = 1.05 * float(law.capture_speed_nm_per_us) or 1.0
-    low, high = slowest, _FASTEST_NM_PER_US
-    if isinstance(law, TabulatedLaw):
-        low, high = max(float(law.slowest_nm_per_us), slowest), float(law.fastest_nm_per_us)
-    u = np.geomspace(low, high, _LAW_POINTS)
-    own = [name for name in MODELS[model] if name not in fixed]
-    late = model.endswith("+delay") and law.delayed
-    if not late:
-        own = [name for name in own if name not in DELAY_NAMES]
-
-    losses = [name for name in own if name not in DELAY_NAMES]
-
-    def values(one: Law) -> dict[str, float]:
-        there = one.at_approach(jnp.asarray(u))
-        found = closest_loss(losses, u, np.asarray(there.rebound), np.ones_like(u), fixed)
-        if late:
-            delay = closest_delay(there.approach, there.rebound, there.delay)
-            found |= {name: float(getattr(delay, name.removeprefix("delay_"))) for name in own if name in DELAY_NAMES}
-        return found
-
-    found = values(law)
-    off = nearness(u, np.asarray(law.rebound_speed(u)), rebound_by_formula({**found, **fixed}, u))
-    note = (
-        f"The law is planned with as the closest formula of {model}: off by at most {100.0 * off.off:.2g} % of u_out,"
-        f" at {off.at_nm_per_us:.3g} nm/us, over {low:.4g} to {high:.4g} nm/us."
-    )
-    information = np.zeros((len(found), len(found)))
-    if isinstance(law, TabulatedLaw) and law.unknowns:
-        unit = np.eye(law.unknowns)
-        changes = np.array([list(values(law.moved(one)).values()) for one in unit]) - list(found.values())
-        sure = np.linalg.norm(changes, axis=0)
-        free = np.flatnonzero(sure > 0.0)
-        scaled = changes[:, free] / sure[free]
-        if free.size and np.linalg.matrix_rank(scaled, tol=_INDISTINCT) == free.size:
-            whole = np.linalg.inv(scaled.T @ scaled) / np.outer(sure[free], sure[free])
-            information[np.ix_(free, free)] = whole
-    return _Closest(found, information, (note,))
-
-
-_INDISTINCT = 1e-6
-"""Singular value below which a law's errors do not tell two parameters apart."""
 
 
 def checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.ndarray, " p"]:

@@ -17,11 +17,11 @@ from fitting.tables.several import SeveralTables
 from fitting.tables.table import TableLike
 
 _T = TypeVar("_T")
-_EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
-"""Differences of AIC up to which models are even, one is favoured, and one is clearly favoured."""
+_EVEN, _PLAIN = 2.0, 10.0
+"""Differences of AIC up to which models are even, and beyond which one is clearly favoured."""
 
 
-@public_result(picture="fitting.report.plots:models_figure", rows="rows")
+@public_result(rows="rows")
 @dataclass(frozen=True)
 class Comparison(Result):
     """Models of one table, the best one first.
@@ -214,10 +214,8 @@ def _said_of(best: dict[str, Any], second: dict[str, Any]) -> str:
     apart = f"their laws differ by at most {change:.2g} % over the measured speeds" if np.isfinite(change) else ""
     if gap < _EVEN:
         said = f"The measurement does not tell {first} from {other} (AIC differs by {gap:.1f})"
-    elif gap < _LEANS:
-        said = f"The measurement leans to {first} over {other} (AIC lower by {gap:.1f}), not conclusively"
     elif gap < _PLAIN:
-        said = f"The measurement favours {first} over {other} (AIC lower by {gap:.1f})"
+        said = f"The measurement favours {first} over {other} (AIC lower by {gap:.1f}), not conclusively"
     else:
         said = f"The measurement tells plainly: {first}, not {other} (AIC lower by {gap:.0f})"
     return f"{said}; {apart}." if apart else f"{said}."

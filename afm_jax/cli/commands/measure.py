@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.design_prior import PRIOR_OPTIONS, check_prior
+from afm_jax.cli.design_prior import PRIOR_OPTIONS
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
 from afm_jax.cli.session import FIT_PROGRAMS, Session
@@ -88,8 +88,7 @@ CALIBRATE = Command(
 
 
 def _check_lists(_: Session, options: Options) -> None:
-    """Check that frequencies and places are said once, and the table that is added to."""
-    check_prior(options)
+    """Check that frequencies and places are said once."""
     if options["frequencies_khz"] is not None and options["detuning"] is not None:
         raise click.UsageError("--frequencies-khz and --detuning both say what the drive frequency can be; give one")
     if options["offsets_nm"] is not None and options["heights"] is not None:
@@ -104,7 +103,7 @@ DESIGN = Command(
     help="""Choose the drives to measure next, and forecast how well the law will then be known.
 
     Say what is known: the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r,
-    --epsilon, ...), or what was measured so far (--fit, --measured); and what can be driven: every combination of
+    --epsilon, ...), or a fit of what was measured so far (--fit); and what can be driven: every combination of
     orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
     itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
     or 170:190:1. With --out the report: design.csv, to_fill_in.csv (a table for `afm-jax fit`, readings left blank),
