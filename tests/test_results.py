@@ -37,8 +37,8 @@ from tests.lockin_traces import noisy_bounce
 from tests.strict_reading import strictly
 
 PARAMETERS = {"BaseDrive", "Cantilever", "CollisionDelay", "Contact", "ForceDrive", "ImpactLaw", "Platform", "Scene"}
-PARAMETERS |= {"TabulatedLaw", "Tone"}
-"""What a simulation is made of, and scene files hold."""
+PARAMETERS |= {"ParameterRange", "TabulatedLaw", "Tone"}
+"""What a simulation is made of, and scene files hold; and what a parameter goes through."""
 ROOT = Path(__file__).parent.parent
 DRAWN_BELOW = {"Comparison", "Continuation", "Design", "FitResult", "Inversion", "LockinResult"}
 DRAWN_BELOW |= {"StabilityChart"}
