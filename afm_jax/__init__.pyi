@@ -51,5 +51,5 @@ from afm_jax.scenefile.parameter_paths import scene_family as scene_family
 from afm_jax.scenefile.scenefile import load_scene as load_scene
 from afm_jax.scenefile.scenefile import save_scene as save_scene
 from afm_jax.scenefile.tables import SceneError as SceneError
-from afm_jax.sweeps.sweep import sweep as sweep
+from afm_jax.studies.sweep import sweep as sweep
 from afm_jax.version import __version__ as __version__

@@ -3,7 +3,6 @@ from afm_jax.contact.law_of_contact import ContactLaw as ContactLaw
 from afm_jax.contact.law_of_contact import fit_delay as fit_delay
 from afm_jax.contact.law_of_contact import fit_law as fit_law
 from afm_jax.saved import load as load
-from fitting.bulk import fit_each as fit_each
 from fitting.calibration.calibrate import calibrate as calibrate
 from fitting.calibration.result import Calibration as Calibration
 from fitting.calibration.stiffness import Stiffness as Stiffness

@@ -30,7 +30,7 @@ from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.law_files import load_law
 from afm_jax.scenefile.scenefile import read_scene, read_toml
-from afm_jax.sweeps.axes import axes_of
+from afm_jax.studies.sweep import axes_of
 from fitting.calibration.sweep import read_sweep
 from fitting.experiments.prior import read_prior
 from fitting.instruments.curve import read_curves

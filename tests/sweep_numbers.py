@@ -1,7 +1,6 @@
 """A sweep whose points are plain sums, for tests of what happens around them; and a program that runs one."""
 
 import json
-import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -11,25 +10,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from afm_jax.sweeps.axes import Axis
-from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, SweepPlan, Variable, plan_of
-from afm_jax.sweeps.sweep import run_plan
+from afm_jax.studies.sweep import MESSAGE, Axis, Columns, Recorder, SweepPlan, Variable, plan_of, run_plan
 
 SIZES = (7, 12)
 """Of the axes; the chunks of ten points do not fill them evenly."""
 
 
 def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noqa: ARG001
-    """Return what adds a tenth of y to x; slowly if asked for, telling which process does, with how many threads."""
+    """Return what adds a tenth of y to x; slowly if asked for."""
     record = given["record"]
 
     def work(columns: Columns) -> Columns:
         time.sleep(record.get("seconds", 0.0))
-        if "told" in record:
-            path = Path(record["told"]) / f"{os.getpid()}"
-            # once, since it may be killed at any time
-            if not path.exists():
-                path.write_text(" ".join(os.environ.get(name, "") for name in ("NPROC", "TF_CPP_MIN_LOG_LEVEL")))
         found = columns["x"] + 0.1 * columns["y"]
         sums = np.where(found < 2.0, np.nan, found)
         why = np.where(found < 2.0, "the sum is below 2 \u00e4", "")
@@ -47,17 +39,17 @@ def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noq
 def plan(*, chunk: int | None = None, last: float = 11.0, **record: Any) -> SweepPlan:
     """Return a plan of sums."""
     axes = [{"parameter": "x", "linear": [0.0, 6.0, SIZES[0]]}, {"parameter": "y", "linear": [0.0, last, SIZES[1]]}]
-    return plan_of({"builder": "tests.sweep_numbers:recorder", "axes": axes, "record": record, "chunk": chunk})
+    return plan_of({"axes": axes, "record": record, "chunk": chunk}, recorder)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return everything in a sweep's folder but its lock."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.name != "lock"]
+    """Return everything in a sweep's folder."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 if __name__ == "__main__":
-    # python -m tests.sweep_numbers FOLDER WORKERS '{"seconds": 0.1}'
+    # python -m tests.sweep_numbers FOLDER '{"seconds": 0.1}'
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    done = run_plan(plan(**json.loads(sys.argv[3])), Path(sys.argv[1]), workers=int(sys.argv[2]))
-    sys.stdout.write(json.dumps({"kept": len(done.kept.done), "computed": done.computed}) + "\n")
+    done = run_plan(plan(**json.loads(sys.argv[2])), Path(sys.argv[1]))
+    sys.stdout.write(json.dumps({"kept": done.kept, "computed": done.computed}) + "\n")

@@ -95,7 +95,7 @@ def test_damping_must_be_said_and_energies_need_a_mass(tmp_path, reported):
     bare = [line for line in lines if not line.startswith(("# quality_factor", "# mass_ng"))]
     path = tmp_path / "bare.csv"
     path.write_text("\n".join(bare) + "\n", encoding="utf-8")
-    for command in (("fit",), ("fit", "--each"), ("invert",)):
+    for command in (("fit",), ("invert",)):
         refused = CliRunner().invoke(main, [*command, str(path)])
         assert refused.exit_code == 2
         assert f"{path}: the quality factor is missing" in refused.stderr

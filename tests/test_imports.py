@@ -22,7 +22,7 @@ ROWS = {
         ("contact",),
         ("motion",),
         ("dynamics", "scenefile"),
-        ("studies", "sweeps", "verify"),
+        ("studies", "verify"),
         ("plots",),
         ("cli",),
         ("__main__",),
@@ -34,7 +34,7 @@ ROWS = {
         ("gradients", "fits"),
         ("sampling",),
         ("report",),
-        ("traces", "calibration", "inversion", "tapping_curves", "experiments", "bulk"),
+        ("traces", "calibration", "inversion", "tapping_curves", "experiments"),
         ("examples",),
     ),
 }

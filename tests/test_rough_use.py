@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from afm_jax.sweeps.store import STORE
+from afm_jax.studies.sweep import STORE
 from afm_jax.whole_files import read_whole, write_whole
 from tests.fresh_python import outputs
 from tests.fuzz import fuzz_files, fuzz_orbits

@@ -14,7 +14,6 @@ A result says itself: `to_dict()` is the JSON object, `printed()` what is writte
 columns of CSV files by the files' names, `reason` is why it is not valid.
 """
 
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,7 +29,7 @@ from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session, session_options, write_json
 from afm_jax.cli.values import Share, scene_and_start
-from afm_jax.compilation_cache import available_cores, silence_xla
+from afm_jax.compilation_cache import silence_xla
 from afm_jax.whole_files import arguments_named, in_callers_words
 
 if TYPE_CHECKING:
@@ -163,13 +162,6 @@ class Command:
         for option in reversed((*self.options, *session_options(self.out_file))):
             function = option(function)
         return click.command(self.name, help=self.help)(function)
-
-
-def use_all_cores() -> None:
-    """Let JAX have a device for every core, before it starts, unless the user has said how many there are."""
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "host_platform_device_count" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
 
 
 _ARGUMENT = re.compile(r"`(\w+)=([^`]*?)(?:, \1_error=([^`]*))?`")

@@ -4,7 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import example_path, tables_with
 from afm_jax.words import text_table
@@ -16,8 +16,6 @@ from fitting.report.report import summary, write_report
 from fitting.sampling.posterior import posterior, require_blackjax
 from fitting.tables.several import SeveralTables
 
-fit_each = later("afm_jax.cli.each:fit_each")
-
 
 def fit(
     session: Session,
@@ -28,12 +26,10 @@ def fit(
     settings: dict[str, Any],
     **options: Any,
 ) -> Output:
-    """Return the fit of one law to tables, with what was asked for besides; with ``each`` a fit of every table."""
+    """Return the fit of one law to tables, with what was asked for besides."""
     if options["posterior"]:
         require_blackjax()
     read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
-    if options["each"]:
-        return fit_each(session, read, {"model": model, **settings}, options["workers"])
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")

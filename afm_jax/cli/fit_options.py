@@ -75,24 +75,20 @@ def check_fit(_: Session, options: dict[str, Any]) -> None:
     if options["example"] == bool(options["tables"]):
         both = "not both: " if options["example"] else ""
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
-    _check_each(options["tables"], options)
+    _check_tables(options["tables"], options)
     options["settings"] = fit_settings(options["model"], options)
 
 
-def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
-    """Check that options are those of one table, of several together, or of each of several by itself.
+def _check_tables(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
+    """Check that options are those of one table, or of several together.
 
     Raises:
         click.UsageError: if not.
     """
-    if options["share"] and (len(tables) < 2 or options["each"]):
+    if options["share"] and len(tables) < 2:
         raise click.UsageError("--share is about several tables that are fitted together; leave it out")
-    if options["workers"] is not None and not options["each"]:
-        raise click.UsageError("--workers is about several tables: add --each")
     alone = {"--example": "example", "--compare": "comparing", "--posterior": "posterior"}
     for option, name in alone.items():
-        if options["each"] and options[name]:
-            raise click.UsageError(f"{option} is about one table: leave --each out")
         if len(tables) > 1 and options[name] and option != "--compare":
             raise click.UsageError(f"{option} is about one table: give one, or leave it out")
 

@@ -11,7 +11,7 @@ from matplotlib.ticker import LogLocator
 
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import GRID, cell_edges, label_axes, new_figure
-from afm_jax.sweeps.axes import dimension_of
+from afm_jax.studies.sweep import dimension_of
 
 if TYPE_CHECKING:
     import xarray
@@ -66,8 +66,7 @@ def _logarithmic(found: "xarray.Dataset") -> list[str]:
     names: list[str] = []
     for axis in json.loads(found.attrs["input"])["axes"]:
         names += [axis["parameter"]] if "log" in axis else []
-        for kind in ("random", "latin_hypercube"):
-            names += [name for name, ends in axis.get(kind, {}).items() if isinstance(ends, dict)]
+        names += [name for name, ends in axis.get("random", {}).items() if isinstance(ends, dict)]
     return names
 
 

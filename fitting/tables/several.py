@@ -50,7 +50,7 @@ class SeveralTables:
             elif abs(table.mass_ng / first.mass_ng - 1.0) > _SAME_MASS:
                 raise ValueError(
                     f"mass_ng is {first.mass_ng:g} in {name} and {table.mass_ng:g} in {label}: tips of different "
-                    "mass share no law of impacts; fit each by itself, by `fitting.fit_each` or `afm-jax fit --each`"
+                    "mass share no law of impacts; fit each by itself"
                 )
             if (table.quality_factor is None) != (first.quality_factor is None):
                 without, having = (label, name) if table.quality_factor is None else (name, label)

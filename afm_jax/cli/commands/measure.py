@@ -242,11 +242,9 @@ FIT = Command(
             "its own.",
         ),
         flag("--example", "Fit the bundled table instead of a file."),
-        flag("--each", "Fit each of several tables by itself; with --out what is done is kept."),
-        click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes for --each, by Dask."),
     ),
     check=check_fit,
-    programs=lambda options: () if options["each"] else FIT_PROGRAMS,
+    programs=lambda _: FIT_PROGRAMS,
 )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from afm_jax.cli.command import Command, Options, use_all_cores
+from afm_jax.cli.command import Command, Options
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Ends, Finite, Grid, Multiples, PositiveInteger, Share
@@ -352,41 +352,38 @@ SIMULATE = Command(
 
 
 def _check_sweep(session: Session, options: Options) -> None:
-    """Check where results go and that they can be written; let JAX have every core, unless the user says how many."""
+    """Check where results go and that they can be written."""
     if options["workers"] is not None and options["scheduler"] is not None:
         raise click.UsageError("--scheduler has workers of its own: leave --workers out")
-    if session.out is None and not options["dry_run"]:
-        raise click.UsageError("--out is missing: name a folder for the results, or ask for a --dry-run")
-    if options["dry_run"] and options["plot"]:
-        raise click.UsageError("--dry-run computes nothing to --plot: leave one of them out")
+    if session.out is None:
+        raise click.UsageError("--out is missing: name a folder for the results")
     import_module("xarray")
     import_module("zarr")
-    use_all_cores()
 
 
 SWEEP = Command(
     name="sweep",
     group="simulate",
-    summary="Compute many scenes, or fit many tables, over a grid of parameters; resumes.",
+    summary="Compute many scenes over a grid of parameters; resumes.",
     runs="afm_jax.cli.sweep:sweep",
     help="""Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
 
     \b
-    scene = "scene.toml"                  # or a preset; or tables = ["a.csv", "b.csv"]
+    scene = "scene.toml"                  # or a preset
     accuracy = 1e-6                       # of resolved contacts; may be left out
     [record]
-    what = "orbits"                       # simulation, collide, lyapunov; of tables: fit
+    what = "orbits"                       # simulation, collide, lyapunov
     orders = [1, 2]
     [[axes]]
     parameter = "platform.reduced_frequency"
     linear = [0.9, 1.1, 1000]             # or log = [low, high, count], or list = [...]
     [[axes]]
-    latin_hypercube = { "interaction.r" = [0.9, 0.99], "interaction.epsilon" = { log = [1, 100] } }
-    count = 500                           # or random = {...}
+    random = { "interaction.r" = [0.9, 0.99], "interaction.epsilon" = { log = [1, 100] } }
+    count = 500
     seed = 1
 
     The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
-    are kept, whatever happens, and computed again only if their bytes have changed.
+    are kept, whatever happens. One sweep at a time: what two write into one folder is undefined.
     """,
     options=(
         click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path)),
@@ -397,7 +394,6 @@ SWEEP = Command(
             help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
         ),
         click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work."),
-        flag("--dry-run", "Measure a chunk and say what the sweep would take; keep nothing."),
         flag("--plot", "Draw a sweep of one or two axes, sweep.png."),
         LAW,
     ),

@@ -1,1 +1,0 @@
-"""Sweeps over many scenes or many fits: in chunks, on all cores and devices or a cluster, resumed after faults."""
