@@ -68,6 +68,7 @@ _COMPUTED = "computed"
 KINDS = ("linear", "log", "list", "random")
 _MOST_HELD = 10_000_000
 """Values of an axis."""
+_MOST_CHUNKS = 1_000_000
 _EXAMPLE = '{ parameter = "platform.reduced_frequency", linear = [0.9, 1.1, 100] }'
 
 
@@ -150,7 +151,7 @@ def _ladder(kind: str, given: Any) -> np.ndarray:
     if not isinstance(given, list | tuple) or len(given) != 3:
         raise ValueError(f"`{kind}` must be [low, high, count], but is {given}")
     low, high = (_number(end, f"an end of `{kind}`") for end in given[:2])
-    count = _whole(given[2], "count", least=1)
+    count = _whole(given[2], "count", least=1, most=_MOST_HELD)
     if not (low < high or (low == high and count == 1)):
         raise ValueError(f"`{kind}` = {list(given)} does not rise: its first end must be below its second")
     if kind == "log" and low <= 0.0:
@@ -162,8 +163,8 @@ def _random(table: dict[str, Any]) -> dict[str, np.ndarray]:
     chosen = table["random"]
     if not isinstance(chosen, Mapping) or not chosen:
         raise ValueError('`random` must name parameters with their ends, as in { "interaction.r" = [0.9, 0.99] }')
-    count = _whole(table.get("count"), "count", least=1)
-    generator = np.random.default_rng(_whole(table.get("seed"), "seed", least=0))
+    count = _whole(table.get("count"), "count", least=1, most=_MOST_HELD)
+    generator = np.random.default_rng(_whole(table.get("seed"), "seed", least=0, most=1 << 63))
     columns = {}
     for parameter, given in chosen.items():
         log = isinstance(given, Mapping) and list(given) == ["log"]
@@ -185,9 +186,9 @@ def _number(value: Any, what: str) -> float:
     return float(value)
 
 
-def _whole(value: Any, name: str, *, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= _MOST_HELD:
-        raise ValueError(f"`{name}` must be a whole number from {least} to {_MOST_HELD}, but is {value!r}")
+def _whole(value: Any, name: str, *, least: int, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ValueError(f"`{name}` must be a whole number from {least} to {most}, but is {value!r}")
     return value
 
 
@@ -659,7 +660,11 @@ def plan_of(
     for axis in axes:
         if axis.dimension in taken or any(dimension_of(name) in taken for name in axis.columns):
             raise ValueError(f"the axis {axis.dimension} has the name of something that is recorded")
-    return SweepPlan(whole | {"chunk": chunk or recorder.points}, axes, recorder)
+    plan = SweepPlan(whole | {"chunk": chunk or recorder.points}, axes, recorder)
+    chunks = math.prod(-(-size // side) for size, side in zip(plan.shape, plan.block, strict=True))
+    if chunks > _MOST_CHUNKS:
+        raise ValueError(f"{chunks} chunks are too many: `chunk` must be larger, or take fewer values along the axes")
+    return plan
 
 
 def _unit(name: str) -> str:
