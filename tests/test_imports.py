@@ -22,7 +22,7 @@ ROWS = {
         ("contact",),
         ("motion",),
         ("dynamics", "scenefile"),
-        ("studies", "verify"),
+        ("studies",),
         ("plots",),
         ("cli",),
         ("__main__",),

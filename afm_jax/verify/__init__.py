@@ -1,1 +1,0 @@
-"""The equations with fifty digits."""
