@@ -21,6 +21,7 @@ from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.presets import preset
 from afm_jax.scenefile.scenefile import Start
+from afm_jax.solve.lanes import LANES, filled
 from afm_jax.studies.sweep import STORE, input_of, plan_of, run_plan, sweep
 from tests.kills import ROOT, chunks_done, survive
 from tests.sweep_numbers import contents, plan
@@ -86,9 +87,11 @@ def test_collisions_and_exponents_are_those_of_their_functions():
     assert not found["captured"].any()
     scene, frequency = preset("figure2"), {"parameter": FREQUENCY, "linear": [1.2, 1.6, 3]}
     found = sweep(scene, [frequency], {"what": "lyapunov", "impacts": 100, "transient": 50})
-    alone = lyapunov_spectrum(scene_batch(scene, {FREQUENCY: np.array([1.2, 1.4, 1.6])}), impacts=100, transient=50)
-    np.testing.assert_allclose(found["exponents_per_impact"], alone.exponents_per_impact, rtol=1e-9)
-    np.testing.assert_array_equal(found["kind"], alone.verdicts.kind)
+    # one of them is chaotic: a program of another width ends elsewhere, by rounding
+    many = filled(np.array([1.2, 1.4, 1.6]), LANES)
+    alone = lyapunov_spectrum(scene_batch(scene, {FREQUENCY: many}), impacts=100, transient=50)
+    np.testing.assert_allclose(found["exponents_per_impact"], alone.exponents_per_impact[:3], rtol=1e-9)
+    np.testing.assert_array_equal(found["kind"], alone.verdicts.kind[:3])
 
 
 @pytest.mark.slow
