@@ -332,7 +332,7 @@ def _scipy_rows(problem: AccuracyProblem, tolerances: Mapping[str, float]) -> It
     """Give DOP853 with events on a few tips one by one; gradients by central differences of a step that suits."""
     begin = jax.jit(problem.begin)
     template, starts = begin(problem.at)
-    tips = np.unique(np.linspace(0, starts.x.size - 1, _FEW).astype(int))
+    tips = np.unique(np.linspace(0, starts.x.size - 1, _FEW).astype(int)).tolist()
     programs, at = ScipyPrograms(template), np.asarray(problem.at)
 
     def value(tip: int, parameters: np.ndarray, tolerance: float) -> np.ndarray:
