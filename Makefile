@@ -108,9 +108,9 @@ bands: $(SETUP) ## do 95 % bands hold the laws of ten random contacts, intervals
 tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (TAPPING="--model contact")
 	$(BIN)/python -m tests.tapping_accuracy $(TAPPING)
 
-ENERGIES ?= --curves 200
+ENERGIES ?= --curves 200 --shaped 75
 
-energies: $(SETUP) ## do the 95 % bands of the energy of a tap hold the energies of 600 simulated curves? (fifteen minutes)
+energies: $(SETUP) ## do the 95 % bands of the energy of a tap hold the energies of 2,700 simulated curves? (half an hour)
 	$(BIN)/python -m tests.coverage_of_tapping $(ENERGIES)
 
 ranks: $(SETUP) ## are true values anywhere in the posteriors of 1000 simulated tables equally often? (half an hour)

@@ -22,6 +22,7 @@ from fitting.parameters import (
     DELAY,
     LAW,
     NUISANCE_NAMES,
+    USUAL_DRIFTS,
     USUAL_ERRORS,
     Parameter,
     is_nuisance,
@@ -260,10 +261,6 @@ def constraints_of(
     return known | _known_of_drifts(table, given) | given
 
 
-PHASE_DRIFT_DEG, FREE_AMPLITUDE_DRIFT = 3.0, 0.03
-"""Standard errors of the drifts over a table whose rows stand in order of time, where nothing says them."""
-
-
 def _known_of_drifts(table: AmplitudeTable, given: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
     """Return what is known of slow drifts along the rows of a table, and of what they start from.
 
@@ -278,12 +275,12 @@ def _known_of_drifts(table: AmplitudeTable, given: Mapping[str, tuple[float, flo
         return {}
     assumed = []
     if table.phase_and_error_deg[0] is not None:
-        assumed.append(("phase_drift_deg", PHASE_DRIFT_DEG, "phase_zero_deg", 0.0))
+        assumed.append(("phase_drift_deg", "phase_zero_deg", 0.0))
     if table.tapping:
-        assumed.append(("free_amplitude_drift", FREE_AMPLITUDE_DRIFT, "drive_calibration", 1.0))
+        assumed.append(("free_amplitude_drift", "drive_calibration", 1.0))
     known = {}
-    for drift, usual, start, neutral in assumed:
-        known[drift] = given.get(drift, (0.0, usual))
+    for drift, start, neutral in assumed:
+        known[drift] = given.get(drift, (0.0, USUAL_DRIFTS[drift]))
         value, error = table.calibration.get(start, (neutral, 0.0))
         known[start] = value, float(np.hypot(error, 0.5 * np.hypot(*known[drift])))
     return known

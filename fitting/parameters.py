@@ -272,6 +272,8 @@ USUAL_ERRORS = {
     "tip_calibration": 0.01,
 }
 """Relative standard errors of what is given of an instrument without one."""
+USUAL_DRIFTS = {"phase_drift_deg": 3.0, "free_amplitude_drift": 0.03}
+"""Standard errors of the drifts over a table whose rows stand in order of time, where nothing says them."""
 
 
 @dataclass(frozen=True, kw_only=True)

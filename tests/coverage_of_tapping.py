@@ -1,20 +1,26 @@
 """Do the 95 % bands of the energy of a tap hold the energies of simulated curves? `make energies` prints and judges.
 
-Curves of laws with a restitution and a viscous loss and of contacts with a viscous bridge, force and base drive, on
-resonance and 2 % above, and curves of two branches that change at other heights out than back: 0.3 % and 0.15 degrees
-of noise, the instrument drawn from its stated errors (f0 1e-5, in a second set 1e-4; Q 1 %, k 5 %). A third set has
-an exact instrument and 100 rows.
+*Shapes*: seven courses of the energy over a = A/A0 on resonance, four levers, force and base drive, one way or both.
+The instrument is drawn from what is stated of it (f0 1e-5, 1e-4 or the usual 2e-4; Q 1 %, k 5 %), and in a third of the
+curves the zero of the phase is stated to 0.2 degrees. The truth must be in its band at 0.92 to 1 of the points of every
+shape and every lever, and nowhere more than four errors off.
+
+*Laws and contacts*: curves of laws with a restitution and a viscous loss and of contacts with a viscous bridge, force
+and base drive, on resonance and 2 % above, and curves of two branches that change at other heights out than back: 0.3 %
+and 0.15 degrees of noise. The last set has an exact instrument and 100 rows.
 """
 
 import argparse
 import itertools
 import sys
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from fitting.tables.table import AmplitudeTable
-from fitting.tapping_curves.energy_fit import Z95
+from fitting.tapping_curves.energy import Z95
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
 from tests.tapping_truth_of_contacts import RATIOS, VISCOSITIES, curve_of_contact
@@ -35,11 +41,103 @@ LAWS = list(itertools.product(TIPS, (1.0, 1.02), ("force", "base")))
 CONTACTS = list(itertools.product(VISCOSITIES, RATIOS, ("force", "base")))
 KINDS = ("law", "law", "law", "contact", "two branches")
 EXACT = Stated(frequency=1e-9, quality=1e-9, stiffness=1e-9)
-LOWEST, HIGHEST, LARGEST_Z, LARGEST_MEDIAN, LARGEST_EXACT = 0.92, 0.99, 4.0, 1.2, 0.03
+LOWEST, LARGEST_Z, LARGEST_MEDIAN, LARGEST_EXACT = 0.92, 4.0, 1.2, 0.03
 """Share of points in their bands, deviation in errors, its median over that of errors as stated and as implied by noise
 and instrument, and relative error of an energy with an exact instrument."""
 _MEDIAN = 0.6745
 """Of the size of a normal deviate."""
+
+
+def step(ratio: np.ndarray) -> np.ndarray:
+    """Return an energy that jumps where the attractive branch ends."""
+    return np.where(ratio > ATTRACTIVE_TO, 0.3, 1.0) * np.sqrt(1.0 - ratio)
+
+
+ATTRACTIVE_TO = 0.8
+"""Amplitude, of the free one, at which the attractive branch of the step ends."""
+SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "constant": np.ones_like,
+    "sqrt(1 - a)": lambda a: np.sqrt(1.0 - a),
+    "a sqrt(1 - a)": lambda a: a * np.sqrt(1.0 - a),
+    "a (1 - a)": lambda a: a * (1.0 - a),
+    "graphite": PchipInterpolator(
+        [0.0, 0.5, 0.8, 0.86, 0.9, 0.92, 0.94, 0.98, 1.0], [9, 12, 12, 10.9, 9.3, 7.6, 4.2, 1.6, 0]
+    ),
+    "step": step,
+    "saturation": lambda a: 1.0 - np.exp(-(1.0 - a) / 0.1),
+}
+"""Courses of the energy over a = A/A0, up to a factor; on the attractive branch those that begin there."""
+LEVERS = {
+    "k 2": Tip(free_nm=60.0, quality=120.0, stiffness=2.0, frequency_khz=70.0),
+    "k 5.4": Tip(),
+    "k 40": Tip(free_nm=20.0, quality=400.0, stiffness=40.0, frequency_khz=300.0),
+    "k 44": GRAPHITE,
+}
+FREQUENCIES = (1e-5, 1e-4, 2e-4)
+"""Relative errors of the free frequency: calibrated, stated with care, and the usual one."""
+
+
+def curve_of_shape(shape: str, tip: Tip, largest: float, rows: int = 120) -> tuple[Truth, np.ndarray]:
+    """Return a curve on resonance of a course of the energy, and which rows are repulsive.
+
+    Args:
+        shape: one of `SHAPES`.
+        tip: the cantilever.
+        largest: energy over the most that a tap can take, where it comes nearest to that.
+        rows: of the curve.
+    """
+    ratio = np.linspace(0.985 if shape in {"graphite", "step", "a (1 - a)"} else 0.93, 0.2, rows)
+    most = np.pi * tip.stiffness * tip.free_nm**2 / tip.quality * ratio * (1.0 - ratio)
+    energy = SHAPES[shape](ratio)
+    energy *= largest / np.max(energy / most)
+    repulsive = ratio < {"step": ATTRACTIVE_TO, "graphite": 0.912}.get(shape, 1.0)
+    return curve_of_energy(tip, ratio, energy, repulsive), repulsive
+
+
+def sides_of(truth: Truth, repulsive: np.ndarray) -> dict[tuple[bool, bool], Truth]:
+    """Return what is true on each way and side of a curve that jumps between the sides."""
+    sides = {side: Truth(*(column[repulsive == side] for column in truth)) for side in (False, True)}
+    return {(retract, side): sides[side] for retract, side in itertools.product((False, True), repeat=2)}
+
+
+def shaped_curve(shape: str, lever: str, number: int) -> "Simulated":
+    """Return how far a random curve of a shape and a lever is off."""
+    rng = np.random.default_rng([number, list(SHAPES).index(shape), list(LEVERS).index(lever)])
+    tip = LEVERS[lever]._replace(drive=("force", "base")[number % 2])
+    truth, repulsive = curve_of_shape(shape, tip, rng.uniform(0.05, 0.9), int(rng.integers(60, 200)))
+    stated = Stated(frequency=FREQUENCIES[number % 3], phase_noise_deg=0.2)
+    zero = {"phase_zero_deg": (3.0 + 0.2 * rng.normal(), 0.2)} if rng.uniform() < 1.0 / 3.0 else {}
+    also = {"calibration": {"tip_calibration": (1.0, 1e-6)} | zero, "back": truth if rng.uniform() < 0.5 else None}
+    result = tapping(table_of(tip, truth, stated, rng, **also), law=False)
+    # where nothing jumps, rows whose lag is next to the free one may count as of the other side
+    anywhere = dict.fromkeys(itertools.product((False, True), repeat=2), truth)
+    every = sides_of(truth, repulsive) if shape == "step" else anywhere
+    return Simulated(f"{shape}, {lever}", points_of(tip, result, every, stated), np.zeros(0), result.valid)
+
+
+def judge_shapes(curves: int) -> bool:
+    """Print how the bands of every shape and lever do; return whether each is as wanted."""
+    found = {
+        (shape, lever): [shaped_curve(shape, lever, number) for number in range(curves)]
+        for shape in SHAPES
+        for lever in LEVERS
+    }
+    sys.stdout.write(f"share of points in their bands, largest deviation in errors ({curves} curves each)\n")
+    sys.stdout.write("".join(f"{head:>16}" for head in ("", *LEVERS, "all")) + "\n")
+    reached = True
+    for shape in (*SHAPES, "all"):
+        cells = []
+        for lever in (*LEVERS, "all"):
+            chosen = [one for key, some in found.items() if {*key} >= {shape, lever} - {"all"} for one in some]
+            off = np.abs(np.concatenate([one.points.energy for one in chosen]))
+            covered = float(np.mean(off < Z95))
+            cells.append(f"{covered:10.3f} {off.max():5.1f}")
+            # those of one shape and lever are too few to be judged by their share: errors of a curve go together
+            reached &= off.max() <= LARGEST_Z and (covered >= LOWEST or "all" not in {shape, lever})
+        sys.stdout.write(f"{shape:>16}" + "".join(cells) + "\n")
+    every = [one for some in found.values() for one in some]
+    sys.stdout.write(f"{sum(one.valid for one in every)} of {len(every)} valid\n")
+    return reached
 
 
 class Points(NamedTuple):
@@ -164,7 +262,7 @@ def judge(name: str, found: list[Simulated], largest_share: float = np.inf) -> b
             + (f"; changes of branch within {hysteresis:.1f} errors\n" if hysteresis else "\n")
         )
         if not kind:
-            reached = LOWEST <= covered <= HIGHEST and max(off.max(), hysteresis) <= LARGEST_Z
+            reached = covered >= LOWEST and max(off.max(), hysteresis) <= LARGEST_Z
             reached &= max(median, of_implied) <= LARGEST_MEDIAN and share <= largest_share
     return reached
 
@@ -172,11 +270,16 @@ def judge(name: str, found: list[Simulated], largest_share: float = np.inf) -> b
 def main() -> int:
     """Measure, print and judge."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
-    parser.add_argument("--curves", type=int, default=200, help="curves of each set")
-    numbers = range(parser.parse_args().curves)
+    parser.add_argument("--curves", type=int, default=200, help="curves of each set of laws and contacts")
+    parser.add_argument("--shaped", type=int, default=75, help="curves of each shape and lever")
+    arguments = parser.parse_args()
+    numbers, reached = range(arguments.curves), judge_shapes(arguments.shaped)
     sets = [(f"f0 to {error:g}", Stated(frequency=error), np.inf) for error in (1e-5, 1e-4)]
     sets.append(("exact instrument", EXACT, LARGEST_EXACT))
-    return sum(not judge(name, [random_curve(n, stated) for n in numbers], most) for name, stated, most in sets)
+    if numbers:
+        judged = [judge(name, [random_curve(n, stated) for n in numbers], most) for name, stated, most in sets]
+        reached &= all(judged)
+    return int(not reached)
 
 
 if __name__ == "__main__":

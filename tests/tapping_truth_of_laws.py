@@ -125,7 +125,10 @@ def curve_like_graphite(rows: int = 150) -> Truth:
 
 
 def curve_of_energy(tip: Tip, ratio: np.ndarray, energy_aj: np.ndarray, repulsive: np.ndarray) -> Truth:
-    """Return the curve on resonance, force on the tip, of given energies: the lag balances them, harmonics too."""
+    """Return the curve on resonance of given energies over the tip's amplitude: the lag balances them, harmonics too.
+
+    A base that shakes moves the tip as a force on it does; what is read is the deflection, D = Z + gamma A0.
+    """
     amplitude, lag, n = ratio * tip.free_nm, np.full(len(ratio), 90.0), np.arange(2, 41)[:, None]
     tap = np.pi * tip.stiffness
     for _ in range(60):
@@ -136,7 +139,11 @@ def curve_of_energy(tip: Tip, ratio: np.ndarray, energy_aj: np.ndarray, repulsiv
         lag = np.degrees(np.arcsin(np.minimum(sine, 1.0)))
         lag = np.where(repulsive, lag, 180.0 - lag)
     virial = -tap / np.pi * amplitude * tip.free_nm / (2.0 * tip.quality) * np.cos(np.radians(lag))
-    return Truth(-amplitude, amplitude, lag, energy_aj, virial)
+    if tip.drive == "force":
+        return Truth(-amplitude, amplitude, lag, energy_aj, virial)
+    seen = -amplitude * np.exp(-1j * np.radians(lag - 90.0)) + tip.gamma * tip.free_nm
+    lag = np.degrees(np.angle(tip.gamma) - np.angle(-seen)) % 360.0
+    return Truth(-amplitude, np.abs(seen), lag, energy_aj, virial)
 
 
 class Stated(NamedTuple):

@@ -16,9 +16,17 @@ from fitting.instruments.curve import read_curve, table_text
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import parse_table
 from fitting.tapping_curves.branches import changes, free_rows
-from fitting.tapping_curves.curve import Given, Instrument, TappingCurve, lag_of_free_tip
-from fitting.tapping_curves.energy import energies, instrument_slopes, lags_of, largest_energies
-from fitting.tapping_curves.energy_fit import Bins, Process, Smoother
+from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
+from fitting.tapping_curves.energy import (
+    Lever,
+    Smoother,
+    energies,
+    lags_of,
+    largest_energies,
+    matern,
+    positive_bands,
+    said_of,
+)
 from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.speeds import _flight, _Seen
 from fitting.tapping_curves.tapping import tapping
@@ -86,57 +94,83 @@ def test_energy_and_virial_of_a_linear_sample_are_the_closed_forms(drive: str):
         np.testing.assert_allclose(lags_of(curve, Instrument(F0, Q), found.energy_aj), curve.lag_deg, atol=0.05)
 
 
-@pytest.mark.parametrize("drive", ["force", "base"])
-def test_slopes_by_the_instrument_are_differences_of_energies(drive: str):
-    curve = curve_of_rows(
-        4,
-        drive=drive,
-        drive_frequency_khz=[88.0, 90.0, 90.0, 97.0],
-        amplitude_nm=[20.0, 15.0, 30.0, 12.0],
-        lag_deg=[70.0, 60.0, 110.0, 100.0],
-        # measured, not measured, and beyond those that count
-        harmonic_amplitudes_nm={2: np.array([0.3, np.nan, 0.2, np.nan]), 5: np.full(4, 0.1), 60: np.full(4, 5.0)},
+def test_measured_harmonics_stand_for_those_of_a_brief_impact():
+    n, measured = np.arange(2, 41), {2: np.array([0.3, np.nan]), 5: np.full(2, 0.1), 60: np.full(2, 5.0)}
+    curve = curve_of_rows(2, amplitude_nm=[20.0, 15.0], lag_deg=[70.0, 60.0], harmonic_amplitudes_nm=measured)
+    found = energies(curve, Instrument(F0, Q, harmonics_factor=0.8))
+    force = np.abs(1j / Q * (40.0 - curve.amplitude_nm * np.exp(-1j * np.radians(curve.lag_deg - 90.0))))
+    squares = 0.8 * (force / np.abs(1.0 - n[:, None] ** 2 + 1j * n[:, None] / Q)) ** 2
+    squares[0, 0], squares[3] = 0.3**2, 0.1**2
+    np.testing.assert_allclose(
+        found.harmonics_aj, np.pi * K / Q * np.sum(n[:, None] ** 2 * squares, axis=0), rtol=1e-12
     )
-    at = Instrument(F0 * 1.001, Q * 1.1, np.full(4, 1.5), np.full(4, 1.02), 0.8)
-    found = instrument_slopes(curve, at)
-    steps = {"free_frequency_khz": 1e-5, "quality_factor": 1e-3, "phase_zero_deg": 1e-4}
-    steps |= {"free_amplitude_factor": 1e-6, "harmonics_factor": 1e-4}
-    assert set(found) == set(steps) == set(at._fields)
-    for name, step in steps.items():
-        up, down = (at._replace(**{name: getattr(at, name) + sign * step}) for sign in (1.0, -1.0))
-        ends = [energies(curve, end) for end in (up, down)]
-        for column in ("energy_aj", "virial_aj"):
-            by = (getattr(ends[0], column) - getattr(ends[1], column)) / (2.0 * step)
-            np.testing.assert_allclose(getattr(found[name], column), by, rtol=1e-6, atol=1e-7, err_msg=name)
-        lag = (lag_of_free_tip(curve, up) - lag_of_free_tip(curve, down)) / (2.0 * step)
-        np.testing.assert_allclose(found[name].free_lag_deg, lag, rtol=1e-6, atol=1e-9, err_msg=name)
 
 
 def test_a_smoother_is_the_mean_of_a_constant_and_a_process():
     rng = np.random.default_rng(3)
     place, noise, values = np.sort(rng.uniform(-3.0, 0.0, 23)), rng.uniform(0.5, 2.0, 23), rng.normal(2.0, 1.0, 23)
-    bins, process, at = Bins.of(place, noise, most=7), Process(2.0, 0.5), np.linspace(-3.5, 0.5, 9)
-    smoother = Smoother.of(bins, process)
+    smoother, at = Smoother.of(place, noise, 2.0, most=7), np.linspace(-3.5, 0.5, 9)
     weights = noise**-2.0 * (np.arange(23) * 7 // 23 == np.arange(7)[:, None])
     average = weights @ values / weights.sum(axis=1)
-    np.testing.assert_allclose(bins.average(values), average, rtol=1e-12)
-    np.testing.assert_allclose(bins.variance, 1.0 / weights.sum(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(smoother.average(values), average, rtol=1e-12)
+    np.testing.assert_allclose(smoother.variance, 1.0 / weights.sum(axis=1), rtol=1e-12)
     # a constant that is known to a thousand: textbook regression with one covariance
     wide = 1e3**2
-    covariance = process.covariance(bins.place, bins.place) + wide + np.diag(bins.variance)
-    cross = process.covariance(at, bins.place) + wide
-    mean, (weights, variance) = smoother.mean(at, average), smoother.at(at)
-    np.testing.assert_allclose(mean, cross @ np.linalg.solve(covariance, average), rtol=1e-4)
-    np.testing.assert_allclose(weights @ average, mean, rtol=1e-9)
-    left = wide + process.size**2 - np.sum(cross * np.linalg.solve(covariance, cross.T).T, axis=1)
+    covariance = matern(smoother.place, smoother.place, 2.0) + wide + np.diag(smoother.variance)
+    cross = matern(at, smoother.place, 2.0) + wide
+    weights, variance = smoother.at(at)
+    np.testing.assert_allclose(weights @ average, cross @ np.linalg.solve(covariance, average), rtol=1e-4)
+    left = wide + 2.0**2 - np.sum(cross * np.linalg.solve(covariance, cross.T).T, axis=1)
     np.testing.assert_allclose(variance, left, rtol=1e-4)
-    np.testing.assert_allclose(smoother.noise_in(average), average - smoother.mean(bins.place, average), rtol=1e-9)
-    whitened = smoother.whitened(np.stack([average, average**2], axis=1))[:, 0]
-    np.testing.assert_allclose(whitened @ whitened, average @ np.linalg.solve(covariance, average), rtol=1e-4)
-    np.testing.assert_allclose(smoother.log_determinant, np.linalg.slogdet(covariance)[1] - np.log(wide), atol=1e-4)
-    # how much a row moves its own mean
-    others = [smoother.mean(place[[i]], bins.average(values + np.eye(23)[i]))[0] for i in range(23)]
-    np.testing.assert_allclose(smoother.leverage(place), others - smoother.mean(place, average), rtol=1e-9)
+    # how much the rows move their own means, together
+    means, taken = smoother.of_rows(place, values)
+    moved = [smoother.of_rows(place, values + np.eye(23)[i])[0][i] for i in range(23)]
+    assert taken == pytest.approx(np.sum(moved - means), rel=1e-9)
+
+
+def test_bands_are_those_of_all_instruments_that_leave_energies_above_nothing():
+    # one unknown x ~ N(0, 1) moves five energies to and fro; hardly a noise: x is cut where one of them is zero
+    energy, by = np.array([4.0, 2.0, 1.0, 3.0, 0.5]), np.array([3.0, 2.5, 1.5, -1.0, 0.2])
+    low, high, possible = positive_bands(energy, np.full(5, 1e-6), np.ones(5, bool), by[:, None])
+    assert possible
+    lowest, highest = -1.0 / 1.5, 3.0
+    x = np.random.default_rng(0).normal(size=400_000)
+    x = x[(x > lowest) & (x < highest)]
+    for i in range(5):
+        # the densest 95 % by counting: towards 0 the density grows up to the cut
+        values = np.sort(energy[i] + by[i] * x)
+        inside = round(0.95 * len(values))
+        first = int(np.argmin(values[inside:] - values[:-inside]))
+        np.testing.assert_allclose([low[i], high[i]], [values[first], values[first + inside]], atol=0.03 * abs(by[i]))
+    # an energy that no instrument brings above nothing
+    assert not positive_bands(np.array([1.0, -5.0]), np.full(2, 0.1), np.ones(2, bool), np.ones((2, 1)))[2]
+    # two that would need opposite ones
+    opposite = positive_bands(np.array([-2.0, -2.0]), np.full(2, 0.1), np.ones(2, bool), np.array([[1.0], [-1.0]]))
+    assert not opposite[2]
+    # first contact cannot say so
+    assert positive_bands(np.array([1.0, -5.0]), np.full(2, 0.1), np.array([True, False]), np.ones((2, 1)))[2]
+    assert [said_of(*ends) for ends in ((1.0, 2.9), (1.0, 3.1), (0.2, 3.0))] == ["measured", "bracket", "upper bound"]
+
+
+def test_rows_in_contact_tell_nothing_of_the_instrument():
+    table = made_curve(frequency_off=0.01)
+    result = tapping(table, law=False)
+    assert result.functions is not None
+    found = {one.kind: one for one in result.functions.nuisances}
+    assert found["free_frequency_khz"].value == pytest.approx(F0 + 0.01, rel=1e-12)
+    assert found["free_frequency_khz"].standard_error == pytest.approx(0.01, rel=1e-3)
+    # the zero is what f0 and Q leave of the free rows' lag: 2 Q df/f0, and their noise
+    wanted = np.hypot(np.degrees(2.0 * Q * 0.01 / F0), 0.2 / np.sqrt(5.0))
+    assert found["phase_zero_deg"].standard_error == pytest.approx(wanted, rel=0.01)
+    # a zero that is stated tells f0; stated of two curves it counts once
+    known = replace(table, calibration={"phase_zero_deg": (3.0, 0.2)})
+    alone, both = (
+        Lever([curve] * count, [result.rows.free] * count) for curve in [tapping(known).curve] for count in (1, 2)
+    )
+    errors = [lever.nuisances(0)[0].standard_error for lever in (alone, both)]
+    wanted = F0 / (2.0 * Q) * np.radians(np.hypot(0.2, 0.2 / np.sqrt(5.0)))
+    assert errors[0] == pytest.approx((wanted**-2.0 + 0.01**-2.0) ** -0.5, rel=0.02)
+    assert errors[1] > 0.9 * errors[0]
 
 
 def test_slopes_of_flights_are_their_differences():
@@ -167,7 +201,8 @@ def made_curve(seed: int = 0, *, noise: float = 0.003, phase_noise: float = 0.2,
 def test_noise_free_energy_is_the_one_put_in_even_with_the_frequency_off():
     # 10 Hz off turn the phase by 2.5 degrees; taken as given the mean is wrong by far
     result = tapping(made_curve(noise=1e-4, phase_noise=0.01, frequency_off=0.01))
-    assert result.valid
+    # that all take the same is no measurement
+    assert not result.valid
     # the frequency is found back; Q is off by nothing: what is left is its prior's pull
     assert result.energy["value"] == pytest.approx(3.0, rel=3e-3)
     assert abs(result.plain_energy["mean"] / 3.0 - 1.0) > 0.3
@@ -261,7 +296,7 @@ def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
 
 
 def test_without_a_spring_constant_energies_are_over_it():
-    table = made_curve()
+    table = replace(made_curve(), calibration={"phase_zero_deg": (3.0, 0.2)})
     found = tapping(replace(table, spring_constant_n_per_m=None, mass_ng=None), law=False)
     told = found.to_dict()
     wanted = tapping(replace(table, spring_constant_error_n_per_m=1e-6), law=False).to_dict()

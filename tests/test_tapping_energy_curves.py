@@ -1,5 +1,7 @@
 """The energy of a tap as a function along a branch: shapes of measured curves, drifts, instruments without errors."""
 
+import re
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,14 +11,16 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
+from fitting.examples.make_raw_curve import raw_curve, true_energy_aj
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import write_table
+from fitting.tapping_curves.energy import _minimum
 from fitting.tapping_curves.pictures import curve_figure
 from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
 from fitting.tapping_curves.together import tapping_together
-from tests.coverage_of_tapping import random_curve
+from tests.coverage_of_tapping import LEVERS, SHAPES, random_curve
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_laws import (
     GRAPHITE,
@@ -53,8 +57,9 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     assert answer["valid"]
     assert answer["energy_per_tap_aj"] is None
     assert "one energy a branch does not describe the rows" in answer["energy_per_tap_reason"]
-    # the instrument is that of the functions, not the one that a constant would need
+    # the instrument is that of statements and free rows, not the one that a constant would need
     assert answer["nuisances"] == answer["functions"]["nuisances"]
+    assert answer["nuisances_of_one_energy"] == {}
     assert [(one["repulsive"], one["constant"]) for one in answer["branches"]] == [(False, False), (True, False)]
     for branch in answer["branches"]:
         along = {name: np.array(column) for name, column in branch["curve"].items()}
@@ -70,7 +75,13 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     assert min(turn["amplitude_ratio"]) < 0.916
     assert max(turn["amplitude_ratio"]) > 0.908
     assert answer["largest_energy_aj"]["value"] == pytest.approx(12.0, rel=0.08)
-    assert "changes along the curve" in tapping_summary(result)
+    assert re.search(
+        r"Energy of a tap: 1[12].\d+ \+- 0.\d+ aJ at 0.[78]\d of the free amplitude", tapping_summary(result)
+    )
+    # rows whose lag is that of the free tip do not hang on the frequency
+    least = answer["least_on_frequency"]
+    assert 0.89 < least["amplitude_ratio"] < 0.93
+    assert least["by_frequency_aj"] < 0.05
 
 
 def test_energies_that_grow_along_a_branch_are_no_single_energy_with_the_frequency_moved():
@@ -91,29 +102,164 @@ EXACT = Stated(frequency=1e-9, quality=1e-9, stiffness=1e-9, phase_noise_deg=0.2
 
 
 @pytest.mark.slow
-def test_an_instrument_without_errors_has_usual_ones_and_ends_right_or_not_valid():
-    truth, rng = one_energy(), np.random.default_rng(25)
-    widths = []
+@pytest.mark.parametrize("zero_known", [False, True])
+def test_an_instrument_without_errors_has_usual_ones_and_ends_right_or_not_valid(zero_known: bool):  # noqa: FBT001
+    truth, rng, widths = one_energy(), np.random.default_rng(25), []
     for _ in range(10):
         table = table_of(Tip(), truth, EXACT, rng, free_frequency_error_khz=None, quality_factor_error=None)
         frequency = table.free_frequency_khz * (1.0 + 2e-4 * rng.uniform(-1.0, 1.0))
         quality = (table.quality_factor or 0.0) * (1.0 + 0.05 * rng.uniform(-1.0, 1.0))
+        zero = {"phase_zero_deg": (3.0 + 0.2 * rng.normal(), 0.2)} if zero_known else {}
+        table = replace(table, calibration=table.calibration | zero)
         result = tapping(replace(table, free_frequency_khz=frequency, quality_factor=quality), law=False)
         answer = result.to_dict()
         assert answer["assumed_errors"] == {"free_frequency_khz": 2e-4, "quality_factor": 0.05}
-        if not result.valid:
-            continue
         assert np.mean(np.abs(deviations(result, truth, 40.0)) < 1.96) > 0.9
+        assert result.valid == zero_known
         if result.energy["value"] is not None:
             low, high = result.energy["interval95"]
             assert low < ONE_ENERGY_AJ < high
-            widths.append((high - low) / ONE_ENERGY_AJ)
             (branch,) = answer["branches"]
-            # the branch says what the headline says
+            # the branch says what the energy for all says
             assert branch["energy_aj"] == pytest.approx(result.energy["value"])
+        low, high = result.energies_at[2]["interval95_aj"]
+        widths.append((high - low) / ONE_ENERGY_AJ)
+        if not zero_known:
+            assert "state the zero of the phase to 0.2 degrees" in answer["reasons"][0]
     # it is no emptiness that holds the truth
-    assert len(widths) >= 5
-    assert np.median(widths) < 0.5
+    assert not zero_known or np.median(widths) < 0.5
+
+
+STIFF = LEVERS["k 40"]
+ISSUED = Stated(1e-12, 1e-12, 1e-12, 0.003, 0.2)
+NOTHING_STATED: dict[str, Any] = {
+    "free_frequency_error_khz": None,
+    "quality_factor_error": None,
+    "spring_constant_error_n_per_m": None,
+    "calibration": {},
+}
+
+
+@pytest.mark.parametrize(
+    ("shape", "lever", "largest_aj"),
+    [
+        ("a sqrt(1 - a)", "k 40", 3.0),
+        ("sqrt(1 - a)", "k 40", 5.0),
+        ("a (1 - a)", "k 40", 3.0),
+        ("graphite", "k 44", 12.0),
+        ("saturation", "k 5.4", 5.0),
+        # a soft polymer
+        ("a (1 - a)", "soft", 500.0),
+    ],
+)
+def test_a_course_of_the_energy_is_never_taken_for_an_error_of_the_frequency(shape: str, lever: str, largest_aj: float):
+    """The free frequency is exactly as stated, its usual error 2e-4: a joint fit made 0.1 +- 0.5 of 3 aJ, and valid."""
+    tip = LEVERS[lever] if lever in LEVERS else Tip(free_nm=100.0, quality=150.0, stiffness=40.0, frequency_khz=300.0)
+    ratio = np.linspace(0.97, 0.3, 100)
+    energy = largest_aj * SHAPES[shape](ratio) / SHAPES[shape](ratio).max()
+    repulsive = ratio < (0.912 if shape == "graphite" else 1.0)
+    truth = curve_of_energy(tip, ratio, energy, repulsive)
+    table = table_of(tip, truth, ISSUED, np.random.default_rng(0), free_rows=30, **NOTHING_STATED)
+    result = tapping(table, law=False)
+    off = deviations(result, truth, tip.free_nm)
+    assert np.mean(np.abs(off) < 1.96) > 0.92
+    assert np.abs(off).max() < 4.0
+    if not result.valid:
+        assert re.search(
+            r"only bracketed .*; state the .* \('# (phase_zero_deg|free_frequency_khz) = ", result.reasons[0]
+        )
+    # what it says to state makes it a measurement, and right
+    known = replace(table, calibration={"phase_zero_deg": (3.0, 0.2)})
+    sharp = tapping(known, law=False)
+    off = deviations(sharp, truth, tip.free_nm)
+    assert np.mean(np.abs(off) < 1.96) > 0.92
+    assert sharp.valid, sharp.reasons
+    by_frequency = tapping(replace(table, free_frequency_error_khz=1e-5 * tip.frequency_khz), law=False)
+    assert np.mean(np.abs(deviations(by_frequency, truth, tip.free_nm)) < 1.96) > 0.92
+
+
+def test_the_dome_of_a_stiff_lever_is_bracketed_until_the_zero_of_the_phase_is_stated():
+    ratio = np.linspace(0.97, 0.3, 100)
+    truth = curve_of_energy(STIFF, ratio, 7.8 * ratio * np.sqrt(1.0 - ratio), np.ones(100, bool))
+    table = table_of(STIFF, truth, ISSUED, np.random.default_rng(0), free_rows=30, **NOTHING_STATED)
+    found = tapping(table, law=False)
+    assert not found.valid
+    assert "0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')" in found.reasons[0]
+    sharp = tapping(replace(table, calibration={"phase_zero_deg": (3.0, 0.2)}), law=False)
+    assert sharp.valid
+    at = {one["amplitude_ratio"]: one for one in sharp.energies_at}
+    for result in (found, sharp):
+        for place, true in ((0.9, 2.22), (0.7, 2.99), (0.5, 2.76)):
+            low, high = next(one["interval95_aj"] for one in result.energies_at if one["amplitude_ratio"] == place)
+            assert low < true < high
+    assert all(at[place]["said"] == "measured" for place in (0.9, 0.7, 0.5))
+
+
+def test_an_instrument_that_no_energy_allows_contradicts_the_curve():
+    truth = one_energy()
+    table = table_of(Tip(), truth, Stated(), np.random.default_rng(3), calibration={"phase_zero_deg": (3.0, 0.2)})
+    # 6e-4 off with an error of 1e-5 both ways: on one side a tap would take less than nothing
+    wrong = [
+        tapping(replace(table, free_frequency_khz=90.0 * (1.0 + off), calibration={}), law=False)
+        for off in (-6e-4, 6e-4)
+    ]
+    refused = [one for one in wrong if not one.valid]
+    assert len(refused) == 1
+    assert "the instrument contradicts the curve" in refused[0].reasons[0]
+    # with the zero stated, statements contradict each other
+    torn = tapping(replace(table, free_frequency_khz=90.0 * (1.0 + 2e-4)), law=False)
+    assert "of its errors from what was given would be needed" in torn.reasons[0]
+
+
+def test_fewer_than_three_free_rows_are_none():
+    truth, rng = one_energy(), np.random.default_rng(1)
+    found = tapping(table_of(Tip(), truth, Stated(), rng, free_rows=2, calibration={}), law=False)
+    assert not found.valid
+    assert "fewer than 3 rows are off the sample" in found.reasons[0]
+    known = {"calibration": {"phase_zero_deg": (3.0, 0.1)}}
+    assert tapping(table_of(Tip(), truth, Stated(), rng, free_rows=2, **known), law=False).valid
+
+
+def test_a_search_that_does_not_settle_is_said():
+    result = tapping(table_of(Tip(), one_energy(), Stated(), np.random.default_rng(2)), law=False)
+    assert result.functions is not None
+    lever = copy(result.functions.lever)
+    lever.minimum = _minimum(lambda x: x * np.nan, lambda x: np.full((len(x), len(x)), np.nan), lever.minimum.at)
+    assert not lever.minimum.settled
+    lost = replace(result, functions=replace(result.functions, lever=lever, branches=()))
+    assert lost.reasons == ["the least squares of the instrument, from what is stated and free rows, does not settle"]
+    assert lost.fit is not None
+    unfitted = replace(result, fit=replace(lost.fit, minimum=lost.fit.minimum._replace(settled=False)))
+    assert (unfitted.energy["value"], unfitted.valid) == (None, True)
+    assert unfitted.energy["reason"] == "the search for one energy a branch does not settle"
+
+
+def test_two_long_curves_of_one_file_share_an_instrument(tmp_path: Path):
+    """Of 1,005 and 1,008 points, both upwards: the common fit ran to Q = 0."""
+    lines = []
+    for points in (1005, 1008):
+        raw = raw_curve(points)
+        columns = np.stack([raw.height_nm[0], raw.amplitude_v[0], raw.phase_deg[0]])
+        rows = columns[:, np.argsort(columns[0], kind="stable")].T
+        lines += ["\t".join(f"{cell:.5f}" for cell in row) for row in rows]
+    path = tmp_path / "two.txt"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    known = ["--spring-constant", "44 +- 4", "--quality-factor", "230 +- 5", "--free-frequency-khz", "344.60 +- 0.01"]
+    columns = ["--columns", "offset_nm=1:nm,lockin_amplitude_nm=2:V,phase_lag_deg=3:deg", "--nm-per-volt", "42"]
+    run = CliRunner().invoke(main, ["tapping", str(path), *known, *columns, "--drive", "force", "--no-law", "--json"])
+    answer = strictly(run.stdout)
+    assert run.exit_code == (0 if answer["valid"] else 3)
+    assert len(answer["curves"]) == 2
+    common = answer["together"]["common_nuisances"]
+    assert common["quality_factor"]["value"] == pytest.approx(230.0, abs=5.0)
+    for one in answer["curves"]:
+        assert one["functions"]["nuisances"]["quality_factor"] == common["quality_factor"]
+        for branch in one["branches"]:
+            along = {
+                name: np.array(branch["curve"][name]) for name in ("amplitude_ratio", "energy_low_aj", "energy_high_aj")
+            }
+            true = true_energy_aj(along["amplitude_ratio"], back=False)
+            assert np.mean((along["energy_low_aj"] < true) & (true < along["energy_high_aj"])) > 0.9
 
 
 def fits_of_a_drift(phase: float, amplitude: float, rows: int, seed: int, *, way_back: bool) -> tuple[Tapping, Tapping]:

@@ -5,7 +5,8 @@
 90 kHz, Q = 200, 5.4 N/m, a tip radius of 10 nm, a force on the tip, free amplitude 40 nm; the sample comes nearer from
 50 to 4 nm and goes away again. Each row is the full scene in time, followed from where the row before left it until it
 settles, or for 300 periods four times over. Lock-in amplitude and phase carry noise of 0.3 % and 0.2 degrees, the
-instrument adds 5 degrees to the lag, and the free frequency and Q that the table states are off by 8 Hz and 0.75 %.
+instrument adds 5 degrees to the lag. What the table states is off by half an error or more: the free frequency by 8 Hz,
+Q by 0.75 %, and the zero of the phase, without which the energy would only be bracketed, by 0.1 degrees.
 """
 
 import sys
@@ -43,7 +44,7 @@ HEIGHTS_NM = (
     *(-45.0, -47.5, -50.0),
 )
 NOISE, PHASE_NOISE_DEG, SEED = 0.003, 0.2, 1
-PHASE_ZERO_DEG, FREQUENCY_OFF_KHZ, QUALITY_OFF = 5.0, 0.008, -1.5
+PHASE_ZERO_DEG, FREQUENCY_OFF_KHZ, QUALITY_OFF, ZERO_OFF_DEG = 5.0, 0.008, -1.5, 0.1
 EXAMPLE = Path(__file__).with_name("tapping_resonance.csv")
 _PERIODS, _PIECES, _CLEARANCE_NM = 300, 4, 6.0
 
@@ -134,6 +135,7 @@ def table_of(rows: list[SteadyRow], heights_nm: tuple[float, ...] = HEIGHTS_NM, 
         quality_factor_error=2.0,
         spring_constant_n_per_m=SPRING_CONSTANT_N_PER_M,
         spring_constant_error_n_per_m=0.1,
+        calibration={"phase_zero_deg": (PHASE_ZERO_DEG + ZERO_OFF_DEG, 0.2)},
         remarks=(
             "simulated: the paper's contact, tip radius 10 nm, a force on the tip at 90 kHz",
             f"truth: a tap of the repulsive branch takes {ENERGY_AJ} aJ; f0 90 kHz, Q 200, zero of phase 5 degrees",

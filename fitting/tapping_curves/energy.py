@@ -1,6 +1,6 @@
-"""The energy of a tap and the virial, row by row, as amplitude and phase give them without any law.
+"""The energy of a tap and the virial along a tapping curve, with bands that hold what the instrument leaves open.
 
-With F_1 = k gamma (Z + A0), the sample's force at the drive's frequency,
+*A row.* With F_1 = k gamma (Z + A0), the sample's force at the drive's frequency,
 
     E = -pi Im(F_1 conj Z) - (pi k s/Q) sum_{n >= 2} n^2 |Z_n|^2,      virial = Re(F_1 conj Z)/2.
 
@@ -8,18 +8,50 @@ The first term is what the drive gives less what the air takes at the drive's fr
 pi k A (A0 |gamma| sin phi - s A/Q); the sum is what the air takes at the harmonics. Those not measured are taken
 as of one brief impact a period, F_n = F_1, a tenth less: on resonance they do not matter, 3 to 10 % above it they
 take as much as the tap.
+
+*The instrument* x (f0, Q, the harmonics' factor; of each curve the lag and the amplitude of its free tip, and drifts)
+comes from what is stated and from rows of the free tip alone. Rows in contact tell nothing of it: a change of f0 turns
+an energy into another one that is as smooth, E(a) + t a sqrt(1 - a^2) with a = A/A0.
+
+*Along a branch* the energy is a constant and a Gaussian process (Matern 5/2) over the logarithm of the amplitude lost,
+for energies change fastest at first contact. Energies of all branches and curves of a lever are E ~ N(E^, G) with
+G = diag(noise^2) + S C S^T, S = dE/dx and C the covariance of x.
+
+*No sample gives energy.* Each point's band is its normal distribution, cut where another point would have less than no
+energy. What is left says of a point that it is measured, bracketed, or below a bound.
+
+*One energy for all taps* is an assumption that narrows the instrument. It stands apart and makes no curve valid.
 """
 
-from dataclasses import replace
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import get_lapack_funcs
+from scipy.optimize import isotonic_regression
+from scipy.special import ndtr
 
-from fitting.tapping_curves.curve import Instrument, Rows, TappingCurve, motion_of
+from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, covariance_of, descended, distance
+from fitting.instruments.lag import free_lag_deg
+from fitting.parameters import USUAL_DRIFTS
+from fitting.tapping_curves.branches import CurveBranch, free_ends, ways
+from fitting.tapping_curves.curve import (
+    HARMONICS_FACTOR,
+    Given,
+    Instrument,
+    Rows,
+    TappingCurve,
+    lag_of_free_tip,
+    motion_of,
+)
 
 _TRIALS = 361
 _HARMONICS = 40
 """The sum of those of a brief impact converges like 1/n; beyond them a contact lasts too long to excite them."""
+Z95 = 1.959964
+_inverse_triangle = get_lapack_funcs("trtri", dtype=float)
 
 
 class Energies(NamedTuple):
@@ -63,7 +95,7 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
     with np.errstate(invalid="ignore", divide="ignore"):
         by_amplitude = change(motion.reading / curve.amplitude_nm)
     by_lag = change(-1j * motion.reading) * np.pi / 180.0
-    harmonics = scale * _harmonics(curve, instrument, np.abs(force)).lost
+    harmonics = scale * _lost_at_harmonics(curve, instrument, np.abs(force))
     return Energies(
         energy_aj=scale * first - harmonics,
         harmonics_aj=harmonics,
@@ -75,102 +107,22 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
     )
 
 
-class _Harmonics(NamedTuple):
-    """What the air takes at the harmonics, over k, of every row.
+def _lost_at_harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> Rows:
+    """Return what the air takes at the harmonics over k, in nm^2: (pi s/Q) sum n^2 |Z_n|^2.
 
-    Attributes:
-        lost: all of it, in nm^2.
-        by_force: of those not measured, over |F_1/k|^2; measured ones do not hang on the force.
-        by_frequency: change of `lost` with f0 while the force stays, in nm^2/kHz.
-        by_quality: likewise with Q.
+    Measured ones as they are, |Z_n| = |F_1/k|/|gamma(n s)| for the others.
     """
-
-    lost: Rows
-    by_force: Rows
-    by_frequency: Rows
-    by_quality: Rows
-
-
-def _harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> _Harmonics:
-    """Return what the air takes at the harmonics; measured where they are, else those of a brief impact."""
-    q, f0 = instrument.quality_factor, instrument.free_frequency_khz
-    n = np.arange(2, _HARMONICS + 1)[:, None]
-    frequencies, row = _distinct(curve.drive_frequency_khz)
-    s = frequencies / f0
-    gamma = 1.0 - (n * s) ** 2 + 1j * n * s / q
-    parts = max(instrument.harmonics_factor, 0.0) * n**2 / np.abs(gamma) ** 2
-    changes = [2.0 * (n * s) ** 2 - 1j * n * s / q, -1j * n * s / q]
-    # relative changes of each part with ln f0 and ln Q
-    slopes = [-2.0 * np.real(change / gamma) * parts for change in changes]
-    factor, square = np.pi * s[row] / q, force**2
-    by_force, by_frequency, by_quality = (part.sum(axis=0)[row] for part in (parts, *slopes))
-    others = np.zeros(curve.rows)
-    for multiple, measured in curve.harmonic_amplitudes_nm.items():
-        here = np.isfinite(measured) & (2 <= multiple <= _HARMONICS)
-        others[here] += multiple**2 * measured[here] ** 2
-        for column, part in zip((by_force, by_frequency, by_quality), (parts, *slopes), strict=True):
-            column[here] -= part[min(multiple, _HARMONICS) - 2, row][here]
-    lost = factor * (others + by_force * square)
-    return _Harmonics(
-        lost=lost,
-        by_force=factor * by_force,
-        by_frequency=(factor * by_frequency * square - lost) / f0,
-        by_quality=(factor * by_quality * square - lost) / q,
-    )
-
-
-def _distinct(values: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Return the different values, and which of them each row has; most curves have one."""
-    if len(values) and (values == values[0]).all():
-        return values[:1], np.zeros(len(values), int)
-    return np.unique(values, return_inverse=True)
-
-
-class InstrumentSlopes(NamedTuple):
-    """Changes of energy (aJ), virial (aJ) and the free tip's lag (degrees) of every row, by one unit of something."""
-
-    energy_aj: Rows
-    virial_aj: Rows
-    free_lag_deg: Rows
-
-
-def instrument_slopes(curve: TappingCurve, instrument: Instrument) -> dict[str, InstrumentSlopes]:
-    """Return the changes of each row's energy and virial by the fields of the instrument, by their names.
-
-    They are the derivatives of `energies`: of gamma, of the phasor read, which turns with arg gamma, and under a base
-    of the free amplitude A_free/|1 - gamma|.
-    """
-    motion = motion_of(curve, instrument)
-    gamma, z, free = motion.gamma, motion.height, motion.free_amplitude_nm
-    q, f0 = instrument.quality_factor, instrument.free_frequency_khz
-    scale = curve.spring_constant_n_per_m.value * curve.tip_calibration.value**2
-    force = gamma * (z + free)
-    harmonics = _harmonics(curve, instrument, np.abs(force))
-    base, nothing = curve.drive == "base", np.zeros(curve.rows)
-
-    def by(dgamma, dreading, dfree, dharmonics=0.0, dlag=nothing) -> InstrumentSlopes:
-        dz = dreading - (dgamma * free + gamma * dfree if base else 0.0)
-        dforce = dgamma * (z + free) + gamma * (dz + dfree)
-        product = dforce * np.conj(z) + force * np.conj(dz)
-        lost = dharmonics + 2.0 * harmonics.by_force * np.real(np.conj(force) * dforce)
-        return InstrumentSlopes(-scale * (np.pi * np.imag(product) + lost), 0.5 * scale * np.real(product), dlag)
-
-    def by_gamma(dgamma, dharmonics) -> InstrumentSlopes:
-        turn, other = np.imag(dgamma / gamma), dgamma / (1.0 - gamma)
-        dfree, dlag = (free * np.real(other), turn + np.imag(other)) if base else (nothing, turn)
-        return by(dgamma, 1j * turn * motion.reading, dfree, dharmonics, np.rad2deg(dlag))
-
-    s = curve.drive_frequency_khz / f0
-    of_force = harmonics.by_force * np.abs(force) ** 2
-    factor = instrument.harmonics_factor
-    stated = curve.free_amplitude_nm / np.abs(1.0 - gamma) if base else curve.free_amplitude_nm
-    return {
-        "free_frequency_khz": by_gamma((2.0 * s**2 - 1j * s / q) / f0, harmonics.by_frequency),
-        "quality_factor": by_gamma(-1j * s / q**2, harmonics.by_quality),
-        "phase_zero_deg": by(0.0, 1j * np.pi / 180.0 * motion.reading, 0.0, dlag=np.ones(curve.rows)),
-        "free_amplitude_factor": by(0.0, 0.0, stated),
-        "harmonics_factor": InstrumentSlopes(-scale * of_force / factor if factor > 0.0 else nothing, nothing, nothing),
-    }
+    n, q = np.arange(2, _HARMONICS + 1)[:, None], instrument.quality_factor
+    frequencies, row = np.unique(curve.drive_frequency_khz, return_inverse=True)
+    s = frequencies / instrument.free_frequency_khz
+    each = max(instrument.harmonics_factor, 0.0) * n**2 / np.abs(1.0 - (n * s) ** 2 + 1j * n * s / q) ** 2
+    of_force, measured = each.sum(axis=0)[row], np.zeros(curve.rows)
+    for multiple, amplitude in curve.harmonic_amplitudes_nm.items():
+        if 2 <= multiple <= _HARMONICS:
+            here = np.isfinite(amplitude)
+            measured[here] += multiple**2 * amplitude[here] ** 2
+            of_force[here] -= each[multiple - 2, row[here]]
+    return np.pi * s[row] / q * (measured + of_force * force**2)
 
 
 def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:
@@ -213,4 +165,1149 @@ def lags_of(curve: TappingCurve, instrument: Instrument, energy_aj: Rows) -> Row
             before, after = off[place, row], off[place + 1, row]
             crossing = turns[place] + (turns[1] - turns[0]) * before / np.where(before == after, 1.0, before - after)
             found[row] = curve.lag_deg[row] + crossing[np.argmin(np.abs(crossing))]
+    return found
+
+
+FEWEST_FREE_ROWS = 3
+"""Rows that are off the sample; fewer may be those of first contact, and are not taken for the free tip's."""
+_ANY_LAG_DEG = 90.0
+"""Error of a free tip's lag of which nothing is known."""
+_WIDE_DRIFTS = {"phase_drift_deg": 30.0, "free_amplitude_drift": 0.3}
+"""Errors of drifts that rows of the free tip at both ends determine."""
+_STEP = 1e-3
+"""Of differences by the unknowns, in their units."""
+_SETTLED, _ROUNDS, _RISE = 1e-6, 40, 0.1
+"""Estimated distance of chi2 to its minimum, steps at most, and by how much a step may raise chi2: slopes of rows in
+contact are taken at smooth readings, not at those that chi2 is of."""
+
+
+class Nuisance(NamedTuple):
+    """Something of the instrument that is not known exactly.
+
+    Attributes:
+        name: its key, with a number where each drive has its own.
+        kind: its key without the number.
+        given: what is stated of it, the unit that of the key; an error of infinity: nothing.
+        value: at the minimum.
+        standard_error: there.
+    """
+
+    name: str
+    kind: str
+    given: Given
+    value: float
+    standard_error: float
+
+    @property
+    def pull(self) -> float:
+        """Distance of the value from what was given, in the error given."""
+        return (self.value - self.given.value) / self.given.error
+
+
+class _Unknown(NamedTuple):
+    """One of the unknowns x, which count in standard errors of what is known beforehand.
+
+    Attributes:
+        kind: what it is; frequency and Q by their logarithms.
+        curve: number of the curve that it is of; None: of the lever.
+        rows: by how much it counts in each row of that curve.
+        given: what is known beforehand.
+    """
+
+    kind: str
+    curve: int | None
+    rows: Rows
+    given: Given
+
+
+class _Means(NamedTuple):
+    """Means of free rows: the weights of the rows in each, its value and its error."""
+
+    weights: Float[np.ndarray, "means rows"]
+    mean: Float[np.ndarray, " means"]
+    error: Float[np.ndarray, " means"]
+
+
+class Minimum(NamedTuple):
+    """Where a least squares ends: unknowns, their covariance, chi2, its degrees of freedom, whether it settled there.
+
+    Every unknown has a residual of what is known of it beforehand, so that the other residuals count the freedom.
+    """
+
+    at: Float[np.ndarray, " unknowns"]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    chi2: float
+    degrees_of_freedom: int
+    settled: bool
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger chi2 if the model is right; NaN where nothing is left to judge by."""
+        return chi2_tail(self.chi2, self.degrees_of_freedom) if self.degrees_of_freedom > 0 else float("nan")
+
+
+Function = Callable[[np.ndarray], np.ndarray]
+
+
+def _minimum(residual: Function, jacobian: Function, start: np.ndarray) -> Minimum:
+    """Return the minimum of a sum of squares, and whether the search settled there."""
+
+    def evaluate(places: np.ndarray, _: np.ndarray) -> Searches:
+        left, slopes = residual(places[0]), jacobian(places[0])
+        return Searches(places, left[None], slopes[None], np.array([left @ left]))
+
+    count = len(start)
+    box = Box(np.full(count, -np.inf), np.full(count, np.inf), np.zeros((1, count), bool))
+    # what is far out of range is refused by its chi2
+    with np.errstate(over="ignore", invalid="ignore"):
+        end = descended(evaluate, evaluate(start[None], np.arange(1)), box, settled=_SETTLED, most=_ROUNDS, rise=_RISE)
+        settled = bool(distance(end, box)[0] <= 1e-2)
+    covariance = covariance_of(end.jacobian[0].T @ end.jacobian[0])
+    settled &= bool(np.isfinite(covariance).all())
+    return Minimum(end.place[0], covariance, float(end.chi2[0]), len(end.residual[0]) - count, settled)
+
+
+def _slopes(function: Function, x: np.ndarray, count: int) -> np.ndarray:
+    """Return the changes of a function by the first unknowns, along the last axis, by central differences."""
+    steps = _STEP * np.eye(len(x))[:count]
+    return np.stack([(function(x + step) - function(x - step)) / (2.0 * _STEP) for step in steps], axis=-1)
+
+
+COMMON = ("free_frequency_khz", "quality_factor", "harmonics_factor")
+"""Unknowns that curves of one lever have in common: the first of a lever's."""
+
+
+class Lever:
+    """Curves of one lever, and the least squares that tells their instrument without the rows in contact.
+
+    Attributes:
+        curves: the curves.
+        free: the rows of the free tip of each.
+        unknowns: of the instrument.
+        minimum: of what is stated and the means of free rows.
+    """
+
+    def __init__(self, curves: Sequence[TappingCurve], free: Sequence[Bool[np.ndarray, " rows"]]):
+        """Find the instrument of curves of which the same is stated of their lever."""
+        self.curves = tuple(curves)
+        self.free = tuple(_of_free_tip(*pair) for pair in zip(curves, free, strict=True))
+        lever = [_of_logarithm(getattr(self.curves[0], name)) for name in COMMON[:2]]
+        pairs = zip(COMMON, [*lever, HARMONICS_FACTOR], strict=True)
+        unknowns = [_Unknown(name, None, np.ones(0), given) for name, given in pairs]
+        self._means = []
+        for number, (curve, here) in enumerate(zip(self.curves, self.free, strict=True)):
+            unknowns += _unknowns_of(number, curve, here)
+            share, error = (part / curve.free_amplitude_nm for part in (curve.amplitude_nm, curve.amplitude_error_nm))
+            lags = _means(curve, curve.lag_deg, curve.lag_error_deg, here, _frequencies(curve), turning=True)
+            self._means.append((lags, _means(curve, share, error, here, _levels(curve))))
+        self.unknowns = tuple(unknowns)
+        self._start = np.array([unknown.given.value for unknown in unknowns])
+        self._unit = np.array([unknown.given.error for unknown in unknowns])
+        # the zero that several curves or frequencies state is one and the same, and counts once
+        self._zeros = [
+            (i, zero) for i, one in enumerate(unknowns) if one.kind == "free_lag_deg" and (zero := self._zero(one))
+        ]
+        self.minimum = _minimum(self.residual, self.jacobian, np.zeros(len(unknowns)))
+
+    def _zero(self, unknown: _Unknown) -> Given | None:
+        return None if unknown.curve is None else self.curves[unknown.curve].phase_zero_deg
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Return the unknowns in their own units."""
+        return self._start + self._unit * x[: len(self._unit)]
+
+    def _of_rows(self, x: np.ndarray, number: int) -> tuple[Rows, Rows]:
+        """Return the lag of the free tip as read, and the true over the stated free amplitude, in a curve's rows."""
+        lag, factor = np.zeros(self.curves[number].rows), np.zeros(self.curves[number].rows)
+        for unknown, value in zip(self.unknowns, self.values(x).tolist(), strict=True):
+            if unknown.curve == number:
+                column = lag if unknown.kind in {"free_lag_deg", "phase_drift_deg"} else factor
+                column += value * unknown.rows
+        return lag, factor
+
+    def _free_lag(self, x: np.ndarray, number: int) -> Rows:
+        """Return the lag of the free tip by frequency and Q, in a curve's rows."""
+        frequency, quality = np.exp(self.values(x)[:2]).tolist()
+        curve = self.curves[number]
+        return free_lag_deg(curve.drive, curve.drive_frequency_khz / frequency, quality)
+
+    def instrument(self, number: int, x: np.ndarray | None = None) -> Instrument:
+        """Return the instrument of a curve, at the minimum if no unknowns are given."""
+        x = self.minimum.at if x is None else x
+        frequency, quality = np.exp(self.values(x)[:2]).tolist()
+        lag, factor = self._of_rows(x, number)
+        return Instrument(frequency, quality, lag - self._free_lag(x, number), factor, float(self.values(x)[2]))
+
+    @property
+    def stated(self) -> np.ndarray:
+        """The unknowns with frequency and Q as stated; free rows tell the zero of the phase."""
+        kinds = {"free_lag_deg"} if all(curve.time is None for curve in self.curves) else set()
+        return np.where([one.kind in kinds.union(COMMON) for one in self.unknowns], 0.0, self.minimum.at)
+
+    def residual(self, x: np.ndarray) -> np.ndarray:
+        """Return in standard errors what is stated, the means of free rows, and stated zeros of the phase."""
+        left = [x[: len(self.unknowns)]]
+        for number, (lags, shares) in enumerate(self._means):
+            lag, factor = self._of_rows(x, number)
+            left.append(turned(lags.weights @ lag - lags.mean) / lags.error)
+            left.append((shares.weights @ factor - shares.mean) / shares.error)
+        off = [turned(self.zero_at(x, i) - zero.value) / max(zero.error, 1e-4) for i, zero in self._zeros]
+        return np.concatenate([*left, np.array(off) / np.sqrt(max(len(off), 1))])
+
+    def zero_at(self, x: np.ndarray, place: int) -> Any:
+        """Return the zero of the phase of a frequency of a curve, from its free tip's lag, whose place is given."""
+        number = self.unknowns[place].curve or 0
+        row = int(np.argmax(self.unknowns[place].rows))
+        return self.values(x)[place] - self._free_lag(x, number)[row]
+
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
+        """Return the changes of the residuals by the unknowns."""
+        return _slopes(self.residual, x, len(self.unknowns))
+
+    def slopes(self, curve: TappingCurve, number: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the changes of each row's energy and virial by every unknown, shape (rows, unknowns).
+
+        Args:
+            curve: readings at which they are taken.
+            number: of the curve that they are of.
+            x: the unknowns.
+        """
+
+        def of(y: np.ndarray) -> np.ndarray:
+            found = energies(curve, self.instrument(number, y))
+            return np.stack([found.energy_aj, found.virial_aj])
+
+        energy, virial = _slopes(of, x, len(self.unknowns))
+        return energy, virial
+
+    def errors_of_rows(self, number: int) -> tuple[dict[str, Rows], dict[str, Rows]]:
+        """Return by how much each energy and each virial moves with one standard error of what all rows share.
+
+        With the instrument as given: frequency, Q and harmonics by what is stated of them, the rest by free rows.
+        """
+        given, errors = self.stated, np.sqrt(np.diag(self.minimum.covariance))
+        errors[: len(COMMON)] = 1.0
+        curve, found = self.curves[number], energies(self.curves[number], self.instrument(number, given))
+        parts: tuple[dict[str, Rows], dict[str, Rows]] = ({}, {})
+        columns = (found.energy_aj, found.virial_aj)
+        for named, by, column in zip(parts, self.slopes(curve, number, given), columns, strict=True):
+            for unknown, part in zip(self.unknowns, np.abs(by * errors).T, strict=True):
+                if unknown.curve in {None, number}:
+                    name = _NAMES.get(unknown.kind, unknown.kind)
+                    named[name] = np.hypot(named.get(name, 0.0), part)
+            named |= {name: share * np.abs(column) for name, share in curve.relative_errors.items()}
+        return parts
+
+    def nuisances(self, number: int, minimum: Minimum | None = None) -> tuple[Nuisance, ...]:
+        """Return what is stated of the instrument of a curve and where a least squares ends."""
+        minimum = self.minimum if minimum is None else minimum
+        x, count, curve = minimum.at, len(self.unknowns), self.curves[number]
+        covariance, values = minimum.covariance[:count, :count], self.values(x)
+        found: list[Nuisance] = []
+        for i, unknown in enumerate(self.unknowns):
+            if unknown.curve not in {None, number}:
+                continue
+            kind, given, value = unknown.kind, unknown.given, float(values[i])
+            by = unknown.given.error * np.eye(count)[i]
+            if kind in {"free_frequency_khz", "quality_factor"}:
+                given, value = getattr(curve, kind), float(np.exp(value))
+                by = value * by
+            elif kind == "free_lag_deg":
+                kind, value = "phase_zero_deg", float(self.zero_at(x, i))
+                given = curve.phase_zero_deg or Given(value, np.inf)
+                by = _slopes(lambda y, i=i: np.array([self.zero_at(y, i)]), x, count)[0]
+            name = f"{kind}_{sum(one.kind == kind for one in found)}" if kind in _NUMBERED else kind
+            found.append(Nuisance(name, kind, given, value, float(np.sqrt(by @ covariance @ by))))
+        return tuple(found)
+
+
+_NUMBERED = ("phase_zero_deg", "free_amplitude")
+_NAMES = {"free_lag_deg": "phase_zero_deg", "harmonics_factor": "harmonics"}
+"""What parts of the errors of rows are called."""
+
+
+def _of_logarithm(given: Given) -> Given:
+    """Return the logarithm of a number with its error."""
+    return Given(float(np.log(given.value)), max(given.error / given.value, 1e-9))
+
+
+def _of_free_tip(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Return free rows with a phase where a frequency has at least three of them."""
+    known = free & (np.isfinite(curve.lag_deg) | (not curve.has_phase))
+    kinds = _frequencies(curve)
+    return known & (np.bincount(kinds[known], minlength=curve.rows + 1)[kinds] >= FEWEST_FREE_ROWS)
+
+
+def _frequencies(curve: TappingCurve) -> Int[np.ndarray, " rows"]:
+    """Return the number of the drive's frequency of each row."""
+    return np.unique(curve.drive_frequency_khz, return_inverse=True)[1].reshape(-1)
+
+
+def _levels(curve: TappingCurve) -> Int[np.ndarray, " rows"]:
+    """Return the number of frequency and free amplitude of each row."""
+    keys = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm])
+    return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
+
+
+def _unknowns_of(number: int, curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> list[_Unknown]:
+    """Return a curve's own unknowns: of each frequency the free tip's lag, of each drive its amplitude, and drifts."""
+    zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
+    given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value, zero)
+    expected, kinds, levels = lag_of_free_tip(curve, given), _frequencies(curve), _levels(curve)
+    found = []
+    for kind in range(kinds.max(initial=-1) + 1):
+        here = kinds == kind
+        rows, lag = np.flatnonzero(here & free & np.isfinite(curve.lag_deg)), float(expected[here][0])
+        if len(rows):
+            first, weights = curve.lag_deg[rows[0]], curve.lag_error_deg[rows] ** -2.0
+            lag = float(first + np.average(turned(curve.lag_deg[rows] - first), weights=weights))
+        found.append(_Unknown("free_lag_deg", number, here.astype(float), Given(lag, _ANY_LAG_DEG)))
+    known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
+    drives = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
+    found += [_Unknown("free_amplitude", number, rows, known) for rows in drives]
+    if curve.time is not None:
+        errors = _WIDE_DRIFTS if free_ends(curve, free) else USUAL_DRIFTS
+        found += [_Unknown(name, number, curve.time, Given(0.0, error)) for name, error in errors.items()]
+    return found
+
+
+def turned(degrees: Any) -> Any:
+    """Return angles between -180 and 180 degrees."""
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+_FEWEST_OF_MEAN, _MOST_MEANS = 4, 8
+
+
+def _means(
+    curve: TappingCurve,
+    values: Rows,
+    errors: Rows,
+    free: Bool[np.ndarray, " rows"],
+    kinds: Int[np.ndarray, " rows"],
+    *,
+    turning: bool = False,
+) -> _Means:
+    """Return means of the free rows of each kind, their errors with what they scatter beyond their noise.
+
+    Where the order of the rows is known each stretch of neighbours has means of its own, which tell a drift.
+    """
+    found = []
+    for kind in np.unique(kinds).tolist():
+        rows = np.flatnonzero(free & (kinds == kind) & np.isfinite(values))
+        for part in _stretches(curve, rows):
+            off = values[part] - values[part[0]]
+            off = turned(off) if turning else off
+            information = errors[part] ** -2.0
+            excess = np.sqrt(max(np.var(off) - 1.0 / information.mean(), 0.0))
+            weights = np.zeros(curve.rows)
+            weights[part] = information / information.sum()
+            mean = values[part[0]] + np.average(off, weights=information)
+            found.append((weights, mean, np.hypot(information.sum() ** -0.5, excess)))
+    if not found:
+        return _Means(np.zeros((0, curve.rows)), np.zeros(0), np.zeros(0))
+    return _Means(*(np.array(column) for column in zip(*found, strict=True)))
+
+
+def _stretches(curve: TappingCurve, rows: Int[np.ndarray, " some"]) -> list[np.ndarray]:
+    """Return the rows in one piece, or where their order in time is known those that follow each other in several."""
+    if not len(rows) or curve.time is None:
+        return [rows] if len(rows) else []
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    return [
+        part
+        for run in runs
+        for part in np.array_split(run, max(1, min(len(run) // _FEWEST_OF_MEAN, _MOST_MEANS)))
+        if len(part)
+    ]
+
+
+_SHALLOW = 0.03
+"""Loss, of the free amplitude, that is added to all: there the length in nm is that at contact."""
+_LENGTH, _SIZE = 0.7, 3.0
+"""Of the process: length in the logarithm of the amplitude lost, and size over the range of the readings; the size that
+readings make most probable is too small for one curve in twenty."""
+_MOST_BINS, _POINTS = 60, 41
+"""Rows of a branch beyond which neighbours are averaged, and points that it is given at."""
+
+
+def losses(curve: TappingCurve, factor: float | Rows = 1.0) -> Rows:
+    """Return the logarithm of what each row's amplitude has lost of the free one, smoothed along its way.
+
+    By amplitude an energy is smooth where by height it is not: an attractive plateau ends within a nanometre.
+
+    Args:
+        curve: the curve.
+        factor: true over stated free amplitude.
+    """
+    place, free = np.zeros(curve.rows), curve.free_amplitude_nm * factor
+    for part in ways(curve):
+        weights = (free[part] / curve.amplitude_error_nm[part]) ** 2
+        ratio = isotonic_regression(curve.amplitude_nm[part] / free[part], weights=weights, increasing=False).x
+        place[part] = np.log(_SHALLOW + np.maximum(1.0 - ratio, 0.0))
+    return place
+
+
+class Smoother(NamedTuple):
+    """A constant and a process, given readings whose neighbours are averaged in bins.
+
+    Attributes:
+        place: of the bins.
+        starts: where each begins.
+        weights: of the rows in their bins.
+        variance: of the bins' averages.
+        size: standard deviation of the process.
+        inverse: of the averages' covariance, noise and process.
+    """
+
+    place: Float[np.ndarray, " bins"]
+    starts: Int[np.ndarray, " bins"]
+    weights: Float[np.ndarray, " rows"]
+    variance: Float[np.ndarray, " bins"]
+    size: float
+    inverse: Float[np.ndarray, "bins bins"]
+
+    @classmethod
+    def of(cls, place: np.ndarray, noise: np.ndarray, size: float, most: int = _MOST_BINS) -> "Smoother":
+        """Return the smoother of rows that stand in the order of their places, for a size of the process."""
+        count = min(len(place), most)
+        starts = -(-np.arange(count) * len(place) // count)
+        information = noise**-2.0
+        total = np.add.reduceat(information, starts)
+        weights = information / np.repeat(total, np.diff(starts, append=len(place)))
+        middle = np.add.reduceat(weights * place, starts)
+        # places of several bins may be one
+        own = np.diag(1.0 / total + 1e-12 * size**2)
+        factor = np.linalg.cholesky(matern(middle, middle, size) + own)
+        root = _inverse_triangle(factor.T)[0]
+        return cls(middle, starts, weights, 1.0 / total, size, root @ root.T)
+
+    def average(self, values: np.ndarray) -> np.ndarray:
+        """Return the weighted averages over the bins of values of the rows, shape (rows, ...)."""
+        return np.add.reduceat((self.weights * values.T).T, self.starts, axis=0)
+
+    def at(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return at some places the weights of the bins, shape (places, bins), and the variance besides."""
+        ones = self.inverse.sum(axis=1)
+        cross = matern(place, self.place, self.size)
+        left, weights = 1.0 - cross @ ones, cross @ self.inverse
+        variance = self.size**2 - np.sum(weights * cross, axis=1) + left**2 / ones.sum()
+        return weights + np.outer(left, ones / ones.sum()), np.maximum(variance, 0.0)
+
+    def of_rows(self, place: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return what rows' values become at their places, and the degrees of freedom that this takes."""
+        weights, _ = self.at(place)
+        bins = np.repeat(np.arange(len(self.starts)), np.diff(self.starts, append=len(place)))
+        return weights @ self.average(values), float(np.sum(weights[np.arange(len(place)), bins] * self.weights))
+
+
+def matern(a: np.ndarray, b: np.ndarray, size: float) -> np.ndarray:
+    """Return the Matern 5/2 covariance of a process between two sets of places."""
+    distance = np.sqrt(5.0) * np.abs(a[:, None] - b[None, :]) / _LENGTH
+    return size**2 * (1.0 + distance + distance**2 / 3.0) * np.exp(-distance)
+
+
+def _size_of(values: np.ndarray, noise: np.ndarray) -> float:
+    """Return the size of the process of some readings: three times their range, in running means of five."""
+    width = min(5, len(values))
+    means = np.convolve(values, np.full(width, 1.0 / width), "valid")
+    return _SIZE * max(float(np.ptp(means)), float(np.median(noise)))
+
+
+def _smooth_readings(curve: TappingCurve, stretches: Sequence[np.ndarray], place: Rows) -> TappingCurve:
+    """Return a curve with its readings smoothed along stretches of rows: errors of energies are taken there."""
+    amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
+    for rows in stretches:
+        for readings, errors in ((amplitude, curve.amplitude_error_nm), (lag, curve.lag_error_deg)):
+            smoother = Smoother.of(place[rows], errors[rows], _size_of(readings[rows], errors[rows]))
+            readings[rows], _ = smoother.of_rows(place[rows], readings[rows])
+    return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
+
+
+FEWEST_ROWS = 3
+"""Of a group of rows that gets an energy of its own."""
+_FAR, _MOST_OUTLIERS = 4.0, 0.2
+"""Residual in standard errors from which a row is excluded, and share of rows that may be."""
+_ALLOWED = 3.0
+"""Standard errors within which an energy of less than nothing is chance."""
+MEASURED, BRACKET = 0.5, 0.1
+"""Half of a band over its middle up to which an energy is measured; lower over upper end from which it is bracketed."""
+HEADLINE = (0.95, 0.9, 0.8, 0.7, 0.5)
+"""Amplitudes, of the free one, at which a reader is told the energy."""
+
+
+def said_of(low: float, high: float) -> str:
+    """Return what a band of 95 % says of an energy: "measured", "bracket", or "upper bound".
+
+    >>> said_of(2.0, 4.0), said_of(0.5, 4.0), said_of(0.1, 4.0)
+    ('measured', 'bracket', 'upper bound')
+    """
+    if high - low <= MEASURED * (high + low):
+        return "measured"
+    return "bracket" if low > BRACKET * high else "upper bound"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EnergyCurve:
+    """Energy and virial along a branch, in the order of the amplitude; bands hold the truth in 95 of 100 places.
+
+    Attributes:
+        amplitude_ratio: amplitude read over the free one.
+        height_nm: of the sample.
+        energy_low_aj: lower end of the energy's band, mean over a period of the drive.
+        energy_high_aj: its upper end.
+        virial_aj: mean of force times height, positive where attraction prevails.
+        virial_error_aj: its standard error.
+        estimate_aj: energy with the instrument where statements and free rows put it, whatever its sign.
+        noise_aj: standard error of that but for the instrument.
+        by_instrument: its change by every unknown of the instrument, in standard errors of what is known beforehand,
+            shape (points, unknowns).
+        certain: whether the place is far enough from first contact to be told from it.
+    """
+
+    amplitude_ratio: Float[np.ndarray, " points"]
+    height_nm: Float[np.ndarray, " points"]
+    energy_low_aj: Float[np.ndarray, " points"]
+    energy_high_aj: Float[np.ndarray, " points"]
+    virial_aj: Float[np.ndarray, " points"]
+    virial_error_aj: Float[np.ndarray, " points"]
+    estimate_aj: Float[np.ndarray, " points"]
+    noise_aj: Float[np.ndarray, " points"]
+    by_instrument: Float[np.ndarray, "points unknowns"]
+    certain: Bool[np.ndarray, " points"]
+
+    @property
+    def energy_aj(self) -> Float[np.ndarray, " points"]:
+        """The middle of the band."""
+        return 0.5 * (self.energy_low_aj + self.energy_high_aj)
+
+    @property
+    def energy_error_aj(self) -> Float[np.ndarray, " points"]:
+        """The standard error that a band of this width has."""
+        return 0.5 * (self.energy_high_aj - self.energy_low_aj) / Z95
+
+    def at(self, ratio: float) -> tuple[float, ...] | None:
+        """Return the band at an amplitude, of the free one; None beyond the branch."""
+        return within(ratio, self.amplitude_ratio, self.energy_low_aj, self.energy_high_aj)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return amplitude ratio, height, energy and virial with their bands, and what is said of each point."""
+        return {
+            "amplitude_ratio": self.amplitude_ratio,
+            "height_nm": self.height_nm,
+            "energy_aj": self.energy_aj,
+            "energy_low_aj": self.energy_low_aj,
+            "energy_high_aj": self.energy_high_aj,
+            "said": [said_of(*ends) for ends in zip(self.energy_low_aj, self.energy_high_aj, strict=True)],
+            "virial_aj": self.virial_aj,
+            "virial_low_aj": self.virial_aj - Z95 * self.virial_error_aj,
+            "virial_high_aj": self.virial_aj + Z95 * self.virial_error_aj,
+        }
+
+
+def within(ratio: float, measured: np.ndarray, *columns: np.ndarray) -> tuple[float, ...] | None:
+    """Return columns at an amplitude, of the free one, by straight lines between those measured; None beyond them."""
+    if not measured[0] <= ratio <= measured[-1]:
+        return None
+    return tuple(float(np.interp(ratio, measured, column)) for column in columns)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TappingBranch(CurveBranch):
+    """Rows of one drive, one way and one side of the phase, and the energy along them.
+
+    Attributes:
+        rows: numbers of the rows.
+        curve: energy and virial along them.
+    """
+
+    rows: Int[np.ndarray, " some"]
+    curve: EnergyCurve
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnergyFunctions:
+    """Energies along the branches of a curve.
+
+    Attributes:
+        lever: the curves of its lever, and their instrument.
+        number: of the curve among them.
+        energies: of every row, with the instrument where statements and free rows put it.
+        branches: energy and virial along each.
+        outliers: rows too far from the others.
+        rows_chi2: of the rows about their functions.
+        rows_freedom: number of these rows less what their functions take.
+        scale: what the rows' own errors were multiplied by, the largest of the branches.
+        possible: whether an instrument as stated makes no energy of the lever's curves less than nothing.
+    """
+
+    lever: Lever
+    number: int
+    energies: Energies
+    branches: tuple[TappingBranch, ...]
+    outliers: Bool[np.ndarray, " rows"]
+    rows_chi2: float
+    rows_freedom: float
+    scale: float
+    possible: bool
+
+    @property
+    def nuisances(self) -> tuple[Nuisance, ...]:
+        """What is known of the instrument."""
+        return self.lever.nuisances(self.number)
+
+    @property
+    def instrument(self) -> Instrument:
+        """Where statements and free rows put it."""
+        return self.lever.instrument(self.number)
+
+    @property
+    def torn(self) -> list[Nuisance]:
+        """Nuisances that had to go beyond three of their errors."""
+        return [one for one in self.nuisances if abs(one.pull) > TORN]
+
+
+def energies_along(
+    lever: Lever, stretches: Sequence[Sequence[np.ndarray]], repulsive: Sequence[Bool[np.ndarray, " rows"]]
+) -> list[EnergyFunctions]:
+    """Return the energies along the branches of the curves of a lever, with their bands.
+
+    Args:
+        lever: the curves, and their instrument.
+        stretches: rows of each curve along which the energy is smooth.
+        repulsive: rows of each curve that are on the repulsive branch.
+    """
+    each = [_along(lever, i, *pair) for i, pair in enumerate(zip(stretches, repulsive, strict=True))]
+    curves = [branch.curve for one in each for branch in one.branches]
+    if not curves:
+        return each
+    columns = (np.concatenate([getattr(c, name) for c in curves]) for name in ("estimate_aj", "noise_aj", "certain"))
+    size, axes = np.linalg.eigh(lever.minimum.covariance)
+    root = axes * np.sqrt(np.maximum(size, 0.0))
+    low, high, possible = positive_bands(*columns, np.concatenate([c.by_instrument for c in curves]) @ root)
+    share = float(np.linalg.norm(list(lever.curves[0].relative_errors.values())))
+    middle, common = 0.5 * (low + high), Z95 * share * 0.5 * (low + high)
+    low, high = np.maximum(middle - np.hypot(middle - low, common), 0.0), middle + np.hypot(high - middle, common)
+    ends = np.cumsum([len(c.noise_aj) for c in curves])[:-1]
+    bands = zip(np.split(low, ends), np.split(high, ends), strict=True)
+    return [
+        replace(
+            one,
+            possible=possible,
+            branches=tuple(
+                replace(branch, curve=replace(branch.curve, energy_low_aj=below, energy_high_aj=above))
+                for branch, (below, above) in zip(one.branches, bands, strict=False)
+            ),
+        )
+        for one in each
+    ]
+
+
+def _along(
+    lever: Lever, number: int, stretches: Sequence[np.ndarray], repulsive: Bool[np.ndarray, " rows"]
+) -> EnergyFunctions:
+    """Return the energies along the branches of one curve, their bands not yet told."""
+    # where the instrument's search did not settle there is no energy
+    stretches = stretches if lever.minimum.settled else ()
+    curve, x, at = lever.curves[number], lever.minimum.at, lever.instrument(number)
+    place = losses(curve, at.free_amplitude_factor)
+    stretches = [rows[np.argsort(place[rows], kind="stable")] for rows in stretches]
+    smooth = _smooth_readings(curve, stretches, place)
+    found, at_smooth = energies(curve, at), energies(smooth, at)
+    energy_slopes, virial_slopes = lever.slopes(smooth, number, x)
+    outliers, branches, chi2, freedom, scales = np.zeros(curve.rows, bool), [], 0.0, 0.0, [1.0]
+    share = float(np.linalg.norm(list(curve.relative_errors.values())))
+    for rows in stretches:
+        fit = _stretch(curve, rows, place, found.energy_aj, at_smooth.amplitude_slope, at_smooth.lag_slope)
+        by_reading = at_smooth.virial_amplitude_slope, at_smooth.virial_lag_slope
+        of_virial = _stretch(curve, fit.rows, place, found.virial_aj, *by_reading)
+        outliers[rows] = ~np.isin(rows, fit.rows)
+        chi2, freedom, scales = chi2 + fit.chi2, freedom + fit.freedom, [*scales, fit.scale]
+        for side in (False, True):
+            here = fit.rows[repulsive[fit.rows] == side]
+            if len(here) < FEWEST_ROWS:
+                continue
+            ratios = 1.0 + _SHALLOW - np.exp(place[here])
+            ratio = np.linspace(max(ratios.min(), 0.0), ratios.max(), _POINTS)
+            estimate, noise, by = _at(lever, number, fit, found.energy_aj, energy_slopes, ratio)
+            virial, virial_noise, virial_by = _at(lever, number, of_virial, found.virial_aj, virial_slopes, ratio)
+            virial_variance = virial_noise**2 + (share * virial) ** 2
+            virial_variance += np.einsum("nu,uv,nv->n", virial_by, lever.minimum.covariance, virial_by)
+            heights = np.interp(_place_of(ratio), fit.smoother.place, fit.smoother.average(curve.offset_nm[fit.rows]))
+            uncertain = _ALLOWED * np.median(curve.amplitude_error_nm[here] / curve.free_amplitude_nm[here])
+            branches.append(
+                TappingBranch(
+                    drive_frequency_khz=float(curve.drive_frequency_khz[here[0]]),
+                    free_amplitude_nm=float(curve.free_amplitude_nm[here[0]]),
+                    retract=bool(curve.retract[here[0]]),
+                    repulsive=side,
+                    rows=np.sort(here),
+                    curve=EnergyCurve(
+                        amplitude_ratio=ratio,
+                        height_nm=heights,
+                        energy_low_aj=estimate,
+                        energy_high_aj=estimate,
+                        virial_aj=virial,
+                        virial_error_aj=np.sqrt(virial_variance),
+                        estimate_aj=estimate,
+                        noise_aj=noise,
+                        by_instrument=by,
+                        certain=1.0 - ratio > uncertain,
+                    ),
+                )
+            )
+    return EnergyFunctions(
+        lever=lever,
+        number=number,
+        energies=found,
+        branches=tuple(sorted(branches, key=lambda b: (b.drive, b.retract, b.repulsive))),
+        outliers=outliers,
+        rows_chi2=chi2,
+        rows_freedom=freedom,
+        scale=max(scales),
+        possible=True,
+    )
+
+
+class _Stretch(NamedTuple):
+    """A smooth function along rows: those kept, their smoother, what they scatter about it, and the scale of errors."""
+
+    rows: Int[np.ndarray, " some"]
+    smoother: Smoother
+    chi2: float
+    freedom: float
+    scale: float
+
+
+def _stretch(
+    curve: TappingCurve,
+    rows: Int[np.ndarray, " some"],
+    place: Rows,
+    values: Rows,
+    amplitude_slope: Rows,
+    lag_slope: Rows,
+) -> _Stretch:
+    """Return the smooth function of values along a stretch of rows, without those that are more than four errors off.
+
+    An energy is one at an amplitude, which is known no better than it was read: an error dA of the reading moves it by
+    E_A dA at the height, and by (E_A - E'/A0) dA at the ratio.
+    """
+    steep, kept, ratios = np.zeros(len(rows)), np.ones(len(rows), bool), 1.0 + _SHALLOW - np.exp(place[rows])
+    for last in (False, False, True):
+        at_ratio = amplitude_slope[rows] - steep / curve.free_amplitude_nm[rows]
+        by_amplitude = np.maximum(np.abs(amplitude_slope[rows]), np.abs(at_ratio)) * curve.amplitude_error_nm[rows]
+        here, noise = rows[kept], np.hypot(by_amplitude, lag_slope[rows] * curve.lag_error_deg[rows])[kept]
+        size = _size_of(values[here], noise)
+        smoother = Smoother.of(place[here], noise, size)
+        mean, taken = smoother.of_rows(place[here], values[here])
+        off, freedom = (values[here] - mean) / noise, max(len(here) - taken, 1.0)
+        chi2 = float(off @ off)
+        scale = 1.0 if chi2_tail(chi2, max(round(freedom), 1)) > IMPROBABLE else float(np.sqrt(chi2 / freedom))
+        if last:
+            break
+        ratio, first = np.unique(ratios[kept], return_index=True)
+        if len(ratio) > 4:
+            steep = np.interp(ratios, ratio, np.gradient(mean[first], ratio))
+        far = np.abs(off) > _FAR * scale
+        if kept.all() and 0 < far.sum() <= _MOST_OUTLIERS * len(here):
+            kept[far] = False
+    smoother = Smoother.of(place[here], noise * scale, size) if scale > 1.0 else smoother
+    return _Stretch(here, smoother, chi2, freedom, scale)
+
+
+def _place_of(ratio: np.ndarray) -> np.ndarray:
+    """Return the places of amplitudes, of the free one, as of `losses`."""
+    return np.log(_SHALLOW + 1.0 - ratio)
+
+
+def _at(
+    lever: Lever,
+    number: int,
+    fit: _Stretch,
+    values: Rows,
+    slopes: Float[np.ndarray, "rows unknowns"],
+    ratio: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a smooth function at some amplitudes, its own standard error, and its change by every unknown."""
+    weights, variance = fit.smoother.at(_place_of(ratio))
+    mean = weights @ fit.smoother.average(values[fit.rows])
+    by = weights @ fit.smoother.average(slopes[fit.rows])
+    # with more of a free amplitude the same ratio is at a larger reading
+    moved = np.gradient(mean, ratio) * ratio
+    for i, unknown in enumerate(lever.unknowns):
+        if unknown.curve == number and unknown.kind.startswith("free_amplitude"):
+            by[:, i] += moved * unknown.given.error * (weights @ fit.smoother.average(unknown.rows[fit.rows]))
+    return mean, np.sqrt(variance), by
+
+
+def positive_bands(
+    estimate: Rows, noise: Rows, certain: Bool[np.ndarray, " rows"], by_instrument: Float[np.ndarray, "rows unknowns"]
+) -> tuple[Rows, Rows, bool]:
+    """Return bands of 95 % of energies none of which is less than nothing, and whether there may be such energies.
+
+    With E(a) = t at one point, E(a') of another has the mean E^' + (t - E^) G(a', a)/G(a, a) and a variance: t may be
+    what leaves each mean + 3 standard deviations >= 0.
+
+    Args:
+        estimate: energies of all points of a lever.
+        noise: their own standard errors.
+        certain: points that may say so.
+        by_instrument: changes of the energies by independent unknowns of the instrument, each known to 1.
+    """
+    variance = noise**2 + np.sum(by_instrument**2, axis=1)
+    possible = not np.any((estimate + _ALLOWED * np.sqrt(variance) <= 0.0) & certain)
+    certain = certain & (estimate + _ALLOWED * np.sqrt(variance) > 0.0)
+    ends = []
+    for n, middle in enumerate(estimate.tolist()):
+        shared = by_instrument @ by_instrument[n]
+        gain = shared / variance[n]
+        left = np.sqrt(np.maximum(variance - gain * shared, 0.0))
+        gain[n], left[n] = 1.0, 0.0
+        with np.errstate(divide="ignore", invalid="ignore"):
+            limits = middle - (estimate + _ALLOWED * left) / gain
+        least = max(limits[certain & (gain > 1e-9)].max(initial=-np.inf), 0.0)
+        most = limits[certain & (gain < -1e-9)].min(initial=np.inf)
+        if least > most - noise[n]:
+            # no instrument leaves all above nothing but by chance: none is taken for more than it is
+            possible = possible and bool(least <= most)
+            least, most = 0.0, np.inf
+        low, high = _densest(middle, float(np.sqrt(variance[n])), least, most)
+        ends.append((low, max(high, low + Z95 * noise[n])))
+    low, high = np.array(ends).T
+    return low, high, possible
+
+
+def _densest(mean: float, error: float, low: float, high: float) -> tuple[float, float]:
+    """Return the 95 % of highest density of a normal distribution that is cut at low and high.
+
+    Equal tails would never hold a truth that is next to nothing.
+    """
+    below, above = (low - mean) / error, (high - mean) / error
+    flip = below > 0.0
+    if flip:
+        # the tail that is left, without cancellation
+        below, above = -above, -below
+
+    def inside(half: float) -> float:
+        return float(ndtr(min(above, half)) - ndtr(max(below, -half))) if max(below, -half) < min(above, half) else 0.0
+
+    near, far, wanted = 0.0, 40.0, 0.95 * float(ndtr(above) - ndtr(below))
+    for _ in range(60):
+        half = 0.5 * (near + far)
+        near, far = (near, half) if inside(half) > wanted else (half, far)
+    ends = max(below, -far), min(above, far)
+    ends = (-ends[1], -ends[0]) if flip else ends
+    return mean + error * ends[0], mean + error * ends[1]
+
+
+@dataclass(frozen=True)
+class LeastOnFrequency:
+    """The energy of a curve that hangs least on the free frequency, relative to itself.
+
+    Attributes:
+        branch: its number.
+        amplitude_ratio: where.
+        energy_aj: there, the middle of its band.
+        interval95_aj: the band.
+        by_frequency_aj: how much of that a standard error of the frequency, as known, is.
+    """
+
+    branch: int
+    amplitude_ratio: float
+    energy_aj: float
+    interval95_aj: tuple[float, float]
+    by_frequency_aj: float
+
+
+def least_on_frequency(functions: EnergyFunctions) -> LeastOnFrequency | None:
+    """Return the energy of a curve that hangs least on the free frequency; None where no energy is above nothing."""
+    known, found = float(np.sqrt(functions.lever.minimum.covariance[0, 0])), []
+    for number, branch in enumerate(functions.branches):
+        c = branch.curve
+        by = known * np.abs(c.by_instrument[:, 0])
+        with np.errstate(divide="ignore"):
+            share = np.where(c.certain & (c.energy_low_aj > 0.0), by / np.maximum(c.energy_aj, 1e-300), np.inf)
+        n = int(np.argmin(share))
+        band = float(c.energy_low_aj[n]), float(c.energy_high_aj[n])
+        at = LeastOnFrequency(number, float(c.amplitude_ratio[n]), float(c.energy_aj[n]), band, float(by[n]))
+        found.append((float(share[n]), at))
+    share, at = min(found, key=lambda pair: pair[0], default=(np.inf, None))
+    return at if np.isfinite(share) else None
+
+
+def largest_of(branches: Sequence[TappingBranch]) -> tuple[int, int]:
+    """Return the branch and the point at which the middle of the band is largest."""
+    tops = [int(np.argmax(branch.curve.energy_aj)) for branch in branches]
+    branch = max(range(len(branches)), key=lambda i: float(branches[i].curve.energy_aj[tops[i]]))
+    return branch, tops[branch]
+
+
+_FREQUENCY_TO, _ZERO_TO_DEG = 1e-5, 0.2
+_NARROWS = 0.7
+"""Half of a band over that of today up to which something more that is known narrows it."""
+
+
+def what_narrows(functions: EnergyFunctions) -> str:
+    """Return what to state to narrow the band where the energy is largest: zero of the phase, or free frequency.
+
+    What is known of a combination g of the unknowns to an error e takes (S C g)^2/(e^2 + g C g) off the variance S C S.
+    """
+    branch, point = largest_of(functions.branches)
+    lever, c = functions.lever, functions.branches[branch].curve
+    rows, x, covariance = functions.branches[branch].rows, lever.minimum.at, lever.minimum.covariance
+    by, noise = c.by_instrument[point], float(c.noise_aj[point])
+    places = [i for i, one in enumerate(lever.unknowns) if one.curve == functions.number and one.rows[rows[0]]]
+    lag = next(i for i in places if lever.unknowns[i].kind == "free_lag_deg")
+    of_zero = _slopes(lambda y: np.array([lever.zero_at(y, lag)]), x, len(x))[0]
+    of_frequency = lever.unknowns[0].given.error * np.eye(len(x))[0]
+    frequency = np.exp(lever.values(x)[0])
+    more = {
+        f"the zero of the phase to {_ZERO_TO_DEG:g} degrees ('# phase_zero_deg = VALUE +- {_ZERO_TO_DEG:g}')": (
+            of_zero,
+            _ZERO_TO_DEG,
+        ),
+        f"the free frequency to 1e-5 of itself ('# free_frequency_khz = VALUE +- {_FREQUENCY_TO * frequency:.1g}')": (
+            of_frequency,
+            _FREQUENCY_TO,
+        ),
+    }
+    today = float(by @ covariance @ by)
+    half = {
+        words: Z95 * np.sqrt(max(today - (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g), 0.0) + noise**2)
+        for words, (g, e) in more.items()
+    }
+    words = min(half, key=lambda name: half[name])
+    now = Z95 * np.sqrt(today + noise**2)
+    if half[words] > _NARROWS * now:
+        return "zero of the phase and free frequency would not narrow that; less noise or more rows would"
+    return f"state {words}, which would leave +- {half[words]:.2g} aJ"
+
+
+@dataclass(frozen=True)
+class WayDifference:
+    """Retract less approach at the same amplitude and on the same side of the phase.
+
+    Attributes:
+        amplitude_ratio: where they differ most, in errors.
+        energy_aj: by how much there.
+        standard_error: its error; what both have in common cancels.
+    """
+
+    amplitude_ratio: float
+    energy_aj: float
+    standard_error: float
+
+
+def differences_of_ways(functions: EnergyFunctions) -> dict[tuple[int, int], WayDifference]:
+    """Return by how much retract differs from approach, by the numbers of the two branches."""
+    found, covariance = {}, functions.lever.minimum.covariance
+    share = float(np.linalg.norm(list(functions.lever.curves[functions.number].relative_errors.values())))
+    for i, one in enumerate(functions.branches):
+        for j, other in enumerate(functions.branches):
+            if one.retract or not other.retract or (one.drive, one.repulsive) != (other.drive, other.repulsive):
+                continue
+            ends = [(b.curve.amplitude_ratio[0], b.curve.amplitude_ratio[-1]) for b in (one, other)]
+            low, high = max(end[0] for end in ends), min(end[1] for end in ends)
+            if not low < high:
+                continue
+            ratio = np.linspace(low, high, _POINTS)
+            (a, of_a, by_a), (b, of_b, by_b) = (estimates_at(branch.curve, ratio) for branch in (one, other))
+            off, by = b - a, by_b - by_a
+            variance = of_a**2 + of_b**2 + np.einsum("nu,uv,nv->n", by, covariance, by) + (share * off) ** 2
+            error = np.sqrt(variance)
+            most = int(np.argmax(np.abs(off) / error))
+            found[i, j] = WayDifference(float(ratio[most]), float(off[most]), float(error[most]))
+    return found
+
+
+def estimates_at(curve: EnergyCurve, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return energy, its own standard error and its change by the instrument at some amplitudes, NaN beyond the ends.
+
+    With the instrument where statements and free rows put it: differences of branches and curves hardly depend on it.
+    """
+    columns = (curve.estimate_aj, curve.noise_aj, *curve.by_instrument.T)
+    energy, noise, *by = (np.interp(ratio, curve.amplitude_ratio, c, np.nan, np.nan) for c in columns)
+    return energy, noise, np.stack(by, axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneEnergy:
+    """One energy for each group of rows, fitted together with the instrument.
+
+    Attributes:
+        energy_aj: of each group.
+        error_aj: its standard error but for spring constant and calibration.
+        relative_error: what these add, by name.
+        budget: of each group what its variance comes from, in aJ^2.
+        nuisances: of the instrument.
+        instrument: at the minimum.
+        used: rows that were fitted.
+        outliers: rows too far from the others.
+        residual: of the rows fitted, in standard errors; NaN elsewhere.
+        minimum: chi2 of rows, free rows and what is stated, its degrees of freedom.
+        scale: what the rows' own errors were multiplied by.
+    """
+
+    energy_aj: Float[np.ndarray, " groups"]
+    error_aj: Float[np.ndarray, " groups"]
+    relative_error: dict[str, float]
+    budget: tuple[dict[str, float], ...]
+    nuisances: tuple[Nuisance, ...]
+    instrument: Instrument
+    used: Bool[np.ndarray, " rows"]
+    outliers: Bool[np.ndarray, " rows"]
+    residual: Rows
+    minimum: Minimum
+    scale: float
+
+    @property
+    def share(self) -> float:
+        """Relative error that all energies have in common, from spring constant and calibration."""
+        return float(np.linalg.norm(list(self.relative_error.values())))
+
+    @property
+    def torn(self) -> list[Nuisance]:
+        """Nuisances that had to go beyond three of their errors."""
+        return [one for one in self.nuisances if abs(one.pull) > TORN]
+
+
+def one_energy(
+    lever: Lever,
+    groups: Sequence[np.ndarray],
+    stretches: Sequence[np.ndarray],
+    *,
+    scale_errors: bool = False,
+) -> OneEnergy:
+    """Return one energy for each group of rows of a lever's only curve, the instrument free within what is stated.
+
+    Args:
+        lever: the curve, and its instrument.
+        groups: rows that share an energy.
+        stretches: rows along which readings are smooth.
+        scale_errors: multiply the rows' own errors such that chi2 is as large as its degrees of freedom, if larger.
+    """
+    curve = lever.curves[0]
+    place = losses(curve, lever.instrument(0).free_amplitude_factor)
+    sorted_stretches = [rows[np.argsort(place[rows], kind="stable")] for rows in stretches]
+    smooth = _smooth_readings(curve, sorted_stretches, place)
+    found = _one_energy(lever, groups, smooth, 1.0)
+    far = np.abs(np.nan_to_num(found.residual)) > _FAR
+    kept = [rows[~far[rows]] for rows in groups]
+    if 0 < far.sum() <= _MOST_OUTLIERS * found.used.sum() and all(len(rows) for rows in kept):
+        found = replace(_one_energy(lever, kept, smooth, 1.0), outliers=far)
+        groups = kept
+    minimum = found.minimum
+    scale = float(np.sqrt(max(minimum.chi2, 0.0) / max(minimum.degrees_of_freedom, 1))) if scale_errors else 1.0
+    return replace(_one_energy(lever, groups, smooth, scale), outliers=found.outliers) if scale > 1.0 else found
+
+
+def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve, scale: float) -> OneEnergy:
+    """Return the least squares of the instrument with the rows of groups, each of one energy."""
+    curve, count = lever.curves[0], len(lever.unknowns)
+    rows, group = np.concatenate(groups), np.repeat(np.arange(len(groups)), [len(part) for part in groups])
+    own = (group[:, None] == np.arange(len(groups))).astype(float)
+
+    def off(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far the rows' energies are from those of their groups, and their noise."""
+        at = lever.instrument(0, x)
+        noise = scale * noise_of(smooth, energies(smooth, at))[rows]
+        return energies(curve, at).energy_aj[rows] - x[count:][group], noise
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        left, noise = off(x)
+        return np.concatenate([lever.residual(x), left / noise])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        # at readings with noise slopes hang on the noise of the same rows, and pull the instrument to small energies
+        by, noise = lever.slopes(smooth, 0, x)[0][rows], off(x)[1]
+        of_free = np.pad(lever.jacobian(x), ((0, 0), (0, len(groups))))
+        return np.concatenate([of_free, np.concatenate([by, -own], axis=1) / noise[:, None]])
+
+    start = energies(curve, lever.instrument(0)).energy_aj
+    x = np.concatenate([lever.minimum.at, [float(np.mean(start[part])) for part in groups]])
+    minimum = _minimum(residual, jacobian, x)
+    left, noise = off(minimum.at)
+    residuals, used = np.full(curve.rows, np.nan), np.zeros(curve.rows, bool)
+    residuals[rows], used[rows] = left / noise, True
+    return OneEnergy(
+        energy_aj=minimum.at[count:],
+        error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
+        relative_error=curve.relative_errors,
+        budget=tuple(_budget(lever, minimum, count + i) for i in range(len(groups))),
+        nuisances=lever.nuisances(0, minimum),
+        instrument=lever.instrument(0, minimum.at),
+        used=used,
+        outliers=np.zeros(curve.rows, bool),
+        residual=residuals,
+        minimum=minimum,
+        scale=scale,
+    )
+
+
+def _budget(lever: Lever, minimum: Minimum, place: int) -> dict[str, float]:
+    """Return what the variance of one energy comes from, in aJ^2: each thing stated, and noise."""
+    parts: dict[str, float] = {}
+    for unknown, moved in zip(lever.unknowns, minimum.covariance[place].tolist(), strict=False):
+        if unknown.kind != "free_lag_deg":
+            parts[unknown.kind] = parts.get(unknown.kind, 0.0) + moved**2
+    noise = float(minimum.covariance[place, place]) - sum(parts.values())
+    relative = {name: (share * minimum.at[place]) ** 2 for name, share in lever.curves[0].relative_errors.items()}
+    return {"noise": max(noise, 0.0)} | parts | relative
+
+
+_LAW_ROUNDS = 3
+FEWEST_SPEEDS = 4
+"""Rows of known speed from which a line is drawn through their energies."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LawOfEnergies:
+    """A law's line through energies against the tip's speed at the sample.
+
+    A law with restitution and adhesion, u_out^2 = r^2 u^2 - epsilon, takes E = m ((1 - r^2) u^2 + epsilon)/2, one with
+    a loss linear in speed E = m (viscous_loss u + epsilon)/2. Both are straight lines, in u^2 and in u.
+
+    Attributes:
+        formula: of the energy.
+        parameters: value and standard error of each, from noise and speeds alone.
+        chi2: of the rows about it.
+        degrees_of_freedom: of chi2.
+        energy_aj: at the rows' speeds.
+    """
+
+    formula: str
+    parameters: dict[str, tuple[float, float]]
+    chi2: float
+    degrees_of_freedom: int
+    energy_aj: Float[np.ndarray, " rows"]
+
+
+def laws_of_energies(
+    speed: Rows, speed_error: Rows, energy: Rows, energy_error: Rows, mass: float
+) -> list[LawOfEnergies]:
+    """Return the two laws' lines through energies in aJ at speeds in nm/us, with errors in both, the mass in ng."""
+    found = []
+    for formula, power, name in (
+        ("E = m ((1 - r^2) u^2 + epsilon)/2", 2, "one_less_r_squared"),
+        ("E = m (viscous_loss u + epsilon)/2", 1, "viscous_loss_nm_per_us"),
+    ):
+        basis = 0.5 * mass * np.stack([speed**power, np.ones_like(speed)], axis=1)
+        error = energy_error
+        at, covariance = np.zeros(2), np.zeros((2, 2))
+        for _ in range(_LAW_ROUNDS):
+            whitened = basis / error[:, None]
+            covariance = np.linalg.inv(whitened.T @ whitened)
+            at = covariance @ (whitened.T @ (energy / error))
+            slope = 0.5 * mass * at[0] * power * speed ** (power - 1)
+            error = np.hypot(energy_error, slope * speed_error)
+        pairs = zip(at.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
+        found.append(
+            LawOfEnergies(
+                formula=formula,
+                parameters=dict(zip((name, "epsilon_nm2_per_us2"), pairs, strict=True)),
+                chi2=float(np.sum(((energy - basis @ at) / error) ** 2)),
+                degrees_of_freedom=len(speed) - 2,
+                energy_aj=basis @ at,
+            )
+        )
     return found

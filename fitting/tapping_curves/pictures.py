@@ -8,8 +8,7 @@ from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, ne
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.branches import side_of, way_of
 from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
-from fitting.tapping_curves.energy import lags_of
-from fitting.tapping_curves.energy_fit import Z95, plain_instrument
+from fitting.tapping_curves.energy import Z95, lags_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
@@ -119,12 +118,11 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
     """Draw the energy along the branches with its 95 % band, and where there is one energy that; return their range."""
     ends = [0.0]
     for branch in result.branches:
-        height, energy, error = branch.curve.by_height
-        error = Z95 * error
+        curve = branch.curve
         colour = ACCENT if branch.retract else BLUE
-        axes.plot(height, energy, color=colour, lw=1.2)
-        axes.fill_between(height, energy - error, energy + error, color=colour, alpha=0.15, lw=0)
-        ends += [float(energy.min()), float(energy.max()), *np.percentile(energy + error, [0.0, 90.0]).tolist()]
+        axes.plot(curve.height_nm, curve.energy_aj, color=colour, lw=1.2)
+        axes.fill_between(curve.height_nm, curve.energy_low_aj, curve.energy_high_aj, color=colour, alpha=0.15, lw=0)
+        ends += [float(curve.energy_aj.max()), *np.percentile(curve.energy_high_aj, [0.0, 90.0]).tolist()]
     if result.fit is not None and result.described:
         for i, group in enumerate(result.groups):
             heights = result.curve.offset_nm[result.fit.used & (result.group_of_rows == i)]
@@ -197,7 +195,8 @@ def frames_figure(result: Tapping) -> Figure:
     curve = result.curve
     row = _example_row(result)
     fit = result.functions or result.fit
-    instrument = plain_instrument(curve, result.rows.free) if fit is None else fit.instrument
+    given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value)
+    instrument = given if fit is None else fit.instrument
     motion = motion_of(curve, instrument)
     free = float(motion.free_amplitude_nm[row])
     omega = RAD_PER_US_PER_KHZ * float(curve.drive_frequency_khz[row])

@@ -22,8 +22,7 @@ from fitting.report.sections import (
     text_of,
 )
 from fitting.tapping_curves.branches import Height, Hysteresis
-from fitting.tapping_curves.energy_curve import HEADLINE
-from fitting.tapping_curves.energy_fit import EnergyFit
+from fitting.tapping_curves.energy import HEADLINE, Z95, EnergyFunctions, OneEnergy, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 from fitting.tapping_curves.verdict import ORIGINS
@@ -93,41 +92,44 @@ def tapping_report(result: Tapping) -> Report:
 
 
 def energy_in_words(result: Tapping) -> str:
-    """Return the energy of a tap in aJ and eV."""
-    energy, largest, over_k = result.energy, result.largest, result.curve.over_spring_constant
-    if energy["kind"] == "upper bound":
-        high = energy["interval95"][1]
-        return f"at most {high:.3g} aJ" + ("" if over_k else f", {_EV_PER_AJ * high:.3g} eV")
-    if energy["value"] is None:
-        if largest is None or result.why_not_functions:
-            return "not known" if energy["kind"] != "several" else energy["reason"]
-        value = with_error(largest["value"], largest["standard_error"])
-        start = energy["reason"] + ";" if energy["kind"] == "several" else "changes along the curve,"
-        return f"{start} at most {value} aJ, at {largest['amplitude_ratio']:.2f} of the free amplitude"
-    low, high = energy["interval95"]
-    value = with_error(energy["value"], energy["standard_error"])
-    electronvolts = "" if over_k else f" {interval(_EV_PER_AJ * low, _EV_PER_AJ * high)} eV,"
-    return f"{value} aJ (95 %: {interval(low, high)}),{electronvolts} if each takes the same"
+    """Return the energy of a tap in aJ and eV, where it is largest."""
+    top, over_k = result.largest, result.curve.over_spring_constant
+    if result.bound_aj is not None:
+        return f"at most {result.bound_aj:.3g} aJ" + ("" if over_k else f", {_EV_PER_AJ * result.bound_aj:.3g} eV")
+    if top is None or not (result.valid or "only bracketed" in result.why_not_functions):
+        return "not known"
+    low, high = top["interval95"]
+    where = f"at {top['amplitude_ratio']:.2f} of the free amplitude, where it is largest"
+    electronvolts = "" if over_k else f", {interval(_EV_PER_AJ * low, _EV_PER_AJ * high)} eV"
+    return f"{_band_in_words(low, high)} aJ {where} (95 %: {interval(low, high)} aJ{electronvolts})"
+
+
+def _band_in_words(low: float, high: float) -> str:
+    """Return a band of 95 % as what it is: a value with its standard error, a bracket, or an upper bound."""
+    said = said_of(low, high)
+    if said == "measured":
+        return with_error(0.5 * (low + high), 0.5 * (high - low) / Z95)
+    return interval(low, high) if said == "bracket" else f"< {high:.3g}"
 
 
 def _along_the_branches(result: Tapping) -> list[ReportSection]:
-    """Return the energy of each branch at some amplitudes, where it turns, and the instrument that was fitted along."""
-    fit = result.functions
-    if fit is None:
+    """Return the energy of each branch at some amplitudes, where it turns, and what is known of the instrument."""
+    functions = result.functions
+    if functions is None or not result.branches:
         return []
     head = ["energy (aJ) at A/A0 =", "measured", *(f"{ratio:g}" for ratio in HEADLINE), "largest"]
     several = len({branch.drive for branch in result.branches}) > 1
     cells = []
     for branch in result.branches:
-        curve = branch.curve
-        *largest, place = curve.largest
+        curve, top = branch.curve, int(np.argmax(branch.curve.energy_aj))
         drive = f", {branch.drive_frequency_khz:g} kHz, {branch.free_amplitude_nm:.4g} nm" if several else ""
+        largest = _band_in_words(float(curve.energy_low_aj[top]), float(curve.energy_high_aj[top]))
         cells.append(
             [
                 branch.name + drive,
                 f"{curve.amplitude_ratio[0]:.2f} to {curve.amplitude_ratio[-1]:.2f}",
-                *("-" if (at := curve.at(ratio)) is None else with_error(*at) for ratio in HEADLINE),
-                f"{with_error(*largest)} at {place:.2f}",
+                *("-" if (at := curve.at(ratio)) is None else _band_in_words(*at) for ratio in HEADLINE),
+                f"{largest} at {curve.amplitude_ratio[top]:.2f}",
             ]
         )
     lines = [
@@ -140,10 +142,23 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
         f"at A/A0 = {one.amplitude_ratio:.2f}, where the difference is largest in units of its error"
         for (i, _), one in result.way_differences.items()
     ]
-    caption = "Energy of a tap, a smooth function of the height, by the amplitude over the free one; standard errors"
-    scaled = "" if fit.scale == 1.0 else f", errors of the rows times {fit.scale:.2f}"
-    chi2 = f"  rows about it: chi2 {fit.rows_chi2:.1f} for {fit.rows_freedom:.0f} degrees of freedom{scaled}"
-    instrument = _instrument(fit, "instrument, fitted with the energy along the branches")
+    least = result.least_on_frequency
+    if least is not None:
+        lines.append(
+            f"  hangs least on the free frequency at A/A0 = {least.amplitude_ratio:.3f} "
+            f"({result.branches[least.branch].name}): {_band_in_words(*least.interval95_aj)} aJ, of which the error of "
+            f"the frequency is {least.by_frequency_aj:.2g}"
+        )
+    caption = (
+        "Energy of a tap by the amplitude over the free one: value and standard error where measured, else the band of "
+        "95 %"
+    )
+    scaled = "" if functions.scale == 1.0 else f", errors of the rows times {functions.scale:.2f}"
+    chi2 = (
+        f"  rows about smooth energies: chi2 {functions.rows_chi2:.1f} for {functions.rows_freedom:.0f} degrees of "
+        f"freedom{scaled}"
+    )
+    instrument = _instrument(functions, "instrument, from what is stated and free rows")
     return [
         ReportSection("Energy along the branches", [Table(caption, head, cells), *_lines(lines)], "Energy"),
         ReportSection("Instrument", [instrument, *_lines([chi2])]),
@@ -154,7 +169,7 @@ def _lines(lines: Sequence[str]) -> list[Text]:
     return [Text("\n".join(lines), "lines")] if lines else []
 
 
-def _instrument(fit: EnergyFit, first: str) -> Table:
+def _instrument(fit: EnergyFunctions | OneEnergy, first: str) -> Table:
     """Return what is given of the instrument and what a fit makes of it."""
     cells = [
         [
@@ -172,12 +187,16 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
     fit = result.fit
     if fit is None or not result.described:
         return []
-    lines, epsilon = ["One energy for all taps of a branch (assumed: each takes the same):"], result.epsilon
-    if epsilon["value"] is not None:
+    energy, epsilon = result.energy, result.epsilon
+    lines = ["If every tap of a branch took the same (assumed: along A sqrt(A0^2 - A^2) the curve cannot test it):"]
+    if energy["value"] is not None:
+        pull = f"the free frequency {energy['free_frequency_pull']:+.1f} of its errors from what is given"
+        value = with_error(energy["value"], energy["standard_error"])
+        lines.append(f"  {value} aJ (95 %: {interval(*energy['interval95'])}), {pull}")
         value = with_error(epsilon["value"], epsilon["standard_error"])
         of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
         lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2" + of_mass)
-    shares = sorted(result.energy.get("share_of_variance", {}).items(), key=lambda pair: -pair[1])
+    shares = sorted(energy.get("share_of_variance", {}).items(), key=lambda pair: -pair[1])
     words = [f"{ORIGINS[name]} {percent(share)}" for name, share in shares if share > 0.005]
     lines += [f"  its variance comes from {', '.join(words)}"] if words else []
     cells = []
@@ -186,7 +205,8 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
         count = int(np.sum(fit.used & (result.group_of_rows == i)))
         known = interval(*ends) if np.isfinite(ends).all() else "open"
         cells.append([group.name, f"{count}", with_error(value, error), known])
-    chi2 = f"  chi2/dof = {fit.chi2:.1f}/{fit.degrees_of_freedom}, probability {fit.p_value:.2g}"
+    least = fit.minimum
+    chi2 = f"  chi2/dof = {least.chi2:.1f}/{least.degrees_of_freedom}, probability {least.p_value:.2g}"
     return [
         ReportSection("One energy for all taps", _lines(lines), "One energy"),
         ReportSection(
@@ -347,15 +367,11 @@ def together_report(result: TappingTogether) -> Report:
         if (at := one.at(ratio)) is not None
     ]
     head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
-    first = next((one.functions for one in result.curves if one.functions is not None), None)
-    common = []
-    if first is not None and result.common is not None:
-        common = [
-            f"  {one.name}, fitted to all: {with_error(one.value, one.standard_error)} ({one.given})"
-            for one in first.nuisances
-            if one.name in result.common.names
-        ]
-        common.append(f"  probability that curves of one instrument disagree more: {result.common.p_value:.2g}")
+    common = [
+        f"  {one.name}: {with_error(one.value, one.standard_error)} ({one.given})" for one in result.common_nuisances
+    ]
+    if result.agreement_p_value is not None:
+        common.append(f"  probability that curves of one instrument disagree more: {result.agreement_p_value:.2g}")
     caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"
     return Report(
         title=f"{len(result.curves)} curves of one lever",

@@ -15,12 +15,26 @@ from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
 from fitting.tapping_curves.curve import Rows, TappingCurve
-from fitting.tapping_curves.energy_by_speed import FEWEST_SPEEDS, LawOfEnergies, laws_of_energies
-from fitting.tapping_curves.energy_curve import HEADLINE, TappingBranch, WayDifference, differences_of_ways
-from fitting.tapping_curves.energy_fit import Z95, EnergyFit, Nuisance
+from fitting.tapping_curves.energy import (
+    FEWEST_SPEEDS,
+    HEADLINE,
+    MEASURED,
+    Z95,
+    EnergyFunctions,
+    LawOfEnergies,
+    LeastOnFrequency,
+    Nuisance,
+    OneEnergy,
+    TappingBranch,
+    WayDifference,
+    differences_of_ways,
+    largest_of,
+    laws_of_energies,
+    least_on_frequency,
+    said_of,
+)
 from fitting.tapping_curves.verdict import (
     ASSUMPTIONS,
-    BRACKET,
     NO_CONSTANT,
     NO_FUNCTIONS,
     REASONS,
@@ -30,10 +44,6 @@ from fitting.tapping_curves.verdict import (
 
 if TYPE_CHECKING:
     from fitting.fits.result import FitResult
-
-
-_STATISTICS = ("chi2", "degrees_of_freedom", "p_value", "scale")
-"""Of a fit of energies, as the JSON has them."""
 
 
 @dataclass(frozen=True)
@@ -137,9 +147,8 @@ class Tapping(Result):
         curve: the table's rows with an amplitude, and what is known of the instrument.
         rows: state, energy and virial of each row of the table.
         groups: the kinds of rows that may share an energy.
-        fit: one energy for each group, the instrument free within its errors; None without a phase or rows.
-        functions: the energy as a smooth function along each branch, the instrument free within its errors; or None.
-        branches: each with its energy and virial over the amplitude.
+        fit: one energy for each group, fitted with the instrument; None without a phase or rows.
+        functions: the energy as a smooth function along each branch, the instrument cut off from it; or None.
         scale_errors: whether errors are multiplied where the rows scatter more.
         followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: energy that a tap takes at most, where only the amplitude was recorded; else None.
@@ -153,16 +162,20 @@ class Tapping(Result):
     curve: TappingCurve
     rows: TapRows
     groups: tuple[EnergyGroup, ...]
-    fit: EnergyFit | None
-    functions: EnergyFit | None
-    branches: tuple[TappingBranch, ...]
+    fit: OneEnergy | None
+    functions: EnergyFunctions | None
     scale_errors: bool
-    followed: EnergyFit | None
+    followed: OneEnergy | None
     bound_aj: float | None
     hysteresis: tuple[Hysteresis, ...]
     speeds: MeasuredSpeeds | None
     law: "FitResult | None" = None
     versions: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def branches(self) -> tuple[TappingBranch, ...]:
+        """Each with its energy and virial over the amplitude."""
+        return () if self.functions is None else self.functions.branches
 
     @property
     def mass_ng(self) -> float:
@@ -189,10 +202,8 @@ class Tapping(Result):
     def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
         """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
         assert self.fit is not None  # noqa: S101
-        energy, variance, slopes = self.fit.function(number, np.zeros(1))
-        value, error = float(energy[0]), float(self.fit.error(energy, variance, slopes)[0])
-        alone = float(np.sqrt(variance + self.fit.by_instrument(slopes))[0])
-        return value, error, _interval(value, alone, self.fit.share)
+        value, alone, share = float(self.fit.energy_aj[number]), float(self.fit.error_aj[number]), self.fit.share
+        return value, float(np.hypot(alone, share * value)), _interval(value, alone, share)
 
     @property
     def why_not_constant(self) -> str:
@@ -211,12 +222,12 @@ class Tapping(Result):
 
     @property
     def reasons(self) -> list[str]:
-        """What makes the energy no measurement: neither one energy nor one along the branches is determined."""
+        """What makes the energy no measurement: where it is largest along the branches it is not measured."""
         return judge(REASONS, self)
 
     @property
     def valid(self) -> bool:
-        """Whether the energy of a tap is determined, as one or along the branches."""
+        """Whether the energy of a tap is measured where it is largest."""
         return not self.reasons
 
     @property
@@ -231,9 +242,10 @@ class Tapping(Result):
 
     @property
     def energy(self) -> dict[str, Any]:
-        """The one energy of all taps: `value`, `standard_error`, `interval95` in aJ, `kind`, and where they come from.
+        """The energy if every tap took the same: `value`, `standard_error`, `interval95` in aJ, `kind`, where from.
 
-        Where one energy does not explain the rows `value` is None and `reason` says why.
+        It makes no curve valid: along a sqrt(1 - a^2) with a = A/A0 the curve cannot test the assumption. Where one
+        energy does not explain the rows `value` is None and `reason` says why.
         """
         blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None}
         if self.fit is None and self.bound_aj is not None:
@@ -250,15 +262,17 @@ class Tapping(Result):
                 "kind": "none",
                 "reason": "the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong",
             }
-        budget = self.fit.budget(chosen[0])
+        budget = self.fit.budget[chosen[0]]
         total = sum(budget.values()) or 1.0
         return {
             "value": value,
             "standard_error": error,
             "interval95": np.maximum(interval, 0.0),
-            "kind": "bracket" if not error < BRACKET * value else "fit",
+            "kind": "bracket" if not error < MEASURED * value else "fit",
             "reason": "",
             "assumption": "each tap of the branch takes the same energy",
+            "p_value": self.fit.minimum.p_value,
+            "free_frequency_pull": self.fit.nuisances[0].pull,
             "share_of_variance": {name: part / total for name, part in budget.items() if part > 0.0},
         }
 
@@ -281,19 +295,34 @@ class Tapping(Result):
         }
 
     @property
-    def largest(self) -> dict[str, float] | None:
-        """The largest energy of a tap along the branches: `value`, `standard_error`, `amplitude_ratio`."""
+    def largest(self) -> dict[str, Any] | None:
+        """Energy of a tap where it is largest along the branches, the middle of its band, and what is said of it."""
         if not self.branches:
             return None
-        top = max(branch.curve.largest for branch in self.branches)
-        return dict(zip(("value", "standard_error", "amplitude_ratio"), top, strict=True))
+        branch, point = largest_of(self.branches)
+        curve = self.branches[branch].curve
+        band = float(curve.energy_low_aj[point]), float(curve.energy_high_aj[point])
+        return {
+            "value": float(curve.energy_aj[point]),
+            "standard_error": float(curve.energy_error_aj[point]),
+            "interval95": band,
+            "said": said_of(*band),
+            "branch": branch,
+            "amplitude_ratio": float(curve.amplitude_ratio[point]),
+        }
+
+    @property
+    def least_on_frequency(self) -> LeastOnFrequency | None:
+        """The energy that hangs least on the free frequency, and where; None where none is above nothing."""
+        return None if self.functions is None else least_on_frequency(self.functions)
 
     @property
     def energy_along_branches_aj(self) -> Rows:
         """Energy of each row's tap by the function of its branch; NaN for rows of none."""
         found = np.full(self.curve.rows, np.nan)
         for branch in self.branches:
-            height, energy, _ = branch.curve.by_height
+            order = np.argsort(branch.curve.height_nm)
+            height, energy = branch.curve.height_nm[order], branch.curve.estimate_aj[order]
             found[branch.rows] = np.interp(self.curve.offset_nm[branch.rows], height, energy)
         return found
 
@@ -304,12 +333,14 @@ class Tapping(Result):
             {
                 "branch": i,
                 "amplitude_ratio": ratio,
-                "energy_aj": found[0],
-                "standard_error_aj": found[1],
+                "energy_aj": 0.5 * sum(band),
+                "standard_error_aj": 0.5 * (band[1] - band[0]) / Z95,
+                "interval95_aj": band,
+                "said": said_of(*band),
             }
             for i, branch in enumerate(self.branches)
             for ratio in HEADLINE
-            if (found := branch.curve.at(ratio)) is not None
+            if (band := branch.curve.at(ratio)) is not None
         ]
 
     @property
@@ -337,7 +368,7 @@ class Tapping(Result):
     @property
     def way_differences(self) -> dict[tuple[int, int], WayDifference]:
         """By how much the energy differs between approach and retract, by the numbers of the branches."""
-        return {} if self.functions is None else differences_of_ways(self.branches, self.functions)
+        return {} if self.functions is None else differences_of_ways(self.functions)
 
     def in_unit(self, text: str) -> str:
         """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant.
@@ -454,7 +485,7 @@ class Tapping(Result):
 
     def _fits(self) -> dict[str, Any]:
         """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
-        fit, functions, smooth = self.fit, self.functions, None
+        fit, functions, smooth, statistics = self.fit, self.functions, None, {}
         if functions is not None:
             smooth = {
                 "valid": not self.why_not_functions,
@@ -462,12 +493,15 @@ class Tapping(Result):
                 **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
                 "nuisances": nuisances_as_dict(functions.nuisances),
             }
-        # of one energy that does not describe the rows the instrument tells nothing
-        believed = fit if self.described or functions is None else functions
+        if fit is not None:
+            statistics = {name: getattr(fit.minimum, name) for name in ("chi2", "degrees_of_freedom", "p_value")}
+            statistics |= {"scale": fit.scale}
         return {
             "functions": smooth,
-            **{name: None if fit is None else getattr(fit, name) for name in _STATISTICS},
-            "nuisances": {} if believed is None else nuisances_as_dict(believed.nuisances),
+            **dict.fromkeys(("chi2", "degrees_of_freedom", "p_value", "scale")),
+            **statistics,
+            "nuisances": {} if functions is None else nuisances_as_dict(functions.nuisances),
+            "nuisances_of_one_energy": {} if fit is None or not self.described else nuisances_as_dict(fit.nuisances),
         }
 
     def _constant_of(self, number: int) -> dict[str, Any]:
@@ -519,6 +553,7 @@ class Tapping(Result):
                 "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
                 "energy_per_tap_reason": energy["reason"] or None,
                 "largest_energy_aj": self.largest,
+                "least_on_frequency": None if self.least_on_frequency is None else vars(self.least_on_frequency),
                 **self._named("energies_at", "turning_points"),
                 "way_differences": [
                     {"approach": i, "retract": j, **vars(one)} for (i, j), one in self.way_differences.items()

@@ -25,7 +25,6 @@ from fitting.tapping_curves.branches import (
     ways,
 )
 from fitting.tapping_curves.curve import (
-    HARMONICS_FACTOR,
     Given,
     Instrument,
     Rows,
@@ -35,9 +34,18 @@ from fitting.tapping_curves.curve import (
     motion_of,
     part_of,
 )
-from fitting.tapping_curves.energy import Energies, energies, largest_energies, noise_of, virial_noise_of
-from fitting.tapping_curves.energy_curve import FEWEST_ROWS, branches_of
-from fitting.tapping_curves.energy_fit import EnergyFit, fit_energy, plain_instrument, usual_drifts
+from fitting.tapping_curves.energy import (
+    FEWEST_ROWS,
+    Energies,
+    Lever,
+    OneEnergy,
+    energies,
+    energies_along,
+    largest_energies,
+    noise_of,
+    one_energy,
+    virial_noise_of,
+)
 from fitting.tapping_curves.result import EnergyGroup, MeasuredSpeeds, Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
 
@@ -280,21 +288,22 @@ def _check_range(curve: TappingCurve, zero: float, name: str) -> None:
 def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool) -> Tapping:
     """Return everything but the law."""
     free = free_rows(curve)
-    given = plain_instrument(curve, free)
+    lever = Lever([curve], [free])
+    given, found = lever.instrument(0, lever.stated), energies(curve, lever.instrument(0))
     plain, kind = energies(curve, given), _kinds_of_rows(curve, given, free)
     groups, alike = _groups(curve, kind.touching & ~kind.rough & ~kind.early, kind.repulsive)
-    fitted = fit_energy(curve, alike, free, smooth=False, scale_errors=scale_errors) if groups else None
     stretches = [rows for rows in smooth_stretches(curve, kind.touching, kind.repulsive) if len(rows) >= FEWEST_ROWS]
-    functions = fit_energy(curve, stretches, free, smooth=True, scale_errors=scale_errors) if stretches else None
+    fitted = one_energy(lever, alike, stretches, scale_errors=scale_errors) if groups else None
+    functions = energies_along(lever, [stretches], [kind.repulsive])[0] if stretches else None
     believed = functions or fitted
-    found = plain if believed is None else believed.energies_at
     alone = kind.touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
     nothing = np.zeros(curve.rows, bool)
     rows = _tap_rows(
         curve,
-        given,
         kind,
         plain,
+        lever.errors_of_rows(0),
+        largest_energy_aj=largest_energies(curve, given),
         energy_of_fit_aj=found.energy_aj,
         virial_of_fit_aj=found.virial_aj,
         used=nothing if fitted is None else fitted.used,
@@ -308,9 +317,8 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         groups=tuple(groups),
         fit=fitted,
         functions=functions,
-        branches=() if functions is None else branches_of(curve, functions, kind.repulsive),
         scale_errors=scale_errors,
-        followed=_followed(curve, alike, free) if groups and curve.time is None else None,
+        followed=_followed(curve, alike, stretches, free) if groups and curve.time is None else None,
         bound_aj=None if curve.has_phase else _bound(curve, given, free),
         hysteresis=tuple(
             changes(curve, free=free, repulsive=kind.repulsive, energy=energy, noise=rows.energy_noise_aj)
@@ -356,10 +364,16 @@ def _kinds_of_rows(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray
     return _KindsOfRows(free, held, touching, repulsive, rough, early, departure)
 
 
-def _tap_rows(curve: TappingCurve, given: Instrument, kind: _KindsOfRows, plain: Energies, **of_fit: Any) -> TapRows:
+def _tap_rows(
+    curve: TappingCurve,
+    kind: _KindsOfRows,
+    plain: Energies,
+    errors: tuple[dict[str, Rows], dict[str, Rows]],
+    **of_fit: Any,
+) -> TapRows:
     """Return the rows one by one: what the instrument as given makes of them, beside what a fit does."""
     states = zip(kind.free, kind.held, np.isfinite(kind.lag_departure_deg), kind.repulsive, strict=True)
-    energy_errors, virial_errors = _errors(curve, given, kind.free)
+    energy_errors, virial_errors = errors
     return TapRows(
         state=tuple(_state(*row) for row in states),
         lag_departure_deg=kind.lag_departure_deg,
@@ -369,16 +383,18 @@ def _tap_rows(curve: TappingCurve, given: Instrument, kind: _KindsOfRows, plain:
         virial_aj=plain.virial_aj,
         virial_noise_aj=virial_noise_of(curve, plain),
         virial_errors_aj=virial_errors,
-        largest_energy_aj=largest_energies(curve, given),
         **of_fit,
     )
 
 
-def _followed(curve: TappingCurve, alike: list[np.ndarray], free: Bool[np.ndarray, " rows"]) -> EnergyFit | None:
+def _followed(
+    curve: TappingCurve, alike: list[np.ndarray], stretches: list[np.ndarray], free: Bool[np.ndarray, " rows"]
+) -> OneEnergy | None:
     """Return the fit of one energy with drifts as if the rows stood in the order of time; None for very few."""
     if sum(map(len, alike)) < _FEWEST_TO_FOLLOW:
         return None
-    return fit_energy(replace(curve, time=np.linspace(-0.5, 0.5, curve.rows)), alike, free, smooth=False)
+    in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
+    return one_energy(Lever([in_order], [free]), alike, stretches)
 
 
 def _energies_along(result: Tapping) -> np.ndarray:
@@ -430,43 +446,6 @@ def _notes(curve: TappingCurve, kind: _KindsOfRows, **which: Bool[np.ndarray, " 
     return tuple(next((words for name, words in said.items() if which[name][i]), "") for i in range(curve.rows))
 
 
-def _errors(
-    curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return by how much each energy and each virial changes with one standard error of what all rows share."""
-    known = np.isfinite(curve.lag_error_deg) & free
-    zero = curve.phase_zero_deg.error if curve.phase_zero_deg else 0.0
-    if known.any():
-        zero = float(np.sum(curve.lag_error_deg[known] ** -2.0) ** -0.5)
-    frequency, quality = curve.free_frequency_khz, curve.quality_factor
-    moved = {
-        "free_frequency_khz": given._replace(free_frequency_khz=frequency.value + frequency.error),
-        "quality_factor": given._replace(quality_factor=quality.value + quality.error),
-        "phase_zero_deg": given._replace(phase_zero_deg=given.phase_zero_deg + zero),
-        "free_amplitude": given._replace(
-            free_amplitude_factor=given.free_amplitude_factor + curve.free_amplitude_error
-        ),
-        "harmonics": given._replace(harmonics_factor=HARMONICS_FACTOR.value + HARMONICS_FACTOR.error),
-    }
-    # with another frequency or Q the free rows fix another zero of the phase
-    for name in ("free_frequency_khz", "quality_factor"):
-        trial = replace(curve, **{name: Given(getattr(moved[name], name))})
-        moved[name] = moved[name]._replace(phase_zero_deg=plain_instrument(trial, free).phase_zero_deg)
-    if curve.time is not None:
-        phase, amplitude = usual_drifts(curve, free)
-        moved["phase_drift_deg"] = given._replace(phase_zero_deg=given.phase_zero_deg + phase * curve.time)
-        factor = given.free_amplitude_factor + amplitude * curve.time
-        moved["free_amplitude_drift"] = given._replace(free_amplitude_factor=factor)
-    start = energies(curve, given)
-    ends = {name: energies(curve, at) for name, at in moved.items()}
-    found = [
-        {name: np.abs(getattr(end, column) - getattr(start, column)) for name, end in ends.items()}
-        | {name: share * np.abs(getattr(start, column)) for name, share in curve.relative_errors.items()}
-        for column in ("energy_aj", "virial_aj")
-    ]
-    return found[0], found[1]
-
-
 def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> float | None:
     """Return the least of the rows' largest energies that hold for every tap of the curve, with 95 % for its errors."""
     touching = ~free & ~held_rows(curve)
@@ -478,7 +457,7 @@ def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows
     return float(np.max(largest) * np.exp(1.645 * share))
 
 
-def _speeds(result: Tapping, fitted: EnergyFit) -> MeasuredSpeeds:
+def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
     """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
     curve = result.curve
     instrument = fitted.instrument if result.described or result.functions is None else result.functions.instrument

@@ -1,4 +1,4 @@
-"""Several tapping curves of one lever: what they have in common fitted to all, and how curves scatter beside errors."""
+"""Several tapping curves of one lever: one instrument for all, and how curves scatter beside their errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,9 +13,17 @@ from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TableLike, as_table
-from fitting.tapping_curves.branches import CurveBranch
-from fitting.tapping_curves.energy_curve import TappingBranch, branches_of, within
-from fitting.tapping_curves.energy_fit import Common, fitted_together
+from fitting.tapping_curves.branches import CurveBranch, smooth_stretches
+from fitting.tapping_curves.energy import (
+    COMMON,
+    FEWEST_ROWS,
+    Lever,
+    Nuisance,
+    TappingBranch,
+    energies_along,
+    estimates_at,
+    within,
+)
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import tapping
 
@@ -56,23 +64,36 @@ class TappingTogether(Result):
     """Energies of a tap from several curves of one lever: what `tapping_together` returns.
 
     Attributes:
-        curves: the result of each curve, with the nuisances fitted to all.
-        common: the nuisances that all curves have in common; None where fewer than two have an energy.
+        curves: the result of each curve, with the instrument of all.
+        lever: the curves that have an energy, and their instrument; None where fewer than two have one.
         scatter: how the energies of each branch scatter from curve to curve.
     """
 
     curves: tuple[Tapping, ...]
-    common: Common | None
+    lever: Lever | None
     scatter: tuple[CurveScatter, ...]
+
+    @property
+    def common_nuisances(self) -> tuple[Nuisance, ...]:
+        """What is known of the instrument that all curves have in common."""
+        return () if self.lever is None else self.lever.nuisances(0)[: len(COMMON)]
+
+    @property
+    def agreement_p_value(self) -> float | None:
+        """Probability that what is stated of one instrument and its free rows disagree more; None if not to be told."""
+        if self.lever is None or not self.lever.minimum.degrees_of_freedom:
+            return None
+        return self.lever.minimum.p_value
 
     @property
     def reasons(self) -> list[str]:
         """What makes it no measurement."""
         found = [f"{one.table.source}: {one.reasons[0]}" for one in self.curves if not one.valid]
-        if self.common is not None and self.common.p_value < IMPROBABLE:
+        probable = self.agreement_p_value
+        if probable is not None and probable < IMPROBABLE:
             found.append(
-                "the curves disagree on the instrument that they have in common (probability "
-                f"{self.common.p_value:.1g}): is it one lever, and was its drive left alone between them?"
+                f"the curves disagree on the instrument that they have in common (probability {probable:.1g}): is it "
+                "one lever, and was its drive left alone between them?"
             )
         return found
 
@@ -83,17 +104,13 @@ class TappingTogether(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return what all curves say together as plain lists, numbers and strings; each curve's own is in `curves`."""
-        first = next((one.functions for one in self.curves if one.functions is not None), None)
-        names = () if self.common is None else self.common.names
         payload = plain(
             {
                 "valid": self.valid,
                 "reasons": self.reasons,
                 "curves": [one.table.source for one in self.curves],
-                "common_nuisances": {}
-                if first is None
-                else nuisances_as_dict(tuple(one for one in first.nuisances if one.name in names)),
-                "agreement_p_value": None if self.common is None else self.common.p_value,
+                "common_nuisances": nuisances_as_dict(self.common_nuisances),
+                "agreement_p_value": self.agreement_p_value,
                 "branches": [{**vars(one), "branch": one.way} for one in self.scatter],
             }
         )
@@ -115,32 +132,31 @@ def tapping_together(tables: Sequence[TableLike], *, scale_errors: bool = False)
 
 
 def together(curves: Sequence[Tapping]) -> TappingTogether:
-    """Return curves that were analysed one by one with what they have in common fitted to all of them.
+    """Return curves that were analysed one by one with one instrument for all of them.
 
     Raises:
         TableError: if not the same is stated of their lever.
     """
     _same_lever(curves)
-    common = None
-    moved = list(curves)
-    chosen = [i for i, one in enumerate(curves) if one.functions is not None]
-    if len(chosen) > 1:
-        fits, common = fitted_together([one.functions for i in chosen if (one := curves[i]).functions is not None])
-        for i, fit in zip(chosen, fits, strict=True):
-            one = curves[i]
-            repulsive = np.array(one.rows.state) == "repulsive"
-            rows = replace(
-                one.rows, energy_of_fit_aj=fit.energies_at.energy_aj, virial_of_fit_aj=fit.energies_at.virial_aj
-            )
-            branches = branches_of(one.curve, fit, repulsive)
-            moved[i] = replace(one, functions=fit, branches=branches, rows=rows)
-    single = [i for i in chosen if curves[i].fit is not None and curves[i].described]
-    if len(single) > 1:
-        fits, _ = fitted_together([one.fit for i in single if (one := curves[i]).fit is not None])
-        for i, fit in zip(single, fits, strict=True):
-            moved[i] = replace(moved[i], fit=fit)
-    names = () if common is None else common.names
-    return TappingTogether(curves=tuple(moved), common=common, scatter=_scatters(moved, names))
+    moved, chosen = list(curves), [i for i, one in enumerate(curves) if one.functions is not None]
+    if len(chosen) < 2:
+        return TappingTogether(curves=tuple(moved), lever=None, scatter=())
+    lever = Lever([curves[i].curve for i in chosen], [curves[i].rows.free for i in chosen])
+    states = [np.array(curves[i].rows.state) for i in chosen]
+    repulsive = [state == "repulsive" for state in states]
+    stretches = [
+        [
+            rows
+            for rows in smooth_stretches(curve, (state == "attractive") | (state == "repulsive"), side)
+            if len(rows) >= FEWEST_ROWS
+        ]
+        for curve, state, side in zip(lever.curves, states, repulsive, strict=True)
+    ]
+    for i, functions in zip(chosen, energies_along(lever, stretches, repulsive), strict=True):
+        found = functions.energies
+        rows = replace(curves[i].rows, energy_of_fit_aj=found.energy_aj, virial_of_fit_aj=found.virial_aj)
+        moved[i] = replace(curves[i], functions=functions, rows=rows)
+    return TappingTogether(curves=tuple(moved), lever=lever, scatter=_scatters(moved))
 
 
 def _same_lever(curves: Sequence[Tapping]) -> None:
@@ -165,7 +181,7 @@ def _same_lever(curves: Sequence[Tapping]) -> None:
                 )
 
 
-def _scatters(curves: Sequence[Tapping], common: tuple[str, ...]) -> tuple[CurveScatter, ...]:
+def _scatters(curves: Sequence[Tapping]) -> tuple[CurveScatter, ...]:
     """Return the scatter of each branch that two curves have."""
     kinds: list[tuple[TappingBranch, list[tuple[Tapping, TappingBranch]]]] = []
     for one in curves:
@@ -176,7 +192,7 @@ def _scatters(curves: Sequence[Tapping], common: tuple[str, ...]) -> tuple[Curve
                     break
             else:
                 kinds.append((branch, [(one, branch)]))
-    return tuple(scatter for first, members in kinds if (scatter := _scatter(first, members, common)) is not None)
+    return tuple(scatter for first, members in kinds if (scatter := _scatter(first, members)) is not None)
 
 
 def _alike(one: TappingBranch, other: TappingBranch) -> bool:
@@ -185,9 +201,7 @@ def _alike(one: TappingBranch, other: TappingBranch) -> bool:
     return sides[0] == sides[1] and apart < _SAME * one.free_amplitude_nm
 
 
-def _scatter(
-    first: TappingBranch, members: list[tuple[Tapping, TappingBranch]], common: tuple[str, ...]
-) -> CurveScatter | None:
+def _scatter(first: TappingBranch, members: list[tuple[Tapping, TappingBranch]]) -> CurveScatter | None:
     """Return mean, scatter and errors of a branch over the amplitudes that half of the curves have, and two."""
     ends = [(b.curve.amplitude_ratio[0], b.curve.amplitude_ratio[-1]) for _, b in members]
     fewest = max(2, (len(members) + 1) // 2)
@@ -197,9 +211,9 @@ def _scatter(
     if not low < high:
         return None
     ratio = np.linspace(low, high, _POINTS)
-    columns = np.array([_parts_at(ratio, one, branch, common) for one, branch in members])
+    columns = np.array([_parts_at(ratio, one, branch) for one, branch in members])
     enough = np.isfinite(columns[:, 0]).sum(axis=0) >= fewest
-    ratio, (energy, own, shared) = ratio[enough], np.moveaxis(columns[:, :, enough], 1, 0)
+    ratio, (energy, estimate, own, shared) = ratio[enough], np.moveaxis(columns[:, :, enough], 1, 0)
     if not len(ratio):
         return None
     return CurveScatter(
@@ -210,24 +224,26 @@ def _scatter(
         curves=len(members),
         amplitude_ratio=ratio,
         energy_aj=np.nanmean(energy, axis=0),
-        energy_scatter_aj=np.nanstd(energy, axis=0, ddof=1),
+        energy_scatter_aj=np.nanstd(estimate, axis=0, ddof=1),
         energy_own_error_aj=np.sqrt(np.nanmean(own, axis=0)),
         energy_common_error_aj=np.sqrt(np.nanmean(shared, axis=0)),
     )
 
 
 def _parts_at(
-    ratio: Float[np.ndarray, " points"], one: Tapping, branch: TappingBranch, common: tuple[str, ...]
-) -> Float[np.ndarray, "3 points"]:
-    """Return energy, its own variance and that by what all curves have in common, NaN where not measured.
+    ratio: Float[np.ndarray, " points"], one: Tapping, branch: TappingBranch
+) -> Float[np.ndarray, "4 points"]:
+    """Return the middle of the band, the estimate, its own variance and that by what all curves have in common.
 
-    The curve's own is what its errors leave open if what all have in common were known.
+    The curve's own is what its errors leave open if what all have in common were known. NaN where not measured.
     """
-    curve, fit = branch.curve, one.functions
-    assert fit is not None  # noqa: S101
-    slopes = curve.energy_by_instrument
-    own = np.einsum("nu,uv,nv->n", slopes, fit.covariance_with(common), slopes)
-    own = np.maximum(own, 0.0) + curve.energy_noise_aj**2
-    rest = np.maximum(curve.energy_error_aj**2 - own, 0.0)
-    parts = [np.interp(ratio, curve.amplitude_ratio, part, np.nan, np.nan) for part in (curve.energy_aj, own, rest)]
-    return np.stack(parts)
+    assert one.functions is not None  # noqa: S101
+    curve, covariance, common = branch.curve, one.functions.lever.minimum.covariance, len(COMMON)
+    gain = np.linalg.solve(covariance[:common, :common], covariance[:common])
+    estimate, noise, by = estimates_at(curve, ratio)
+    own = np.maximum(np.einsum("nu,uv,nv->n", by, covariance - gain.T @ covariance[:common], by), 0.0) + noise**2
+    middle, error = (
+        np.interp(ratio, curve.amplitude_ratio, column, np.nan, np.nan)
+        for column in (curve.energy_aj, curve.energy_error_aj)
+    )
+    return np.stack([middle, estimate, own, np.maximum(error**2 - own, 0.0)])

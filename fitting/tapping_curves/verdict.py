@@ -11,14 +11,20 @@ from jaxtyping import Bool
 
 from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED
 from afm_jax.outcomes import Rule, Rules
-from fitting.parameters import USUAL_ERRORS
-from fitting.tapping_curves.branches import free_ends
-from fitting.tapping_curves.curve import TappingCurve
-from fitting.tapping_curves.energy_curve import FEWEST_ROWS
-from fitting.tapping_curves.energy_fit import EnergyFit, Nuisance
+from afm_jax.words import interval
+from fitting.parameters import USUAL_DRIFTS, USUAL_ERRORS
+from fitting.tapping_curves.branches import free_ends, ways
+from fitting.tapping_curves.curve import TappingCurve, lag_of_free_tip
+from fitting.tapping_curves.energy import (
+    FEWEST_FREE_ROWS,
+    FEWEST_ROWS,
+    EnergyFunctions,
+    Nuisance,
+    OneEnergy,
+    turned,
+    what_narrows,
+)
 
-BRACKET = 0.5
-"""Relative standard error from which a number is only a bracket."""
 _LARGEST_UNASKED_SCALE = 2.0
 """Scatter of rows in contact, of their errors, that is believed without `scale_errors`: measured curves have up to 1.8
 times that of the free tip."""
@@ -26,8 +32,6 @@ _DRIFTING = 5.0
 """Errors of a drift of the free rows from which it is one."""
 _FOLLOWING = 3.0
 """Errors of a drift along the rows, of one energy for all taps, from which it is one."""
-_NEGATIVE = 3.0
-"""Standard errors below zero from which an energy is impossible."""
 _SAY_SO = "if they stand as they were measured, say so by '# rows = in order of time', and the drift is fitted along"
 ORIGINS = {
     "noise": "noise",
@@ -45,7 +49,7 @@ ORIGINS = {
 """What an error comes from, in words."""
 
 
-def _torn(fit: EnergyFit) -> list[str]:
+def _torn(fit: EnergyFunctions | OneEnergy) -> list[str]:
     """Return which nuisances had to go too far, in words."""
     parts = [f"{ORIGINS[n.kind]} {n.pull:+.1f} of its errors from what was given" for n in fit.torn]
     return [f"{' and '.join(parts)} would be needed"] if parts else []
@@ -53,7 +57,7 @@ def _torn(fit: EnergyFit) -> list[str]:
 
 def _followed(e: Any) -> list[str]:
     """Return by what drift rows about one energy follow their order, which the table does not state as that in time."""
-    if e.followed is None or not e.followed.p_value > IMPROBABLE:
+    if e.followed is None or not e.followed.minimum.p_value > IMPROBABLE:
         return []
     units = {"phase_drift_deg": (1.0, "degrees"), "free_amplitude_drift": (100.0, "%")}
 
@@ -67,10 +71,11 @@ def _followed(e: Any) -> list[str]:
 
 NO_CONSTANT: tuple[Rule[Any], ...] = (
     Rule(lambda e: e.fit is None, "no branch has enough rows of taps that come every period for one energy"),
+    Rule(lambda e: not e.fit.minimum.settled, "the search for one energy a branch does not settle"),
     Rule(
-        lambda e: e.fit.scale == 1.0 and e.fit.p_value < IMPROBABLE,
-        "one energy a branch does not describe the rows (chi2 {e.fit.chi2:.0f} for {e.fit.degrees_of_freedom} degrees "
-        "of freedom, probability {e.fit.p_value:.1g})",
+        lambda e: e.fit.scale == 1.0 and e.fit.minimum.p_value < IMPROBABLE,
+        "one energy a branch does not describe the rows (chi2 {e.fit.minimum.chi2:.0f} for "
+        "{e.fit.minimum.degrees_of_freedom} degrees of freedom, probability {e.fit.minimum.p_value:.1g})",
     ),
     Rule(
         lambda e: e.fit.scale > LARGEST_SCALE,
@@ -115,12 +120,63 @@ def drift_of_free_rows(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> 
     return found[:1]
 
 
-def _impossible(e: Any) -> bool:
-    """Say whether an energy along a branch is below zero by more than its errors."""
-    return any(np.any(b.curve.energy_aj + _NEGATIVE * b.curve.energy_error_aj < 0.0) for b in e.branches)
+_LONG = 10.0
+"""Errors of an amplitude over which rows off the sample must reach: the first in contact loses 1 nm per nm."""
+_BENT_DEG, _BENT = 0.3, 0.005
+"""Change of the free tip's lag and amplitude along its rows, over the free amplitude, that is no departure yet."""
+
+
+def _not_flat(e: Any) -> list[str]:
+    """Return why rows that count as the free tip's may be those of first contact, which depart by two, in words."""
+    curve, lever, number = e.curve, e.functions.lever, e.functions.number
+    at, free = lever.instrument(number), lever.free[number]
+    columns = {
+        "lag": (turned(curve.lag_deg - lag_of_free_tip(curve, at)), curve.lag_error_deg, _BENT_DEG, "degrees"),
+        "amplitude": (
+            100.0 * (curve.amplitude_nm / curve.free_amplitude_nm - at.free_amplitude_factor),
+            100.0 * curve.amplitude_error_nm / curve.free_amplitude_nm,
+            100.0 * _BENT,
+            "%",
+        ),
+    }
+    for way in ways(curve):
+        rows, nearer = way[free[way]], way[~free[way]]
+        if len(rows) < FEWEST_FREE_ROWS or not len(nearer):
+            continue
+        reach = curve.offset_nm[nearer].min() - curve.offset_nm[rows].min()
+        if reach < _LONG * np.median(curve.amplitude_error_nm[rows]):
+            return [f"the free part is {reach:.2g} nm long, too short to tell it from first contact: {_MORE_FREE}"]
+        height = (curve.offset_nm[rows] - curve.offset_nm[rows].mean()) / max(np.ptp(curve.offset_nm[rows]), 1e-9)
+        for name, (values, errors, least, unit) in columns.items():
+            # weighted by the error of a row, which is one for all
+            change = float(height @ values[rows] / max(height @ height, 1e-9))
+            left = values[rows] - values[rows].mean() - change * height
+            noise = max(float(np.median(errors[rows])), float(np.sqrt(left @ left / max(len(rows) - 2, 1))))
+            error = noise / np.sqrt(max(height @ height, 1e-9))
+            if abs(change) > max(_DRIFTING * error, least):
+                change_in_words = f"{change:+.2g} +- {error:.1g} {unit}"
+                return [f"the free part is not flat: its {name} changes by {change_in_words} along it: {_MORE_FREE}"]
+    return []
+
+
+_MORE_FREE = "record more heights off the sample"
+
+
+def _bracketed(e: Any) -> list[str]:
+    """Return what is known of the energy where it is largest, if that is no measurement, and what would narrow it."""
+    top = e.largest
+    if top["said"] == "measured":
+        return []
+    low, high = top["interval95"]
+    words = f"{interval(low, high)} aJ" if top["said"] == "bracket" else f"below {high:.3g} aJ"
+    return [f"{words} at {top['amplitude_ratio']:.2f} of the free amplitude; {what_narrows(e.functions)}"]
 
 
 NO_FUNCTIONS: tuple[Rule[Any], ...] = (
+    Rule(
+        lambda e: e.functions is not None and not e.functions.lever.minimum.settled,
+        "the least squares of the instrument, from what is stated and free rows, does not settle",
+    ),
     Rule(
         lambda e: e.functions is None or e.largest is None,
         "no branch has enough rows in contact for an energy of a tap",
@@ -131,31 +187,19 @@ NO_FUNCTIONS: tuple[Rule[Any], ...] = (
         "the rows scatter {e.functions.scale:.1f} times as much about a smooth energy as their errors say",
     ),
     Rule(lambda e: e.drift, "{case}"),
-    Rule(_impossible, "energies below zero beyond their errors: frequency, Q or the zero of the phase is wrong"),
+    Rule(_not_flat, "{case}"),
     Rule(
-        lambda e: not e.largest["standard_error"] < BRACKET * e.largest["value"],
-        lambda e, _: (
-            f"the energy along the branches is only bracketed, {max(e.largest['value'], 0.0):.2g} aJ at its largest "
-            f"with a standard error of {e.largest['standard_error']:.2g}"
-        ),
+        lambda e: not e.functions.possible,
+        "the instrument contradicts the curve: with no frequency, Q and zero of the phase as stated are all energies "
+        "above nothing, and no sample gives energy",
     ),
+    Rule(
+        lambda e: e.curve.phase_zero_deg is None and not e.functions.lever.free[e.functions.number].any(),
+        f"fewer than {FEWEST_FREE_ROWS} rows are off the sample, and no zero of the phase is stated: {_MORE_FREE}",
+    ),
+    Rule(_bracketed, "the energy along the branches is only bracketed where it is largest: {case}"),
 )
-"""Why the energy along the branches is not determined; the first that applies."""
-
-
-def _undetermined(e: Any) -> list[str]:
-    """Return why neither one energy nor one along the branches is determined; nothing where one of them is."""
-    energy = e.energy
-    one = energy["reason"]
-    if energy["kind"] == "bracket":
-        chief = max(energy["share_of_variance"], key=lambda name: energy["share_of_variance"][name])
-        low, high = energy["interval95"]
-        one = f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} aJ; most of that is {ORIGINS[chief]}"
-    if energy["kind"] == "several":
-        each = [e.constant(i) for i in e.chief]
-        if all(error < BRACKET * value for value, error, _ in each):
-            return []
-    return list(dict.fromkeys([one, e.why_not_functions])) if one and e.why_not_functions else []
+"""Why the energy along the branches is not measured; the first that applies."""
 
 
 REASONS: Rules[Any] = [
@@ -165,8 +209,7 @@ REASONS: Rules[Any] = [
             lambda e: not e.curve.has_phase and e.bound_aj is not None,
             "without a phase the curve gives no more than an upper bound of the energy of a tap",
         ),
-        Rule(lambda e: e.drift, "{case}"),
-        Rule(_undetermined, "{case}"),
+        Rule(lambda e: [e.why_not_functions] if e.why_not_functions else [], "{case}"),
     )
 ]
 """What makes the energy no measurement."""
@@ -187,23 +230,20 @@ WARNINGS: Rules[Any] = [
         "one energy for all taps is not given: {e.why_not_constant}",
     ),
     Rule(
-        lambda e: _given(e) and bool(e.why_not_functions),
-        "as a function of the amplitude it is not determined: {e.why_not_functions}",
-    ),
-    Rule(
         _scaled,
         "the rows scatter {case[1]:.2g} times more about {case[0]} than their errors say: its errors are multiplied by "
         "that",
     ),
     Rule(
-        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > PULLED] if _given(e) and e.described else [],
+        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > PULLED] if e.described else [],
         lambda _, n: (
-            f"{ORIGINS[n.kind]} ends {n.pull:+.1f} standard errors from what was given ({n.given} to {n.value:.6g})"
+            f"for one energy {ORIGINS[n.kind]} ends {n.pull:+.1f} standard errors from what was given ({n.given} to "
+            f"{n.value:.6g})"
         ),
     ),
     Rule(
         lambda e: _given(e) and not e.rows.free.any() and e.curve.phase_zero_deg is None,
-        "no row of the free tip fixes the zero of the phase: it is fitted, and the energy depends on it",
+        "no row of the free tip fixes the zero of the phase: it is not known, and the energy depends on it",
     ),
     Rule(
         lambda e: [len(e.set_aside)] if e.set_aside else [],
@@ -221,9 +261,8 @@ def _spring_constant(e: Any) -> str:
 
 def _lag(e: Any) -> str:
     behind = "the base" if e.curve.drive == "base" else "the force on the tip"
-    zero = "the zero of the phase from the free rows"
-    if not e.rows.free.any():
-        zero = f"zero of phase {e.curve.phase_zero_deg or 'fitted'}"
+    known = "from the free rows" if e.rows.free.any() else "not known"
+    zero = f"zero of the phase {known if e.curve.phase_zero_deg is None else f'{e.curve.phase_zero_deg} degrees'}"
     return f"lag behind {behind}, {zero}; heights upward, virial positive where attraction prevails"
 
 
@@ -246,7 +285,11 @@ ASSUMPTIONS: Rules[Any] = [
             lambda e: free_ends(e.curve, e.rows.free),
             "phase and free amplitude drift evenly along the rows, as free rows at both ends tell",
         ),
-        Rule(lambda _: True, "phase and free amplitude drift evenly along the rows, usually by 3 degrees and 2 %"),
+        Rule(
+            lambda _: True,
+            f"phase and free amplitude drift evenly along the rows, usually by {USUAL_DRIFTS['phase_drift_deg']:g} "
+            f"degrees and {100.0 * USUAL_DRIFTS['free_amplitude_drift']:g} %",
+        ),
     ),
     Rule(lambda e: list(e.curve.phase.notes), "{case}"),
     Rule(lambda e: [_lag(e)] if e.curve.has_phase else [], "{case}"),
