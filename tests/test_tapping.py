@@ -267,6 +267,10 @@ def test_a_zero_that_free_rows_were_set_to_is_no_knowledge_besides_frequency_and
     found = instrument()
     frequency = found["free_frequency_khz"]
     assert frequency.standard_error == instrument(phase_zero_deg=(0.0, 1e3))["free_frequency_khz"].standard_error
+    # stated worse later on, the frequency is not known by the zero that was made with it
+    vague = tapping(replace(table, free_frequency_error_khz=0.1), law=False).functions
+    assert vague is not None
+    assert vague.nuisances[0].standard_error == pytest.approx(0.1, rel=1e-3)
     # the example's own frequency, which is not the one that is stated
     assert abs(frequency.value - make_raw_curve.FREE_FREQUENCY_KHZ) < frequency.standard_error
     # a zero that is known better is used

@@ -773,6 +773,8 @@ def table_text(curve: MeasuredCurve) -> str:
     if rows.in_order_of_time:
         lines.append("# rows = in order of time")
     remarks = [f"read from {Path(curve.source).name} ({curve.format}), curve {curve.curve}", *curve.notes]
+    zero = curve.known.get("phase_zero_deg")
+    remarks += [] if zero is None or not zero.error else [zero_of_free_rows(zero.error)]
     if not moving.all():
         remarks.append(f"left out: {np.sum(~moving)} rows whose amplitude is not above zero")
     lines += [f"# {remark}" for remark in remarks]
@@ -782,6 +784,11 @@ def table_text(curve: MeasuredCurve) -> str:
         for row in zip(*present.values(), strict=True)
     ]
     return "\n".join(lines) + "\n"
+
+
+def zero_of_free_rows(error: float) -> str:
+    """Return the remark that a zero of the phase with this error is that of the free rows, and no knowledge besides."""
+    return f"phase_zero_deg +- {error!r} is that of the free rows, as frequency and Q leave it"
 
 
 def _rows(curve: MeasuredCurve) -> Binned:

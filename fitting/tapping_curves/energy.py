@@ -249,8 +249,8 @@ class Minimum(NamedTuple):
 Function = Callable[[np.ndarray], np.ndarray]
 
 
-def _minimum(residual: Function, jacobian: Function, start: np.ndarray) -> Minimum:
-    """Return the minimum of a sum of squares, and whether the search settled there."""
+def _minimum(residual: Function, jacobian: Function, start: np.ndarray, *, until: float = _SETTLED) -> Minimum:
+    """Return the minimum of a sum of squares to some distance of chi2, and whether the search settled there."""
 
     def evaluate(places: np.ndarray, _: np.ndarray) -> Searches:
         left, slopes = residual(places[0]), jacobian(places[0])
@@ -260,7 +260,7 @@ def _minimum(residual: Function, jacobian: Function, start: np.ndarray) -> Minim
     box = Box(np.full(count, -np.inf), np.full(count, np.inf), np.zeros((1, count), bool))
     # what is far out of range is refused by its chi2
     with np.errstate(over="ignore", invalid="ignore"):
-        end = descended(evaluate, evaluate(start[None], np.arange(1)), box, settled=_SETTLED, most=_ROUNDS, rise=_RISE)
+        end = descended(evaluate, evaluate(start[None], np.arange(1)), box, settled=until, most=_ROUNDS, rise=_RISE)
         settled = bool(distance(end, box)[0] <= 1e-2)
     covariance = covariance_of(end.jacobian[0].T @ end.jacobian[0])
     settled &= bool(np.isfinite(covariance).all())
@@ -307,7 +307,8 @@ class Lever:
         self._zeros = [
             (i, zero) for i, one in enumerate(unknowns) if one.kind == "free_lag_deg" and (zero := self._zero(one))
         ]
-        self.minimum = _minimum(self.residual, self.jacobian, np.zeros(len(unknowns)))
+        # all but linear: a few steps more are as good as none
+        self.minimum = _minimum(self.residual, self.jacobian, np.zeros(len(unknowns)), until=1e-20)
 
     def _zero(self, unknown: _Unknown) -> Given | None:
         return None if unknown.curve is None else self.curves[unknown.curve].phase_zero_deg

@@ -10,6 +10,7 @@ from afm_jax.checks import checked
 from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
+from fitting.instruments.curve import zero_of_free_rows
 from fitting.instruments.lag import AS_STATED, PhaseReadings, PhaseSense, sense_of_phase, turned
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
@@ -80,7 +81,7 @@ def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale
     """
     table = as_table(table)
     table, sense = with_sense_of_phase(table)
-    curve = _with_zero_of_free_rows(replace(curve_of(table), phase=sense))
+    curve = _with_zero_of_free_rows(replace(curve_of(table), phase=sense), table.remarks)
     if sense.origin == "assumed":
         curve = replace(curve, free_frequency_khz=_for_both_signs(curve))
     result = _energies(table, curve, scale_errors=scale_errors)
@@ -250,11 +251,11 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, stated: float, off
         )
 
 
-def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
+def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> TappingCurve:
     """Return a curve that knows no zero of the phase but that of its free rows, if what is stated tells no more.
 
     A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q
-    given: taken for knowledge besides, it would count both twice.
+    given, and says so: taken for knowledge besides, it would count both twice.
     """
     stated, free = curve.phase_zero_deg, free_rows(curve) & np.isfinite(curve.lag_deg)
     if stated is None or not free.any():
@@ -263,7 +264,8 @@ def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
     start = lag_of_free_tip(curve, Instrument(frequency.value, quality.value))[free]
     moved = [Instrument(sum(frequency), quality.value), Instrument(frequency.value, sum(quality))]
     of_lag = np.linalg.norm([np.median(lag_of_free_tip(curve, at)[free] - start) for at in moved])
-    return curve if stated.error < of_lag else replace(curve, phase_zero_deg=None)
+    own = zero_of_free_rows(stated.error) in remarks or not stated.error < of_lag
+    return replace(curve, phase_zero_deg=None) if own else curve
 
 
 def _check_range(curve: TappingCurve, zero: float, name: str) -> None:
