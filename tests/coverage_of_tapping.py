@@ -97,7 +97,7 @@ def curve_of_shape(shape: str, tip: Tip, largest: float, rows: int = 120) -> tup
 def sides_of(truth: Truth, repulsive: np.ndarray) -> dict[tuple[bool, bool], Truth]:
     """Return what is true on each way and side of a curve that jumps between the sides."""
     sides = {side: Truth(*(column[repulsive == side] for column in truth)) for side in (False, True)}
-    return {(retract, side): sides[side] for retract, side in itertools.product((False, True), repeat=2)}
+    return {(retract, side): sides[side] for retract in (False, True) for side in (False, True)}
 
 
 def shaped_curve(shape: str, lever: str, number: int) -> "Simulated":
@@ -110,7 +110,7 @@ def shaped_curve(shape: str, lever: str, number: int) -> "Simulated":
     also = {"calibration": {"tip_calibration": (1.0, 1e-6)} | zero, "back": truth if rng.uniform() < 0.5 else None}
     result = tapping(table_of(tip, truth, stated, rng, **also), law=False)
     # where nothing jumps, rows whose lag is next to the free one may count as of the other side
-    anywhere = dict.fromkeys(itertools.product((False, True), repeat=2), truth)
+    anywhere = {(retract, side): truth for retract in (False, True) for side in (False, True)}
     every = sides_of(truth, repulsive) if shape == "step" else anywhere
     return Simulated(f"{shape}, {lever}", points_of(tip, result, every, stated), np.zeros(0), result.valid)
 

@@ -216,8 +216,8 @@ def test_fewer_than_three_free_rows_are_none():
     found = tapping(table_of(Tip(), truth, Stated(), rng, free_rows=2, calibration={}), law=False)
     assert not found.valid
     assert "fewer than 3 rows are off the sample" in found.reasons[0]
-    known = {"calibration": {"phase_zero_deg": (3.0, 0.1)}}
-    assert tapping(table_of(Tip(), truth, Stated(), rng, free_rows=2, **known), law=False).valid
+    known = {"phase_zero_deg": (3.0, 0.1)}
+    assert tapping(table_of(Tip(), truth, Stated(), rng, free_rows=2, calibration=known), law=False).valid
 
 
 def test_a_search_that_does_not_settle_is_said():

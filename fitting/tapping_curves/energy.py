@@ -34,7 +34,7 @@ from scipy.optimize import isotonic_regression
 from scipy.special import ndtr
 
 from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, covariance_of, descended, distance
-from fitting.instruments.lag import free_lag_deg
+from fitting.instruments.lag import free_lag_deg, turned
 from fitting.parameters import USUAL_DRIFTS
 from fitting.tapping_curves.branches import CurveBranch, free_ends, ways
 from fitting.tapping_curves.curve import (
@@ -51,7 +51,7 @@ _TRIALS = 361
 _HARMONICS = 40
 """The sum of those of a brief impact converges like 1/n; beyond them a contact lasts too long to excite them."""
 Z95 = 1.959964
-_inverse_triangle = get_lapack_funcs("trtri", dtype=float)
+(_inverse_triangle,) = get_lapack_funcs(("trtri",), dtype=float)
 
 
 class Energies(NamedTuple):
@@ -472,11 +472,6 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Bool[np.ndarray, " rows
     return found
 
 
-def turned(degrees: Any) -> Any:
-    """Return angles between -180 and 180 degrees."""
-    return (degrees + 180.0) % 360.0 - 180.0
-
-
 _FEWEST_OF_MEAN, _MOST_MEANS = 4, 8
 
 
@@ -782,10 +777,12 @@ def energies_along(
     curves = [branch.curve for one in each for branch in one.branches]
     if not curves:
         return each
-    columns = (np.concatenate([getattr(c, name) for c in curves]) for name in ("estimate_aj", "noise_aj", "certain"))
+    names = ("estimate_aj", "noise_aj", "certain")
+    estimate, noise, certain = (np.concatenate([getattr(c, name) for c in curves]) for name in names)
     size, axes = np.linalg.eigh(lever.minimum.covariance)
     root = axes * np.sqrt(np.maximum(size, 0.0))
-    low, high, possible = positive_bands(*columns, np.concatenate([c.by_instrument for c in curves]) @ root)
+    by_instrument = np.concatenate([c.by_instrument for c in curves]) @ root
+    low, high, possible = positive_bands(estimate, noise, certain, by_instrument)
     share = float(np.linalg.norm(list(lever.curves[0].relative_errors.values())))
     middle, common = 0.5 * (low + high), Z95 * share * 0.5 * (low + high)
     low, high = np.maximum(middle - np.hypot(middle - low, common), 0.0), middle + np.hypot(high - middle, common)

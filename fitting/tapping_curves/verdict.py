@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED
 from afm_jax.outcomes import Rule, Rules
 from afm_jax.words import interval
+from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS, USUAL_ERRORS
 from fitting.tapping_curves.branches import free_ends, ways
 from fitting.tapping_curves.curve import TappingCurve, lag_of_free_tip
@@ -21,7 +22,6 @@ from fitting.tapping_curves.energy import (
     EnergyFunctions,
     Nuisance,
     OneEnergy,
-    turned,
     what_narrows,
 )
 
