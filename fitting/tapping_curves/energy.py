@@ -930,8 +930,8 @@ def _at(
     weights, variance = fit.smoother.at(_place_of(ratio))
     mean = weights @ fit.smoother.average(values[fit.rows])
     by = weights @ fit.smoother.average(slopes[fit.rows])
-    # with more of a free amplitude the same ratio is at a larger reading
-    moved = np.gradient(mean, ratio) * ratio
+    # with more of a free amplitude the same ratio is at a larger reading; a branch may be all at one amplitude
+    moved = np.gradient(mean, ratio) * ratio if np.ptp(ratio) > 0.0 else np.zeros(len(ratio))
     for i, unknown in enumerate(lever.unknowns):
         if unknown.curve == number and unknown.kind.startswith("free_amplitude"):
             by[:, i] += moved * unknown.given.error * (weights @ fit.smoother.average(unknown.rows[fit.rows]))
