@@ -9,11 +9,11 @@ from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, ne
 
 _SMALLEST = 1e-17
 """Errors below this are 0 but for rounding; they are drawn here."""
-_STYLES = {"afm-jax": (BLUE, "o"), "Diffrax Dopri8": (DARK, "s"), "SciPy DOP853": (ACCENT, "^")}
+_STYLES = {"afm-jax": (BLUE, "o", ""), "Diffrax Dopri8": (DARK, "s", "-"), "SciPy DOP853": (ACCENT, "^", "-")}
 
 
 def accuracy_figure(result: Mapping[str, Any]) -> Figure:
-    """Return two panels, value and gradient: a line a method, a point a setting; smaller errors to the right.
+    """Return two panels, value and gradient: a line a rival, a point a setting; smaller errors to the right.
 
     Errors of 1 and more are left out: no more than that they are wrong is known.
 
@@ -25,7 +25,7 @@ def accuracy_figure(result: Mapping[str, Any]) -> Figure:
     for axes, kind, own in zip(
         panels, ("value", "gradient"), ("reference_error", "reference_gradient_error"), strict=True
     ):
-        for method, (colour, marker) in _STYLES.items():
+        for method, (colour, marker, line) in _STYLES.items():
             chosen = [row for row in result["rows"] if (row["of"], row["method"]) == (kind, method)]
             places = [
                 (max(row["error"], _SMALLEST), row["microseconds"])
@@ -33,7 +33,7 @@ def accuracy_figure(result: Mapping[str, Any]) -> Figure:
                 if row["error"] is not None and row["error"] < 1.0
             ]
             if places:
-                axes.plot(*zip(*sorted(places), strict=True), color=colour, marker=marker, label=method)
+                axes.plot(*zip(*sorted(places), strict=True), color=colour, marker=marker, ls=line, label=method)
         if result[own] > _SMALLEST:
             axes.axvline(result[own], color=DARK, linestyle=":", label="error of the reference")
         axes.set(xscale="log", yscale="log", title=kind)

@@ -55,7 +55,7 @@ Parameters = Float[Array, " parameters"]
 Values = Float[Any, " tips"]
 Slopes = Float[Any, "tips parameters"]
 
-_LONGEST_US, _LONGEST_TOUCH_US = 1000.0, 20.0
+_LONGEST_US, _LONGEST_TOUCH_US = 1000.0, 10.0
 """No flight, and no phase of a contact, of a motion that is compared lasts as long, unless rounding holds the tip."""
 _MOST_PHASES = 100
 """Of a tip between two crossings."""
@@ -203,7 +203,7 @@ def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[s
         ValueError: if a scene's tip has fewer contacts, or mpmath is missing (map).
     """
     tips, repetitions = (20, 1) if quick else (500, 5)
-    tolerances = {f"tolerance {each:g}": each for each in ((1e-8,) if quick else (1e-4, 1e-6, 1e-8, 1e-10, 1e-12))}
+    tolerances = {f"tolerance {each:g}": each for each in ((1e-8,) if quick else (1e-6, 1e-8, 1e-10, 1e-12))}
     problems = {"map": partial(impact_times, tips), "collide": partial(rebound_speeds, tips)}
     solved = problems.get(problem, partial(contact_arrivals, problem, contacts))()
     names = list(solved.settings)
