@@ -125,7 +125,7 @@ def test_an_instrument_without_errors_has_usual_ones_and_ends_right_or_not_valid
         low, high = result.energies_at[2]["interval95_aj"]
         widths.append((high - low) / ONE_ENERGY_AJ)
         if not zero_known:
-            assert "state the zero of the phase to 0.2 degrees" in answer["reasons"][0]
+            assert re.search("state the (zero of the phase|free frequency) to", answer["reasons"][0])
     # it is no emptiness that holds the truth
     assert not zero_known or np.median(widths) < 0.5
 
@@ -205,7 +205,8 @@ def test_an_instrument_that_no_energy_allows_contradicts_the_curve():
     ]
     refused = [one for one in wrong if not one.valid]
     assert len(refused) == 1
-    assert "the instrument contradicts the curve" in refused[0].reasons[0]
+    # that the sign of the phase may be the other is said before
+    assert "the instrument contradicts the curve" in refused[0].why_not_functions
     # with the zero stated, statements contradict each other
     torn = tapping(replace(table, free_frequency_khz=90.0 * (1.0 + 2e-4)), law=False)
     assert "of its errors from what was given would be needed" in torn.reasons[0]
@@ -321,15 +322,15 @@ def test_each_free_amplitude_has_an_energy_of_its_own_and_the_picture_shows_all_
 
 @pytest.mark.slow
 def test_bands_hold_the_energies_of_random_curves():
-    # `make energies` takes more of them, and an instrument that is known better
-    found = [random_curve(number, Stated(frequency=1e-4)) for number in range(1000, 1025)]
+    # `make energies` takes more of them, and an instrument that is known better; points of a curve are off together
+    found = [random_curve(number, Stated(frequency=1e-4)) for number in range(1000, 1040)]
     assert {one.kind.split(" ")[0] for one in found} == {"law", "contact", "two"}
     off = np.abs(np.concatenate([one.points.energy for one in found]))
     assert np.mean(off < 1.96) > 0.9
     assert off.max() < 4.0
     assert np.median(off) < 1.2 * 0.6745
     changes = np.concatenate([one.hysteresis for one in found])
-    assert len(changes) == 10
+    assert len(changes) == 16
     assert np.abs(changes).max() < 2.0
 
 

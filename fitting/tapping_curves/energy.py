@@ -1216,8 +1216,16 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
         return np.concatenate([lever.residual(x), left / noise])
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        # at readings with noise slopes hang on the noise of the same rows, and pull the instrument to small energies
-        by, noise = lever.slopes(smooth, 0, x)[0][rows], off(x)[1]
+        """Return the changes at the likeliest readings with the groups' energies.
+
+        At others slopes hang on how the energies scatter, and pull Q and f0 to where all of them are smaller.
+        """
+        noise, there = off(x)[1], energies(smooth, lever.instrument(0, x))
+        missing = (x[count:][group] - there.energy_aj[rows]) / (noise / scale) ** 2
+        moved = replace(smooth, amplitude_nm=smooth.amplitude_nm.copy(), lag_deg=smooth.lag_deg.copy())
+        moved.amplitude_nm[rows] += missing * (there.amplitude_slope * smooth.amplitude_error_nm**2)[rows]
+        moved.lag_deg[rows] += missing * (there.lag_slope * smooth.lag_error_deg**2)[rows]
+        by = lever.slopes(moved, 0, x)[0][rows]
         of_free = np.pad(lever.jacobian(x), ((0, 0), (0, len(groups))))
         return np.concatenate([of_free, np.concatenate([by, -own], axis=1) / noise[:, None]])
 
