@@ -96,8 +96,9 @@ class Platform(eqx.Module):
 
     @property
     def top_speed_nm_per_us(self) -> Float[Array, "..."]:
-        """Largest speed of the first cosine, beta omega, in nm/us."""
-        return self.amplitude_nm * self.angular_frequency
+        """Largest speed against the ramp, beta omega, in nm/us; a bound where there are two cosines."""
+        first = self.amplitude_nm * self.angular_frequency
+        return first if self.second is None else first + self.second.amplitude * self.second.angular_frequency
 
     @property
     def reach_nm(self) -> Float[Array, "..."]:
@@ -107,7 +108,7 @@ class Platform(eqx.Module):
     @property
     def largest_acceleration_nm_per_us2(self) -> Float[Array, "..."]:
         """Largest acceleration, beta omega^2, in nm/us^2; a bound where there are two cosines."""
-        first = self.top_speed_nm_per_us * self.angular_frequency
+        first = self.amplitude_nm * self.angular_frequency**2
         return first if self.second is None else first + self.second.amplitude * self.second.angular_frequency**2
 
     @property
@@ -120,7 +121,8 @@ class Platform(eqx.Module):
         """Return z_p with its derivatives at a time in us, from one sine-cosine pair a frequency."""
         time = as_argument(time_us)
         sine, cosine = sine_cosine(self.angular_frequency * time)
-        first = Oscillation(self.angular_frequency, self.amplitude_nm * cosine, -self.top_speed_nm_per_us * sine)
+        omega = self.angular_frequency
+        first = Oscillation(omega, self.amplitude_nm * cosine, -self.amplitude_nm * omega * sine)
         others = [] if self.second is None else [_of_tone(self.second, time)]
         return SurfaceMotion(
             self.offset_nm + self.offset_rate_nm_per_us * time, self.offset_rate_nm_per_us, (first, *others)

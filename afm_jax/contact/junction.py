@@ -129,6 +129,17 @@ def _dry_junction(contact: Contact, junction: Hertz) -> Junction:
     )
 
 
+def end_of_contact(contact: Contact) -> Float[Array, "..."]:
+    """Return the gap in nm at which contact ends: where the bridge breaks, or the junction where that outlives it.
+
+    Args:
+        contact: the contact; its parameters are numbers, or arrays with one axis.
+    """
+    if contact.bridge_breaks_nm.ndim:
+        return jax.vmap(end_of_contact)(contact)
+    return jnp.maximum(contact.bridge_breaks_nm, find_junction(contact).breaks_gap_nm)
+
+
 def _excess_stiffness(log_gap: Float[Array, "..."], model: Tangent) -> Float[Array, "..."]:
     """Return by how much the bridge is stiffer than the JKR contact that bears the same force, in nN/nm."""
     bridge, load_scale, depth_scale = model

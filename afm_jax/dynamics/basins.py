@@ -70,8 +70,8 @@ class Basins(ResultTuple):
 
     Attributes:
         phase_rad: drive phase of the columns' starts.
-        rebound_speed_nm_per_us: speed off the platform of the rows' starts; at the gap where the bridge breaks, if the
-            scene has a contact.
+        rebound_speed_nm_per_us: speed off the platform of the rows' starts; of a scene with a contact at the gap where
+            that ends.
         attractors: the motions, by falling share of the starts.
         attractor: the number of each start's attractor, (rows, columns).
         share: fraction of the starts that ends on each attractor.
@@ -274,8 +274,6 @@ class _Finder:
         """Return tips that leave at drive phases with rebound speeds."""
         scenes, time = self.scenes(len(phase)), phase / self.omega
         tips = tips_at(scenes, time, np.asarray(_velocity(self.scene.platform, time)) + speed)
-        if isinstance(self.scene.interaction, Contact):
-            tips = tips._replace(gap_nm=scenes.interaction.bridge_breaks_nm)
         return jax.tree.map(np.asarray, tips)
 
     def _later(self, tips: Tips, impacts: int, report: Report | None = None) -> tuple[Tips, Record]:

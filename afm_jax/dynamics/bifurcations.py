@@ -25,7 +25,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Record, Tips, follow
 from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
-from afm_jax.motion.start import start_of
+from afm_jax.motion.start import gap_of_departure, start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
@@ -164,8 +164,14 @@ class Ramps(NamedTuple):
         }
 
     def printed(self) -> list[str]:
-        """Return a line a direction."""
-        return [line for sweep in self.sweeps for line in sweep.printed()]
+        """Return a line a direction, and what irregular motions may be."""
+        lines = [line for sweep in self.sweeps for line in sweep.printed()]
+        if any((sweep.verdicts.kind == MotionKind.IRREGULAR).any() for sweep in self.sweeps):
+            lines.append(
+                f"irregular: nothing repeated within the {self.impacts_each} impacts at a value; with a high quality "
+                "factor the motion may still be settling (`impacts=...` gives it more)"
+            )
+        return lines
 
     def tables(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the columns of three files, the directions one below the other."""
@@ -344,7 +350,7 @@ def carried(before: Scene, after: Scene, fresh: Tips, tips: Tips) -> Tips:
         time_us=time,
         periods=jnp.zeros_like(time),
         velocity_nm_per_us=after.platform.velocity(time) + rebound,
-        gap_nm=after.interaction.bridge_breaks_nm if isinstance(after.interaction, Contact) else tips.gap_nm,
+        gap_nm=gap_of_departure(after) if isinstance(after.interaction, Contact) else tips.gap_nm,
     )
     going = tips.outcome == Outcome.IMPACT
     return jax.tree.map(lambda old, new: jnp.where(going, old, new), tips_there, fresh)
@@ -417,7 +423,7 @@ def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.n
     begin = record.turns(period)[:, some] + ahead
     end = record.arrival_periods + record.arrival_us / period[:, None] + ahead
     begin, end, used = begin[:, :-1], end[:, some][:, 1:], shown[:, some][:, 1:]
-    gap = np.asarray(scenes.interaction.bridge_breaks_nm) if isinstance(scenes.interaction, Contact) else 0.0 * period
+    gap = np.asarray(gap_of_departure(scenes))
     strobe = np.ceil(begin)[..., None] + np.arange(_STROBES)
     flown = (strobe - begin[..., None]) * period[:, None, None]
     departure, velocity = (

@@ -29,11 +29,12 @@ from afm_jax.dynamics.impact_orbits import (
     multipliers_of,
 )
 from afm_jax.dynamics.many_tips import next_contact, tips_after_contacts
-from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leaving_tips
+from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leaving_tips, sample_driven
 from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_sum, peak_amplitude, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
+from afm_jax.motion.start import default_start, gap_of_departure
 from afm_jax.scenefile.parameter_paths import scene_family
 from afm_jax.solve.arclength import EquationsAt
 from afm_jax.solve.lanes import Report, compiled_quickly, in_blocks
@@ -41,7 +42,9 @@ from afm_jax.solve.newton import LinearisedRows, Newton, Roots, newton_rows, sho
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _STARTS = 8
-"""Tips that are simulated for guesses."""
+"""Tips that are simulated for guesses, besides the one that starts where `simulate` does."""
+_GRID, _SPEEDS = (32, 24), (0.05, 20.0)
+"""Drive phases and rebound speeds that are tried for orbits of one contact; the speeds' ends, over `leaving_tips`'."""
 _SETTLING = 60
 """Contacts before their guesses."""
 _WINDOW = 0.05
@@ -76,10 +79,10 @@ def contact_orbits(
         accuracy: of `simulate`.
 
     Returns:
-        The orbits; a contact begins where the bridge forms and ends where it breaks. In the reading phases and
+        The orbits; a contact begins where the bridge forms and ends at `end_of_contact`. In the reading phases and
         velocities after are those of the departures, delays those between straight paths extrapolated to gap 0
         (as in `collide`); ``loops`` holds departure phases in rad and rebound speeds in
-        nm/us. Stable orbits that eight tips do not come to and unstable ones that the closest law lacks are not found.
+        nm/us. Stable orbits that nine tips do not come to and unstable ones that the closest law lacks are not found.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
@@ -126,7 +129,10 @@ def contact_loops(
         One row a loop: m departure phases in rad, ascending, and m rebound speeds in nm/us.
     """
     scene, order = flights.scene_at(*values), flights.order
-    guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, order, impacts, flights.accuracy)]
+    seen = sample_driven(scene)
+    guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, seen, order, impacts, flights.accuracy)]
+    if impacts == 1:
+        guesses += [*_near_a_grid(seen, flights, values)]
     loops = _closed(np.array(guesses).reshape(-1, 2 * impacts), flights, values)
     return loops_told_apart(loops, order)
 
@@ -149,12 +155,12 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, 
     # `phase_rad` is within [0, 2 pi), but the impacts follow one another: a phase that falls is one turn later
     turns = np.cumsum(np.diff(phases, axis=1) < 0.0, axis=1)
     starts = phases + 2.0 * np.pi * np.pad(turns, ((0, 0), (1, 0)))
-    departures, speeds = _where_the_bridge_breaks(scene, starts, rebounds)
+    departures, speeds = _where_contact_ends(scene, starts, rebounds)
     guesses = np.concatenate([departures, speeds], axis=1)
     return guesses[np.isfinite(guesses).all(axis=1) & (speeds > 0.0).all(axis=1)]
 
 
-def _where_the_bridge_breaks(
+def _where_contact_ends(
     scene: Scene, phases: Float[np.ndarray, "orbits m"], rebounds: Float[np.ndarray, "orbits m"]
 ) -> tuple[Float[np.ndarray, "orbits m"], Float[np.ndarray, "orbits m"]]:
     """Return phases and speeds against the surface at which flights from the surface first are as high; NaN if never.
@@ -167,7 +173,7 @@ def _where_the_bridge_breaks(
     height, rate = surface.position_and_velocity(begin)
     position, velocity = scene.cantilever.propagator(after)(height, rate + rebounds[..., None])
     surface_height, surface_rate = surface.position_and_velocity(begin + after)
-    above = np.asarray(position - surface_height) - float(scene.interaction.bridge_breaks_nm)
+    above = np.asarray(position - surface_height) - float(gap_of_departure(scene))
     crossing = np.argmax(above > 0.0, axis=-1)[..., None]
     before = np.take_along_axis(above, np.maximum(crossing - 1, 0), axis=-1)[..., 0]
     behind = np.take_along_axis(above, crossing, axis=-1)[..., 0]
@@ -178,20 +184,56 @@ def _where_the_bridge_breaks(
     return phases + omega * rise_us, speed
 
 
-def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
-    """Return sequences of m contacts in nearly N drive periods that a few simulated tips come to, as guesses."""
-    scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS, *leaf.shape)), scene)
-    tips = leaving_tips(scenes)
-    period = drive_of(scene).period_us
+def _near_a_grid(
+    seen: SampleDriven, flights: "ContactFlights", values: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, "guesses 2"]:
+    """Return the departures of a grid of drive phases and rebound speeds that are within a cell of an orbit.
+
+    From these a step of Newton's method is not longer than the grid is wide there. The phases count from where the
+    surface that the free tip sees is highest.
+
+    Args:
+        seen: the scene.
+        flights: of the scene and its parameters.
+        values: of the parameters.
+    """
+    tip = leaving_tips(jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], seen.scenes))
+    usual = float(tip.velocity_nm_per_us[0] - seen.scenes.platform.velocity(tip.time_us)[0])
+    phase, across = np.linspace(0.0, 2.0 * np.pi, _GRID[0], endpoint=False, retstep=True)
+    speed = usual * np.geomspace(*_SPEEDS, _GRID[1])
+    grid = np.stack(np.meshgrid(phase + float(seen.frame.phase_rad), speed, indexing="ij"), axis=-1).reshape(-1, 2)
+    cell = np.stack([np.full(len(grid), across), grid[:, 1] * (speed[1] / speed[0] - 1.0)], axis=1)
+    near = []
+    for departure, width, flown in zip(grid, cell, flights.flown(grid, np.tile(values, (len(grid), 1))), strict=True):
+        if flown is not None:
+            step = np.linalg.lstsq(flown.slopes[:, :2], flown.gaps)[0]
+            near += [departure] if (np.abs(step) <= width).all() else []
+    return np.array(near).reshape(-1, 2)
+
+
+def _repetitions(scene: Scene, seen: SampleDriven, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
+    """Return sequences of m contacts in nearly N drive periods that a few simulated tips come to, as guesses.
+
+    The tips start evenly spread, and where `simulate` starts. They are simulated in the frame in which the drive is a
+    platform's: what they come to does not depend on the clock that the drive's phase counts in.
+    """
+    platform = seen.scenes.platform
+    scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS + 1, *leaf.shape)), seen.scenes)
+    leaving, period = leaving_tips(scenes), float(platform.period_us)
     across, up = evenly_spread(_STARTS).T
-    time = period * across
-    faster = np.asarray(tips.velocity_nm_per_us - scene.platform.velocity(tips.time_us)) * (0.5 + 3.0 * up)
-    tips = tips._replace(time_us=time, velocity_nm_per_us=np.asarray(scene.platform.velocity(time)) + faster)
+    usual = seen.start(default_start(scene))
+    time = np.append(period * across, float(usual.time_us))
+    faster = float(leaving.velocity_nm_per_us[0] - platform.velocity(leaving.time_us[0])) * (0.5 + 3.0 * up)
+    velocity = np.asarray(platform.velocity(time)) + np.append(faster, 0.0)
+    velocity[-1] = float(usual.velocity_nm_per_us)
+    gap = np.array(leaving.gap_nm)
+    gap[-1] = float(usual.position_nm - platform.position(usual.time_us))
+    tips = leaving._replace(time_us=time, gap_nm=gap, velocity_nm_per_us=velocity)
     _, record = tips_after_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=accuracy)
-    turns = record.departure_periods + record.departure_us / period
-    rebound = record.velocity_after_nm_per_us - np.asarray(scene.platform.velocity(record.departure_us))
+    turns = record.departure_periods + record.departure_us / period + float(seen.frame.phase_rad) / (2.0 * np.pi)
+    rebound = record.velocity_after_nm_per_us - np.asarray(platform.velocity(record.departure_us))
     guesses = []
-    for lane in range(_STARTS):
+    for lane in range(_STARTS + 1):
         for begin in range(impacts + 1):
             window = turns[lane, begin : begin + impacts + 1]
             if abs(window[-1] - window[0] - order) < _WINDOW:
@@ -276,7 +318,7 @@ class _Guesses(NamedTuple):
     column: Int[np.ndarray, " guesses"]
     """Number of the order."""
     phase_rad: Float[np.ndarray, " guesses"]
-    """At the departure from where the bridge breaks."""
+    """At the departure from where contact ends."""
     rebound_speed: Float[np.ndarray, " guesses"]
     turn_rad: Float[np.ndarray, " guesses"]
     """Drive phase that an orbit takes: 2 pi N."""
@@ -290,7 +332,7 @@ def _guesses_of_law(seen: SampleDriven, orders: Sequence[int]) -> _Guesses:
     law, exists = laws or (None, np.zeros(0, bool))
     with_law = np.flatnonzero(exists)
     law_scenes = jax.tree.map(lambda leaf: leaf[with_law], Scene(scenes.cantilever, scenes.platform, law))
-    rise = np.asarray(scenes.platform.angular_frequency * scenes.interaction.bridge_breaks_nm)
+    rise = np.asarray(scenes.platform.angular_frequency * gap_of_departure(scenes))
     for column, order in enumerate(orders if with_law.size else ()):
 
         def work(block: Scene, order: int = order) -> SingleImpactOrbits:
@@ -299,7 +341,7 @@ def _guesses_of_law(seen: SampleDriven, orders: Sequence[int]) -> _Guesses:
         orbits = in_blocks(work, law_scenes, block=_CONTACTS_AT_ONCE)
         row, slot = np.nonzero(orbits.exists & orbits.admissible)
         rebound, lane = orbits.rebound_speed_nm_per_us[row, slot], with_law[row]
-        # a straight path to the gap at which the bridge breaks
+        # a straight path to the gap at which contact ends
         phase = orbits.phase_rad[row, slot] + rise[lane] / rebound
         columns.append(
             _Guesses(lane, np.full(len(row), column), phase, rebound, np.full(len(row), 2.0 * np.pi * order))
@@ -364,7 +406,7 @@ def _peak_of_flight(seen: SampleDriven, begin_us: Array, rebound: Array, arrival
     """Return the largest height in nm, in the lab, of the flight between two contacts of one scene."""
     scene = seen.scenes
     height, rate = scene.platform.position_and_velocity(begin_us)
-    height, velocity, lasts = height + scene.interaction.bridge_breaks_nm, rate + rebound, arrival_us - begin_us
+    height, velocity, lasts = height + gap_of_departure(scene), rate + rebound, arrival_us - begin_us
     flight = FlightEnds(begin_us, lasts, height, velocity, *scene.cantilever.propagator(lasts)(height, velocity))
     if seen.frame.response is None:
         return peak_amplitude(scene.cantilever, flight)
@@ -510,8 +552,8 @@ class ContactFlights:
         there, time, rebound = self._departures(flown)
         loop, contacts, count = flown.loop, flown.contacts, len(rebound)
         height, rate = (np.asarray(part) for part in there.platform.position_and_velocity(time))
-        breaks, forms = (float(getattr(there.interaction, f"bridge_{what}_nm")) for what in ("breaks", "forms"))
-        peaks = peaks_of_flights(there, time, height + breaks, rebound + rate, contacts.arrival_time_us)
+        ends, forms = float(gap_of_departure(there)), float(there.interaction.bridge_forms_nm)
+        peaks = peaks_of_flights(there, time, height + ends, rebound + rate, contacts.arrival_time_us)
         # of the contact before each departure
         approach = np.roll(contacts.approach_speed_nm_per_us, 1)
         lasts = np.roll(contacts.departure_time_us - contacts.arrival_time_us, 1)
@@ -521,7 +563,7 @@ class ContactFlights:
             np.roll(contacts.arrival_velocity_nm_per_us, 1),
             approach,
             rebound,
-            lasts - forms / approach - breaks / rebound,
+            lasts - forms / approach - ends / rebound,
             np.max(peaks),
             *flown.trace_and_determinant,
             True,
@@ -585,6 +627,6 @@ def _lowest_gap(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array
     surface, _ = surface_of(scene)
     height, rate = surface.position_and_velocity(begin_us)
     contact, still = scene.interaction, jnp.zeros_like(begin_us)
-    flights = FreeFlights(begin_us, height + contact.bridge_breaks_nm, rate + rebound, still, arrival_us - begin_us)
+    flights = FreeFlights(begin_us, height + gap_of_departure(scene), rate + rebound, still, arrival_us - begin_us)
     lowest = lowest_of_flights(scene.cantilever, surface, flights, _SAMPLES).gap_nm - contact.bridge_forms_nm
     return lowest, scene.cantilever.angular_frequency

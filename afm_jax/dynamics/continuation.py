@@ -121,7 +121,7 @@ class Continuation(ResultTuple):
             return f"the tip meets the sample at every value of {self.range}; try `impacts=1`"
         if self.rejected:
             return f"in every {what} {where} the tip would have to pass through the platform; try another order"
-        return f"no {what} was found {where}; try another order or range"
+        return f"no {what} was found {where}, but a search may miss some; try another order or range"
 
     @property
     def impact_speeds_nm_per_us(self) -> list[float]:

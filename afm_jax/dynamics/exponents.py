@@ -194,7 +194,10 @@ def exponent_verdicts(exponents: Lyapunov) -> list[str]:
         elif kind == MotionKind.IRREGULAR and larger > CHAOTIC_ERRORS * error:
             words.append("chaotic: the larger exponent is positive")
         elif kind == MotionKind.IRREGULAR:
-            words.append("undecided: nothing repeats, and the larger exponent is not clearly positive")
+            words.append(
+                "undecided: nothing repeats, and the larger exponent is not clearly positive; the motion may still be "
+                "settling (`transient=...` gives it more)"
+            )
         elif kind == MotionKind.FREE:
             words.append("free: the tip no longer meets the platform")
         else:

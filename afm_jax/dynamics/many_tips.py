@@ -33,6 +33,7 @@ from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, through_impact
 from afm_jax.motion.record import ContactKind, Contacts, Simulation, State
 from afm_jax.motion.settle import HELD_PERIODS
 from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import gap_of_departure
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import again_for
 
@@ -63,8 +64,7 @@ class Tips(NamedTuple):
     periods: Float[Any, " lanes"]
     """Whole drive periods gone before."""
     gap_nm: Float[Any, " lanes"]
-    """Height over the surface: 0 after an impact of a law, almost 0 after a release from rest, and after a contact the
-    gap where the bridge breaks."""
+    """Height over the surface: `gap_of_departure`, almost 0 after a release from rest."""
     velocity_nm_per_us: Float[Any, " lanes"]
     """In the lab."""
     outcome: Int[Any, " lanes"]
@@ -313,7 +313,7 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     end = Tips(
         time_us=of_last(time_in_period, tips.time_us),
         periods=tips.periods + of_last(passed, np.zeros_like(tips.periods)),
-        gap_nm=np.where(goes_on, np.asarray(scenes.interaction.bridge_breaks_nm), tips.gap_nm),
+        gap_nm=np.where(goes_on, np.asarray(gap_of_departure(scenes)), tips.gap_nm),
         velocity_nm_per_us=of_last(velocity, tips.velocity_nm_per_us),
         outcome=np.where(going, outcome, tips.outcome).astype(np.int32),
     )
@@ -346,7 +346,7 @@ def next_contact(
     scene: Scene, departure_us: Array, velocity_nm_per_us: Array, until_us: Array, accuracy: float
 ) -> Contacts:
     """Return the first contact after a departure, followed until a time; one scene, a velocity in the lab."""
-    height = scene.platform.position(departure_us) + scene.interaction.bridge_breaks_nm
+    height = scene.platform.position(departure_us) + gap_of_departure(scene)
     start = State(departure_us, height, velocity_nm_per_us)
     rows = simulate(scene, start, until_us - departure_us, max_contacts=1, accuracy=accuracy).contacts
     return jax.tree.map(lambda part: part[0], rows._replace(detail=None))

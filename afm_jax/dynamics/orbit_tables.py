@@ -12,6 +12,7 @@ from rich.table import Table
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, ManyImpactOrbits, orbit_facts
 from afm_jax.impact.orbits import SingleImpactOrbits
 from afm_jax.results import Result
@@ -178,13 +179,18 @@ def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> st
     """Return a sentence on why a scene has no admissible orbit of an order, and what to try.
 
     Args:
-        scene: a scene with an impact law.
+        scene: the scene.
         order: N, drive periods between impacts.
         rejected: how many orbits would close if the tip could pass through the platform.
         impacts: m, impacts in an orbit.
     """
     if float(getattr(scene.interaction, "r", 1.0)) == 0.0:
         return "with r = 0 every impact is a capture: no orbit leaves the sample; `afm-jax simulate` follows the tip"
+    if isinstance(scene.interaction, Contact):
+        return (
+            f"the search found no orbit of {counted(impacts, 'impact')} in {counted(order, 'drive period')}; of a "
+            "contact it may miss some: `afm-jax simulate` shows what the tip comes to from a start"
+        )
     if impacts > 1:
         return (
             f"the search found no orbit of {impacts} impacts in {order} drive periods; `afm-jax orbits --order` and "

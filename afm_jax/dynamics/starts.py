@@ -23,7 +23,7 @@ from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
 from afm_jax.motion.law_motion import or_rest
 from afm_jax.motion.record import State
-from afm_jax.motion.start import default_start
+from afm_jax.motion.start import default_start, gap_of_departure
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import compiled_quickly, in_blocks
 
@@ -31,7 +31,7 @@ _TOUCHING = 1e-13
 """Gap over the heights it is the difference of, below which it is rounding."""
 _ORBITS_AT_ONCE = 128
 _RISEN = 0.9
-"""Fraction of the gap at which the bridge breaks: from there a tip on its way up is free."""
+"""Fraction of the gap at which contact ends: a tip that comes so far on a straight path's time comes there."""
 
 
 class SampleDriven(NamedTuple):
@@ -80,7 +80,10 @@ def sample_driven(scenes: Scene) -> SampleDriven:
         raise ValueError("`offset_rate_nm_per_us` must be 0 here: under a ramp no motion repeats")
     frame = free_frame(scenes)
     if not np.all(np.asarray(frame.periodic)):
-        raise ValueError("the drive has several frequencies, so that no period of the drive repeats")
+        raise ValueError(
+            "the drive has several frequencies, so that no period of the drive repeats; a range of a frequency moves "
+            "one part's alone: give the others that move an amplitude of 0, or `simulate` scenes one by one"
+        )
     if not np.all(np.asarray(frame.platform.amplitude_nm) > 0.0):
         raise ValueError("`amplitude_nm` of the platform must be positive here: on a resting platform motion dies away")
     if frame.response is not None:
@@ -143,11 +146,11 @@ def leaving_tips(scenes: Scene) -> Tips:
     platform, interaction = scenes.platform, scenes.interaction
     time = 0.75 * platform.period_us
     if isinstance(interaction, Contact):
-        slowest, gap = jax.vmap(capture_speed)(interaction, scenes.cantilever.mass_ng), interaction.bridge_breaks_nm
+        slowest = jax.vmap(capture_speed)(interaction, scenes.cantilever.mass_ng)
     else:
-        slowest, gap = impact_law_of(scenes).capture_speed_nm_per_us, jnp.zeros_like(time)
+        slowest = impact_law_of(scenes).capture_speed_nm_per_us
     rebound = jnp.maximum(platform.top_speed_nm_per_us, jnp.where(jnp.isfinite(slowest), 2.0 * slowest, 0.0))
-    return tips_at(scenes, time, platform.velocity(time) + rebound)._replace(gap_nm=gap)
+    return tips_at(scenes, time, platform.velocity(time) + rebound)
 
 
 def bouncing_tips(scenes: Scene) -> Tips:
@@ -159,13 +162,11 @@ def bouncing_tips(scenes: Scene) -> Tips:
     Args:
         scenes: a batch of scenes, driven by the sample alone.
     """
-    usual, gap = leaving_tips(scenes), np.zeros(scenes.platform.frequency_khz.shape)
+    usual, gap = leaving_tips(scenes), gap_of_departure(scenes)
     laws = laws_of(scenes)
     if laws is None:
         return usual
     law, has_law = laws
-    if isinstance(scenes.interaction, Contact):
-        gap = scenes.interaction.bridge_breaks_nm
 
     def work(lanes: tuple[Scene, Array]) -> tuple[Array, Tips]:
         return _on_orbits(*lanes)
@@ -176,7 +177,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
 
 @compiled_quickly()
 def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Bool[Array, " lanes"], Tips]:
-    """Return which scenes with laws have a stable orbit, and tips on them, about as high above the platform as told."""
+    """Return which scenes with laws have a stable orbit, and tips on them that have risen to a gap in nm."""
 
     def on_orbit_of(scene: Scene, clearance: Array) -> tuple[Array, ...]:
         platform = scene.platform
@@ -186,12 +187,12 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
         start, velocity = orbit.flight.start_us, orbit.flight.start_velocity
         rise = clearance / orbit.speeds.rebound
         height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
-        gap = jnp.where(clearance > 0.0, height - platform.position(start + rise), 0.0)
-        risen = (clearance == 0.0) | (gap > _RISEN * clearance)
-        return steady & risen & law.leaves, (start + rise) % platform.period_us, gap, speed
+        # the path bends by less than this, where it rises at all
+        risen = height - platform.position(start + rise) >= _RISEN * clearance
+        return steady & risen & law.leaves, (start + rise) % platform.period_us, speed
 
-    there, time, gap, velocity = jax.vmap(on_orbit_of)(scenes, clearance_nm)
-    return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
+    there, time, velocity = jax.vmap(on_orbit_of)(scenes, clearance_nm)
+    return there, tips_at(scenes, time, velocity)._replace(gap_nm=clearance_nm)
 
 
 def laws_of(scenes: Scene) -> tuple[Law, Bool[np.ndarray, " lanes"]] | None:
@@ -221,7 +222,7 @@ def tips_at(scenes: Scene, time_us: Array, velocity_nm_per_us: Array) -> Tips:
     """Return tips that leave the platform at a time in us with a velocity in nm/us in the lab; arrays of one shape."""
     zero = jnp.zeros_like(scenes.platform.frequency_khz)
     going = jnp.full(zero.shape, int(Outcome.IMPACT), jnp.int32)
-    return Tips(zero + time_us, zero, zero, zero + velocity_nm_per_us, going)
+    return Tips(zero + time_us, zero, gap_of_departure(scenes), zero + velocity_nm_per_us, going)
 
 
 def evenly_spread(count: int) -> Float[np.ndarray, "count 2"]:

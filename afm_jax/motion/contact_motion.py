@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
@@ -59,6 +59,8 @@ _LEGS_AT_ONCE, _TRIALS_AT_ONCE = 256, 64
 """Tips of a batch that go through legs together, and that try steps in time together."""
 _TRIALS = 4
 """Trial steps between two checks which tips of a batch need more."""
+_ROUNDINGS = 32.0
+"""Roundings of the numbers from which a gap is made, within which it is at a level."""
 _LASTS_LONG = 5.0
 """Duration from which a contact counts as long, in units of (gap at arrival + gap at departure)/(arrival speed)."""
 _FINER, _MOST_REPEATS = 1.5, 5
@@ -157,12 +159,40 @@ def follow_contacts(  # noqa: PLR0913
     )
 
 
+def has_just_left(
+    surface: Platform | Surface, ends_nm: ArrayLike, time_us: ArrayLike, gap_nm: ArrayLike, rate: ArrayLike
+) -> Bool[Array, "..."]:
+    """Say whether a tip has just left a contact: it is where contact ends, but for rounding, and the gap opens.
+
+    It is free there, although a contact may begin at that very gap: where nothing bridges it, the way in begins where
+    the way out ends, and only the gap's rate tells the two apart.
+
+    Args:
+        surface: what the free tip sees (`surface_of`).
+        ends_nm: the gap at which contact ends (`end_of_contact`).
+        time_us: the time; arrays of one shape from here on.
+        gap_nm: of the tip then.
+        rate: of the gap in nm/us.
+    """
+    # of the heights whose difference the gap is, and of the surface's phase omega t
+    heights = jnp.abs(surface.offset_nm + surface.offset_rate_nm_per_us * time_us) + surface.reach_nm + jnp.abs(gap_nm)
+    moved = jnp.abs(time_us) * surface.top_speed_nm_per_us
+    rounding = _ROUNDINGS * jnp.finfo(heights.dtype).eps * (heights + moved)
+    return (jnp.abs(gap_nm - ends_nm) <= rounding) & (jnp.asarray(rate) > 0.0)
+
+
 def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, rows: int) -> ContactTip:
-    """Return a tip at its start: free above the gap where the bridge forms, in the bridge below it."""
-    sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & (gap_nm > driven.junction.forms_gap_nm)
+    """Return a tip at its start: free above the gap where the bridge forms or if it has just left, else in the bridge.
+
+    One that has just left starts exactly where contact ends, with the derivatives of the gap that was given.
+    """
+    leaves = has_just_left(driven.surface, driven.ends_nm, time_us, gap_nm, rate)
+    gap_nm = gap_nm + lax.stop_gradient(jnp.where(leaves, driven.ends_nm - gap_nm, 0.0))
+    above = leaves | (gap_nm > driven.junction.forms_gap_nm)
+    sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & above
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START)
     outcome = jnp.where(driven.junction.exists, outcome, MotionOutcome.NO_JUNCTION)
-    phase = jnp.where(gap_nm <= driven.forms_nm, Phase.BRIDGE, Phase.DRY)
+    phase = jnp.where(leaves | (gap_nm > driven.forms_nm), Phase.DRY, Phase.BRIDGE)
     none, zero = jnp.zeros_like(phase), jnp.zeros_like(time_us)
     start = ContactState(gap_nm, rate, time_us, zero)
     return ContactTip(

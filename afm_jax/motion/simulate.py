@@ -15,10 +15,10 @@ from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, is_traced, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase, explain_missing_junction, find_junction
+from afm_jax.contact.junction import Phase, end_of_contact, explain_missing_junction, find_junction
 from afm_jax.contact.settings import driven_setting_of
 from afm_jax.impact.law import Law
-from afm_jax.motion.contact_motion import follow_contacts
+from afm_jax.motion.contact_motion import follow_contacts, has_just_left
 from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import (
     Contacts,
@@ -211,9 +211,10 @@ def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface 
     junction = find_junction(scene.interaction)
     if not bool(junction.exists):
         raise ValueError(f"the contact has no junction: {explain_missing_junction(scene.interaction)}")
-    gap = float(to_gap(surface, response, start)[0])
-    if not gap > float(junction.forms_gap_nm):
+    gap, rate = to_gap(surface, response, start)
+    leaves = has_just_left(surface, end_of_contact(scene.interaction), start.time_us, gap, rate)
+    if not (bool(leaves) or float(gap) > float(junction.forms_gap_nm)):
         raise ValueError(
-            f"the start is inside the sample: the gap is {gap:.6g} nm, but must be above "
+            f"the start is inside the sample: the gap is {float(gap):.6g} nm, but must be above "
             f"{float(junction.forms_gap_nm):.6g} nm, where the junction forms; raise `position_nm`"
         )

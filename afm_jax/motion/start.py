@@ -5,12 +5,14 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import free_frame, surface_of
 from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import end_of_contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
@@ -53,7 +55,7 @@ def default_start(scene: Scene) -> State:
     if on_orbit is not None:
         return on_orbit
     sample_alone = scene.base is None and scene.force is None
-    if not sample_alone and -float(scene.platform.position(0.0)) > 2.0 * _clearance(scene) + 1.0:
+    if not sample_alone and -float(scene.platform.position(0.0)) > 2.0 * float(gap_of_departure(scene)) + 1.0:
         return state(0.0, 0.0, 0.0)
     return _leaving(scene)
 
@@ -80,15 +82,14 @@ def state(time_us: float, position_nm: float, velocity_nm_per_us: float) -> Stat
     return State(*(as_parameter(float(value)) for value in (time_us, position_nm, velocity_nm_per_us)))
 
 
-_FREE_NM = 1e-6
+def gap_of_departure(scene: Scene) -> Float[Array, "..."]:
+    """Return the gap in nm at which flights begin, of one scene or a batch: 0 after an impact of a law.
 
-
-def _clearance(scene: Scene) -> float:
-    """Return the gap, in nm, at which a tip that leaves the sample is free."""
-    if not isinstance(scene.interaction, Contact):
-        return 0.0
-    # a contact without forces begins at gap 0: rounding must not put the tip below it
-    return max(float(scene.interaction.bridge_breaks_nm), _FREE_NM)
+    After a contact it is where that ends (`end_of_contact`).
+    """
+    if isinstance(scene.interaction, Contact):
+        return end_of_contact(scene.interaction)
+    return jnp.zeros_like(scene.platform.frequency_khz)
 
 
 def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
@@ -110,7 +111,7 @@ def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
     if not isinstance(scene.interaction, Contact):
         height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
         return state(time, height, velocity if stable.any() else velocity + _PUSH * (velocity - speed))
-    return _risen(scene, time, velocity, _clearance(scene))
+    return _risen(scene, time, velocity, float(gap_of_departure(scene)))
 
 
 def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | None:
@@ -129,7 +130,6 @@ def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | No
         duration += step
         if abs(step) < 1e-13:
             break
-    # a rounding above the gap at which the bridge breaks
     end = time + duration
     v += 0.0 if response is None else float(response.velocity(end))
     return state(end, float(scene.platform.position(end)) + gap, v)
@@ -146,4 +146,4 @@ def _leaving(scene: Scene) -> State:
     elif isinstance(scene.interaction, Law):
         slowest = float(scene.interaction.capture_speed_nm_per_us)
     rebound = max(float(scene.platform.top_speed_nm_per_us), 2.0 * slowest if math.isfinite(slowest) else 0.0)
-    return state(time, height + _clearance(scene), speed + (rebound or drive.angular_frequency))
+    return state(time, height + float(gap_of_departure(scene)), speed + (rebound or drive.angular_frequency))

@@ -277,21 +277,29 @@ def _excitation_of(
     table = tables.get(name)
     if table is None:
         return None
+    numbers = _tone_of_excitation(table, name, kind, cantilever)
+    drive = _with_second(tables, name, table.build(kind, **numbers), cantilever)
+    table.build(check_steady_response, cantilever, drive.tones, name)
+    return drive
+
+
+def _tone_of_excitation(
+    table: SceneTable, name: str, kind: type[BaseDrive | ForceDrive], cantilever: Cantilever
+) -> dict[str, float]:
+    """Return the numbers of a tone of base or force, with its own amplitude in place of the free tip's height."""
     amplitude, free = _amplitude(name), "free_amplitude_nm"
     if amplitude in table.values and free in table.values:
         table.fail(f"has both {amplitude} and {free}; give one of them")
     given = free if free in table.values else amplitude
     numbers = _with_frequency(table, table.numbers(given), cantilever)
+    table.build(check_parameter, given, numbers[given], "not negative")
     if given == free:
-        table.build(check_parameter, free, numbers[free], "not negative")
         # the tone's amplitude only says that it moves
         tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
         table.build(check_steady_response, cantilever, (tone,), name)
         per_height = float(drive_per_free_height(cantilever, numbers["frequency_khz"], kind))
         numbers[amplitude] = numbers.pop(free) * per_height
-    drive = _with_second(tables, name, table.build(kind, **numbers), cantilever)
-    table.build(check_steady_response, cantilever, drive.tones, name)
-    return drive
+    return numbers
 
 
 def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, cantilever: Cantilever) -> Driven:
@@ -300,9 +308,12 @@ def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, can
     if table is None:
         return drive
     key = _amplitude(name)
-    numbers = table.numbers(key)
-    table.build(check_parameter, key, numbers[key], "not negative")
-    numbers = _with_frequency(table, numbers, cantilever)
+    if isinstance(drive, Platform):
+        numbers = table.numbers(key)
+        table.build(check_parameter, key, numbers[key], "not negative")
+        numbers = _with_frequency(table, numbers, cantilever)
+    else:
+        numbers = _tone_of_excitation(table, name, type(drive), cantilever)
     second = table.build(Tone, numbers.pop(key), **numbers)
     if _same_frequency(drive, second):
         table.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")

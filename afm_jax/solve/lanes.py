@@ -159,7 +159,8 @@ class QuicklyCompiled:
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Return the function's result."""
-        traced = any(map(is_traced, jax.tree.leaves((arguments, named))))
+        # inside a program everything is traced, also what is made of known numbers
+        traced = is_traced(jnp.asarray(0.0)) or any(map(is_traced, jax.tree.leaves((arguments, named))))
         return (self.inside if traced else self.outside)(*arguments, **named)
 
     def shapes(self, *arguments: Any, **named: Any) -> Any:

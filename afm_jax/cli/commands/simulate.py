@@ -218,13 +218,14 @@ ORBITS = Command(
     group="simulate",
     summary="Find the orbits of a scene, of one impact or more, and whether they are stable.",
     runs="afm_jax.cli.orbits:orbits",
-    help="""Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
+    help="""Find all single-impact orbits of a scene with a law, or with --impacts orbits of several impacts.
 
     Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
     whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase and lag
     at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and orbits.png. Exit
     code 3 if none is admissible. With --impacts every impact is listed, the hardest first. A contact's orbits are
-    listed like this, too: its impacts begin where the bridge forms and end, with phase and velocity, where it breaks.
+    listed like this, too: its impacts begin where the bridge forms and end, with phase and velocity, where it breaks (a
+    dry one's where its forces begin). All are found with a law only: of a contact the search may miss some.
     """,
     options=(
         SCENE,

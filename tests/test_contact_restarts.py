@@ -1,0 +1,193 @@
+"""Tips that have just left a contact: free, whatever the contact, wherever a motion is taken up again.
+
+What follows is compared with SciPy's integration of eq. 16, and with Liouville's theorem: where the contact takes no
+energy, the air alone contracts the plane of states, by exp(-Omega T/Q) in a time T.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import afm_jax as afm
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import end_of_contact
+from afm_jax.dynamics.contact_orbits import contact_orbits
+from afm_jax.dynamics.exponents import lyapunov_spectrum
+from afm_jax.dynamics.many_tips import departure_jacobians, tips_after_contacts
+from afm_jax.dynamics.starts import batch_and_tips, sample_driven
+from afm_jax.motion.contact_motion import has_just_left
+from afm_jax.motion.follow import follow_long, state_after
+from afm_jax.motion.record import MotionOutcome
+from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import default_start
+from afm_jax.outcomes import Outcome
+
+QUALITY, MASS, AMPLITUDE_NM, RATIO = 40.0, 1.0, 4.0, 2.02
+OMEGA = 2e-3 * np.pi * 90.0
+PERIOD_US = 2.0 * np.pi / (RATIO * OMEGA)
+CONTACTS = {
+    "wet": Contact.paper(),
+    # the junction breaks at 8.0 nm, beyond the bridge
+    "soft": Contact.paper(modulus_gpa=1.0),
+    # a bridge that breaks where it forms
+    "narrow": Contact.paper(bridge_forms_nm=4.7),
+    "dry": Contact.of(["van_der_waals", "dmt"]),
+    "hertz": Contact.of(["hertz"]),
+}
+CONSERVE = ("dry", "hertz")
+
+
+def scene_of(name: str) -> afm.Scene:
+    platform = afm.Platform(amplitude_nm=AMPLITUDE_NM, frequency_khz=90.0 * RATIO)
+    return afm.Scene(afm.Cantilever(90.0, QUALITY, MASS), platform, CONTACTS[name])
+
+
+def integrated(name: str, time: float, position: float, velocity: float, duration: float) -> np.ndarray:
+    """Return position and velocity a duration later by SciPy, from the forces of a dry contact as they are written."""
+    begins, attraction = (0.0, 0.0) if name == "hertz" else (0.165, 0.1 * 100.0 / 6.0)
+    reach = 0.0 if name == "hertz" else float(CONTACTS[name].bridge_forms_nm)
+
+    def platform(t):
+        return AMPLITUDE_NM * np.cos(RATIO * OMEGA * t)
+
+    def rates(region):
+        def of(t, state):
+            gap = state[0] - platform(t)
+            if region == "free":
+                force = 0.0
+            elif region == "attracted":
+                force = -attraction / gap**2
+            else:
+                force = 100.0 * 10.0 * max(begins - gap, 0.0) ** 1.5 - (attraction / begins**2 if begins else 0.0)
+            return [state[1], force / MASS - OMEGA / QUALITY * state[1] - OMEGA**2 * state[0]]
+
+        return of
+
+    # regions from outside inwards, with the gaps between them
+    regions, levels = (
+        (["free", "solid"], [0.0]) if name == "hertz" else (["free", "attracted", "solid"], [reach, begins])
+    )
+    at, end, state = 0, time + duration, [position, velocity]
+    while time < end:
+        events = []
+        for level, direction in [(levels[at], -1.0)] * (at < len(levels)) + [(levels[at - 1], 1.0)] * (at > 0):
+
+            def meets(t, s, level=level):
+                return s[0] - platform(t) - level
+
+            vars(meets).update(terminal=True, direction=direction)
+            events.append(meets)
+        way = solve_ivp(rates(regions[at]), (time, end), state, "DOP853", events=events, rtol=1e-12, atol=1e-12)
+        time, state = float(way.t[-1]), way.y[:, -1]
+        if way.status == 1:
+            inwards = at < len(levels) and way.t_events[0].size
+            at += 1 if inwards else -1
+            # a step off the level, lest the event is met again at once
+            state, time = state + 1e-13 * np.array(rates(regions[at])(time, state)), time + 1e-13
+    return np.asarray(state)
+
+
+def test_the_gap_where_contact_ends_is_that_of_what_lasts_longer():
+    assert float(end_of_contact(CONTACTS["wet"])) == 4.7
+    assert float(end_of_contact(CONTACTS["soft"])) == pytest.approx(8.0125, abs=1e-3)
+    assert float(end_of_contact(CONTACTS["hertz"])) == 0.0
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), CONTACTS["wet"], CONTACTS["soft"])
+    np.testing.assert_allclose(end_of_contact(both), [4.7, float(end_of_contact(CONTACTS["soft"]))], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("off_nm", "rate", "left"), [(0.0, 1.0, True), (1e-14, 1.0, True), (0.0, -1.0, False)])
+def test_a_tip_has_just_left_where_contact_ends_and_the_gap_opens(off_nm, rate, left):
+    platform = afm.Platform(4.0, 180.0)
+    for sign in (1.0, -1.0):
+        assert bool(has_just_left(platform, 20.0, 3.0, 20.0 + sign * off_nm, rate)) is left
+    assert not bool(has_just_left(platform, 20.0, 3.0, 20.0 + 1e-6, 1.0))
+    # the phase omega t has the rounding of the time
+    assert bool(has_just_left(platform, 20.0, 1e6, 20.0 + 1e-9, 1.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(CONTACTS))
+def test_a_motion_taken_up_at_a_departure_is_the_whole_motion(name):
+    scene = scene_of(name)
+    whole = simulate(scene, default_start(scene), 12.0 * PERIOD_US, max_contacts=32)
+    assert int(whole.outcome) == MotionOutcome.FINISHED
+    rows, count = whole.contacts, int(whole.count)
+    assert count >= 10
+    departure = state_after(whole, 4)
+    later = simulate(scene, departure, float(whole.final.time_us - departure.time_us), max_contacts=32)
+    assert int(later.count) == count - 5
+    for column in ("arrival_time_us", "departure_time_us", "rebound_speed_nm_per_us"):
+        again, before = getattr(later.contacts, column)[: count - 5], getattr(rows, column)[5:count]
+        np.testing.assert_allclose(again[:-1], before[:-1], rtol=1e-8)
+    # and from the gap itself, as maps of departures take it up
+    batch, tips = batch_and_tips(sample_driven(scene).scenes, departure)
+    _, record = tips_after_contacts(batch, tips, skip=0, record=40, accuracy=1e-9)
+    turned = (record.departure_periods + record.departure_us / PERIOD_US)[0, :3]
+    np.testing.assert_allclose(
+        turned % 1.0, np.asarray(rows.departure_time_us)[5:8] / PERIOD_US % 1.0, rtol=0.0, atol=1e-7
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONSERVE)
+def test_dry_orbits_close_in_scipy_and_contract_by_what_the_air_takes(name):
+    scene = scene_of(name)
+    found = contact_orbits(scene, 1, 1)
+    assert found.stable.tolist() == [True]
+    expected = np.exp(-OMEGA * PERIOD_US / QUALITY)
+    assert float(found.reading.determinant[0]) == pytest.approx(expected, rel=1e-6)
+    # of the issue's simulation, and of Hertz's
+    assert float(found.reading.peak_amplitude_nm[0]) == pytest.approx(
+        {"dry": 97.3079, "hertz": 93.7513}[name], abs=1e-4
+    )
+    time = float(found.reading.phase_rad[0, 0]) / (RATIO * OMEGA)
+    height = AMPLITUDE_NM * np.cos(RATIO * OMEGA * time) + float(end_of_contact(scene.interaction))
+    velocity = float(found.reading.velocity_after_nm_per_us[0, 0])
+    after = integrated(name, time, height, velocity, PERIOD_US)
+    np.testing.assert_allclose(after, [height, velocity], rtol=0.0, atol=2e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONSERVE)
+def test_exponents_of_dry_contacts_are_those_of_the_air(name):
+    found = lyapunov_spectrum(scene_of(name), impacts=200, transient=500)
+    assert found.exponents_per_impact.sum() == pytest.approx(-OMEGA * PERIOD_US / QUALITY, rel=1e-5)
+    # the multipliers of both are a pair on a circle
+    assert found.exponents_per_impact[0] == pytest.approx(found.exponents_per_impact[1], rel=1e-5)
+    assert (int(found.verdicts.impacts), int(found.verdicts.periods)) == (1, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["wet", *CONSERVE])
+def test_six_hundred_and_fifty_periods_have_a_contact_each(name):
+    scene = scene_of(name)
+    run = follow_long(scene, default_start(scene), 650.0 * PERIOD_US)
+    assert run.pieces > 2
+    rows = run.simulation.contacts
+    assert abs(len(rows.kind) - 650) <= 1
+    # none is counted twice or has no length: they follow one another by a period
+    departures = np.asarray(rows.departure_time_us)[np.isfinite(np.asarray(rows.departure_time_us))]
+    np.testing.assert_allclose(np.diff(departures)[-400:], PERIOD_US, rtol=1e-3)
+    assert run.verdict.settled
+    batch, tips = batch_and_tips(sample_driven(scene).scenes, default_start(scene))
+    end, record = tips_after_contacts(batch, tips, skip=640, record=40, accuracy=1e-6)
+    assert end.outcome.tolist() == [Outcome.IMPACT]
+    np.testing.assert_allclose(np.diff(record.departure_periods + record.departure_us / PERIOD_US), 1.0, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONSERVE)
+def test_the_map_of_departures_contracts_by_what_the_air_takes(name):
+    scene = scene_of(name)
+    motion = simulate(scene, default_start(scene), 4.5 * PERIOD_US, max_contacts=16)
+    rows = motion.contacts
+    first, second = (state_after(motion, row) for row in (1, 2))
+    batch = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
+    columns = (jnp.asarray(part)[None] for part in (first.time_us, first.velocity_nm_per_us, second.time_us))
+    slopes = departure_jacobians(batch, *columns, accuracy=1e-9)[0]
+    # time and velocity on a surface of constant gap: the area element carries the speed of the gap
+    speeds = np.asarray(rows.rebound_speed_nm_per_us)[1:3]
+    passed = float(second.time_us - first.time_us)
+    assert np.linalg.det(slopes) == pytest.approx(np.exp(-OMEGA * passed / QUALITY) * speeds[0] / speeds[1], rel=1e-5)
