@@ -54,7 +54,7 @@ MUTATIONS = {
     ),
     "damped velocity leans the wrong way": Mutation("decay * (cosine {- => +} lag)", FLIGHT),
     "damped frequency with 1/2Q^2": Mutation("1.0 - {0.25 => 0.5} / self", FLIGHT),
-    "platform velocity turned round": Mutation("{- => +}self.top_speed_nm_per_us * sine", PLATFORM),
+    "platform velocity turned round": Mutation("{- => +}self.amplitude_nm * omega * sine", PLATFORM),
     "platform acceleration without an omega": Mutation(
         "{-(part.angular_frequency**2) => -part.angular_frequency} * part.position", PLATFORM
     ),

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.drives import Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.trigonometry import sine_cosine
 from tests.reference_examples import scene
@@ -139,3 +140,13 @@ def test_parameters_are_strong_floats_whatever_they_were():
 def test_traced_parameters_are_not_checked():
     # A compiled program cannot raise; the value outside its range goes through.
     assert float(jax.jit(lambda f: Cantilever(f).frequency_khz)(-1.0)) == -1.0
+
+
+def test_the_top_speed_of_a_platform_counts_its_second_tone():
+    platform = Platform(4.0, 180.0, second=Tone(1.5, 270.0, 20.0))
+    speeds = np.abs(platform.velocity(np.linspace(0.0, 2e3 / 90.0, 200_001)))
+    # both cosines are steepest at once somewhere near, as their frequencies are 2:3
+    expected = 2e-3 * np.pi * (4.0 * 180.0 + 1.5 * 270.0)
+    assert float(platform.top_speed_nm_per_us) == pytest.approx(expected, rel=1e-14)
+    assert speeds.max() <= expected
+    assert speeds.max() > 2e-3 * np.pi * 4.0 * 180.0
