@@ -449,6 +449,10 @@ def _number_of(value: ArrayLike, key: str) -> float:
     return float(number)
 
 
+_TOUCHING_NM = 1e-9
+"""Height of a start that is one on the surface, but for rounding."""
+
+
 def check_start(start: Start, scene: Scene) -> None:
     """Check that a tip can begin at a start: outside the sample, and not on its way into it from its surface.
 
@@ -473,6 +477,9 @@ def check_start(start: Start, scene: Scene) -> None:
     # only here, so that scenes with a law do without the contact's modules
     from afm_jax.scenefile.contact import junction_of  # noqa: PLC0415
 
+    if not scene.interaction.spans and abs(height) <= _TOUCHING_NM:
+        _check_leaves(start, scene.platform)
+        return
     if height <= 0.0:
         raise ValueError(
             f"`height_above_platform_nm` must be positive, but is {height:g}: the tip would start inside the sample"
