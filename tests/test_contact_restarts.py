@@ -102,12 +102,12 @@ def test_the_gap_where_contact_ends_is_that_of_what_lasts_longer():
 
 @pytest.mark.parametrize(("off_nm", "rate", "left"), [(0.0, 1.0, True), (1e-14, 1.0, True), (0.0, -1.0, False)])
 def test_a_tip_has_just_left_where_contact_ends_and_the_gap_opens(off_nm, rate, left):
-    platform = afm.Platform(4.0, 180.0)
+    platform, ends = afm.Platform(4.0, 180.0), jnp.asarray(20.0)
     for sign in (1.0, -1.0):
-        assert bool(has_just_left(platform, 20.0, 3.0, 20.0 + sign * off_nm, rate)) is left
-    assert not bool(has_just_left(platform, 20.0, 3.0, 20.0 + 1e-6, 1.0))
+        assert bool(has_just_left(platform, ends, 3.0, ends + sign * off_nm, rate)) is left
+    assert not bool(has_just_left(platform, ends, 3.0, ends + 1e-6, 1.0))
     # the phase omega t has the rounding of the time
-    assert bool(has_just_left(platform, 20.0, 1e6, 20.0 + 1e-9, 1.0))
+    assert bool(has_just_left(platform, ends, 1e6, ends + 1e-9, 1.0))
 
 
 @pytest.mark.slow

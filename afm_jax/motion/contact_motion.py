@@ -160,7 +160,7 @@ def follow_contacts(  # noqa: PLR0913
 
 
 def has_just_left(
-    surface: Platform | Surface, ends_nm: ArrayLike, time_us: ArrayLike, gap_nm: ArrayLike, rate: ArrayLike
+    surface: Platform | Surface, ends_nm: Array, time_us: ArrayLike, gap_nm: Array, rate: ArrayLike
 ) -> Bool[Array, "..."]:
     """Say whether a tip has just left a contact: it is where contact ends, but for rounding, and the gap opens.
 
