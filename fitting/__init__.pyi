@@ -3,12 +3,9 @@ from afm_jax.contact.law_of_contact import ContactLaw as ContactLaw
 from afm_jax.contact.law_of_contact import fit_delay as fit_delay
 from afm_jax.contact.law_of_contact import fit_law as fit_law
 from afm_jax.saved import load as load
+from fitting.calibration.calibrate import Calibration as Calibration
 from fitting.calibration.calibrate import calibrate as calibrate
-from fitting.calibration.result import Calibration as Calibration
-from fitting.calibration.stiffness import Stiffness as Stiffness
-from fitting.calibration.stiffness import equipartition as equipartition
 from fitting.calibration.stiffness import sader as sader
-from fitting.calibration.stiffness import sensitivity as sensitivity
 from fitting.calibration.sweep import ResonanceSweep as ResonanceSweep
 from fitting.calibration.sweep import read_sweep as read_sweep
 from fitting.experiments.candidates import drive_grid as drive_grid

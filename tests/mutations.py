@@ -189,8 +189,16 @@ MUTATIONS = {
         "tests/test_inversion.py::test_one_amplitude_and_the_phase_suffice",
     ),
     "resonance damped at the natural frequency": Mutation(
-        "{frequency * natural => natural**2} / quality_factor",
+        "damping = 1j * {frequency * natural => natural**2} / quality_factor",
         "tests/test_calibrate.py::test_a_sweep_without_noise_gives_its_parameters_back[3.0-True]",
+    ),
+    "thermal motion of half a line": Mutation(
+        "area = {0.5 => 0.25} * np.pi",
+        "tests/test_thermal.py::test_the_area_gives_k_where_the_quality_factor_is_hardly_resolved",
+    ),
+    "Sader's stiffness without a frequency": Mutation(
+        "np.imag(gamma) * omega{**2 => }",
+        "tests/test_thermal.py::test_saders_stiffness_is_what_nanosurf_states_in_the_file",
     ),
     "posterior of twice the misfit": Mutation(
         "{ => 2.0 * }residual**2 / (1.0 + root)", "tests/test_posterior.py::test_the_samplers_density_is_the_objectives"

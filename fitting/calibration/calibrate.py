@@ -1,299 +1,465 @@
-"""Free resonance calibration: natural frequency and quality factor of a cantilever from a sweep."""
+"""Calibrate a free cantilever: frequency, quality factor and spring constant from a scan or a thermal spectrum."""
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
-from afm_jax.checks import checked, require_float64
-from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from afm_jax.version import version_of
-from fitting.calibration.model import TERMS, SweepFit, fit_sweep, kind_of, model_at, refit, sum_without_resonance
-from fitting.calibration.result import Alternative, CalibratedValue, Calibration, Curves
-from fitting.calibration.sweep import ResonanceSweep, read_sweep
-from fitting.calibration.verdict import (
-    SweepEvidence,
-    autocorrelation,
-    inflation_of,
-    judge_calibration,
-    preferred,
-    repeat_of,
-    runs_excess,
-)
-from fitting.fits.intervals import Interval, profile_intervals
+from afm_jax.checks import checked
+from afm_jax.columns import printed_table
+from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
+from afm_jax.outcomes import Rule, Rules, judge
+from afm_jax.results import Result, public_result
+from afm_jax.units import TWO_SIDED_95
+from afm_jax.words import bullets, counted, decimals, with_error
+from fitting.calibration.model import Minimum, chi2_without_resonance, minimum
+from fitting.calibration.stiffness import equipartition, sader
+from fitting.calibration.sweep import ResonanceSweep, read_sweep, stated_settings
 from fitting.tables.csv_text import TableError
 
-_PACKAGES = ("afm-jax", "jax", "optax", "numpy")
+FORMAT_VERSION = 2
+AIR_K = (296.0, 3.0)
+"""Temperature of lever and air where none is given."""
+SCALE_ERROR = (0.05, None)
+"""Relative standard error of the deflection's scale where none is given: force curves repeat it to some per cent."""
+_PEAK = 30.0
+"""Fall of chi2 per unit of chi2/dof that four more parameters practically never bring about by chance."""
+_SYSTEMATIC = 0.5
+"""Correlation of neighbouring residuals beyond which the standard errors mean nothing."""
+_OPEN = 20.0
+"""Variance of a logarithm from which on nothing is determined."""
+_FAST_KHZ = 2e4
+"""The fastest cantilevers resonate at a few MHz."""
+_HALF_WIDTHS = (20.0, 10.0, 5.0, 3.0)
+"""Of a thermal spectrum so much is fitted on both sides of the resonance: as much as the model explains."""
+_LEAST_FREQUENCIES = 6
+"""One more than the amplitude has parameters."""
+_LEAST_POINTS = 3
+"""Within the half-width of a scan's resonance."""
+
+
+@dataclass(frozen=True)
+class CalibratedValue:
+    """A quantity with its standard error and 95 % interval, None where `reason` says why there are none."""
+
+    value: float
+    standard_error: float | None
+    interval95: tuple[float | None, float | None]
+    reason: str | None = None
+
+
+@public_result(picture="fitting.calibration.picture:calibration_figure")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration(Result):
+    """What `calibrate` returns, named like the keys of its JSON.
+
+    Attributes:
+        frequency_khz: undamped natural frequency Omega/2 pi.
+        quality_factor: Q in m z'' + (m Omega/Q) z' + k z = F cos(omega t).
+        spring_constant_n_per_m: by "equipartition" (of a spectrum) and by "sader" (with the size of the lever).
+        mean_square_nm2: of a spectrum, <x^2> of the resonance; else None.
+        model: "phase", "amplitude" or "power", what was fitted.
+        error_origin: of the points' errors: "file", "noise", "averages", or "estimated" such that chi2/dof = 1.
+        phase_reversed: the phase rises through the resonance and was taken with the opposite sign.
+        chi2: sum of squared residuals over their errors.
+        degrees_of_freedom: numbers measured less parameters.
+        p_value: probability of a larger chi2 if the model is right; NaN where the errors come from the fit itself.
+        residual_autocorrelation: of neighbouring points.
+        chi2_without_resonance: of a parabola.
+        left: estimated distance of chi2 to its minimum.
+        fitted: the complex response at every point, or the amplitude, in the sweep's unit.
+        sweep: what was fitted; of a spectrum the part around the resonance.
+        valid: whether to trust it; `reasons` say why not.
+        reasons: what makes the result invalid.
+        warnings: what a reader should know besides.
+    """
+
+    frequency_khz: CalibratedValue
+    quality_factor: CalibratedValue
+    spring_constant_n_per_m: dict[str, CalibratedValue] = field(default_factory=dict)
+    mean_square_nm2: CalibratedValue | None
+    model: str
+    error_origin: str
+    phase_reversed: bool
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+    residual_autocorrelation: float
+    chi2_without_resonance: float
+    left: float
+    fitted: np.ndarray
+    sweep: ResonanceSweep
+    valid: bool = False
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def reason(self) -> str | None:
+        """Why the calibration is not valid; None if it is."""
+        return next(iter(self.reasons), None)
+
+    @property
+    def half_widths(self) -> tuple[float, float]:
+        """How many half-widths f0/2Q the scan reaches below and above the resonance."""
+        half = 0.5 * self.frequency_khz.value / self.quality_factor.value
+        below, above = (self.frequency_khz.value - self.sweep.frequency_khz[[0, -1]]) / half
+        return float(below), -float(above)
+
+    @property
+    def inside(self) -> int:
+        """Points within the half-width."""
+        half = 0.5 * self.frequency_khz.value / self.quality_factor.value
+        return int(np.sum(np.abs(self.sweep.frequency_khz - self.frequency_khz.value) < half))
+
+    @property
+    def table_comments(self) -> list[str]:
+        """The comment lines that carry the calibration into an amplitude table; none if it is not valid."""
+        if not self.valid:
+            return []
+        # three digits of the error: it enters every amplitude of a table
+        places = max(decimals(0.1 * (self.frequency_khz.standard_error or 0.0), unknown=12), 3)
+        lines = [f"# free_frequency_khz = {self.frequency_khz.value:.{places}f}"]
+        sure = [one for one in self.spring_constant_n_per_m.values() if one.standard_error is not None]
+        values = {"quality_factor": self.quality_factor, **({"spring_constant_n_per_m": sure[0]} if sure else {})}
+        return lines + [f"# {name} = {with_error(one.value, one.standard_error)}" for name, one in values.items()]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax calibrate`."""
+        own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
+        values = {name: vars(value) for name, value in own.items() if isinstance(value, CalibratedValue)}
+        springs = {name: vars(value) for name, value in self.spring_constant_n_per_m.items()}
+        more = {"spring_constant_n_per_m": springs, "instrument": self.sweep.instrument}
+        head = {"format": "afm-jax calibrate", "format_version": FORMAT_VERSION}
+        return head | own | values | more | {"table_comments": self.table_comments}
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of calibration_points.csv: the scan and the fit."""
+        sweep = self.sweep
+        columns = {"frequency_khz": sweep.frequency_khz, "measured_amplitude": sweep.amplitude}
+        columns["fitted_amplitude"] = np.abs(self.fitted)
+        if sweep.phase_deg is not None:
+            sign = -1.0 if self.phase_reversed else 1.0
+            fitted = sign * np.angle(self.fitted, deg=True)
+            # the turns of the measured phase are kept
+            apart = (fitted - sweep.phase_deg + 180.0) % 360.0 - 180.0
+            columns |= {"measured_phase_deg": sweep.phase_deg, "fitted_phase_deg": sweep.phase_deg + apart}
+        return {"calibration_points.csv": columns}
+
+    def printed(self) -> list[Any]:
+        """Return verdict, values, what the instrument says, and the lines for an amplitude table."""
+        values = {"frequency_khz (kHz)": self.frequency_khz, "quality_factor": self.quality_factor}
+        values |= {f"spring constant, {name} (N/m)": one for name, one in self.spring_constant_n_per_m.items()}
+        rows = [{"name": name} | vars(one) for name, one in values.items()]
+        cells: dict[str, Any] = {"of the free cantilever": "name", "value +- standard error": _in_words}
+        fit = f"chi2/dof {self.chi2:.1f}/{self.degrees_of_freedom}, errors: {self.error_origin}"
+        found = [f"{name} {value:.8g}" for name, value in self.sweep.instrument.items()]
+        return [
+            f"{'VALID' if self.valid else 'NOT VALID'}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
+            printed_table("", cells, rows),
+            fit,
+            f"The instrument says: {', '.join(found)}." if found else None,
+            *bullets("Reasons:", self.reasons),
+            *bullets("Notes:", self.warnings),
+            *(["", "For the top of an amplitude table:", *self.table_comments] if self.valid else []),
+        ]
+
+
+def _in_words(row: dict[str, Any]) -> str:
+    error = row["standard_error"]
+    return f"{row['value']:.4g}, no calibration" if error is None else with_error(row["value"], error)
 
 
 @checked
 def calibrate(
     sweep: ResonanceSweep | str | os.PathLike[str],
     *,
-    background: str | None = None,
     noise: float | None = None,
-    scale_errors: bool = False,
-    compare: bool = True,
-    whole: bool = False,
+    static: bool = True,
+    **settings: tuple[float, float | None] | float | None,
 ) -> Calibration:
-    """Fit frequency and quality factor of the free cantilever to a resonance sweep.
+    """Fit frequency and quality factor of the free cantilever to a scan or a thermal spectrum, and its stiffness.
 
-    The frequency is the undamped natural one, Omega/2 pi of m z'' + (m Omega/Q) z' + k z = F cos(omega t); a base
-    that moves by d cos(omega t) is the force F = k d. The amplitude is largest a little lower, at
-    f0 sqrt(1 - 1/2Q^2), and a background moves the measured maximum further.
+    The frequency is the undamped natural one; the amplitude is largest a little lower, at f0 sqrt(1 - 1/2Q^2).
 
     Args:
-        sweep: from `read_sweep`; its phase is used where it is there.
-        background: what is added to the response. With phase: "none", "constant" or "linear" (both complex). Amplitude
-            only: "none", "floor" (in quadrature) or "constant" (in quadrature and interfering). None: constant, or the
-            one that Akaike's criterion prefers clearly (if the others are compared).
-        noise: standard error of every point as a share of the largest amplitude, for a sweep without errors of its own.
+        sweep: from `read_sweep`, or a file; its phase is used where it is there.
+        noise: standard error of every point as a share of the largest amplitude, for a scan without errors of its own.
             Without either the errors are estimated from the misfit, and goodness of fit cannot be judged.
-        scale_errors: scale given errors such that chi2 equals its degrees of freedom.
-        compare: fit the other backgrounds too, for comparison.
-        whole: fit all of a thermal spectrum, not the part around its resonance that the model explains.
+        static: the deflection was calibrated by the slope of a force curve (static InvOLS), not by the mode itself.
+        **settings: what the file's comments say where it is left out, each a number or a pair with its error:
+            `averages`, how many spectra a thermal spectrum is the mean of; `temperature_k` of lever and air (else 296
+            +- 3); `length_um` and `width_um` of a rectangular lever, for k by Sader's method; `scale_error`, the
+            relative error of the deflection's scale (else 0.05), of which k by equipartition has twice as much.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `Calibration`.
 
     Raises:
         ValueError: if an option is impossible.
-        TableError: if the sweep has too few points for the model, or its amplitude is the same everywhere.
-        RuntimeError: if JAX is not set to 64-bit floats.
+        TableError: if the scan has too few points, or its amplitude is the same everywhere.
     """
     if not isinstance(sweep, ResonanceSweep):
         sweep = read_sweep(Path(os.fspath(sweep)))
-    require_float64()
-    kind = kind_of(sweep)
-    first = ("floor" if sweep.spectrum else "constant") if background is None else background
-    _check_options(kind, first, noise)
-    _check_sweep(sweep, kind, first)
-    settings = {"scale_errors": scale_errors, "compare": compare}
-    windows = _windows(sweep) if sweep.spectrum and not whole else [sweep]
-    result = _calibrated_sweep(windows[0], first, background, noise, **settings)
-    for window in windows[1:]:
-        if result.explained:
-            break
-        ends = f"{window.frequency_khz[0]:.6g} to {window.frequency_khz[-1]:.6g} kHz"
-        note = f"Fitted from {ends}: further out the spectrum is not that of one resonance and white noise."
-        result = _calibrated_sweep(window, first, background, noise, **settings)
-        result = replace(result, warnings=[*result.warnings, note])
-    return result
-
-
-_HALF_WIDTHS = (20.0, 10.0, 5.0)
-"""Of a thermal spectrum so much is fitted on both sides of the resonance: as much as the model explains."""
-_WIDEST_LINE = 7
-"""Points over which the median is taken: what stands out over three of them at most, it does not see."""
-_SURROUNDINGS = (10, 4, 1)
-"""Parts of a spectrum that show how far a peak stands out."""
-
-
-def _windows(sweep: ResonanceSweep) -> list[ResonanceSweep]:
-    """Return parts of a spectrum around the peak that stands out most of its surroundings, the widest first.
-
-    Lines of a few points (mains, a clock) are no resonance, whose half-width holds at least three.
-    """
-    power = sweep.amplitude**2
-    smooth = uniform_filter1d(median_filter(power, _WIDEST_LINE, mode="nearest"), 5, mode="nearest")
-    top, floor = _standing_out(smooth)
-    # few averages scatter: a wide peak is measured on a curve that is smoothed more
-    widths = [(size, _points_above_half(uniform_filter1d(power, size), top, float(floor[top]))) for size in (5, 21, 85)]
-    wide = max(width for size, width in widths if size == 5 or width > 2 * size)
-    step = np.ptp(sweep.frequency_khz) / (sweep.points - 1)
-    half, centre = max(0.5 * wide, 3.0) * step, float(sweep.frequency_khz[top])
-    return [sweep.within(centre - times * half, centre + times * half) for times in _HALF_WIDTHS]
-
-
-def _standing_out(smooth: Float[np.ndarray, " n"]) -> tuple[int, Float[np.ndarray, " n"]]:
-    """Return where a curve stands out most of its surroundings, and these."""
-    top, floor = 0, smooth
-    for part in _SURROUNDINGS:
-        reach = max(smooth.size // part, _WIDEST_LINE)
-        floor = median_filter(smooth, reach, mode="nearest")
-        top = int(np.argmax(smooth / floor))
-        # surroundings that the peak itself fills do not show it
-        if 2 * _points_above_half(smooth, top, float(floor[top])) < reach:
-            break
-    return top, floor
-
-
-def _points_above_half(smooth: Float[np.ndarray, " n"], top: int, floor: float) -> int:
-    """Return how many points around the top of a curve lie above half of it."""
-    low = smooth < 0.5 * (smooth[top] + floor)
-    left, right = np.flatnonzero(low[:top]), np.flatnonzero(low[top:])
-    return (int(right[0]) if right.size else 1) + (top - int(left[-1]) if left.size else 1)
-
-
-def _calibrated_sweep(
-    sweep: ResonanceSweep,
-    first: str,
-    background: str | None,
-    noise: float | None,
-    *,
-    scale_errors: bool,
-    compare: bool,
-) -> Calibration:
-    fit = fit_sweep(sweep, first, noise, scale_errors=scale_errors)
-    alternatives = _alternatives(sweep, fit, first) if compare else []
-    chosen = first if background is not None else preferred(fit, first, alternatives)
-    if chosen != first:
-        fit = fit_sweep(sweep, chosen, noise, scale_errors=scale_errors)
-        alternatives = _alternatives(sweep, fit, chosen)
-    return _summary(sweep, fit, chosen, alternatives)
-
-
-def _alternatives(sweep: ResonanceSweep, fit: SweepFit, background: str) -> list[Alternative]:
-    """Return fits of a frequency scan, errors unchanged, in front of all other backgrounds that it has points for."""
-    kind = fit.objective.kind
-    others = [name for name in TERMS[kind] if name != background and _enough_points(sweep, kind, name)]
-    return [_alternative(refit(fit, sweep, name), name) for name in others]
-
-
-def _check_options(kind: str, background: str, noise: float | None) -> None:
-    if background not in TERMS[kind]:
-        what = "with" if kind == "phase" else "without"
-        raise ValueError(f"the background of a sweep {what} phase is {', '.join(TERMS[kind])}, but not {background!r}")
     if noise is not None and not 0.0 < noise < 1.0:
-        raise ValueError(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+    sweep = replace(sweep, settings=stated_settings(sweep, settings))
+    _check_sweep(sweep)
+    found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep, noise)
+    found = replace(found, spring_constant_n_per_m=_springs(found, static=static))
+    reasons = judge(REASONS, found)
+    warnings = (*found.warnings, *judge(WARNINGS, found))
+    return replace(found, reasons=tuple(reasons), warnings=warnings, valid=not reasons)
 
 
-def _enough_points(sweep: ResonanceSweep, kind: str, background: str) -> bool:
-    """Say whether a sweep has more numbers than the model has parameters, at enough frequencies."""
-    parameters = TERMS[kind][background] + 2
-    # A frequency gives one number or, with phase, two; one frequency more than needed leaves something to judge by.
-    needed = parameters // 2 + 1 if kind == "phase" else parameters + 1
-    return len(np.unique(sweep.frequency_khz)) >= needed
-
-
-def _check_sweep(sweep: ResonanceSweep, kind: str, background: str) -> None:
-    if not _enough_points(sweep, kind, background):
-        raise TableError(
-            f"{sweep.source}: {len(np.unique(sweep.frequency_khz))} frequencies are too few for the "
-            f"{TERMS[kind][background] + 2} parameters of the background '{background}'; measure at more"
-        )
+def _check_sweep(sweep: ResonanceSweep) -> None:
+    """Refuse scans with fewer frequencies than the model has parameters, or with nothing that changes."""
+    count = len(np.unique(sweep.frequency_khz))
+    if count < _LEAST_FREQUENCIES:
+        raise TableError(f"{sweep.source}: measure at {_LEAST_FREQUENCIES} or more frequencies, not at {count}")
     turning = sweep.phase_deg is not None and np.ptp(sweep.phase_deg) > 0.0 and sweep.amplitude[0] > 0.0
     if np.ptp(sweep.amplitude) == 0.0 and not turning:
         value = f"{sweep.amplitude[0]:g} {sweep.amplitude_unit}".strip()
         raise TableError(f"{sweep.source}: the amplitude is {value} at every frequency; sweep across a resonance")
 
 
-def _alternative(fit: SweepFit, background: str) -> Alternative:
-    variance = float(fit.covariance[1, 1])
-    return Alternative(
-        background=background,
-        frequency_khz=float(fit.values[0]),
-        quality_factor=float(fit.values[1]),
-        quality_factor_error=float(np.sqrt(variance)) if np.isfinite(variance) else None,
-        chi2=fit.chi2,
-        degrees_of_freedom=fit.freedom,
-        aic=fit.aic,
-        residual_autocorrelation=autocorrelation(fit, 1),
-    )
-
-
-def _evidence(sweep: ResonanceSweep, fit: SweepFit, curves: Curves, alternatives: list[Alternative]) -> SweepEvidence:
-    """Return all that the verdict looks at."""
-    judged = fit.errors.origin != "estimated" and fit.errors.scale is None
+def _fitted(sweep: ResonanceSweep, noise: float | None) -> Calibration:
+    """Return the fit of a scan or of a part of a spectrum, not yet judged."""
+    largest = float(sweep.amplitude.max())
+    known = sweep.averages if sweep.spectrum else noise if sweep.amplitude_error is None else 1.0
+    if sweep.spectrum:
+        error = np.full(sweep.points, 1.0 / np.sqrt(sweep.averages or 1.0))
+    elif sweep.amplitude_error is not None:
+        error = np.array(sweep.amplitude_error)
+    else:
+        error = np.full(sweep.points, (noise or 0.01) * largest)
+    fit = minimum(sweep, error)
+    freedom = len(fit.residual) - fit.jacobian.shape[1]
+    chi2 = float(np.sum(fit.residual**2))
+    # without errors they are what makes chi2/dof 1; a scan without noise keeps rounding for an error
+    scale = 1.0 if known else max(chi2 / freedom, 1e-12)
     # the mean of a term of the gamma deviance is a little above 1
     size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages)) if sweep.averages else 1.0
-    p_value = chi2_tail(fit.chi2 / size, fit.freedom) if judged else float("nan")
-    frequency, quality_factor = _calibrated(fit, explained=not p_value < IMPROBABLE)
-    return SweepEvidence(
-        sweep=sweep,
-        fit=fit,
-        frequency=frequency,
-        quality_factor=quality_factor,
-        p_value=p_value,
-        autocorrelation=autocorrelation(fit, 1),
-        repeat=repeat_of(fit),
-        runs_excess=runs_excess(fit, curves.amplitude_misfit),
-        chi2_without=sum_without_resonance(fit.objective.points, sweep.points, fit.objective.kind),
-        alternatives=alternatives,
-    )
+    together = _autocorrelation(fit, sweep.points)
+    # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
+    fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(fit.residual)) < together < 1.0 else 1.0
+    covariance = covariance_of(fit.jacobian.T @ fit.jacobian) * scale * fewer
+    p_value = chi2_tail(chi2 / size, freedom) if known else np.nan
+    origin = "averages" if sweep.spectrum else "noise" if sweep.amplitude_error is None else "file"
+    why = "the model does not explain the scan" if p_value < IMPROBABLE else None
 
+    def stated(value: float, slopes: Float[np.ndarray, " p"]) -> CalibratedValue:
+        """Return a value whose logarithm has these derivatives by the parameters."""
+        used = np.flatnonzero(slopes)
+        variance = float(slopes[used] @ covariance[np.ix_(used, used)] @ slopes[used])
+        reason = why if variance < _OPEN else "the scan does not determine it"
+        if reason is not None:
+            return CalibratedValue(value, None, (None, None), reason)
+        share = float(np.sqrt(variance))
+        ends = (value * float(np.exp(side * TWO_SIDED_95 * share)) for side in (-1.0, 1.0))
+        return CalibratedValue(value, value * share, (next(ends), next(ends)))
 
-def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives: list[Alternative]) -> Calibration:
-    kind, curves = fit.objective.kind, _curves(sweep, fit)
-    evidence = _evidence(sweep, fit, curves, alternatives)
-    reasons, warnings = judge_calibration(evidence)
-    errors = np.sqrt(np.diag(fit.covariance)[:2])
-    known = evidence.frequency.standard_error is not None
-    linear = fit.values[2:]
-    height = np.hypot(linear[0], linear[1]) if kind == "phase" else np.sqrt(max(linear[0], 0.0))
-    below_peak = 1.0 - 0.5 / evidence.quality_factor.value**2
+    places = np.eye(fit.jacobian.shape[1])
+    area, slopes = 0.0, places[0] - places[1]
+    if sweep.spectrum:
+        # the integral of a |L|^2 over all frequencies
+        area = 0.5 * np.pi * 1e3 * fit.frequency_khz / fit.quality_factor * fit.linear[0] * largest**2
+        slopes = slopes + places[2] / fit.linear[0]
     return Calibration(
-        frequency_khz=evidence.frequency,
-        quality_factor=evidence.quality_factor,
-        peak_frequency_khz=evidence.frequency.value * float(np.sqrt(below_peak)) if below_peak > 0.0 else None,
-        peak_amplitude=float(height * sweep.amplitude.max()),
-        mean_square=_mean_square(fit, float(sweep.amplitude.max())) if kind == "power" and known else None,
-        correlation=float(fit.covariance[0, 1] / errors[0] / errors[1]) if known else None,
-        model=kind,
-        background=background,
-        background_values=dict(zip(fit.objective.problem.names[2:], linear.tolist(), strict=True)),
+        frequency_khz=stated(fit.frequency_khz, places[0]),
+        quality_factor=stated(fit.quality_factor, places[1]),
+        mean_square_nm2=stated(float(area), slopes) if sweep.spectrum else None,
+        model="power" if sweep.spectrum else "amplitude" if sweep.phase_deg is None else "phase",
+        error_origin=origin if known else "estimated",
         phase_reversed=fit.reverse,
-        chi2=fit.chi2,
-        degrees_of_freedom=fit.freedom,
-        p_value=evidence.p_value,
-        errors=fit.errors,
-        residual_autocorrelation=evidence.autocorrelation,
-        residual_repeat=evidence.repeat,
-        runs_excess=evidence.runs_excess,
-        convergence=fit.convergence,
-        alternatives=alternatives,
-        curves=curves,
-        valid=not reasons,
-        reasons=reasons,
-        warnings=warnings,
+        chi2=chi2 / scale,
+        degrees_of_freedom=freedom,
+        p_value=p_value,
+        residual_autocorrelation=together,
+        chi2_without_resonance=chi2_without_resonance(sweep, error) / scale,
+        left=fit.left / scale,
+        fitted=fit.model * largest,
         sweep=sweep,
-        versions={name: version_of(name) for name in _PACKAGES},
     )
 
 
-def _calibrated(fit: SweepFit, *, explained: bool) -> list[CalibratedValue]:
-    """Return frequency and quality factor with errors, or without where there is nothing to base them on."""
-    wider = inflation_of(fit)
-    errors = np.sqrt(np.diag(fit.covariance)[:2]) * wider
-    if not explained or not np.all(np.isfinite(errors)):
-        reason = "the sweep does not determine the parameters" if explained else "the model does not explain the sweep"
-        return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
-    # The linear parameters need no interval of their own: an infinite variance leaves them out.
-    profiled = fit.covariance.copy()
-    nuisances = np.arange(2, len(profiled))
-    profiled[nuisances, nuisances] = np.inf
-    intervals: list[Interval] = profile_intervals(fit.objective, fit.values, profiled, fit.chi2)
-    found = zip(fit.values[:2].tolist(), errors.tolist(), intervals[:2], wider.tolist(), strict=True)
-    stated = [(value, error, interval.moved(value, value, factor)) for value, error, interval, factor in found]
-    return [CalibratedValue(value, error, (ends.low, ends.high), ends.reason) for value, error, ends in stated]
+def _autocorrelation(fit: Minimum, points: int) -> float:
+    """Return the correlation of residuals of neighbouring points; 0 where there is no misfit but rounding."""
+    blocks = fit.residual.reshape(-1, points)
+    total = float(np.sum(blocks**2))
+    return float(np.sum(blocks[:, 1:] * blocks[:, :-1])) / total if total > 1e-12 * blocks.size else 0.0
 
 
-def _mean_square(fit: SweepFit, largest: float) -> CalibratedValue:
-    """Return the thermal <x^2> of the resonance: the integral of a |L|^2 over all frequencies, pi/2 f0/Q a.
+def _of_spectrum(sweep: ResonanceSweep) -> Calibration:
+    """Return the fit of as much of a spectrum around its resonance as one oscillator and white noise explain.
 
-    Args:
-        fit: of a spectrum.
-        largest: unit of the fit's amplitudes, nm per root Hz.
+    The resonance is the peak that stands out most of its surroundings. Lines of up to three points (mains, a clock)
+    are none: a median does not see them, and sees the flanks of a resonance, however narrow.
     """
-    frequency, quality_factor, power = fit.values[:3]
-    slopes = np.array([1.0 / frequency, -1.0 / quality_factor, 1.0 / power])
-    share = float(np.sqrt(slopes @ fit.covariance[:3, :3] @ slopes) * inflation_of(fit).max())
-    value = float(0.5 * np.pi * 1e3 * frequency / quality_factor * power * largest**2)
-    ends = (value * float(np.exp(-1.96 * share)), value * float(np.exp(1.96 * share)))
-    return CalibratedValue(value, value * share, ends, None)
+    power = sweep.amplitude**2
+    smooth = uniform_filter1d(median_filter(power, 7, mode="nearest"), 5, mode="nearest")
+    floor = median_filter(smooth, max(smooth.size // 4, 7), mode="nearest")
+    top = int(np.argmax(smooth / np.where(floor > 0.0, floor, np.inf)))
+    step = float(np.ptp(sweep.frequency_khz)) / (sweep.points - 1)
+    low = np.flatnonzero(smooth < 0.5 * (smooth[top] + floor[top]))
+    wide = np.min(low[low > top], initial=sweep.points) - np.max(low[low < top], initial=-1)
+    first = (float(sweep.frequency_khz[top]), max(0.5 * float(wide), 3.0) * step)
+    found = _around(sweep, *first, _HALF_WIDTHS[0])
+    for times in _HALF_WIDTHS:
+        centre = min(max(found.frequency_khz.value, sweep.frequency_khz[0]), sweep.frequency_khz[-1])
+        # once more, around the resonance that was found
+        half = max(0.5 * centre / found.quality_factor.value, 3.0 * step)
+        found = _around(sweep, centre, half, times)
+        if not found.p_value < IMPROBABLE:
+            break
+    ends = found.sweep.frequency_khz[[0, -1]]
+    note = f"Fitted from {ends[0]:.6g} to {ends[1]:.6g} kHz: what one resonance and white noise explain."
+    return found if found.sweep.points == sweep.points else replace(found, warnings=(note,))
 
 
-def _curves(sweep: ResonanceSweep, fit: SweepFit) -> Curves:
-    used = sweep.points
-    model = np.asarray(model_at(fit.values, fit.objective.points, fit.objective.kind))[:used]
-    amplitude = np.abs(model) * sweep.amplitude.max()
-    if sweep.phase_deg is None:
-        return Curves(amplitude, amplitude - sweep.amplitude, None, None)
-    between = np.rad2deg(np.angle(model * np.conj(np.asarray(fit.objective.points.measured)[:used])))
-    misfit = -between if fit.reverse else between
-    # Adding the misfit keeps the turns of the measured phase.
-    return Curves(amplitude, amplitude - sweep.amplitude, sweep.phase_deg + misfit, misfit)
+def _around(sweep: ResonanceSweep, centre_khz: float, half_khz: float, times: float) -> Calibration:
+    """Return the fit of a spectrum within so many half-widths of a frequency."""
+    part = sweep.within(centre_khz - times * half_khz, centre_khz + times * half_khz)
+    _check_sweep(part)
+    return _fitted(part, None)
+
+
+def _springs(found: Calibration, *, static: bool) -> dict[str, CalibratedValue]:
+    """Return the spring constants that a calibration supports; that by equipartition without error if contradicted."""
+    frequency, quality = found.frequency_khz, found.quality_factor
+    springs, mean = {}, found.mean_square_nm2
+    if quality.standard_error is None or frequency.standard_error is None:
+        return {}
+    stated = found.sweep.settings
+    warm = stated.get("temperature_k", AIR_K)
+    if "length_um" in stated:
+        inputs = [(frequency.value, frequency.standard_error), (quality.value, quality.standard_error)]
+        inputs += [stated["length_um"], stated["width_um"], warm]
+        centre = [value for value, _ in inputs]
+        value = sader(*centre)
+        moved = [[*centre[:k], one + (error or 0.0), *centre[k + 1 :]] for k, (one, error) in enumerate(inputs)]
+        springs["sader"] = _spring(value, float(np.sqrt(sum((sader(*one) / value - 1.0) ** 2 for one in moved))))
+    if mean is not None and mean.standard_error is not None:
+        value = equipartition(mean.value, warm[0], static=static)
+        shares = (
+            mean.standard_error / mean.value,
+            (warm[1] or 0.0) / warm[0],
+            2.0 * stated.get("scale_error", SCALE_ERROR)[0],
+        )
+        one, other = _spring(value, float(np.linalg.norm(shares))), springs.get("sader")
+        said = found.sweep.instrument.get("spring_constant_n_per_m")
+        if other is not None:
+            doubt = _doubt(one, other.value, other.standard_error or 0.0, "Sader's method")
+        else:
+            doubt = None if said is None else _doubt(one, said, 0.1 * said, "the instrument")
+        springs["equipartition"] = one if doubt is None else CalibratedValue(value, None, (None, None), doubt)
+    return springs
+
+
+def _spring(value: float, share: float) -> CalibratedValue:
+    ends = (value * float(np.exp(-TWO_SIDED_95 * share)), value * float(np.exp(TWO_SIDED_95 * share)))
+    return CalibratedValue(value, value * share, ends)
+
+
+def _doubt(thermal: CalibratedValue, wanted: float, error: float, who: str) -> str | None:
+    """Return what another spring constant says about the scale of the deflection; None if they agree."""
+    apart = float(np.log(thermal.value / wanted))
+    shares = ((thermal.standard_error or 0.0) / thermal.value, error / wanted, 0.05)
+    if abs(apart) < TWO_SIDED_95 * np.linalg.norm(shares):
+        return None
+    return (
+        f"equipartition gives {thermal.value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm are "
+        f"{np.exp(-0.5 * apart):.3g} times the true ones"
+    )
+
+
+REASONS: Rules[Calibration] = [
+    Rule(
+        lambda e: e.chi2_without_resonance - e.chi2 < _PEAK * max(e.chi2 / e.degrees_of_freedom, 1e-300),
+        "No resonance stands out of the sweep: a parabola explains it about as well.",
+    ),
+    (
+        Rule(
+            lambda e: not e.left < 1e-3,
+            "Not converged: chi2 lies an estimated {e.left:.2g} above its minimum.",
+        ),
+        Rule(
+            lambda e: min(e.half_widths) < 0.0,
+            "The resonance ({e.frequency_khz.value:.6g} kHz) lies outside the sweep: sweep around it.",
+        ),
+        Rule(
+            lambda e: min(e.half_widths) < 1.0,
+            "The resonance ({e.frequency_khz.value:.6g} kHz) lies at the edge of the sweep: sweep at least one "
+            "half-width (f0/2Q) to both sides.",
+        ),
+        Rule(
+            lambda e: e.model != "power" and e.inside < _LEAST_POINTS,
+            lambda e, _: f"Only {counted(e.inside, 'point')} within the half-width: sweep in finer steps.",
+        ),
+        Rule(
+            lambda e: e.p_value < IMPROBABLE,
+            "The model does not explain the sweep: chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom. "
+            "The background may be another one, the frequency may have drifted, or the errors are too small.",
+        ),
+        Rule(
+            lambda e: [v.reason for v in (e.frequency_khz, e.quality_factor) if v.reason is not None][:1],
+            "Not identified: {case}.",
+        ),
+    ),
+    Rule(
+        lambda e: e.residual_autocorrelation > _SYSTEMATIC,
+        "Neighbouring residuals are strongly correlated ({e.residual_autocorrelation:+.2f}): the model misses "
+        "something (another background, drift, a second resonance, too fast a sweep), and the errors mean nothing.",
+    ),
+    Rule(
+        lambda e: [
+            one.reason
+            for one in e.spring_constant_n_per_m.values()
+            if all(other.standard_error is None for other in e.spring_constant_n_per_m.values())
+        ],
+        "The spring constant is not calibrated: {case}; `length_um=...` and `width_um=...` give k by Sader's method.",
+    ),
+]
+"""What makes a calibration invalid."""
+WARNINGS: Rules[Calibration] = [
+    Rule(
+        lambda e: e.frequency_khz.value > _FAST_KHZ,
+        "A resonance of {e.frequency_khz.value:.6g} kHz is beyond any cantilever's: if the frequencies are in Hz, name "
+        "their column frequency_hz.",
+    ),
+    Rule(lambda e: e.sweep.reordered, "The frequencies did not rise from point to point: the points were sorted."),
+    Rule(lambda e: e.phase_reversed, "The phase rises through the resonance: it was taken with the opposite sign."),
+    Rule(
+        lambda e: 1.0 <= min(e.half_widths) < 2.0,
+        "The sweep reaches less than two half-widths to one side: frequency, Q and background are hard to tell apart.",
+    ),
+    Rule(
+        lambda e: e.model == "power" and e.inside < _LEAST_POINTS,
+        lambda e, _: (
+            f"{counted(e.inside, 'point')} within the half-width: Q is hardly resolved, and a window of the spectrum "
+            "widens the line; the area under it, and k, hold."
+        ),
+    ),
+    (
+        Rule(
+            lambda e: e.error_origin == "estimated",
+            "The points' errors were estimated from the misfit so that chi2/dof = 1: the goodness of fit cannot be "
+            "judged.",
+        ),
+        Rule(lambda e: e.p_value > 1.0 - 1e-6, "The errors look too large: chi2 is improbably small."),
+    ),
+    Rule(
+        lambda e: [v.reason for v in e.spring_constant_n_per_m.values() if v.reason is not None],
+        "The spring constants contradict each other: {case}.",
+    ),
+    Rule(
+        lambda e: bool(e.spring_constant_n_per_m),
+        "A spring constant rests on a rectangular lever: by equipartition with the laser on its end, by Sader's method "
+        "in dry air, to some 5 %.",
+    ),
+]
+"""What a reader should know besides."""

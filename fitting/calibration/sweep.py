@@ -12,6 +12,7 @@ form is recognised by its line ``[DATA]``.
 
 A thermal spectrum is a sweep whose amplitude is the root of a spectral density: NanoSurf's .nid, or a CSV file with
 ``asd_nm_per_sqrt_hz`` or ``psd_nm2_per_hz`` and a comment ``# averages = 1000``, the number of spectra averaged.
+Comments may also say ``temperature_k``, ``length_um`` and ``width_um`` of the lever, and ``scale_error``.
 
 Nanonis writes a header of tab-separated lines, then a block of data. The columns read are ``Frequency Shift (Hz)`` with
 ``Center Frequency (Hz)`` (or ``Frequency (Hz)``), ``Amplitude (m)`` and, where it is there, ``Phase (deg)``; others are
@@ -19,6 +20,7 @@ passed over.
 """
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -40,6 +42,7 @@ from fitting.tables.csv_text import (
     TableError,
     column_of,
     columns_of_rows,
+    fault_in_number,
     read_columns,
     read_text,
 )
@@ -72,11 +75,21 @@ SWEEP = Form(
         Column("phase_error_deg"),
     ),
     "point",
-    separators=" (Nanonis text needs its line [DATA])",
+    separator="",
 )
 """The columns that a CSV file may have, and the attribute of `ResonanceSweep` that each becomes."""
 _UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}
-_SETTINGS = {"averages": FileSetting("averages", "1000", lowest=0.5)}
+_SETTINGS = {
+    setting.key: setting
+    for setting in (
+        FileSetting("averages", "1000", lowest=0.5),
+        FileSetting("temperature_k", "296 +- 3", unit="K", error="maybe"),
+        FileSetting("length_um", "225 +- 2", unit="um", error="maybe"),
+        FileSetting("width_um", "40 +- 1", unit="um", error="maybe"),
+        FileSetting("scale_error", "0.05"),
+    )
+}
+"""What comments of a CSV file say, in place of options of `calibrate`."""
 
 _MARK = "[DATA]"
 """The line above the block of data of Nanonis text."""
@@ -134,8 +147,10 @@ def _parse_csv(text: str, faults: Faults) -> dict[str, Any]:
     """Return what a CSV file says, by the names of `ResonanceSweep`."""
     table = read_columns(text, SWEEP, _SETTINGS, faults)
     unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
-    averages, _ = table.settings.get("averages", (None, None))
-    found = {"amplitude_unit": unit, "averages": averages, "lines": table.lines, "remarks": table.remarks}
+    if unit != DENSITY:
+        for key in {"averages", "scale_error"} & set(table.settings):
+            faults.add(f"{key} belongs to a thermal spectrum (asd_nm_per_sqrt_hz or psd_nm2_per_hz); remove the line")
+    found = {"amplitude_unit": unit, "settings": table.settings, "lines": table.lines, "remarks": table.remarks}
     return table.columns | found
 
 
@@ -155,12 +170,12 @@ class ResonanceSweep(Result):
         phase_error_deg: standard error of the phase; None takes the noise as equal in all directions.
         amplitude_unit: "nm", empty where the file does not say, "nm/sqrt(Hz)" of a thermal spectrum.
         instrument: what the instrument itself found, for comparison: ``frequency_khz``, ``quality_factor``; of a
-            thermal spectrum also ``spring_constant_n_per_m`` and ``temperature_k``.
-        averages: how many periodograms a thermal spectrum is the mean of, or None: not known.
+            thermal spectrum also ``spring_constant_n_per_m``.
+        settings: value and error of ``averages`` (how many periodograms a thermal spectrum is the mean of),
+            ``temperature_k``, ``length_um``, ``width_um`` and ``scale_error``, as far as they are known.
         source: path of the file as it was given.
         lines: the line of the file that each point stands in, shape (points,).
         remarks: free comments of the file.
-        reordered: the frequencies did not rise from point to point, so the points were sorted.
 
     Raises:
         TableError: if a value is impossible, the lengths differ, or there are errors without what they belong to.
@@ -173,11 +188,10 @@ class ResonanceSweep(Result):
     phase_error_deg: Float[np.ndarray, " points"] | None = None
     amplitude_unit: str = "nm"
     instrument: dict[str, float] = field(default_factory=dict)
-    averages: float | None = None
+    settings: Mapping[str, tuple[float, float | None]] = field(default_factory=dict)
     source: str = "sweep in memory"
     lines: Int[np.ndarray, " points"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     remarks: tuple[str, ...] = ()
-    reordered: bool = field(default=False, init=False)
 
     def __post_init__(self):
         faults = Faults(self.source, place="line" if len(self.lines) else "row")
@@ -192,9 +206,6 @@ class ResonanceSweep(Result):
         faults.raise_any()
         # The sort is stable: repeated measurements at one frequency keep their order.
         order = np.argsort(arrays["frequency_khz"], kind="stable")
-        falling = np.array_equal(order, np.arange(points)[::-1])
-        rising = np.array_equal(order, np.arange(points))
-        object.__setattr__(self, "reordered", not (rising or falling))
         for name, values in (arrays | {"lines": lines}).items():
             ordered = values[order]
             ordered.setflags(write=False)
@@ -204,6 +215,17 @@ class ResonanceSweep(Result):
     def points(self) -> int:
         """The number of points of the frequency scan."""
         return len(self.frequency_khz)
+
+    @property
+    def reordered(self) -> bool:
+        """Whether the frequencies did not rise, or fall, from point to point, so that the points were sorted."""
+        steps = np.diff(self.lines)
+        return bool((steps > 0).any() and (steps < 0).any())
+
+    @property
+    def averages(self) -> float | None:
+        """How many periodograms a thermal spectrum is the mean of, or None: not known."""
+        return self.settings.get("averages", (None, None))[0]
 
     @property
     def spectrum(self) -> bool:
@@ -247,8 +269,8 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
             return _spectrum_of(read_recording(path))
         if holds_curves(head, str(path)):
             raise TableError(
-                f"{path}: holds curves against height, no resonance sweep; `afm-jax calibrate --slope` reads the "
-                "sensitivity off force curves, `afm-jax tapping` the energy of a tap off amplitude and phase"
+                f"{path}: holds curves against height, no resonance sweep; `afm-jax tapping` reads the energy of a tap "
+                "off amplitude and phase"
             )
     text = read_text(path)
     parse = _parse_nanonis if any(line.strip() == _MARK for line in text.split("\n")) else _parse_csv
@@ -272,19 +294,39 @@ def _spectrum_of(recording: Recording) -> ResonanceSweep:
     used = (khz > 0.0) & (amplitude > 0.0)
     known = {key.removeprefix("free_"): one.value for key, one in recording.known.items()}
     found = {key: float(known[key]) for key in _FOUND_IN_SPECTRA if key in known}
+    errors = {"averages": None, "temperature_k": 3.0}
+    settings = {key: (float(known[key]), error) for key, error in errors.items() if key in known}
     return ResonanceSweep(
         frequency_khz=khz[used],
         amplitude=amplitude[used],
         amplitude_unit=DENSITY,
         instrument=found,
-        averages=float(known["averages"]) if "averages" in known else None,
+        settings=settings,
         source=recording.source,
     )
 
 
-_FOUND_IN_SPECTRA = ("frequency_khz", "quality_factor", "spring_constant_n_per_m", "temperature_k")
+_FOUND_IN_SPECTRA = ("frequency_khz", "quality_factor", "spring_constant_n_per_m")
 
 
-def without_phase(sweep: ResonanceSweep) -> ResonanceSweep:
-    """Return a sweep without its phase, to be fitted by the amplitude alone."""
-    return replace(sweep, phase_deg=None, phase_error_deg=None)
+def stated_settings(
+    sweep: ResonanceSweep, given: Mapping[str, tuple[float, float | None] | float | None]
+) -> dict[str, tuple[float, float | None]]:
+    """Return the settings of a call, each with its error, in front of those of the file.
+
+    Raises:
+        TypeError: if there is no such setting.
+        ValueError: if a value is impossible, or a lever has one side only.
+    """
+    found = dict(sweep.settings)
+    for key, value in given.items():
+        if key not in _SETTINGS:
+            raise TypeError(f"there is no setting `{key}`; the settings are {', '.join(_SETTINGS)}")
+        if value is not None:
+            found[key] = value if isinstance(value, tuple) else (float(value), None)
+            fault = fault_in_number(_SETTINGS[key], *found[key])
+            if fault is not None:
+                raise ValueError(f"`{key}` {fault}")
+    if ("length_um" in found) != ("width_um" in found):
+        raise ValueError("Sader's method needs both `length_um=...` and `width_um=...`")
+    return found

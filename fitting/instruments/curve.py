@@ -259,7 +259,7 @@ def _joined(
     if sources["lockin_amplitude_nm"] is None:
         is_one = f"; if one of the channels {others} is"
         told = f'{is_one}: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`' if others else ""
-        notes.append(f"{_NO_AMPLITUDE}{told}. The slope of a force curve is what `afm-jax calibrate` reads.")
+        notes.append(f"{_NO_AMPLITUDE}{told}.")
     elif sources["phase_lag_deg"] is None and others:
         notes.append(f'Phase: none known; if one of the channels {others} is: `columns="phase_lag_deg=CHANNEL:UNIT"`.')
     parts: dict[str, list[Any]] = {role: [] for role in ROLES}

@@ -36,7 +36,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "basins_of_attraction": lambda: afm.basins_of_attraction(bouncing(), columns=2, rows=2),
     "bifurcation_diagram": lambda: afm.bifurcation_diagram(bouncing(), "platform.amplitude_nm", np.array([1.0, 2.0])),
-    "calibrate": lambda: fitting.calibrate(fitting.read_sweep(EXAMPLES / "real" / "thermal_nanosurf.nid")),
     "compare": lambda: fitting.compare(fitting.read_table(TABLE)),
     "contact_orbits": lambda: afm.contact_orbits(_contact(), 1, 1),
     "continue_orbits": lambda: afm.continue_orbits(bouncing(), 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0)),
@@ -79,8 +78,8 @@ LEFT: dict[str, Callable[[Any], Any]] = {
 NO_NUMBERS = {
     # read, write, remember; NumPy alone; or what one of the above hands to them
     *("load", "load_law", "load_scene", "save_law", "save_scene", "scene_family", "use_cache", "trajectory"),
-    *("prior_of_values", "design", "drive_grid", "equipartition", "lockin", "posterior", "read_curve"),
-    *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "sensitivity", "tapping_map"),
+    *("prior_of_values", "design", "drive_grid", "calibrate", "lockin", "posterior", "read_curve"),
+    *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "tapping_map"),
     *("tapping_together", "table_of_curve", "write_table"),
 }
 

@@ -21,12 +21,6 @@ def _number(name: str, unit: str, text: str) -> Any:
     return click.option(f"--{name}", *short, type=ValueAndError(), metavar=unit, help=text)
 
 
-def _check_lever(_: Session, options: Options) -> None:
-    """Check that a lever has both sides or none."""
-    if (options["length_um"] is None) != (options["width_um"] is None):
-        raise click.UsageError("Sader's method needs both --length-um and --width-um")
-
-
 CALIBRATE = Command(
     name="calibrate",
     group="measure",
@@ -34,39 +28,32 @@ CALIBRATE = Command(
     runs="afm_jax.cli.calibrate:calibration",
     help="""Fit frequency and quality factor to a frequency scan of the free resonance, or to a thermal spectrum.
 
-    SWEEP is Nanonis text, or CSV with the columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any
-    unit) and, where known, phase_deg, amplitude_error_nm (or amplitude_error), phase_error_deg. Without errors and
-    --noise the errors are estimated from the misfit. frequency_khz is the undamped natural frequency, not that of the
-    maximum. A thermal spectrum (NanoSurf .nid, or CSV with asd_nm_per_sqrt_hz or psd_nm2_per_hz and a comment
-    `# averages = 1000`) gives the spring constant besides, by equipartition and, with the lever's length and width, by
-    Sader's method; --slope gives the sensitivity from force curves. With --out the report: calibration.html, .txt,
-    .json, .png and (without --slope) calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at
-    the edge, not converged, or not explained by the model.
+    SWEEP is Nanonis text, or columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any unit) and, where
+    known, phase_deg, amplitude_error_nm (or amplitude_error), phase_error_deg. A thermal spectrum (NanoSurf .nid, or
+    asd_nm_per_sqrt_hz or psd_nm2_per_hz) gives the spring constant, too, by equipartition; with the lever's size also
+    by Sader's method. Comments `# averages = 1000`, `# temperature_k = 296` and so on stand for options. frequency_khz
+    is the undamped natural frequency, not that of the maximum. With --out calibration.json, .png and
+    calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the edge, not explained by the
+    model, or a scale of the deflection that another spring constant contradicts.
     """,
     options=(
         click.argument("sweep", metavar="SWEEP", type=click.Path(path_type=Path)),
-        click.option(
-            "--background",
-            type=click.Choice(("none", "floor", "constant", "linear")),
-            help="What is added to the response: with phase none, constant or linear; without none, floor or "
-            "constant. Without this option constant, or what Akaike's criterion prefers clearly.",
-        ),
         flag("--amplitude-only", "Ignore the phase of the scan."),
         click.option(
             "--noise",
             type=Share("a relative error"),
             metavar="SHARE",
-            help="Error of every point as a share of the largest amplitude.",
+            help="Error of every point as a share of the largest amplitude; else estimated from the misfit.",
         ),
-        flag("--scale-errors", "Take given errors as relative: scale them until chi2/dof is 1."),
-        flag("--whole", "Fit all of a thermal spectrum, not what the model explains of it."),
         click.option(
-            "--length-um", type=ValueAndError(), metavar="UM", help="Length of a rectangular lever: Sader's method."
+            "--averages",
+            type=Finite(positive=True),
+            metavar="N",
+            help="Spectra that a thermal spectrum is the mean of.",
         ),
-        click.option("--width-um", type=ValueAndError(), metavar="UM", help="Its width, '40 +- 1' with its error."),
-        click.option(
-            "--temperature-k", type=ValueAndError(), metavar="K", help="Of lever and air [default: the file's, 296]."
-        ),
+        _number("length-um", "UM", "Length of a rectangular lever, '225 +- 2' with its error: Sader's method."),
+        _number("width-um", "UM", "Its width."),
+        _number("temperature-k", "K", "Of lever and air [default: the file's, 296 +- 3]."),
         click.option(
             "--deflection",
             type=click.Choice(["static", "mode"]),
@@ -81,9 +68,8 @@ CALIBRATE = Command(
             help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much "
             "[default: 5 %].",
         ),
-        flag("--slope", "SWEEP holds force curves: the sensitivity (nm/V) from their slope."),
     ),
-    check=_check_lever,
+    computes=False,
 )
 
 
