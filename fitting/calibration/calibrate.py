@@ -17,7 +17,7 @@ from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
-from fitting.calibration.model import Minimum, chi2_without_resonance, minimum
+from fitting.calibration.model import ScanFit, chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
 from fitting.calibration.sweep import ResonanceSweep, read_sweep, stated_settings
 from fitting.tables.csv_text import TableError
@@ -287,7 +287,7 @@ def _fitted(sweep: ResonanceSweep, noise: float | None) -> Calibration:
     )
 
 
-def _autocorrelation(fit: Minimum, points: int) -> float:
+def _autocorrelation(fit: ScanFit, points: int) -> float:
     """Return the correlation of residuals of neighbouring points; 0 where there is no misfit but rounding."""
     blocks = fit.residual.reshape(-1, points)
     total = float(np.sum(blocks**2))

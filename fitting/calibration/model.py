@@ -31,7 +31,7 @@ _LEAST_SQUARE = 1e-12
 _SEARCHES, _STEPS, _SETTLED = 6, 200, 1e-12
 
 
-class Minimum(NamedTuple):
+class ScanFit(NamedTuple):
     """A scan fitted: amplitudes in units of the largest.
 
     Attributes:
@@ -158,7 +158,7 @@ def _linear(points: Points, natural: float, quality_factor: float) -> tuple[Floa
     return found, np.inf if dip else float(np.sum((design @ found - wanted) ** 2))
 
 
-def minimum(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> Minimum:
+def minimum(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> ScanFit:
     """Return the least squares of a scan, from the best places of a grid of frequencies and widths.
 
     Args:
@@ -198,7 +198,7 @@ def minimum(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> Minim
     left = float(distance(ends, box)[end])
     residual, jacobian, model = _evaluate(points, place)
     natural, quality_factor = np.exp(place[:2]).tolist()
-    return Minimum(natural, quality_factor, place[2:], residual, jacobian, model + 0j, reverse, left)
+    return ScanFit(natural, quality_factor, place[2:], residual, jacobian, model + 0j, reverse, left)
 
 
 def chi2_without_resonance(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> float:

@@ -9,7 +9,7 @@ asked for, too: the other lines of a motion of that order then cancel. T is cut 
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -17,7 +17,7 @@ from jaxtyping import Complex, Float, Int
 from afm_jax.checks import checked
 from afm_jax.columns import printed_table
 from afm_jax.outcomes import Rule, Rules, judge
-from afm_jax.results import Result, public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.units import within_turn
 from afm_jax.words import bullets
 from fitting.tables.csv_text import Column, Faults, FileSetting, Form, TableError, read_columns, read_text
@@ -35,7 +35,8 @@ _SEEN = 4.0
 """Standard errors from which an amplitude stands out of the noise."""
 
 
-class Trace(NamedTuple):
+@public_result()
+class Trace(ResultTuple):
     """A deflection in time, as a file has it.
 
     Attributes:
