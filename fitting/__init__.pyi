@@ -22,8 +22,8 @@ from fitting.gradients import amplitude_gradients as amplitude_gradients
 from fitting.instruments.curve import MeasuredCurve as MeasuredCurve
 from fitting.instruments.curve import read_curve as read_curve
 from fitting.instruments.curve import read_curves as read_curves
+from fitting.inversion.invert import Inversion as Inversion
 from fitting.inversion.invert import invert as invert
-from fitting.inversion.result import Inversion as Inversion
 from fitting.sampling.posterior import posterior as posterior
 from fitting.sampling.posterior_result import Posterior as Posterior
 from fitting.simulated.experiment import SimulatedExperiment as SimulatedExperiment

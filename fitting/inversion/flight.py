@@ -19,7 +19,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.lasting_impact import gained_and_longer, indentation, middle_of_contact
 from afm_jax.impact.orbits import FlightEnds, lockin, peak_amplitude
-from afm_jax.least_squares import Box, Searches, descended
+from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from afm_jax.solve.lanes import compiled_quickly
 
 _HALF_SINE = 0.42441318157838753
@@ -53,15 +53,14 @@ class FlightEnd(NamedTuple):
 
 
 class Inverted(NamedTuple):
-    """A row inverted; `impact` by the two unknowns has the covariance J C J^T."""
+    """Rows inverted; arrays with a leading axis of rows."""
 
-    impact: FlightEnd
-    covariance: Float[Array, "3 3"]
-    """Of approach speed, rebound speed and delay."""
-    flight: FlightEnds
-    chi2: Float[Array, ""]
+    impact: Float[np.ndarray, "rows 3"]
+    """Approach speed, rebound speed and delay."""
+    covariance: Float[np.ndarray, "rows 3 3"]
+    chi2: Float[np.ndarray, " rows"]
     """Of the measured numbers; 0 where there are only two."""
-    converged: Bool[Array, ""]
+    converged: Bool[np.ndarray, " rows"]
 
 
 def flight_of(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> FlightEnds:
@@ -153,33 +152,23 @@ def _look(
     return residual, slopes
 
 
-def _searched(
-    starts: Float[np.ndarray, "searches 2"], rows: MeasuredRow, cantilever: Cantilever
-) -> Float[np.ndarray, "searches 2"]:
-    """Return where searches end that start from places, each of its own row."""
-    kept = np.array(starts)
+@compiled_quickly()
+@partial(jax.vmap, in_axes=(0, 0, None))
+def _impacts(
+    unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever
+) -> tuple[Float[Array, " 3"], Float[Array, "3 2"]]:
+    """Return the impact that unknowns say, and its derivatives by them."""
 
-    def look(places: Float[np.ndarray, "some 2"], some: Int[np.ndarray, " some"]) -> Searches:
-        # all places at once, so that one program serves: what the others have is known already
-        kept[some] = places
-        residual, slopes = (np.asarray(part)[some] for part in _look(kept, rows, cantilever))
-        chi2 = np.sum(residual**2, axis=1)
-        return Searches(places, residual, slopes, np.where(np.isfinite(chi2), chi2, np.inf))
+    def twice(unknowns):
+        impact = jnp.stack(impact_of(flight_of(unknowns, row, cantilever), row, cantilever))
+        return impact, impact
 
-    free = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros(starts.shape, dtype=bool), _LONGEST_MOVE)
-    first = look(starts, np.arange(len(starts)))
-    return descended(look, first, free, settled=_SETTLED, most=_ITERATIONS).place
-
-
-def _solve(matrix: Float[Array, "2 2"], right: Float[Array, "2 ..."]) -> Float[Array, "2 ..."]:
-    """Return the solution of two equations; not finite where there is none."""
-    (a, b), (c, d) = matrix
-    inverse = jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)
-    return inverse @ right
+    slopes, impact = jax.jacfwd(twice, has_aux=True)(unknowns)
+    return impact, slopes
 
 
 def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
-    """Return the flights and impacts of rows with a phase and at least one amplitude.
+    """Return the impacts of rows with a phase and at least one amplitude: the least squares of the two unknowns.
 
     Args:
         rows: arrays with a leading axis of rows.
@@ -189,36 +178,28 @@ def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
     height = np.where(np.isfinite(rows.error[:, 0]), rows.value[:, 0], rows.value[:, 1] / _HALF_SINE)
     # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi
     middle = np.stack([np.full_like(height, np.pi), np.log(np.asarray(cantilever.angular_frequency) * height)], axis=1)
-    starts = (middle[:, None] + beside).reshape(-1, 2)
+    kept = (middle[:, None] + beside).reshape(-1, 2)
     each = jax.tree.map(lambda part: np.repeat(np.asarray(part), len(beside), axis=0), rows)
-    return _best_ends(_searched(starts, each, cantilever).reshape(-1, len(beside), 2), rows, cantilever)
 
+    def look(places: Float[np.ndarray, "some 2"], some: Int[np.ndarray, " some"]) -> Searches:
+        # all places at once, so that one program serves: what the others have is known already
+        kept[some] = places
+        residual, slopes = (np.asarray(part)[some] for part in _look(kept, each, cantilever))
+        chi2 = np.sum(residual**2, axis=1)
+        return Searches(places, residual, slopes, np.where(np.isfinite(chi2), chi2, np.inf))
 
-@compiled_quickly()
-@partial(jax.vmap, in_axes=(0, 0, None))
-def _best_ends(places: Float[Array, "starts 2"], row: MeasuredRow, cantilever: Cantilever) -> Inverted:
-    """Return what the best of a row's searches has found."""
-
-    def one(place):
-        def impact(unknowns):
-            flight = flight_of(unknowns, row, cantilever)
-            found = impact_of(flight, row, cantilever)
-            residual = _residual(unknowns, row, cantilever)
-            return (jnp.stack(found), residual), (found, flight, residual)
-
-        (slopes, residual_slopes), (found, flight, residual) = jax.jacfwd(impact, has_aux=True)(place)
-        normal = residual_slopes.T @ residual_slopes
-        covariance = slopes @ _solve(normal, slopes.T)
-        # distance to the minimum in standard errors, squared
-        rest = residual_slopes.T @ residual
-        left = rest @ _solve(normal, rest)
-        good = (found.approach_speed > 0.0) & (found.rebound_speed > 0.0)
-        good = good & (left < _ARRIVED) & jnp.all(jnp.isfinite(covariance))
-        return Inverted(found, covariance, flight, jnp.sum(residual**2), good)
-
-    ends = jax.vmap(one)(places)
+    box = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros(kept.shape, dtype=bool), _LONGEST_MOVE)
+    ends = descended(look, look(kept.copy(), np.arange(len(kept))), box, settled=_SETTLED, most=_ITERATIONS)
+    impact, slopes = (np.asarray(part) for part in _impacts(ends.place, each, cantilever))
+    covariance = (
+        slopes
+        @ whole_covariance_of(np.einsum("snp,snq->spq", ends.jacobian, ends.jacobian))
+        @ np.swapaxes(slopes, 1, 2)
+    )
+    good = (distance(ends, box) < _ARRIVED) & (impact[:, :2] > 0.0).all(axis=1)
+    good &= np.isfinite(covariance).all(axis=(1, 2))
     # of equally good ones that with the shortest contact
-    response = row.order * row.platform.period_us
-    score = ends.chi2 + 1e-3 * (ends.impact.delay_us / response) ** 2
-    best = jnp.argmin(jnp.where(ends.converged, score, jnp.inf))
-    return jax.tree.map(lambda part: part[best], ends)
+    response = np.repeat(np.asarray(rows.order * rows.platform.period_us), len(beside))
+    score = np.where(good, ends.chi2 + 1e-3 * (impact[:, 2] / response) ** 2, np.inf).reshape(-1, len(beside))
+    best = np.argmin(score, axis=1) + len(beside) * np.arange(len(score))
+    return Inverted(impact[best], covariance[best], ends.chi2[best], good[best])

@@ -1,35 +1,36 @@
 """Direct inversion: amplitude and phase of each row give the speeds of its impact and the collision delay, no law."""
 
-from typing import NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import check_mass
 from afm_jax.checks import checked, require_float64
-from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
+from afm_jax.columns import printed_table
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.least_squares import IMPROBABLE, chi2_tail
+from afm_jax.outcomes import Rule, Rules, judge
+from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import filled
-from afm_jax.version import version_of
+from afm_jax.words import bullets, with_error
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
-from fitting.inversion.regression import Laws, distance_from, regressed_laws
-from fitting.inversion.result import (
-    Inversion,
-    InvertedRows,
-    Rebound,
-    on_resonance,
-    read_on_resonance,
-)
-from fitting.inversion.verdict import InversionEvidence, contradictory, judge_inversion
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table, check_quality_factor
 
 _BLOCK = 64
 """Rows come filled up to a multiple of this, so that one program serves most tables."""
-_PACKAGES = ("afm-jax", "jax", "numpy")
+_OUTLIER = 16.0
+"""chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
+_SLOW = 2.5
+"""Rows below this multiple of sqrt(epsilon) are left out of the lines: their contact is no short event any more."""
+_PASSES = 6
+POWERS = {"viscous": 1, "restitution": 2}
+"""By the law the power n of u_in in u_in^2 - u_out^2 = epsilon + slope u_in^n; slopes are viscous_loss and 1 - r^2."""
 
 
 class _Instrument(NamedTuple):
@@ -43,40 +44,149 @@ class _Instrument(NamedTuple):
     phase_zero_deg: float = 0.0
 
 
-class _Shared(NamedTuple):
-    """An instrument, and others each one standard error of one quantity away."""
+@dataclass(frozen=True)
+class Line:
+    """The loss u_in^2 - u_out^2 as a straight line over 1 and u_in^n.
 
-    instrument: _Instrument
-    moved: dict[str, _Instrument]
+    Attributes:
+        epsilon: in nm^2/us^2.
+        epsilon_error: its standard error.
+        slope: viscous_loss in nm/us, or 1 - r^2.
+        slope_error: its standard error.
+        chi2: of the rows.
+        degrees_of_freedom: rows less two.
+        p_value: probability of a larger chi2.
+    """
+
+    epsilon: float
+    epsilon_error: float
+    slope: float
+    slope_error: float
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+
+
+@public_result(picture="fitting.inversion.picture:inversion_figure", rows="records")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Inversion(Result):
+    """What `invert` finds; rows that give nothing are NaN and have a note.
+
+    Attributes:
+        approach_speed_nm_per_us: relative to the platform, shape (rows,).
+        rebound_speed_nm_per_us: likewise; both are those of a free tip on a sample at rest.
+        collision_delay_us: how much longer than an instantaneous impact.
+        covariance: of these three, from the errors of each row's numbers.
+        shared: change of the three by one standard error of each quantity that all rows share.
+        shared_names: these quantities: quality_factor, free_frequency_khz, ...
+        note: why a row gave nothing or is left out of the lines; else empty.
+        in_lines: which rows the lines go through.
+        lines: by "viscous" and "restitution"; empty where the rows determine none.
+        table: what was inverted.
+        valid: whether a line explains the rows.
+        reasons: why not.
+        warnings: what a reader should know besides.
+    """
+
+    approach_speed_nm_per_us: Float[np.ndarray, " rows"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " rows"]
+    collision_delay_us: Float[np.ndarray, " rows"]
+    covariance: Float[np.ndarray, "rows 3 3"]
+    shared: Float[np.ndarray, "rows 3 shared"]
+    shared_names: tuple[str, ...]
+    note: tuple[str, ...]
+    in_lines: Bool[np.ndarray, " rows"]
+    lines: dict[str, Line]
+    table: AmplitudeTable
+    valid: bool = False
+    reasons: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def errors(self) -> Float[np.ndarray, "rows 3"]:
+        """Standard errors of approach speed, rebound speed and delay, what rows share included."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2) + np.sum(self.shared**2, axis=2))
+
+    @property
+    def preferred(self) -> str | None:
+        """The law of the line with the smaller chi2; None without lines."""
+        return min(self.lines, key=lambda name: self.lines[name].chi2, default=None)
+
+    @property
+    def law(self) -> ImpactLaw | None:
+        """The law of the preferred line; None without lines."""
+        if self.preferred is None:
+            return None
+        line = self.lines[self.preferred]
+        lost = max(line.slope, 0.0)
+        r, viscous_loss = (1.0, lost) if self.preferred == "viscous" else (max(1.0 - lost, 0.0) ** 0.5, 0.0)
+        return ImpactLaw(r, max(line.epsilon, 0.0), viscous_loss)
+
+    @property
+    def reason(self) -> str | None:
+        """Why the inversion is not valid; None if it is."""
+        return next(iter(self.reasons), None)
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return the rows, each with its drive."""
+        (columns,) = self.tables().values()
+        return [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax invert`."""
+        told = {name: getattr(self, name) for name in ("valid", "reasons", "warnings", "preferred", "shared_names")}
+        lines = {name: asdict(line) for name, line in self.lines.items()}
+        return {"format": "afm-jax invert", "format_version": 2} | told | {"rows": self.records(), "lines": lines}
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of invert.csv."""
+        drive = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
+        names = ("approach_speed", "rebound_speed", "collision_delay")
+        columns: dict[str, Any] = {name: getattr(self.table, name).tolist() for name in drive}
+        for name, unit, error in zip(names, ("nm_per_us", "nm_per_us", "us"), self.errors.T, strict=True):
+            columns |= {f"{name}_{unit}": getattr(self, f"{name}_{unit}").tolist()}
+            columns |= {f"{name}_error_{unit}": error.tolist()}
+        return {"invert.csv": columns | {"in_lines": self.in_lines.tolist(), "note": list(self.note)}}
+
+    def printed(self) -> list[Any]:
+        """Return the verdict, the rows and the lines."""
+        cells: dict[str, Any] = {
+            **{name: name.replace(" ", "_") for name in ("order", "drive frequency khz", "drive amplitude nm")},
+            "approach\nnm/us": "approach_speed_nm_per_us:.4f",
+            "rebound\nnm/us": "rebound_speed_nm_per_us:.4f",
+            "delay\nus": "collision_delay_us:.4f",
+            "note": "note",
+        }
+        lines = [
+            f"u_in^2 - u_out^2 = epsilon + {name} u_in{'^2' * (law != 'viscous')}: epsilon "
+            f"{with_error(line.epsilon, line.epsilon_error)}, {name} {with_error(line.slope, line.slope_error)}, "
+            f"chi2/dof {line.chi2:.1f}/{line.degrees_of_freedom}"
+            for (law, line), name in zip(self.lines.items(), ("viscous_loss", "(1 - r^2)"), strict=False)
+        ]
+        head = f"{'VALID' if self.valid else 'NOT VALID'}: {self.table.source}, {self.table.rows} rows"
+        notes = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
+        return [head, printed_table("", cells, self.records()), *lines, *notes]
 
 
 @checked
-def invert(
-    table: TableLike,
-    *,
-    frequency_error_khz: float | None = None,
-    truth: ImpactLaw | TabulatedLaw | None = None,
-    law: ImpactLaw | TabulatedLaw | None = None,
-) -> Inversion:
-    """Return approach speed, rebound speed and collision delay of every row with a phase, and the laws they follow.
+def invert(table: TableLike, *, frequency_error_khz: float | None = None) -> Inversion:
+    """Return approach speed, rebound speed and collision delay of every row with a phase, and lines through the losses.
 
     A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
     motion and the air do during the contact is taken back by parameter-free corrections (`inversion.flight`), so that
-    the speeds are those of a free tip on a sample at rest. Rows on resonance are also read as the paper proposes.
+    the speeds are those of a free tip on a sample at rest. The losses u_in^2 - u_out^2 are then set on a straight line
+    over (1, u_in), a viscous loss, and over (1, u_in^2), a restitution.
 
     Args:
-        table: from `read_table`; a table without phases must have rows on resonance.
+        table: from `read_table`, with phases.
         frequency_error_khz: standard error of the free frequency; None: the table's, exactly known if it has none.
-        truth: the law if it is known, as of `law`: what the reading on resonance is compared with.
-        law: of a fit, from `load_law`, or any other, to be set beside the rows.
 
     Returns:
-        Rows with errors, regressed laws and a verdict; see `Inversion`.
+        Rows with errors, lines and a verdict; see `Inversion`.
 
     Raises:
-        TableError: if the table has no phase and no row on resonance, or does not say its quality factor, or the law
-            is known at other speeds only.
-        ValueError: if the frequency's error is not positive, or the law is that of a tip of another mass.
+        TableError: if the table has no phase, or does not say its quality factor.
+        ValueError: if the frequency's error is not positive.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
@@ -89,89 +199,51 @@ def invert(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "
             "`afm-jax tapping` reads energy and impact speeds off such rows without a law, `afm-jax fit` fits a law"
         )
-    for known_law in (truth, law):
-        if known_law is not None and table.mass_ng is not None:
-            check_mass(known_law, Cantilever(table.free_frequency_khz, None, table.mass_ng))
-    frequency_error_khz = table.free_frequency_error_khz if frequency_error_khz is None else frequency_error_khz
-    with_phase = _with_phase(table)
-    if not with_phase.any() and not on_resonance(table).any():
-        raise TableError(
-            f"{table.source}: no row has a phase, and none is on resonance (2 N times the free frequency), where the "
-            "phase could be assumed; add the columns phase_deg and phase_error_deg, or use `afm-jax fit`"
-        )
-    rows = _inverted_rows(table, _shared(table, frequency_error_khz))
-    laws = regressed_laws(rows)
-    known, reference = _reference(truth, laws)
-    resonance = read_on_resonance(table, law=known, reference=reference)
-    distance = None if law is None else distance_from(law, table, laws.rows, resonance)
-    reasons, warnings = judge_inversion(InversionEvidence(table, with_phase, laws, law, distance))
-    return Inversion(
-        table=table,
-        rows=laws.rows,
-        approach_speed_nm_per_us=laws.speeds,
-        laws=laws.laws,
-        delay=laws.delay,
-        preferred=laws.preferred,
-        verdict=laws.verdict,
-        resonance=resonance,
-        beside=law,
-        distance=distance,
-        valid=not reasons,
-        reasons=reasons,
-        warnings=warnings,
-        versions={name: version_of(name) for name in _PACKAGES},
-    )
-
-
-def _with_phase(table: AmplitudeTable) -> np.ndarray:
-    """Return which rows have a phase and an amplitude."""
     known = np.isfinite(_numbers(table)[1])
-    return known[:, 2] & known[:, :2].any(axis=1)
-
-
-def _shared(table: AmplitudeTable, frequency_error_khz: float | None) -> _Shared:
-    known = {name: value for name, (value, _) in table.calibration.items()}
-    errors = {name: error for name, (_, error) in table.calibration.items()}
-    instrument = _Instrument(float(table.free_frequency_khz), table.quality_factor, **known)
-    errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": frequency_error_khz} | errors
-    moved = {
-        name: instrument._replace(**{name: getattr(instrument, name) + error})
-        for name, error in errors.items()
-        if error
-    }
-    return _Shared(instrument, moved)
-
-
-def _inverted_rows(table: AmplitudeTable, shared: _Shared) -> InvertedRows:
-    with_phase = _with_phase(table)
-    count = table.rows
-    impact, covariance = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    moved, chi2 = np.full((count, 3, len(shared.moved)), np.nan), np.full(count, np.nan)
-    note = ["" if there else "no phase with an amplitude: nothing to invert" for there in with_phase]
-    chosen = np.flatnonzero(with_phase)
-    if chosen.size:
-        found = _at(table, chosen, shared.instrument)
-        good = chosen[found.converged]
-        impact[good] = np.stack(found.impact, axis=1)[found.converged]
-        covariance[good] = found.covariance[found.converged]
-        three = np.isfinite(_numbers(table)[1][chosen]).all(axis=1)
-        chi2[chosen] = np.where(three & found.converged, found.chi2, np.nan)
-        for k, instrument in enumerate(shared.moved.values()):
-            other = _at(table, chosen, instrument)
-            moved[good, :, k] = np.stack(other.impact, axis=1)[found.converged] - impact[good]
-        for row in np.setdiff1d(chosen, good):
-            note[row] = "no flight between two impacts has this amplitude and phase"
-        for row in np.flatnonzero(contradictory(chi2)):
-            note[row] = f"amplitudes and phase contradict each other (chi2 {chi2[row]:.3g} of one degree of freedom)"
-    return InvertedRows(
-        impact=impact,
+    chosen = np.flatnonzero(known[:, 2] & known[:, :2].any(axis=1))
+    if not chosen.size:
+        raise TableError(
+            f"{table.source}: no row has a phase with an amplitude; add the columns phase_deg and phase_error_deg, or "
+            "use `afm-jax fit`"
+        )
+    frequency_error_khz = table.free_frequency_error_khz if frequency_error_khz is None else frequency_error_khz
+    values = {name: value for name, (value, _) in table.calibration.items()}
+    errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": frequency_error_khz}
+    errors = {name: e for name, e in (errors | {k: e for k, (_, e) in table.calibration.items()}).items() if e}
+    at = _Instrument(float(table.free_frequency_khz), table.quality_factor, **values)
+    found = _at(table, chosen, at)
+    moved = [_at(table, chosen, at._replace(**{name: getattr(at, name) + e})) for name, e in errors.items()]
+    impact, covariance = np.full((table.rows, 3), np.nan), np.full((table.rows, 3, 3), np.nan)
+    shared = np.full((table.rows, 3, len(moved)), np.nan)
+    good = np.logical_and.reduce([one.converged for one in (found, *moved)])
+    rows = chosen[good]
+    impact[rows], covariance[rows] = found.impact[good], found.covariance[good]
+    for k, other in enumerate(moved):
+        shared[rows, :, k] = (other.impact - found.impact)[good]
+    note = np.full(table.rows, "no phase with an amplitude: nothing to invert", dtype=object)
+    note[chosen] = "no flight between two impacts has this amplitude and phase"
+    note[rows] = ""
+    chi2 = found.chi2[good]
+    for row, apart in zip(rows[chi2 > _OUTLIER], chi2[chi2 > _OUTLIER], strict=True):
+        note[row] = f"amplitudes and phase contradict each other (chi2 {apart:.3g} of one degree of freedom)"
+    lines, fast = _lines(impact[rows], covariance[rows], shared[rows])
+    for row in rows[~fast]:
+        note[row] = note[row] or f"slower than {_SLOW} sqrt(epsilon): left out of the lines"
+    u, w, delay = impact.T
+    result = Inversion(
+        approach_speed_nm_per_us=u,
+        rebound_speed_nm_per_us=w,
+        collision_delay_us=delay,
         covariance=covariance,
-        shared=moved,
-        shared_names=tuple(shared.moved),
-        chi2=chi2,
-        regressed=np.asarray(np.isfinite(impact).all(axis=1) & np.isfinite(moved).all(axis=(1, 2))),
+        shared=shared,
+        shared_names=tuple(errors),
         note=tuple(note),
+        in_lines=np.isin(np.arange(table.rows), rows[fast]),
+        lines=lines,
+        table=table,
     )
+    reasons, warnings = tuple(judge(REASONS, result)), tuple(judge(WARNINGS, result))
+    return replace(result, valid=not reasons, reasons=reasons, warnings=warnings)
 
 
 def _numbers(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"]]:
@@ -187,49 +259,118 @@ def _numbers(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows 3"], Float[
     return np.where(there, value, 1.0), np.where(there, error, np.inf)
 
 
-def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> Inverted:
+def _at(table: AmplitudeTable, chosen: Int[np.ndarray, " chosen"], instrument: _Instrument) -> Inverted:
     """Return some rows inverted with an instrument."""
     value, error = _numbers(table)
     per_nm = np.array([instrument.tip_calibration, instrument.tip_calibration, 1.0])
     zero = np.array([0.0, 0.0, instrument.phase_zero_deg])
     fill = filled(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
+    amplitude = instrument.drive_calibration * table.excitation_nm
     # every field an array of the rows' shape, for `vmap`
-    amplitude, frequency, offset = (
-        instrument.drive_calibration * table.excitation_nm,
-        table.drive_frequency_khz,
-        instrument.offset_origin_nm + table.offset_nm,
-    )
-    drive = (jnp.asarray(part[fill]) for part in (amplitude, frequency, offset))
-    platform = Platform(*drive, offset_rate_nm_per_us=jnp.zeros(fill.size))
-    rows = MeasuredRow(
-        platform,
-        jnp.asarray(table.order[fill], float),
-        jnp.asarray(((value - zero) / per_nm)[fill]),
-        jnp.asarray((error / per_nm)[fill]),
-    )
+    drive = (amplitude, table.drive_frequency_khz, instrument.offset_origin_nm + table.offset_nm)
+    platform = Platform(*(jnp.asarray(part[fill]) for part in drive), offset_rate_nm_per_us=jnp.zeros(fill.size))
+    readings = (jnp.asarray(part[fill]) for part in ((value - zero) / per_nm, error / per_nm))
+    rows = MeasuredRow(platform, jnp.asarray(table.order[fill], float), *readings)
     cantilever = Cantilever(instrument.free_frequency_khz, instrument.quality_factor, table.mass_ng)
     return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
 
 
-def _reference(truth: Law | None, laws: Laws) -> tuple[Rebound | None, str]:
-    """Return what the reading on resonance is compared with, and its name."""
-    if truth is not None:
+def _lines(
+    impact: Float[np.ndarray, "rows 3"],
+    covariance: Float[np.ndarray, "rows 3 3"],
+    shared: Float[np.ndarray, "rows 3 k"],
+) -> tuple[dict[str, Line], Bool[np.ndarray, " rows"]]:
+    """Return the lines through the losses, and which rows they go through: those that are not too slow."""
+    fast, lines = np.ones(len(impact), dtype=bool), {}
+    for _ in range(2):
+        if fast.sum() < 3 or np.ptp(impact[fast, 0]) < 1e-6 * impact[fast, 0].max():
+            return {}, fast
+        lines = {law: line(impact[fast], covariance[fast], shared[fast], power) for law, power in POWERS.items()}
+        epsilon = min(lines.values(), key=lambda one: one.chi2).epsilon
+        fast = impact[:, 0] > _SLOW * max(epsilon, 0.0) ** 0.5
+    return lines, fast
 
-        def rebound(speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-            known = ~np.asarray(truth.extrapolated(speeds) | truth.captures(speeds))
-            return np.where(known, np.asarray(truth.rebound_speed(speeds)), np.nan)
 
-        return rebound, "truth"
-    best = laws.laws.get(laws.preferred or "viscous")
-    if best is None:
-        return None, "none"
-    known = np.isfinite(best.curve)
-    u, w = laws.speeds[known], best.curve[known]
+def line(
+    impact: Float[np.ndarray, "rows 3"],
+    covariance: Float[np.ndarray, "rows 3 3"],
+    shared: Float[np.ndarray, "rows 3 k"],
+    power: int,
+) -> Line:
+    """Return the line u_in^2 - u_out^2 = epsilon + slope u_in^n of correlated rows.
 
-    def regressed(speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        # the loss is all but linear in the speed, the rebound speed of slow tips is not
-        square = speeds**2 - np.interp(speeds, u, u**2 - w**2)
-        inside = (speeds >= u[0]) & (speeds <= u[-1])
-        return np.sqrt(np.where(inside & (square > 0.0), square, np.nan))
+    The residual of a row varies by (2 u_in - n slope u_in^(n - 1), -2 u_out) times the errors of its speeds, which its
+    covariance and what all rows share give together (total least squares to first order).
 
-    return regressed, "law"
+    Args:
+        impact: approach speeds, rebound speeds and delays.
+        covariance: of each row's.
+        shared: their changes by one standard error of each quantity that all rows share.
+        power: n.
+    """
+    u, w, _ = impact.T
+    scale = np.array([1.0, np.mean(u**power)])
+    design, wanted = np.stack([np.ones_like(u), u**power], axis=1) / scale, u**2 - w**2
+
+    def at(slope: float) -> Line:
+        slopes = np.stack([2.0 * u - power * slope * u ** (power - 1), -2.0 * w], axis=1)
+        common = np.einsum("ni,nik->nk", slopes, shared[:, :2])
+        own = np.einsum("ni,nij,nj->n", slopes, covariance[:, :2, :2], slopes)
+        # whitened by the root of the covariance of all residuals
+        whiten = np.linalg.inv(np.linalg.cholesky(np.diag(own) + common @ common.T))
+        inverse = np.linalg.pinv(whiten @ design)
+        found = inverse @ whiten @ wanted
+        chi2, freedom = float(np.sum((whiten @ (design @ found - wanted)) ** 2)), len(u) - 2
+        value, error = found / scale, np.sqrt(np.sum(inverse**2, axis=1)) / scale
+        (epsilon, slope), (epsilon_error, slope_error) = value.tolist(), error.tolist()
+        return Line(epsilon, epsilon_error, slope, slope_error, chi2, freedom, chi2_tail(chi2, freedom))
+
+    found = at(0.0)
+    for _ in range(_PASSES):
+        found = at(found.slope)
+    return found
+
+
+def _inverted(e: Inversion) -> int:
+    return int(np.isfinite(e.approach_speed_nm_per_us).sum())
+
+
+REASONS: Rules[Inversion] = [
+    (
+        Rule(
+            lambda e: not _inverted(e),
+            "no row could be inverted: check the phases' sign and zero (t = 0 when the platform is highest)",
+        ),
+        Rule(
+            lambda e: [] if e.lines else [int(e.in_lines.sum())],
+            "{case} rows do not determine a line of two coefficients: measure at more drives",
+        ),
+        Rule(
+            lambda e: max(one.p_value for one in e.lines.values()) < IMPROBABLE,
+            "neither line explains the rows: check the errors, Q, and the calibration of tip and drive",
+        ),
+        Rule(
+            lambda e: all(
+                abs(one.epsilon) < 2.0 * one.epsilon_error and abs(one.slope) < 2.0 * one.slope_error
+                for one in e.lines.values()
+            ),
+            "the rows determine no coefficient of either line to two standard errors: measure more finely",
+        ),
+    )
+]
+"""What makes an inversion invalid."""
+WARNINGS: Rules[Inversion] = [
+    Rule(
+        lambda e: e.table.quality_factor is not None and e.table.quality_factor_error is None,
+        "Q comes without an error: its uncertainty is not in the errors here",
+    ),
+    Rule(
+        lambda e: [lost for lost in [sum(note.startswith("no flight") for note in e.note)] if lost and _inverted(e)],
+        "{case} rows could not be inverted (see their notes)",
+    ),
+    Rule(
+        lambda e: [many for many in [sum("contradict" in note for note in e.note)] if many],
+        "{case} rows contradict themselves by more than 4 standard errors (see their notes)",
+    ),
+]
+"""What a reader should know besides."""

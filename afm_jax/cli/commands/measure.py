@@ -247,10 +247,10 @@ INVERT = Command(
     runs="afm_jax.cli.invert:inversion",
     help="""Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
 
-    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses are then regressed on both laws
-    (restitution, viscous loss), the delays on the delay law. Rows on resonance are also read as the paper proposes,
-    without their phase. With --out the report: invert.html, .txt, .json, .png, .csv and law.csv. Exit code 3 if
-    the rows determine no law, or none explains them.
+    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses u_in^2 - u_out^2 are then set on
+    straight lines over (1, u_in), a viscous loss, and (1, u_in^2), a restitution. Rows that give nothing are named,
+    with the reason. With --out invert.csv, .json and .png. Exit code 3 if the rows determine no line, or none
+    explains them.
     """,
     options=(
         click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path)),
@@ -262,20 +262,6 @@ INVERT = Command(
             type=Finite(positive=True),
             metavar="KHZ",
             help="Standard error of the free frequency; without it, exactly known.",
-        ),
-        click.option(
-            "--truth",
-            type=click.Path(path_type=Path),
-            metavar="FILE",
-            help="The law if it is known, from a file as of --law or the collide.csv of `afm-jax collide --out`: "
-            "compared with the reading on resonance.",
-        ),
-        click.option(
-            "--law",
-            type=click.Path(path_type=Path),
-            metavar="FILE",
-            help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its "
-            "law with its band beside the rows; one of other speeds is refused.",
         ),
         flag("--example", "Invert the bundled table instead of a file."),
     ),
