@@ -182,7 +182,7 @@ MUTATIONS = {
         "tests/test_lockin.py::test_harmonics_of_a_motion_are_read_and_nothing_beside_them",
     ),
     "loss of a line as a sum": Mutation(
-        "u**2 {- => +} w**2, 0.0", "tests/test_inversion_law.py::test_values_without_noise_are_exact"
+        "/ scale, u**2 {- => +} w**2", "tests/test_inversion_law.py::test_values_without_noise_are_exact"
     ),
     "inverted rebound against the platform": Mutation(
         "flight.start_velocity {- => +} platform.velocity(flight.start_us)",
