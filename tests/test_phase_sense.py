@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def measured(tip: Tip, truth: Truth, stored: str = "lag", **also) -> AmplitudeTa
     return replace(table, phase_lag_deg=STORED[stored][1](lag - 3.0, tip.free_reading[1]))
 
 
-def recorded(tip: Tip, table: AmplitudeTable, folder: Path, **options: object) -> AmplitudeTable:
+def recorded(tip: Tip, table: AmplitudeTable, folder: Path, **options: Any) -> AmplitudeTable:
     """Return the same curve as an instrument's file that knows no more than its channels, read back."""
     columns = {"Z (nm)": table.offset_nm, "Amp (nm)": table.lockin_amplitude_nm, "Phase (deg)": table.phase_lag_deg}
     path = folder / "curve.csv"
@@ -110,6 +111,7 @@ def test_a_phase_is_taken_right_or_as_assumed_or_the_curve_refused(
             assert said == "right"
         if said == "right":
             # the frequency that is stated is off by 1e-5 and turns the free lag by half a degree
+            assert of_file.phase_lag_deg is not None
             np.testing.assert_allclose(of_file.phase_lag_deg, _true_lag(tip, table, sign), atol=2.0)
         # who says it needs no curve that decides
         stated = with_sense_of_phase(replace(table, phase_sense="lag" if sign > 0.0 else "lead"))[1]
@@ -152,6 +154,7 @@ def test_a_sign_that_is_stated_is_taken_and_not_asked_for(tmp_path: Path):
             assert told.phase_sense == "lag"
             assert with_sense_of_phase(told)[1].origin == "stated"
             assert not any(one.startswith("Sign") for one in told.remarks)
+            assert told.phase_lag_deg is not None
             np.testing.assert_allclose(told.phase_lag_deg, _true_lag(tip, table, float(factor)), atol=2.0)
 
 
