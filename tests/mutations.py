@@ -135,7 +135,7 @@ MUTATIONS = {
     "dissipation left out of the time": Mutation("at.available_aj{ - state[0] => })", COLLISIONS),
     "energy lost where it is gained": Mutation("- self.end_potential_aj {- => +} spent", COLLISIONS),
     "collocation that integrates from the end": Mutation("integrals[:, 0] = {roots + 1.0 => 1.0 - roots}", COLLOCATION),
-    "time in the junction counted once": Mutation("{2.0 *  => }one + rests", COLLISIONS),
+    "time in the junction counted once": Mutation("{2.0 *  => }inside + rests", COLLISIONS),
     "dry contact as stiff as a flat of its radius": Mutation(
         "{jnp.sqrt(junction.tip_radius_nm) => junction.tip_radius_nm}",
         "tests/test_dry_contact.py::test_hertz_collision_time_is_the_closed_form[20.0]",

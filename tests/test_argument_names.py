@@ -148,14 +148,14 @@ def test_text_json_and_files_of_a_command_name_its_options(tmp_path: Path, monke
     np.savez("image.npz", amplitude_nm=images[0], phase_deg=images[1])
     (curve,) = fitting.read_curves("abc.csv", columns=columns, **LEVER)
     found = fitting.tapping_map("image.npz", free_amplitude_nm=13.4, free_phase_deg=90.0, **LEVER)
-    assert any('if it leads, `columns="phase_lag_deg=CHANNEL:-1"`' in note for note in curve.notes)
+    assert any('say `phase_sense="lag|lead"`' in note for note in curve.notes)
     assert any("(`amplitude_error_nm=...`, `phase_error_deg=...`)" in note for note in found.notes)
     for call, out, files, said in (
         (
             ["read", "abc.csv", "--columns", columns],
             "t.csv",
             ["t.csv"],
-            "it leads, --columns phase_lag_deg=CHANNEL:-1.",
+            "say --phase-sense lag|lead.",
         ),
         (
             ["tapping-map", "image.npz", "--free-amplitude-nm", "13.4", "--free-phase-deg", "90"],

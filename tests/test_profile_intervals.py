@@ -145,31 +145,21 @@ def test_an_interval_ends_where_an_orbit_is_lost_and_what_is_undetermined_has_no
     assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
 
 
-TAPS = Problem("contact", ("relative_humidity", "modulus_gpa"), drive="force")
+CONTACT = Problem("contact", ("relative_humidity", "modulus_gpa"), drive="force")
 ALL = np.ones(2, dtype=bool)
 
 
-def test_what_taps_leave_open_is_anything_within_its_range():
-    """Of the sample's own contact it is no minimum; the variance of ln K over its range is that of an even density."""
+def test_what_readings_leave_open_is_no_minimum():
     values, design = np.array([0.4, 90.0]), np.diag([50.0, 0.0])
-    taps = LinearObjective(design, values, TAPS)
-    here = taps.problem.coordinates(values)
-    assert check_minimum(taps, here, ALL).converged
-    sample = LinearObjective(design, values, Problem("contact", TAPS.names))
-    assert not check_minimum(sample, here, ALL).converged
-    assert np.isinf(covariance(sample, values, ALL)[1, 1])
-    spread = covariance(taps, values, ALL)
-    ranged = np.diff(np.log(np.array([1.0, 2000.0])))[0] / np.sqrt(12.0)
-    assert np.sqrt(np.diag(spread)) == pytest.approx([0.02, 90.0 * ranged], rel=0.01)
-    humidity, modulus = profile_intervals(taps, values, spread, 1.5**2)
-    assert (humidity.low, humidity.high) == pytest.approx((0.4 - QUANTILE * 0.02, 0.4 + QUANTILE * 0.02), abs=1e-4)
-    assert (modulus.low, modulus.high) == (None, None)
+    objective = LinearObjective(design, values, CONTACT)
+    assert not check_minimum(objective, objective.problem.coordinates(values), ALL).converged
+    assert np.isinf(covariance(objective, values, ALL)[1, 1])
 
 
 @pytest.mark.parametrize(("drawn_to", "outward"), [(2100.0, True), (1900.0, False)])
 def test_a_parameter_at_the_end_of_its_range_is_held_there(drawn_to: float, outward: bool):  # noqa: FBT001
     values = np.array([0.4, 2000.0])
-    objective = LinearObjective(np.diag([50.0, 0.01]), np.array([0.4, drawn_to]), TAPS)
+    objective = LinearObjective(np.diag([50.0, 0.01]), np.array([0.4, drawn_to]), CONTACT)
     held = at_bound(objective, values)
     assert held.tolist() == [False, True]
     state = check_minimum(objective, objective.problem.coordinates(values), ~held)

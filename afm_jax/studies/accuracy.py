@@ -680,8 +680,8 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     exact, coarser = (_value_and_slopes(partial(solve, setting), at) for setting in references)
     if not np.isfinite(exact[0]).all():
         raise ValueError(
-            f"{name}: the tip has not as many as {contacts} contacts before it is held or flies on: lower --contacts, "
-            "or start elsewhere"
+            f"{name}: the tip has not as many as {contacts} contacts before it is held or flies on: lower "
+            "`contacts=...`, or start elsewhere"
         )
     problem = AccuracyProblem(
         what=f"arrival of contact {contacts} (us)",

@@ -156,7 +156,7 @@ def _side_by_side(recording: Recording, used: list[str]) -> list[int]:
     return steps if alike else [0]
 
 
-def _ended(columns: dict[str, Float[np.ndarray, " rows"]]) -> dict[str, Float[np.ndarray, " rows"]]:
+def _ended(columns: dict[str, Float[np.ndarray, " rows"]]) -> dict[str, Float[np.ndarray, " kept"]]:
     """Return columns without the rows at their end that hold nothing, or zeros alone: padding of a shorter way."""
     there = np.any([np.isfinite(numbers) & (numbers != 0.0) for numbers in columns.values()], axis=0)
     rows = int(np.flatnonzero(there)[-1]) + 1 if there.any() else 0

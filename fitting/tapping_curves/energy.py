@@ -228,7 +228,7 @@ class _Means(NamedTuple):
     error: Float[np.ndarray, " means"]
 
 
-class Minimum(NamedTuple):
+class Solution(NamedTuple):
     """Where a least squares ends: unknowns, their covariance, chi2, its degrees of freedom, whether it settled there.
 
     Every unknown has a residual of what is known of it beforehand, so that the other residuals count the freedom.
@@ -249,7 +249,7 @@ class Minimum(NamedTuple):
 Function = Callable[[np.ndarray], np.ndarray]
 
 
-def _minimum(residual: Function, jacobian: Function, start: np.ndarray, *, until: float = _SETTLED) -> Minimum:
+def _minimum(residual: Function, jacobian: Function, start: np.ndarray, *, until: float = _SETTLED) -> Solution:
     """Return the minimum of a sum of squares to some distance of chi2, and whether the search settled there."""
 
     def evaluate(places: np.ndarray, _: np.ndarray) -> Searches:
@@ -264,7 +264,7 @@ def _minimum(residual: Function, jacobian: Function, start: np.ndarray, *, until
         settled = bool(distance(end, box)[0] <= 1e-2)
     covariance = covariance_of(end.jacobian[0].T @ end.jacobian[0])
     settled &= bool(np.isfinite(covariance).all())
-    return Minimum(end.place[0], covariance, float(end.chi2[0]), len(end.residual[0]) - count, settled)
+    return Solution(end.place[0], covariance, float(end.chi2[0]), len(end.residual[0]) - count, settled)
 
 
 def _slopes(function: Function, x: np.ndarray, count: int) -> np.ndarray:
@@ -399,7 +399,7 @@ class Lever:
             named |= {name: share * np.abs(column) for name, share in curve.relative_errors.items()}
         return parts
 
-    def nuisances(self, number: int, minimum: Minimum | None = None) -> tuple[Nuisance, ...]:
+    def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
         """Return what is stated of the instrument of a curve and where a least squares ends."""
         minimum = self.minimum if minimum is None else minimum
         x, count, curve = minimum.at, len(self.unknowns), self.curves[number]
@@ -1155,7 +1155,7 @@ class OneEnergy:
     used: Bool[np.ndarray, " rows"]
     outliers: Bool[np.ndarray, " rows"]
     residual: Rows
-    minimum: Minimum
+    minimum: Solution
     scale: float
 
     @property
@@ -1250,7 +1250,7 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
     )
 
 
-def _budget(lever: Lever, minimum: Minimum, place: int) -> dict[str, float]:
+def _budget(lever: Lever, minimum: Solution, place: int) -> dict[str, float]:
     """Return what the variance of one energy comes from, in aJ^2: each thing stated, and noise."""
     parts: dict[str, float] = {}
     for unknown, moved in zip(lever.unknowns, minimum.covariance[place].tolist(), strict=False):
