@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import afm_jax as afm
+from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import end_of_contact
 from afm_jax.dynamics.contact_orbits import contact_orbits
@@ -19,7 +20,7 @@ from afm_jax.dynamics.many_tips import departure_jacobians, tips_after_contacts
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.motion.contact_motion import has_just_left
 from afm_jax.motion.follow import follow_long, state_after
-from afm_jax.motion.record import ContactKind
+from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import Outcome
@@ -106,6 +107,9 @@ def test_a_tip_has_just_left_where_contact_ends_and_the_gap_opens(off_nm, rate, 
     for sign in (1.0, -1.0):
         assert bool(has_just_left(platform, ends, 3.0, ends + sign * off_nm, rate)) is left
     assert not bool(has_just_left(platform, ends, 3.0, ends + 1e-6, 1.0))
+    # a tip that has grazed the sample has a rate of rounding
+    assert bool(has_just_left(platform, ends, 3.0, ends, -1e-15))
+    assert not bool(has_just_left(platform, ends, 3.0, ends, -1e-9))
     # the phase omega t has the rounding of the time
     assert bool(has_just_left(platform, ends, 1e6, ends + 1e-9, 1.0))
 
@@ -193,3 +197,36 @@ def test_the_map_of_departures_contracts_by_what_the_air_takes(name):
     speeds = np.asarray(rows.rebound_speed_nm_per_us)[1:3]
     passed = float(second.time_us - first.time_us)
     assert np.linalg.det(slopes) == pytest.approx(np.exp(-OMEGA * passed / QUALITY) * speeds[0] / speeds[1], rel=1e-5)
+
+
+def test_a_tip_that_grazes_is_turned_round_by_its_drive_alone():
+    # the free tip swings by 40 nm, and its sample is 40 nm below
+    ratio, free_nm = 1.05, 40.0
+    force = free_nm * OMEGA**2 * abs(1.0 - ratio**2 + 1j * ratio / QUALITY)
+    drive = afm.ForceDrive(force, 90.0 * ratio)
+    scene = afm.Scene(
+        afm.Cantilever(90.0, QUALITY, MASS), afm.Platform(0.0, 90.0 * ratio, -free_nm), CONTACTS["hertz"], force=drive
+    )
+    # in its steady motion, but for next to nothing
+    _, steady = surface_of(scene)
+    position, velocity = (float(part) for part in steady.position_and_velocity(4.0))
+    motion = simulate(scene, afm.State(4.0, position, velocity + 1e-7), 1500.0, max_contacts=512)
+    rows = motion.contacts
+    left = np.asarray(rows.kind) == ContactKind.IMPACT
+    arrival, departure, approach, rebound, deepest = (
+        np.asarray(part)[left]
+        for part in (
+            *(rows.arrival_time_us, rows.departure_time_us, rows.approach_speed_nm_per_us),
+            *(rows.rebound_speed_nm_per_us, rows.detail.deepest_gap_nm),
+        )
+    )
+    assert (departure > arrival).all()
+    assert (arrival[1:] > departure[:-1]).all()
+    slow = approach < 1e-3
+    assert slow.sum() > 20
+    # a parabola under the acceleration at the lowest point of the swing; the contact's own force is nothing there
+    upward = free_nm * (ratio * OMEGA) ** 2
+    np.testing.assert_allclose(rebound[slow], approach[slow], rtol=2e-3)
+    np.testing.assert_allclose(-deepest[slow], approach[slow] ** 2 / (2.0 * upward), rtol=2e-2)
+    resumed = simulate(scene, state_after(motion, int(np.flatnonzero(left)[-1])), 50.0, max_contacts=64)
+    assert int(resumed.outcome) in (MotionOutcome.FINISHED, MotionOutcome.HELD)

@@ -100,7 +100,8 @@ class QuickSetting(NamedTuple):
             duration_us: of the leg.
         """
         settled = jnp.max(change, axis=0) < self.tolerance
-        return settled & (series_tail(pace) < self.tail * duration_us) & jnp.isfinite(duration_us)
+        lasts = jnp.isfinite(duration_us) & (duration_us > 0.0)
+        return settled & (series_tail(pace) < self.tail * duration_us) & lasts
 
 
 class DrivenSetting(NamedTuple):

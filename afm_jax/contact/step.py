@@ -31,6 +31,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.driven import ContactState, Driven
+from afm_jax.contact.forces.force import slope_of
 from afm_jax.contact.junction import Phase
 
 _NEAR = 1e-7
@@ -294,15 +295,19 @@ def inverse_bridge_step(driven: Driven, state: ContactState, acceleration: Float
 def inverse_junction_step(driven: Driven, state: ContactState) -> Float[Array, "..."]:
     """Return the inverse of the scale of fictitious time of a tip in the junction, in 1/us.
 
-    0.8 times the root of the sum of three squares: the frequency of the junction's stiffness; three times the speed
-    over the distance in which the load changes; and the frequencies of cantilever and drive times the depth's slope by
-    s, which turns time into fictitious time.
+    0.8 times the root of the sum of four squares: the frequency of the junction's stiffness; that with which cantilever
+    and drive alone would turn a tip round, as they do one that grazes; three times the speed over the distance in which
+    the load changes; and the frequencies of cantilever and drive times the depth's slope by s, which turns time into
+    fictitious time.
     """
     s, curve = state.x, driven.solid
     energy = 0.5 * driven.mass_ng * state.gap_rate**2 / curve.energy_scale_aj
     elastic = curve.bend(s) * curve.load_scale_nn * driven.inverse_mass / curve.depth_scale_nm
     passing = 3.0 * state.gap_rate / (curve.depth_scale_nm * curve.reach(s, energy))
-    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_frequency(driven) * curve.depth_slope(s)) ** 2)
+    pull = driven.acceleration(driven.gap_of_root(s), state.gap_rate, state.time_us, jnp.zeros_like(s))
+    # of s'' = -pull depth_slope(s)/depth_scale
+    pulled = jnp.abs(pull * slope_of(curve.depth_slope, s)) / curve.depth_scale_nm
+    return 0.8 * jnp.sqrt(elastic + pulled + passing**2 + (_drive_frequency(driven) * curve.depth_slope(s)) ** 2)
 
 
 def _drive_frequency(driven: Driven) -> Float[Array, "..."]:

@@ -162,10 +162,11 @@ def follow_contacts(  # noqa: PLR0913
 def has_just_left(
     surface: Platform | Surface, ends_nm: Array, time_us: ArrayLike, gap_nm: Array, rate: ArrayLike
 ) -> Bool[Array, "..."]:
-    """Say whether a tip has just left a contact: it is where contact ends, but for rounding, and the gap opens.
+    """Say whether a tip has just left a contact: it is where contact ends and the gap opens, both but for rounding.
 
     It is free there, although a contact may begin at that very gap: where nothing bridges it, the way in begins where
-    the way out ends, and only the gap's rate tells the two apart.
+    the way out ends, and only the gap's rate tells the two apart. A tip that has grazed the sample leaves it with next
+    to no rate.
 
     Args:
         surface: what the free tip sees (`surface_of`).
@@ -178,16 +179,29 @@ def has_just_left(
     heights = jnp.abs(surface.offset_nm + surface.offset_rate_nm_per_us * time_us) + surface.reach_nm + jnp.abs(gap_nm)
     moved = jnp.abs(time_us) * surface.top_speed_nm_per_us
     rounding = _ROUNDINGS * jnp.finfo(heights.dtype).eps * (heights + moved)
-    return (jnp.abs(gap_nm - ends_nm) <= rounding) & (jnp.asarray(rate) > 0.0)
+    return (jnp.abs(gap_nm - ends_nm) <= rounding) & (jnp.asarray(rate) > -slowest_departure(surface, time_us))
+
+
+def slowest_departure(surface: Platform | Surface, time_us: ArrayLike) -> Float[Array, "..."]:
+    """Return the gap rate in nm/us below which its rounding does not tell whether a gap opens or closes.
+
+    Args:
+        surface: what the free tip sees.
+        time_us: the time.
+    """
+    speeds = surface.top_speed_nm_per_us + jnp.abs(time_us) * surface.largest_acceleration_nm_per_us2
+    return _ROUNDINGS * jnp.finfo(speeds.dtype).eps * speeds
 
 
 def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, rows: int) -> ContactTip:
     """Return a tip at its start: free above the gap where the bridge forms or if it has just left, else in the bridge.
 
-    One that has just left starts exactly where contact ends, with the derivatives of the gap that was given.
+    One that has just left starts exactly where contact ends, on its way up, with the derivatives of what was given.
     """
     leaves = has_just_left(driven.surface, driven.ends_nm, time_us, gap_nm, rate)
     gap_nm = gap_nm + lax.stop_gradient(jnp.where(leaves, driven.ends_nm - gap_nm, 0.0))
+    slower = jnp.maximum(slowest_departure(driven.surface, time_us) - rate, 0.0)
+    rate = rate + lax.stop_gradient(jnp.where(leaves, slower, 0.0))
     above = leaves | (gap_nm > driven.junction.forms_gap_nm)
     sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & above
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START)
