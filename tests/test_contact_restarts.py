@@ -209,9 +209,11 @@ def test_a_tip_that_grazes_is_turned_round_by_its_drive_alone():
     )
     # in its steady motion, but for next to nothing
     _, steady = surface_of(scene)
+    assert steady is not None
     position, velocity = (float(part) for part in steady.position_and_velocity(4.0))
     motion = simulate(scene, afm.State(4.0, position, velocity + 1e-7), 1500.0, max_contacts=512)
     rows = motion.contacts
+    assert rows.detail is not None
     left = np.asarray(rows.kind) == ContactKind.IMPACT
     arrival, departure, approach, rebound, deepest = (
         np.asarray(part)[left]
