@@ -505,7 +505,8 @@ def test_files_that_say_another_mode_are_refused_by_name(tmp_path: Path, head: s
 def test_a_curve_that_was_read_leads_to_tapping():
     import fitting  # noqa: PLC0415
 
-    assert fitting.tapping(read_curve(EXAMPLE, **OPTIONS), law=False).valid
+    curve: Any = read_curve(EXAMPLE, **OPTIONS)
+    assert fitting.tapping(curve, law=False).valid
 
 
 # ---- the command
