@@ -1,8 +1,7 @@
 """Which of many scenes have a stable single-impact orbit of which order, and its peak amplitude.
 
 For every scene and every order N the roots of the closing condition are found; where there is one the orbit is read and
-judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 and 3: drive frequency and amplitude),
-`OffsetAmplitudes` of order 1 over drive frequency, restitution and offset (figure 9).
+judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 and 3: drive frequency and amplitude).
 """
 
 from collections.abc import Callable

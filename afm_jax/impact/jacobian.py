@@ -209,7 +209,7 @@ def map_jacobian(scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: Array
     """Return d(time, velocity after) of the next impact over d(time, velocity after) of this one (eqs. 5 and 7).
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`.
+        scene: a scene with a law (`ImpactLaw`, `TabulatedLaw`).
         time_us: when the flight starts, scalar.
         velocity_nm_per_us: lab velocity just after the impact then, scalar.
 

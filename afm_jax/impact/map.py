@@ -121,7 +121,7 @@ def next_impact(
     """Return the next impact of a tip that has just left the platform (eqs. 2-4 and 6; the Poincare map).
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`, however driven.
+        scene: a scene with a law (`ImpactLaw`, `TabulatedLaw`), however driven.
         time_us: when the flight starts, scalar; the tip is then at the platform's position.
         velocity_nm_per_us: tip velocity in the lab just after the impact, scalar, above the platform's velocity.
         max_steps: steps of the search for the impact before it gives up.
@@ -159,7 +159,7 @@ def iterate_map(
     """Return a sequence of impacts: `next_impact` iterated.
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`, however driven.
+        scene: a scene with a law (`ImpactLaw`, `TabulatedLaw`), however driven.
         time_us: when the first flight starts, scalar.
         velocity_nm_per_us: tip velocity in the lab at that time, scalar.
         impacts: how many impacts to follow; a plain integer, it shapes the result.
@@ -407,7 +407,7 @@ def iterate_batch(
     """Return the impacts of many tips: `iterate_map` for every row of a batch of any size.
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`; each parameter a scalar for all rows, or of shape (batch,).
+        scene: a scene with a law (`ImpactLaw`, `TabulatedLaw`); parameters are scalars, or of shape (batch,).
         time_us: when the first flights start, shape (batch,).
         velocity_nm_per_us: tip velocities in the lab then, shape (batch,).
         impacts: how many impacts to follow.

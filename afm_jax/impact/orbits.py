@@ -114,7 +114,7 @@ def single_impact_orbits(scene: SceneLike, order: ArrayLike) -> SingleImpactOrbi
     """Return every single-impact orbit of an order (eq. 9; damped, with viscous loss and delay).
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`, driven by sample, base, force or several of them with one
+        scene: a scene with a law (`ImpactLaw`, `TabulatedLaw`), driven by sample, base, force or several with one
             frequency, without offset ramp.
         order: N, drive periods between impacts; a positive integer, scalar.
 
