@@ -160,7 +160,7 @@ def test_text_json_and_files_of_a_command_name_its_options(tmp_path: Path, monke
         (
             ["tapping-map", "image.npz", "--free-amplitude-nm", "13.4", "--free-phase-deg", "90"],
             "map",
-            ["map/map.html", "map/map.json", "map/map.txt"],
+            ["map/map.json", "map/map.txt"],
             "(--amplitude-error-nm, --phase-error-deg)",
         ),
     ):

@@ -2,17 +2,16 @@
 
 import io
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import BLUE, DARK, label_axes, new_figure, png_of, svg_of
+from afm_jax.plots.picture_style import label_axes, new_figure, png_of
 from afm_jax.results import words_of
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import whole_folder, write_whole
-from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, page_of, pictures_of, text_of
+from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, text_of
 from fitting.tapping_curves.maps import ARRAYS, PixelState, TappingMap
 
 _MOST = 1024
@@ -39,11 +38,11 @@ def map_report(result: TappingMap) -> Report:
         parts = [f"{words_of(name)} {value:+.2g}" for name, value in result.common.items()]
         common = f"The common error of the energy comes of ({unit}, one standard error each): {', '.join(parts)}."
         table = Table("95 of 100 pixels lie between the first and the third number", head, cells)
-        sections = [ReportSection("Energy and virial", [table], "Energy"), ReportSection("Errors", [Text(common)])]
+        sections = [ReportSection("Energy and virial", [table]), ReportSection("Errors", [Text(common)])]
     known = [[words_of(key), f"{one.value:.7g}", one.unit, one.origin] for key, one in result.known.items()]
     head = ["known", "value", "unit", "from"]
-    sections.append(ReportSection("What is known", [Table("Of the instrument", head, known, words=head[2:])], "Known"))
-    sections.append(ReportSection("Notes", [Bullets(result.notes, "Notes:")], "Notes"))
+    sections.append(ReportSection("What is known", [Table("Of the instrument", head, known, words=head[2:])]))
+    sections.append(ReportSection("Notes", [Bullets(result.notes, "Notes:")]))
     return Report(
         title=f"Map {result.source}: {rows} x {columns} pixels, {counts['used']} used, "
         + (f"masked: {', '.join(masked)}" if masked else "none masked"),
@@ -55,36 +54,30 @@ def map_report(result: TappingMap) -> Report:
 
 
 def map_figure(result: TappingMap) -> Figure:
-    """Return energy and virial over the image with colour bars, pixels out of range in grey, and their histograms."""
-    figure = new_figure(11.0, 8.0)
-    axes = figure.subplots(2, 2, height_ratios=(2.0, 1.0))
+    """Return energy and virial over the image with colour bars, pixels out of range in grey."""
+    figure = new_figure(11.0, 5.0)
     used = result.state == PixelState.USED
     step = max(1, int(np.ceil(max(used.shape) / _MOST)))
     size = result.size_m
     extent = None if size is None else (0.0, 1e6 * size[1], 1e6 * size[0], 0.0)
     where = "um" if size is not None else "pixel"
-    for (top, bottom), name, colours in zip(axes.T, ("energy", "virial"), ("viridis", "coolwarm"), strict=True):
-        image, values = getattr(result, name), getattr(result, name)[used]
-        low, high = np.percentile(values, (0.5, 99.5)) if values.size else (0.0, 1.0)
+    for axes, name, colours in zip(figure.subplots(1, 2), ("energy", "virial"), ("viridis", "coolwarm"), strict=True):
+        image = getattr(result, name)
+        low, high = np.percentile(image[used], (0.5, 99.5)) if used.any() else (0.0, 1.0)
         if name == "virial":
             low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
-        top.set_facecolor("#d0d0d0")
+        axes.set_facecolor("#d0d0d0")
         colour = {"cmap": colours, "vmin": low, "vmax": high, "interpolation": "nearest"}
-        shown = top.imshow(image[::step, ::step], extent=extent, **colour)
-        label = f"{'energy of a tap' if name == 'energy' else name} ({result.unit})"
-        figure.colorbar(shown, ax=top, label=label)
-        label_axes(top, x=f"x ({where})", y=f"y ({where})")
-        if values.size:
-            bottom.hist(values, bins=80, range=(low, high) if high > low else None, color=BLUE)
-            bottom.axvline(float(np.median(values)), color=DARK)
-        label_axes(bottom, x=label, y="pixels")
+        shown = axes.imshow(image[::step, ::step], extent=extent, **colour)
+        figure.colorbar(shown, ax=axes, label=f"{name} ({result.unit})", shrink=0.8)
+        label_axes(axes, x=f"x ({where})", y=f"y ({where})")
     common = f"; common error at the median {result.energy_common_error:.2g} {result.unit}" if used.any() else ""
-    figure.suptitle(f"{used.sum()} pixels, {(~used).sum()} masked (grey){common}", fontsize=11)
+    figure.suptitle(f"Energy of a tap: {used.sum()} pixels, {(~used).sum()} masked (grey){common}", fontsize=11)
     return figure
 
 
 def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Write page, picture, JSON, text and the arrays in the formats wanted, and return their paths.
+    """Write picture, JSON, text and the arrays in the formats wanted, and return their paths.
 
     Args:
         result: the map.
@@ -92,16 +85,10 @@ def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[
         formats: of "npz", "gsf" and "zarr".
     """
     payload = {"format": "afm-jax tapping-map", "format_version": 1, **result.to_dict()}
-    report, figure = map_report(result), map_figure(result)
-    # the SVG file has the layout of the PNG drawn before
-    picture = png_of(figure)
-    shows = "Energy and virial over the image, pixels out of range in grey; below, how often each value comes."
-    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
     contents: dict[str, str | bytes] = {
-        "map.html": page_of(replace(report, sections=[seen, *report.sections])),
-        "map.png": picture,
+        "map.png": png_of(map_figure(result)),
         "map.json": strict_json(payload) + "\n",
-        "map.txt": text_of(report) + "\n",
+        "map.txt": text_of(map_report(result)) + "\n",
     }
     if "npz" in formats:
         packed = io.BytesIO()

@@ -7,7 +7,7 @@ on which every energy hangs.
 import enum
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,7 +16,7 @@ from afm_jax.checks import checked
 from afm_jax.results import Result, public_result, words_of
 from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
-from fitting.instruments.lag import free_lag_deg
+from fitting.instruments.lag import PhaseReadings, free_lag_deg, sense_of_phase, turned
 from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
@@ -31,9 +31,8 @@ _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 """Relative standard errors of what is given without one."""
 _USUAL_ZERO_DEG = 0.2
 """Standard error of the free tip's phase where it is given without one."""
-_NEAR_DEG, _READS_DEG = 20.0, 2.0
-"""How near to the opposite of its lag the free tip must read for a phase that leads to be the likelier one; how near to
-its lag for the instrument to have no zero of its own."""
+_DECIDING = 4096
+"""Pixels that tell the sign of the phase, evenly chosen."""
 _BLOCK = 1 << 16
 """Pixels that are computed at once, for the memory."""
 _UNITS = {
@@ -157,10 +156,10 @@ def tapping_map(
     known = _known(images, given, notes)
     value = {key: float(one.value) for key, one in known.items()} | {"harmonics_factor": HARMONICS_FACTOR.value}
     amplitude = images.amplitude * (value["nm_per_volt"] if images.in_volts else 1.0)
-    behind = _half_turn(images.phase_deg - value["free_phase_deg"])
-    measured = np.isfinite(amplitude) & (amplitude > 0.0) & np.isfinite(behind)
+    measured = np.isfinite(amplitude) & (amplitude > 0.0) & np.isfinite(images.phase_deg)
     if not measured.any():
         raise TableError(f"{images.source}: no pixel has both an amplitude above 0 and a phase")
+    behind = turned(images.phase_deg - value["free_phase_deg"])
     noise = [
         _roughness(amplitude, images.source) if amplitude_error_nm is None else amplitude_error_nm,
         _roughness(behind, images.source) if phase_error_deg is None else phase_error_deg,
@@ -170,32 +169,49 @@ def tapping_map(
             f"Noise: {noise[0]:.3g} nm and {noise[1]:.3g} degrees a pixel, from the roughness along the lines "
             "(`amplitude_error_nm=...`, `phase_error_deg=...`)."
         )
-    stated = {"lag": 1.0, "lead": -1.0}.get(phase_sense or "", images.sense)
-    senses = {
-        sense: _taps(drive, value, _errors(known, value), amplitude[measured], sense * behind[measured], noise)
-        for sense in ([stated] if stated else [1.0, -1.0])
-    }
-    taps, undecided = _sense(senses, value["free_phase_deg"], _free_lag(drive, value), notes)
-    unit = "aJ" if _spring_is_known(known) else "nm^2"
+    errors = _errors(known, value)
+    readings = _readings(drive, value, errors, amplitude[measured], images.phase_deg[measured], noise)
+    sense = sense_of_phase(readings, phase_sense or {1.0: "lag", -1.0: "lead"}.get(images.sense, ""))
+    notes += sense.notes
+    if sense.origin == "assumed":
+        # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
+        errors["free_frequency_khz"] += readings.detuning * value["free_frequency_khz"]
+    pixels = np.flatnonzero(measured)
+    amplitudes, lags = amplitude.ravel(), sense.sign * behind.ravel()
+    blocks = [pixels[first : first + _BLOCK] for first in range(0, len(pixels), _BLOCK)]
+    found = [_of_rows(drive, value, amplitudes[block], lags[block], noise) for block in blocks]
+    values, own = np.concatenate(found, axis=2)
+    median = int(np.argsort(values[0])[(values.shape[1] - 1) // 2])
+    there = pixels[[median]]
+    changes = {}
+    for name, error in errors.items():
+        lag = lags[there] - (sense.sign * error if name == "free_phase_deg" else 0.0)
+        changed = _of_rows(drive, value | {name: value[name] + error}, amplitudes[there], lag, noise)
+        changes[name] = changed[0, :, 0] - values[:, median]
+    energy_error, virial_error = np.linalg.norm(list(changes.values()), axis=0).tolist()
+    total = np.hypot(own[0], energy_error)
     state = np.full(amplitude.shape, PixelState.NOT_MEASURED, dtype=np.int8)
     state[measured] = np.where(
         amplitude[measured] > value["free_amplitude_nm"] + _BEYOND * noise[0],
         PixelState.AMPLITUDE_ABOVE_FREE,
-        np.where(taps.values[0] < -_BEYOND * taps.total_errors, PixelState.ENERGY_BELOW_ZERO, PixelState.USED),
+        np.where(values[0] < -_BEYOND * total, PixelState.ENERGY_BELOW_ZERO, PixelState.USED),
     )
     arrays = np.full((4, *amplitude.shape), np.nan)
-    arrays[:, measured] = np.stack([taps.values[0], taps.errors[0], taps.values[1], taps.errors[1]])
+    arrays[:, measured] = np.stack([values[0], own[0], values[1], own[1]])
     arrays[:, state != PixelState.USED] = np.nan
+    unit = "aJ" if _spring_is_known(known) else "nm^2"
+    common = {name: float(change[0]) for name, change in changes.items()}
+    parts = {words_of(name): abs(part) for name, part in common.items()} | {"noise of a pixel": float(own[0, median])}
     return TappingMap(
         source=images.source,
         drive=drive,
         unit=unit,
         **dict(zip(ARRAYS, arrays, strict=True)),
         state=state,
-        energy_common_error=taps.common_error,
-        virial_common_error=float(np.linalg.norm([change[1] for change in taps.common.values()])),
-        common={name: change[0] for name, change in taps.common.items()},
-        reasons=tuple(filter(None, [undecided, *_reasons(taps, state, unit)])),
+        energy_common_error=energy_error,
+        virial_common_error=virial_error,
+        common=common,
+        reasons=(*filter(None, [sense.reason]), *_reasons(float(values[0, median]), energy_error, parts, state, unit)),
         size_m=images.size_m,
         known=known,
         notes=tuple(notes),
@@ -244,17 +260,6 @@ def _errors(known: dict[str, Known], value: dict[str, float]) -> dict[str, float
     return errors
 
 
-def _half_turn(degrees: Any) -> Any:
-    """Return angles between -180 and 180 degrees."""
-    return (degrees + 180.0) % 360.0 - 180.0
-
-
-def _free_lag(drive: str, value: dict[str, float]) -> float:
-    """Return the lag of the free tip in degrees."""
-    ratio = value["drive_frequency_khz"] / value["free_frequency_khz"]
-    return float(free_lag_deg(drive, ratio, value["quality_factor"]))
-
-
 def _roughness(image: Float[np.ndarray, "rows columns"], source: str) -> float:
     """Return the noise of a pixel: the spread of second differences along the lines, robust against edges.
 
@@ -269,61 +274,30 @@ def _roughness(image: Float[np.ndarray, "rows columns"], source: str) -> float:
     return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
 
 
-class _Taps(NamedTuple):
-    """Energies and virials of pixels for one sense of the phase.
-
-    Attributes:
-        values: energies and virials.
-        errors: their standard errors from each pixel's own noise.
-        median: place of the median energy.
-        common: how energy and virial there change with one standard error of each number that all pixels share.
-    """
-
-    values: Float[np.ndarray, "2 pixels"]
-    errors: Float[np.ndarray, "2 pixels"]
-    median: int
-    common: dict[str, list[float]]
-
-    @property
-    def energy(self) -> float:
-        """The median energy."""
-        return float(self.values[0, self.median])
-
-    @property
-    def common_error(self) -> float:
-        """The standard error of the median energy that all pixels have in common."""
-        return float(np.linalg.norm([change[0] for change in self.common.values()]))
-
-    @property
-    def total_errors(self) -> Float[np.ndarray, " pixels"]:
-        """Standard errors of the energies, own noise and what all have in common together."""
-        return np.hypot(self.errors[0], self.common_error)
-
-    @property
-    def possible(self) -> bool:
-        """Whether the median energy is not below zero beyond its errors."""
-        return self.energy + _BAND * self.common_error >= 0.0
-
-
-def _taps(
-    drive: Literal["base", "force"],
+def _readings(
+    drive: str,
     value: dict[str, float],
     errors: dict[str, float],
     amplitude: Float[np.ndarray, " pixels"],
-    behind: Float[np.ndarray, " pixels"],
+    phase: Float[np.ndarray, " pixels"],
     noise: list[float],
-) -> _Taps:
-    """Return what pixels mean that lag behind the free tip by so many degrees."""
-    blocks = [slice(first, first + _BLOCK) for first in range(0, len(amplitude), _BLOCK)]
-    parts = [_of_rows(drive, value, amplitude[block], behind[block], noise) for block in blocks]
-    values, own = np.concatenate(parts, axis=2)
-    median = int(np.argsort(values[0])[(len(amplitude) - 1) // 2])
-    common = {}
-    for name, error in errors.items():
-        turned = behind[[median]] - (error if name == "free_phase_deg" else 0.0)
-        changed = _of_rows(drive, value | {name: value[name] + error}, amplitude[[median]], turned, noise)
-        common[name] = (changed[0, :, 0] - values[:, median]).tolist()
-    return _Taps(values, own, median, common)
+) -> PhaseReadings:
+    """Return what of pixels says which sense their phase has, the free tip in front."""
+    chosen = np.linspace(0, len(amplitude) - 1, min(len(amplitude), _DECIDING)).astype(int)
+    ratio, ones = amplitude[chosen] / value["free_amplitude_nm"], np.ones(len(chosen) + 1)
+    relative = {key: errors[key] / value[key] for key in _USUAL if key in errors}
+    return PhaseReadings(
+        drive=drive,
+        frequency_ratio=value["drive_frequency_khz"] / value["free_frequency_khz"] * ones,
+        frequency_error=relative["free_frequency_khz"],
+        quality_factor=value["quality_factor"],
+        quality_error=relative["quality_factor"],
+        ratio=np.append(1.0, ratio),
+        ratio_error=np.hypot(noise[0] / value["free_amplitude_nm"], relative["free_amplitude_nm"]) * ones,
+        phase_deg=np.append(value["free_phase_deg"], phase[chosen]),
+        phase_error_deg=np.hypot(noise[1], errors["free_phase_deg"]) * ones,
+        free=np.arange(len(ones)) == 0,
+    )
 
 
 def _of_rows(
@@ -335,16 +309,17 @@ def _of_rows(
 ) -> Float[np.ndarray, "2 2 pixels"]:
     """Return energies and virials of pixels and their errors from noise, as those of rows of a tapping curve."""
     ones, f0, q = np.ones(len(amplitude)), value["free_frequency_khz"], value["quality_factor"]
+    drive_frequency = value["drive_frequency_khz"]
     curve = TappingCurve(
         source="",
         drive=drive,
         offset_nm=ones,
         amplitude_nm=amplitude,
         amplitude_error_nm=noise[0] * ones,
-        lag_deg=_free_lag(drive, value) + behind,
+        lag_deg=free_lag_deg(drive, drive_frequency / f0, q) + behind,
         lag_error_deg=noise[1] * ones,
         free_amplitude_nm=value["free_amplitude_nm"] * ones,
-        drive_frequency_khz=value["drive_frequency_khz"] * ones,
+        drive_frequency_khz=drive_frequency * ones,
         retract=ones < 0.0,
         free_frequency_khz=Given(f0),
         quality_factor=Given(q),
@@ -356,62 +331,33 @@ def _of_rows(
     return np.array([[found.energy_aj, found.virial_aj], [noise_of(curve, found), virial_noise_of(curve, found)]])
 
 
-def _sense(senses: dict[float, _Taps], reading: float, lag: float, notes: list[str]) -> tuple[_Taps, str]:
-    """Return the pixels in the sense of the phase, and why it is undecided.
-
-    No sample gives energy: a sense that makes the median energy negative is wrong. Near resonance both make it about
-    the same; one is assumed, and the other a part of the error. Elsewhere a free tip that reads its lag, or the
-    opposite, decides.
+def _reasons(
+    energy: float, common: float, parts: dict[str, float], state: Int[np.ndarray, "rows columns"], unit: str
+) -> list[str]:
+    """Return why the energies must not be used.
 
     Args:
-        senses: what the pixels mean where the phase lags (1) or leads (-1); one alone was stated.
-        reading: of the free tip, in degrees.
-        lag: of the free tip, in degrees.
-        notes: get what was decided or assumed.
+        energy: of the median pixel.
+        common: its standard error that all pixels have in common.
+        parts: standard errors of that energy by what they come from, in words.
+        state: of all pixels.
+        unit: of energies.
     """
-    if len(senses) == 1:
-        return next(iter(senses.values())), ""
-    words = {1.0: "lags", -1.0: "leads"}
-    off = {sense: abs(_half_turn(reading - sense * lag)) for sense in senses}
-    likelier = -1.0 if off[-1.0] < _NEAR_DEG < off[1.0] else 1.0
-    taps, other = senses[likelier], senses[-likelier]
-    state = 'say `phase_sense="lag|lead"`'
-    if taps.possible != other.possible:
-        likelier = likelier if taps.possible else -likelier
-        notes.append(f"Sense: the phase {words[likelier]}; the other way energies would be below zero.")
-    elif abs(lag - 90.0) < _NEAR_DEG:
-        notes.append(
-            f"Sense: assumed: the phase {words[likelier]}. The energy hardly hangs on it, but the sign of the virial "
-            f"does, attractive or repulsive; {state}."
-        )
-        return taps._replace(common=taps.common | {"sense_of_the_phase": [taps.energy - other.energy, 0.0]}), ""
-    elif off[likelier] < _READS_DEG and off[-likelier] > 3.0 * _READS_DEG:
-        notes.append(f"Sense: the phase {words[likelier]}; the free tip reads {reading:.1f} deg, its lag is {lag:.1f}.")
-    elif taps.possible:
-        both = f"{senses[1.0].energy:.3g} where it lags, {senses[-1.0].energy:.3g} where it leads"
-        return taps, f"the sense of the phase is not known, and the median energy hangs on it ({both}); {state}"
-    return senses[likelier], ""
-
-
-def _reasons(taps: _Taps, state: Int[np.ndarray, "rows columns"], unit: str) -> list[str]:
-    """Return why the energies must not be used."""
     used, above, below = (int(np.sum(state == one)) for one in list(PixelState)[:3])
     doubt = "free amplitude, its phase, quality factor or units do not belong to this image"
-    total = float(taps.total_errors[taps.median])
-    low, high = max(taps.energy - _BAND * total, 0.0), taps.energy + _BAND * total
+    total = float(np.hypot(common, parts["noise of a pixel"]))
     reasons = []
-    if 2 * used < len(taps.errors[0]):
+    if used < above + below:
         why = f"{above} with an amplitude above the free one, {below} with an energy below zero"
-        reasons.append(f"only {used} of {len(taps.errors[0])} pixels are in range ({why}): {doubt}")
-    if not taps.possible:
-        said = f"{taps.energy:.3g} +- {taps.common_error:.2g} {unit}"
-        reasons.append(f"the median energy is below zero beyond its errors ({said}): {doubt}")
-    elif _BAND * total > 0.5 * taps.energy:
-        shares = {words_of(name): abs(change[0]) for name, change in taps.common.items()}
-        shares["noise of a pixel"] = float(taps.errors[0, taps.median])
-        largest = max(shares, key=lambda name: shares[name])
+        reasons.append(f"only {used} of {used + above + below} pixels are in range ({why}): {doubt}")
+    if energy + _BAND * common < 0.0:
+        reasons.append(
+            f"the median energy is below zero beyond its errors ({energy:.3g} +- {common:.2g} {unit}): {doubt}"
+        )
+    elif _BAND * total > 0.5 * energy:
+        low, high = max(energy - _BAND * total, 0.0), energy + _BAND * total
         reasons.append(
             f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} {unit} in the median pixel "
-            f"({taps.energy:.3g} +- {total:.2g}); most of its error comes from {largest}"
+            f"({energy:.3g} +- {total:.2g}); most of its error comes from {max(parts, key=lambda name: parts[name])}"
         )
     return reasons

@@ -464,7 +464,7 @@ TAPPING_MAP = Command(
     its program on the file). Needed are amplitude and phase of the free tip, at the same drive. Each pixel has its own
     error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said once.
     Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
-    With --out the report: map.html, .png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
+    With --out map.png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
     median energy is below zero or only bracketed, or the sense of the phase decides and is not known.
     """,
     options=(
