@@ -20,9 +20,9 @@ from afm_jax.cli.main import main
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.presets import preset
-from afm_jax.scenefile.scenefile import Start
+from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.solve.lanes import LANES, filled
-from afm_jax.studies.sweep import STORE, input_of, plan_of, run_plan, sweep
+from afm_jax.studies.sweep import STORE, plan_of, run_plan, sweep
 from tests.kills import ROOT, chunks_done, survive
 from tests.sweep_numbers import contents, plan
 
@@ -99,7 +99,8 @@ def test_workers_give_what_one_process_does(tmp_path: Path, monkeypatch: pytest.
     # as JAX leaves it behind
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
     axes = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 200]}]
-    wanted = plan_of(input_of(preset("figure2"), axes, {"what": "orbits"}, chunk=30))
+    scene = scene_tables(preset("figure2"))
+    wanted = plan_of({"scene": scene, "axes": axes, "record": {"what": "orbits"}, "chunk": 30})
     for folder, workers in (("one", 1), ("two", 2)):
         assert run_plan(wanted, tmp_path / folder, workers=workers).computed == 7
     one, two = (xarray.open_zarr(str(tmp_path / folder / STORE)).load() for folder in ("one", "two"))

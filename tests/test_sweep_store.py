@@ -13,6 +13,7 @@ import xarray
 
 from afm_jax.plots.sweeps import sweep_figure
 from afm_jax.scenefile.presets import preset
+from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.studies import sweep as sweeps
 from afm_jax.studies.sweep import (
     FORMAT_VERSION,
@@ -20,7 +21,6 @@ from afm_jax.studies.sweep import (
     SweepPlan,
     axes_of,
     compute_chunk,
-    input_of,
     plan_of,
     run_plan,
 )
@@ -35,7 +35,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a whole sweep, which tests only read."""
     folder = tmp_path_factory.mktemp("whole")
     done = run_plan(plan(), folder)
-    assert (done.chunks, done.computed) == (14, 14)
+    assert (done.kept, done.computed) == (0, 14)
     return folder
 
 
@@ -192,7 +192,7 @@ def test_a_worker_with_other_versions_is_refused(monkeypatch: pytest.MonkeyPatch
     for name in ("open_cache", "silence_xla"):
         monkeypatch.setattr(sweeps, name, lambda: None)
     axes = [{"parameter": "platform.amplitude_nm", "list": [1.0]}]
-    given = plan_of(input_of(preset("figure2"), axes, {"what": "orbits"})).given
+    given = plan_of({"scene": scene_tables(preset("figure2")), "axes": axes, "record": {"what": "orbits"}}).given
     other = given | {"versions": given["versions"] | {"jax": "0.0.1"}}
     with pytest.raises(RuntimeError, match=r"a worker would compute otherwise than the others: jax is .*, not 0.0.1"):
         compute_chunk(json.dumps(other), (slice(0, 1),))

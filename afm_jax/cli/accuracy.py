@@ -1,4 +1,4 @@
-"""`afm-jax accuracy`: error against time, of a value and of its gradient, and the cheapest way to a wanted error."""
+"""`afm-jax accuracy`: error against time, of a value and of its gradient."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,24 +6,14 @@ from typing import Any
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import scene_and_start
-from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.columns import columns_of, printed_table
 from afm_jax.studies import timing
-from afm_jax.studies.accuracy import cheapest
 
 _COLUMNS = ("of", "method", "setting", "microseconds", "error", "compile_s", "reason")
-_CELLS = {"of": "of", "method": "method", "setting": "setting", "us": "microseconds", "error": "error"}
-_CHEAPEST: dict[str, Cell] = {
-    "of": "of",
-    "error": "wanted_error:g",
-    "afm-jax": lambda row: row["afm_jax"] or "none",
-    "us": "afm_jax_microseconds",
-    "SciPy, Diffrax": lambda row: row["rival"] or "none",
-    "us there": "rival_microseconds",
-}
-WANTED = (1e-3, 1e-6, 1e-9, 1e-11)
+_CELLS = {name: name for name in ("of", "method", "setting", "microseconds", "error", "compile_s")}
 
 
-def accuracy(session: Session, study: str, wanted_error: float, *, contacts: int, quick: bool) -> Output:
+def accuracy(session: Session, study: str, *, contacts: int, quick: bool) -> Output:
     """Measure errors and times of the impact map, of collisions, or of a scene."""
     if study not in ("map", "collide"):
         # what is wrong with a file is said at once, and what it leaves to be assumed
@@ -31,17 +21,15 @@ def accuracy(session: Session, study: str, wanted_error: float, *, contacts: int
     with session.working("measuring"):
         settings = {"problem": study, "contacts": contacts, "quick": quick}
         result = timing.run_in_own_process("afm_jax.studies.accuracy:measured", settings)
-    rows, choices = result["rows"], cheapest(result["rows"], sorted({*WANTED, wanted_error}))
-    cells = _CELLS | {"compile s": "compile_s"}
+    rows = result["rows"]
     return Output(
-        payload={"problem": study, **result, "cheapest": choices},
+        payload={"problem": study, **result},
         text=[
             printed_table(
-                f"Error of the {result['value_of']} and of its gradient against time", cells, rows, form=".3g"
+                f"Error of the {result['value_of']} and of its gradient against time", _CELLS, rows, form=".3g"
             ),
             *dict.fromkeys(f"{row['method']}, {row['setting']}: {row['reason']}" for row in rows if "reason" in row),
             reference_sentence(result),
-            printed_table("The fastest way to a wanted error", _CHEAPEST, choices, form=".3g"),
         ],
         tables={"accuracy.csv": columns_of(rows, _COLUMNS)},
         files={"accuracy.png": picture_of("accuracy:accuracy_figure", result)},

@@ -1,6 +1,9 @@
 """`afm-jax sweep SWEEP.toml --out DIR`: a grid of scenes, in chunks, on all cores; goes on where it was."""
 
+import math
+from collections import Counter
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +14,15 @@ from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import scene_and_start
-from afm_jax.scenefile.scenefile import read_toml, scene_of_tables
-from afm_jax.studies.sweep import STORE, SweepPlan, input_of, plan_of, processes_for, run_plan, swept
+from afm_jax.compilation_cache import available_cores
+from afm_jax.scenefile.scenefile import read_toml, scene_of_tables, scene_tables
+from afm_jax.studies.sweep import EXTRAPOLATED, MESSAGE, STORE, SweepPlan, plan_of, run_plan
+from afm_jax.words import counted
 
 _KEYS = {"scene": (str, dict), "record": (dict,), "axes": (list,), "accuracy": (float, int), "chunk": (int,)}
 _MOST_DRAWN = 2
 """Axes of a sweep that a picture can show."""
+_MOST_MESSAGES = 3
 
 
 def sweep(
@@ -31,12 +37,44 @@ def sweep(
         raise ValueError(said if said.startswith(str(sweep)) else f"{sweep}: {said}") from error
     if plot and len(plan.axes) > _MOST_DRAWN:
         raise click.UsageError(f"--plot draws sweeps of one or two axes, but this has {len(plan.axes)}: slice it first")
-    number = processes_for(plan) if workers is None and scheduler is None else workers or 1
+    if workers is None:
+        # batches take every core themselves
+        alone = plan.recorder.alone and scheduler is None and find_spec("distributed") is not None
+        workers = min(available_cores(), len(plan.regions())) if alone else 1
     with session.working("computing (the first chunk compiles)", "points") as report:
-        run = run_plan(plan, session.out, workers=number, scheduler=scheduler, report=report)
-    result = swept(plan, run, session.out / STORE)
-    files = {"sweep.png": partial(_draw, plan, result.store)} if plot else {}
-    return Output(payload=result.to_dict(), text=result.printed(), files=files)
+        run = run_plan(plan, session.out, workers=workers, scheduler=scheduler, report=report)
+    store, points, chunks = session.out / STORE, math.prod(plan.shape), run.kept + run.computed
+    messages, beyond = Counter[str](), None
+    with xarray.open_zarr(str(store)) as found:
+        if MESSAGE.name in found:
+            messages.update(text for text in found[MESSAGE.name].values.ravel().tolist() if text)
+        if EXTRAPOLATED in found:
+            outside = int(found[EXTRAPOLATED].values.reshape(points, -1).any(axis=1).sum())
+            if outside:
+                beyond = f"Extrapolated: at {outside} of {points} points {found[EXTRAPOLATED].attrs['long_name']}."
+    many = sum(messages.values())
+    grid = f"{' x '.join(map(str, plan.shape))} points in {counted(chunks, 'chunk')}"
+    lines = [f"{grid}. Computed in {run.seconds:.1f} s: {run.computed}; done before and kept: {run.kept}."]
+    if many:
+        lines.append(f"{many} points have no result to be trusted (`message` says why), most of them:")
+        lines += [f"  {count}: {text}" for text, count in messages.most_common(_MOST_MESSAGES)]
+    payload = {
+        "store": store,
+        "points": points,
+        "shape": plan.shape,
+        "chunks": chunks,
+        "chunks_kept": run.kept,
+        "chunks_computed": run.computed,
+        "seconds": run.seconds,
+        "without_result": many,
+        "messages": dict(messages),
+        "extrapolated": beyond,
+    }
+    return Output(
+        payload=payload,
+        text=[*lines, f"Open them with xarray.open_zarr({str(store)!r}).", beyond],
+        files={"sweep.png": partial(_draw, plan, store)} if plot else {},
+    )
 
 
 def _draw(plan: SweepPlan, store: Path, target: Path) -> None:
@@ -66,6 +104,5 @@ def _plan(given: dict[str, Any], folder: Path, law: Path | None) -> SweepPlan:
         scene, start = scene_and_start(str(beside) if beside.exists() else given["scene"])
     scene, _ = with_fitted_law(scene, law)
     # a start is of use for simulations alone
-    start = start if given["record"].get("what") == "simulation" else None
-    settings = {"accuracy": given.get("accuracy"), "chunk": given.get("chunk")}
-    return plan_of(input_of(scene, given.get("axes", []), given["record"], start=start, **settings))
+    begin = start._asdict() if start is not None and given["record"].get("what") == "simulation" else None
+    return plan_of(given | {"scene": scene_tables(scene), "start": begin})

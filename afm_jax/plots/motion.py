@@ -1,7 +1,8 @@
 """Pictures of a simulated motion: its course in time, its contacts, its Poincare section and its spectrum."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -38,10 +39,15 @@ _MANY = 12
 """Contacts from which on the peaks of all flights are shown besides."""
 _GAP_PANELS = 3
 _GAP_SHOWN_NM = 6.0
-_CURVES = 3
-_STROKES = ((GRID, 5.0), (BLUE, 3.2), ("black", 1.4))
+_STROKES = ((GRID, 5.0), ("#56B4E9", 3.2), ("black", 1.4))
 """Wide below narrow, so that loops that coincide all show."""
-_SIDE = {"bridge breaks": "center", "bridge forms": "center", "junction breaks": "bottom", "junction forms": "top"}
+_MARKS = {
+    "bridge breaks": (BLUE, (0, (1, 2))),
+    "bridge forms": (BLUE, "--"),
+    "junction breaks": (ACCENT, (0, (1, 2))),
+    "junction forms": (ACCENT, "--"),
+}
+"""Colour and line of the gaps at which the phase of a contact changes."""
 _MOST_PERIODS = 60
 """Of the drive; each contact in them is integrated once more."""
 _SAMPLES_PER_PERIOD = 32
@@ -60,8 +66,8 @@ def draw_motion(
 ) -> list[Path]:
     """Draw what there is to see of a motion, as PNG files.
 
-    Always the time course and the spectrum; with contacts the gap and the Poincare section, and of resolved contacts
-    the force against the gap.
+    Always the time course and the spectrum; with contacts the Poincare section, and of resolved contacts the gap and
+    the force against it.
 
     Args:
         scene: the scene that was simulated.
@@ -78,10 +84,10 @@ def draw_motion(
     """
     look = look_at(scene, simulation, verdict=verdict, dense=dense)
     figures = {"time_course": course_figure, "spectrum": spectrum_figure}
-    if look.touched:
-        figures |= {"gap": gap_figure}
-        figures |= {"poincare": section_figure} if look.left else {}
-        figures |= {"force_gap": force_gap_figure} if isinstance(scene.interaction, Contact) else {}
+    if np.isfinite(look.departure_us).any():
+        figures |= {"poincare": section_figure}
+    if look.used.any() and isinstance(scene.interaction, Contact):
+        figures |= {"gap": gap_figure, "force_gap": force_gap_figure}
     files = []
     for name, figure in figures.items():
         files.append(folder / f"{name}.png")
@@ -143,16 +149,6 @@ class Look(NamedTuple):
         """Return the part of the path between two times."""
         inside = (self.path.time_us >= from_us) & (self.path.time_us <= to_us)
         return Trajectory(*(column[inside] for column in self.path))
-
-    @property
-    def touched(self) -> bool:
-        """Whether the tip ever met the sample."""
-        return bool(self.used.any())
-
-    @property
-    def left(self) -> bool:
-        """Whether the tip ever left it again."""
-        return bool(np.isfinite(self.departure_us).any())
 
     @property
     def arrival_us(self) -> Float[np.ndarray, " contacts"]:
@@ -244,16 +240,12 @@ def _edges(rows: Contacts, used: Bool[np.ndarray, " rows"]) -> Float[np.ndarray,
 
 def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
     """Shade where the tip is in the bridge or in the junction, or held by the platform of a law."""
-    resolved = isinstance(contact, Contact)
-    names = {Phase.BRIDGE: "liquid bridge", Phase.JUNCTION: "solid junction" if resolved else "held by the platform"}
-    for phase, colour in ((Phase.BRIDGE, BLUE), (Phase.JUNCTION, ACCENT)):
+    joined = "solid junction" if isinstance(contact, Contact) else "held by the platform"
+    for phase, colour, name in ((Phase.BRIDGE, BLUE, "liquid bridge"), (Phase.JUNCTION, ACCENT, joined)):
         inside = path.phase == phase
-        edges = np.diff(np.concatenate([[0], inside.astype(int), [0]]))
-        label: str | None = names[phase]
-        for begin, stop in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
-            right = path.time_us[min(stop, path.time_us.size - 1)]
-            axes.axvspan(path.time_us[begin], right, color=colour, alpha=0.18, linewidth=0, label=label)
-            label = None
+        if inside.any():
+            style: dict[str, Any] = {"color": colour, "alpha": 0.18, "linewidth": 0, "label": name}
+            axes.fill_between(path.time_us, 0, 1, where=inside, transform=axes.get_xaxis_transform(), **style)
 
 
 def course_figure(look: Look) -> Figure:
@@ -279,23 +271,20 @@ def _course(axes: Axes, look: Look) -> None:
     shade_phases(axes, look.path, look.scene.interaction)
     with_zero_line(axes)
     axes.set_xlim(look.from_us, look.to_us)
-    # room for the legend above the curves
+    _with_legend_above(axes, x="time (µs)", y="height (nm)")
+    shown = int(look.used.sum())
+    what = f"The last contacts of {shown}" if shown else "Last periods"
+    if is_stuck(look.scene, look.simulation):
+        what += ", the sample holds the tip"
+    axes.set_title(what, fontsize=12, loc="left")
+
+
+def _with_legend_above(axes: Axes, *, x: str, y: str) -> None:
+    """Label the axes, and put a legend into room above the curves."""
     low, high = axes.get_ylim()
     axes.set_ylim(low, high + 0.22 * (high - low))
-    label_axes(axes, x="time (µs)", y="height (nm)")
+    label_axes(axes, x=x, y=y)
     axes.legend(loc="upper right", fontsize=10, ncols=5, framealpha=1.0)
-    axes.set_title(_title(look), fontsize=12, loc="left")
-
-
-def _title(look: Look) -> str:
-    if not look.touched:
-        what = "the tip never meets the sample" if look.scene.interaction is not None else "a free cantilever"
-        return f"Last periods; {what}"
-    shown = int(look.used.sum())
-    if np.isfinite(look.departure_us[-1]):
-        return f"The last contacts of {shown}"
-    end = "the sample holds the tip" if is_stuck(look.scene, look.simulation) else "the last one not over at the end"
-    return f"The last contacts of {shown}, {end}"
 
 
 def _peaks(axes: Axes, look: Look) -> None:
@@ -308,61 +297,26 @@ def _peaks(axes: Axes, look: Look) -> None:
     axes.axvspan(look.from_us, look.to_us, color=GRID, alpha=0.4, linewidth=0, label="shown above")
     with_zero_line(axes)
     what = "contact" if isinstance(look.scene.interaction, Contact) else "impact"
-    label_axes(axes, x="time (µs)", y=f"peak after each {what} (nm)")
-    low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.15 * (high - low))
-    axes.legend(loc="upper right", fontsize=10, framealpha=1.0)
+    _with_legend_above(axes, x="time (µs)", y=f"peak after each {what} (nm)")
 
 
 def gap_figure(look: Look) -> Figure:
-    """Return the gap around the last contacts; of impacts that take no time, over the flights between."""
-    return _gap_of_contacts(look) if isinstance(look.scene.interaction, Contact) else _gap_of_flights(look)
-
-
-def _gap_of_flights(look: Look) -> Figure:
-    picture = new_figure(10.0, 4.4)
-    axes = picture.subplots()
-    axes.plot(look.path.time_us, look.path.gap_nm, color="black", linewidth=1.6)
-    with_zero_line(axes)
-    shade_phases(axes, look.path, look.scene.interaction)
-    shown = look.arrival_us[(look.arrival_us >= look.path.time_us[0]) & (look.arrival_us <= look.path.time_us[-1])]
-    axes.plot(shown, np.zeros_like(shown), "o", color=ACCENT, markersize=5, label="impacts", clip_on=False)
-    axes.set_xlim(look.path.time_us[0], look.path.time_us[-1])
-    label_axes(axes, x="time (µs)", y="gap (nm)")
-    axes.set_title(f"gap over the last {shown.size} of {look.arrival_us.size} impacts", fontsize=12, loc="left")
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=10, frameon=False)
-    return picture
-
-
-def _gap_of_contacts(look: Look) -> Figure:
     """Return the gap around the last contacts, a panel each, with the gaps at which the phase changes."""
     rows = np.arange(look.arrival_us.size)[-_GAP_PANELS:]
-    picture = new_figure(4.0 * len(rows) + 1.0, 4.4)
+    picture = new_figure(4.0 * len(rows) + 1.0, 4.8)
     panels = picture.subplots(1, len(rows), squeeze=False, sharey=True)[0]
     contact = look.scene.interaction
-    marks = _marks(contact)
-    top = 0.0
     for axes, row in zip(panels, rows, strict=True):
-        begin, end = _around(look, int(row))
-        part = look.between(begin, end)
+        part = look.between(*_around(look, int(row)))
         since = part._replace(time_us=part.time_us - look.arrival_us[row])
         axes.plot(since.time_us, since.gap_nm, color="black", linewidth=1.8)
         shade_phases(axes, since, contact)
-        for gap in marks.values():
-            axes.axhline(gap, color=DARK, linewidth=0.9, linestyle=(0, (1, 2)))
+        _mark(axes.axhline, contact)
         with_zero_line(axes)
         axes.set_xlim(since.time_us[0], since.time_us[-1])
-        label_axes(axes, x=f"time after {look.arrival_us[row]:.2f} µs (µs)", y="")
+        label_axes(axes, x=f"time after {look.arrival_us[row]:.2f} µs (µs)", y="gap (nm)" if row == rows[0] else "")
         axes.set_title(f"contact {row + 1} of {look.arrival_us.size}", fontsize=11, loc="left")
-        top = max(top, float(since.gap_nm.max()))
-    panels[0].set_ylabel("gap (nm)", fontsize=12)
-    lowest = min(axes.get_ylim()[0] for axes in panels)
-    panels[0].set_ylim(lowest, 1.35 * top)
-    for name, gap in marks.items():
-        panels[-1].annotate(f" {name}", (1.0, gap), xycoords=("axes fraction", "data"), va=_SIDE[name], fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
-    if handles:
-        panels[0].legend(handles, labels, loc="upper center", fontsize=10, framealpha=1.0)
+    picture.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=10)
     return picture
 
 
@@ -376,22 +330,19 @@ def _around(look: Look, row: int) -> tuple[float, float]:
     return max(first, min(arrival, end) - lead), min(last, max(arrival, end) + lead)
 
 
-def _marks(contact: Contact) -> dict[str, float]:
-    """Return the gaps at which the phase of a contact changes, the inner two only where they can be told apart."""
+def _mark(line: Callable[..., object], contact: Contact) -> None:
+    """Draw a line, of either direction, at each gap at which the phase of a contact changes."""
     junction = find_junction(contact)
-    return {
-        "bridge breaks": float(contact.bridge_breaks_nm),
-        "bridge forms": float(contact.bridge_forms_nm),
-        "junction breaks": float(junction.breaks_gap_nm),
-        "junction forms": float(junction.forms_gap_nm),
-    }
+    gaps = contact.bridge_breaks_nm, contact.bridge_forms_nm, junction.breaks_gap_nm, junction.forms_gap_nm
+    for (name, (colour, dashes)), gap in zip(_MARKS.items(), gaps, strict=True):
+        line(float(gap), color=colour, linewidth=1.0, linestyle=dashes, label=name)
 
 
 def force_gap_figure(look: Look) -> Figure:
     """Return the force against the gap through the last contacts: all of it, and the attractive part."""
     picture = new_figure(12.0, 5.0)
     whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
-    rows = np.arange(look.arrival_us.size)[-_CURVES:]
+    rows = np.arange(look.arrival_us.size)[-_GAP_PANELS:]
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
         path_of_row = look.between(*_around(look, int(row)))
@@ -401,23 +352,7 @@ def force_gap_figure(look: Look) -> Figure:
         least = min(least, float(path_of_row.force_nn.min()))
         for axes in (whole, part):
             axes.plot(path_of_row.gap_nm, path_of_row.force_nn, color=colour, linewidth=width, label=label)
-    for name, gap in _marks(look.scene.interaction).items():
-        part.axvline(gap, color=DARK, linewidth=0.9, linestyle=(0, (1, 2)))
-        # two close lines have their names on their outer sides; left of where the junction forms the curve is high
-        side, align = (-2, "right") if name.endswith("forms") else (2, "left")
-        height, end = (0.03, "bottom") if name == "junction forms" else (0.97, "top")
-        part.annotate(
-            name,
-            (gap, height),
-            (side, 0),
-            xycoords=("data", "axes fraction"),
-            textcoords="offset points",
-            rotation=90,
-            ha=align,
-            va=end,
-            fontsize=9,
-            color=DARK,
-        )
+    _mark(part.axvline, look.scene.interaction)
     for axes in (whole, part):
         with_zero_line(axes)
         label_axes(axes, x="gap (nm)", y="force on the tip (nN)" if axes is whole else "")
@@ -451,11 +386,8 @@ def section_figure(look: Look) -> Figure:
     middle, spread = 0.5 * float(velocity.max() + velocity.min()), 0.5 * float(velocity.max() - velocity.min())
     half = max(1.1 * spread, _LEAST_SHOWN * float(np.abs(velocity).max()))
     axes.set_ylim(middle - half, middle + half)
-    if velocity.min() < 0.0 < velocity.max():
-        with_zero_line(axes)
     axes.legend(loc="best", fontsize=10, framealpha=1.0)
-    narrow = f", within {2.0 * spread:.1e} nm/µs" if half > 1.1 * spread and phase.size > 1 else ""
-    axes.set_title(f"Poincaré section, {phase.size} departures{narrow}", fontsize=12, loc="left")
+    axes.set_title(f"Poincaré section, {phase.size} departures", fontsize=12, loc="left")
     return picture
 
 
@@ -464,11 +396,6 @@ class Spectrum(NamedTuple):
 
     frequency_khz: Float[np.ndarray, " lines"]
     amplitude_nm: Float[np.ndarray, " lines"]
-    response_khz: float
-    """Drive frequency over N; the drive's own where nothing repeats."""
-    periods: int
-    """Response periods in the stretch."""
-    repeats: bool
 
 
 def spectrum_of(look: Look) -> Spectrum:
@@ -484,8 +411,7 @@ def spectrum_of(look: Look) -> Spectrum:
     samples = shown.periods * _SAMPLES_PER_PERIOD * max(1, round(shown.response_us / look.drive.period_us))
     step = (shown.to_us - shown.from_us) / samples
     times = shown.from_us + step * np.arange(samples)
-    path = look.dense.at(times)
-    deflection = path.position_nm
+    deflection = look.dense.at(times).position_nm
     if look.scene.base is not None:
         deflection = deflection - np.asarray(look.scene.base.position_and_velocity(times)[0])
     weight = np.ones(samples) if shown.repeats else np.hanning(samples + 1)[:-1]
@@ -493,49 +419,40 @@ def spectrum_of(look: Look) -> Spectrum:
     mean = float(np.sum(weight * deflection) / weight.sum())
     amplitude = 2.0 * np.abs(np.fft.rfft((deflection - mean) * weight)) / weight.sum()
     amplitude[0] = abs(mean)
-    return Spectrum(
-        1e3 * np.fft.rfftfreq(samples, step), amplitude, 1e3 / shown.response_us, shown.periods, shown.repeats
-    )
+    return Spectrum(1e3 * np.fft.rfftfreq(samples, step), amplitude)
 
 
 def spectrum_figure(look: Look) -> Figure:
     """Return the spectrum, with the drive, a second tone, the response and the free vibration marked."""
-    found = spectrum_of(look)
+    found, repeats = spectrum_of(look), look.responses.repeats
     picture = new_figure(9.0, 5.0)
     axes = picture.subplots()
-    drive = 1e3 / look.drive.period_us
-    slow = min(found.response_khz, 2.0 * float(look.scene.cantilever.frequency_khz))
-    top = max(_HIGHEST * slow, 2.2 * drive, *(1.1 * tone for tone in _further_tones_khz(look.scene, drive)))
-    shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= top * (1.0 + 1e-9))
+    drive, response = 1e3 / look.drive.period_us, 1e3 / look.responses.response_us
+    free, tones = float(look.scene.cantilever.frequency_khz), _further_tones_khz(look.scene, drive)
+    right = max(_HIGHEST * min(response, 2.0 * free), 2.2 * drive, *(1.1 * tone for tone in tones))
+    shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= right)
     frequency, amplitude = found.frequency_khz[shown], found.amplitude_nm[shown]
-    floor = max(float(amplitude.max()) * _DECADES, 1e-12)
-    if found.repeats:
+    floor, top = max(float(amplitude.max()) * _DECADES, 1e-12), float(amplitude.max()) * 30.0
+    if repeats:
         axes.vlines(frequency, floor, np.maximum(amplitude, floor), color="black", linewidth=1.2, zorder=3)
     else:
         axes.plot(frequency, np.maximum(amplitude, floor), color="black", linewidth=1.0, zorder=3)
-    axes.set_yscale("log")
-    right = float(frequency[-1]) if frequency.size else drive
-    for multiple in range(1, int(right / drive + 1e-9) + 1):
-        label = "drive and its harmonics" if multiple == 1 else None
-        axes.axvline(multiple * drive, color=ACCENT, linewidth=5.0, alpha=0.30, label=label)
-    if found.repeats and found.response_khz < 0.99 * drive:
-        label = f"subharmonics, drive/{round(drive / found.response_khz)}"
-        for multiple in range(1, int(right / found.response_khz + 1e-9) + 1):
-            axes.axvline(multiple * found.response_khz, color=BLUE, linewidth=1.0, linestyle=":", label=label)
-            label = None
-    label = "second frequency"
-    for tone in _further_tones_khz(look.scene, drive):
-        axes.axvline(tone, color="#009E73", linewidth=3.0, linestyle=(0, (3, 1)), alpha=0.7, label=label)
-        label = None
-        right = max(right, tone)
-    free = float(look.scene.cantilever.frequency_khz)
-    if free <= right:
-        axes.axvline(free, color=DARK, linewidth=1.4, linestyle="--", label="free frequency")
-    axes.set(xlim=(0.0, 1.02 * right), ylim=(floor, float(amplitude.max()) * 30.0))
+    order = round(drive / response)
+    marks: list[tuple[str, Any, dict[str, Any]]] = [
+        ("drive and its harmonics", np.arange(drive, right, drive), {"color": ACCENT, "lw": 5.0, "alpha": 0.3}),
+        (f"subharmonics, drive/{order}", np.arange(response, right, response), {"color": BLUE, "lw": 1.0, "ls": ":"}),
+        ("second frequency", tones, {"color": "#009E73", "lw": 3.0, "ls": (0, (3, 1)), "alpha": 0.7}),
+        ("free frequency", [free], {"color": DARK, "lw": 1.4, "ls": "--"}),
+    ]
+    for label, places, style in marks:
+        if len(places) and (order > 1 or not label.startswith("sub")):
+            axes.vlines(places, floor, top, label=label, **style)
+    axes.set(xlim=(0.0, 1.02 * right), ylim=(floor, top), yscale="log")
     label_axes(axes, x="frequency (kHz)", y="amplitude (nm)")
     axes.grid(color=GRID, alpha=0.25)
     axes.legend(loc="upper right", fontsize=10, ncols=3, framealpha=1.0)
-    kind = f"{found.periods} response periods" if found.repeats else f"{found.periods} drive periods, nothing repeats"
+    periods = look.responses.periods
+    kind = f"{periods} response periods" if repeats else f"{periods} drive periods, nothing repeats"
     axes.set_title(f"Spectrum of the deflection ({kind})", fontsize=12, loc="left")
     return picture
 

@@ -12,7 +12,7 @@ Runs in a process of its own on one core (`afm_jax.studies.timing.run_in_own_pro
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -216,26 +216,6 @@ def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[s
     value, gradient = solved.doubt
     told = {"reference": solved.reference, "reference_error": value, "reference_gradient_error": gradient}
     return {"rows": sorted(rows, key=lambda row: row["of"] == "gradient"), "value_of": solved.what, **told}
-
-
-def cheapest(rows: Sequence[Row], wanted: Sequence[float]) -> list[Row]:
-    """Return of value and gradient, for each wanted error, the fastest method of this package and of the others."""
-    table = []
-    for kind in ("value", "gradient"):
-        for error in wanted:
-            good = [row for row in rows if row["of"] == kind and row["error"] is not None and row["error"] <= error]
-            cells: Row = {"of": kind, "wanted_error": error}
-            for name in ("afm_jax", "rival"):
-                own = [row for row in good if row["method"].startswith(RIVALS) == (name == "rival")]
-                best = min(own, key=lambda row: row["microseconds"], default=None)
-                cells[name] = None if best is None else f"{best['method']}, {best['setting']}"
-                cells[f"{name}_microseconds"] = None if best is None else best["microseconds"]
-            table.append(cells)
-    return table
-
-
-RIVALS = ("SciPy", "Diffrax")
-"""How methods that are not this package's begin."""
 
 
 def _row(of: str, method: str, setting: str, seconds: float, error: float, **more: Any) -> Row:

@@ -6,10 +6,9 @@ full scene is. What the two readings differ by is what the effect changes; what 
 it costs.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,10 +24,10 @@ from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.parameters import WHY_REQUIRED
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.motion.follow import follow_in_pieces, joined, why_over
+from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import MotionWindow
 from afm_jax.motion.periodic import Orbit, follow_to_orbit, why_impossible
-from afm_jax.motion.record import Simulation, State
+from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import last_fifth
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
@@ -40,8 +39,7 @@ from afm_jax.words import counted, known
 
 PERIODS_AT_MOST = 400.0
 """Drive periods after which a motion that has not settled is given up."""
-_PERIODS_AT_ONCE = 50.0
-"""Drive periods that are simulated at a time where nothing settles, and that are timed."""
+_PERIODS_TIMED = 50.0
 _REPETITIONS = 7
 _ROWS = 1024
 """Contacts there is room for in one piece of a motion."""
@@ -161,14 +159,6 @@ class Change(NamedTuple):
         return max(abs(self.peak_amplitude), abs(self.lockin_amplitude))
 
 
-class Cost(NamedTuple):
-    """What following a scene for a drive period takes, in us: the median of several runs."""
-
-    time_us: float
-    noise_us: float
-    """By which the median lies above the quickest run."""
-
-
 class Reading(NamedTuple):
     """What a motion shows in a window of time, in a few numbers."""
 
@@ -193,14 +183,26 @@ class Observed(NamedTuple):
 
 
 class EffectReport(NamedTuple):
-    """One effect: what leaving it out changes and saves."""
+    """One effect: what leaving it out changes and costs."""
 
     effect: SceneEffect
     change: Change
     reason: str | None
     """Why there is no change to tell: the effect is required, or nothing steady is left without it."""
-    cost: Cost | None
-    """Of the scene without it; None without a motion to time."""
+    cost: float | None
+    """Of the scene without it (see `EffectStudy`); None without a motion to time."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        name, sentence, _, required = self.effect
+        return {
+            "name": name,
+            "description": sentence,
+            "required": required is not None,
+            "change": self.change._asdict(),
+            "reason": self.reason,
+            "time_us_per_period": self.cost,
+        }
 
 
 class Reduction(NamedTuple):
@@ -210,17 +212,25 @@ class Reduction(NamedTuple):
     change: Change
     """Of all of them together, simulated."""
     scene: Scene
-    cost: Cost | None
+    cost: float | None
 
 
 @dataclass(frozen=True)
 class EffectStudy:
-    """All effects of a scene, and which of them an accuracy of the amplitudes does not need."""
+    """All effects of a scene, and which of them an accuracy of the amplitudes does not need.
+
+    Attributes:
+        observed: the full scene.
+        frequency_khz: at which the lock-in reads.
+        cost: what computing a drive period takes, in us: the median of several runs.
+        effects: each left out.
+        accuracy: that is wanted, relative.
+        reduction: what it does not need.
+    """
 
     observed: Observed
     frequency_khz: float
-    """At which the lock-in reads."""
-    cost: Cost | None
+    cost: float | None
     effects: list[EffectReport]
     accuracy: float
     reduction: Reduction
@@ -230,48 +240,29 @@ class EffectStudy:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax effects`."""
-        return self._object
-
-    @cached_property
-    def _object(self) -> dict[str, Any]:
         reading, orbit, reduction = self.observed.reading, self.observed.orbit, self.reduction
         assert reading is not None  # a study has one  # noqa: S101
         return {
-            "compared": "steady orbits" if orbit is not None else "last fifth of the duration",
+            "compared": "last fifth of the duration" if orbit is None else "steady orbits",
             "full": {
                 **reading._asdict(),
                 "lockin_frequency_khz": self.frequency_khz,
                 "drive_periods": None if orbit is None else orbit.periods,
-                "time_us_per_period": self.cost and self.cost.time_us,
+                "time_us_per_period": self.cost,
             },
-            "effects": [self._effect(report) for report in self.effects],
+            "effects": [
+                {**report.to_dict(), "needed": report.effect.name not in reduction.left_out} for report in self.effects
+            ],
             "accuracy": self.accuracy,
             "not_needed": list(reduction.left_out),
             "joint_change": reduction.change._asdict(),
-            "reduced": {"time_us_per_period": reduction.cost and reduction.cost.time_us},
-        }
-
-    def _effect(self, report: EffectReport) -> dict[str, Any]:
-        name, sentence, _, required = report.effect
-        full, cost = self.cost, report.cost
-        saved, noise = None, None
-        if full is not None and cost is not None:
-            saved = full.time_us - cost.time_us
-            noise = math.hypot(full.noise_us, cost.noise_us)
-        return {
-            "name": name,
-            "description": sentence,
-            "required": required is not None,
-            "needed": name not in self.reduction.left_out,
-            "change": report.change._asdict(),
-            "reason": report.reason,
-            "time_us_per_period": cost and cost.time_us,
-            "saved_time_us_per_period": saved,
-            "saved_time_noise_us": noise,
+            "reduced": {"time_us_per_period": reduction.cost},
         }
 
     def printed(self) -> list[str | Table]:
         """Return what `afm-jax effects` prints: the full scene, a table of effects, and which are not needed."""
+        told = self.to_dict()
+        full, reduction = told["full"], self.reduction
         cells: dict[str, Cell] = {
             "effect": "name",
             "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
@@ -279,70 +270,41 @@ class EffectStudy:
             "phase\ndeg": lambda effect: known(effect["change"]["lockin_phase_deg"]),
             "loss/impact\nchange": lambda effect: _percent(effect["change"]["energy_per_impact"]),
             "time\nus/period": "time_us_per_period:.4g",
-            "saved": _saved,
-            "": _remark,
+            "": lambda effect: "required" if effect["required"] else "" if effect["needed"] else "not needed",
         }
-        table = printed_table("Without the effect", cells, self.to_dict()["effects"])
-        return [self._of_full(), table, *self._sentences()]
-
-    def _of_full(self) -> str:
-        full = self.to_dict()["full"]
-        motion = f"no steady orbit, {full['impacts']} impacts in the last fifth of the duration"
-        if full["drive_periods"] is not None:
-            periods = counted(full["drive_periods"], "drive period")
-            motion = f"steady orbit, {counted(full['impacts'], 'impact')} in {periods}"
-        lost = full["energy_per_impact_aj"]
-        lockin = f"lock-in at {full['lockin_frequency_khz']:.6g} kHz {full['lockin_amplitude_nm']:.5g} nm"
-        return (
-            f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, {lockin} "
-            f"at {full['lockin_phase_deg']:.4g} deg{f', {lost:.4g} aJ lost per impact' if lost is not None else ''}; "
-            f"{known(full['time_us_per_period'], '.4g')} us to compute a drive period."
+        periods, impacts = full["drive_periods"], counted(full["impacts"], "impact")
+        motion = f"no steady orbit, {impacts} in the last fifth of the duration"
+        if periods is not None:
+            motion = f"steady orbit, {impacts} in {counted(periods, 'drive period')}"
+        summary = (
+            f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, lock-in at "
+            f"{full['lockin_frequency_khz']:.6g} kHz "
+            f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
+            f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(self.cost, '.4g')} us to compute "
+            "a drive period."
         )
-
-    def _sentences(self) -> Iterator[str]:
-        for report in self.effects:
-            if report.reason is not None:
-                where = "" if report.effect.required else "without it: "
-                yield f"{report.effect.name}: {where}{report.reason}."
-        wanted, reduction = f"For amplitudes to {100.0 * self.accuracy:g} %", self.reduction
-        if not reduction.left_out:
-            yield f"{wanted} every effect that can be left out is needed."
-            return
-        yield (
-            f"{wanted} these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes "
-            f"by {_percent(reduction.change.peak_amplitude)}, the lock-in amplitude by "
-            f"{_percent(reduction.change.lockin_amplitude)}; "
-            f"{known(reduction.cost and reduction.cost.time_us, '.4g')} us per drive period."
-        )
+        reasons = [f"{report.effect.name}: {report.reason}." for report in self.effects if report.reason is not None]
+        conclusion = "every effect that can be left out is needed."
+        if reduction.left_out:
+            conclusion = (
+                f"these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes by "
+                f"{_percent(reduction.change.peak_amplitude)}, the lock-in amplitude by "
+                f"{_percent(reduction.change.lockin_amplitude)}; {known(reduction.cost, '.4g')} us per drive period."
+            )
+        table = printed_table("Without the effect", cells, told["effects"])
+        return [summary, table, *reasons, f"For amplitudes to {100.0 * self.accuracy:g} % {conclusion}"]
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of effects.csv, a row an effect."""
-        effects = self.to_dict()["effects"]
-        names = ("name", "description", "required", "needed", *(f"change_{name}" for name in Change._fields))
-        rows = [
-            {**effect, **{f"change_{name}": value for name, value in effect["change"].items()}} for effect in effects
-        ]
-        return {"effects.csv": columns_of(rows, (*names, *_TIMES, "reason"))}
-
-
-_TIMES = ("time_us_per_period", "saved_time_us_per_period", "saved_time_noise_us")
+        rows = []
+        for effect in self.to_dict()["effects"]:
+            changes = {f"change_{name}": value for name, value in effect.pop("change").items()}
+            rows.append(effect | changes)
+        return {"effects.csv": columns_of(rows)}
 
 
 def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100.0 * share:+z.3g} %"
-
-
-def _saved(effect: dict[str, Any]) -> str:
-    saved = effect["saved_time_us_per_period"]
-    return "within timing noise" if saved and abs(saved) <= effect["saved_time_noise_us"] else known(saved)
-
-
-def _remark(effect: dict[str, Any]) -> str:
-    if effect["required"]:
-        return "required"
-    if effect["change"]["peak_amplitude"] is None:
-        return "no steady motion"
-    return "" if effect["needed"] else "not needed"
 
 
 # --- the study --------------------------------------------------------------------------------------------------------
@@ -377,7 +339,11 @@ def study_effects(
         raise ValueError(f"`accuracy` must be between 0 and 1, but is {accuracy!r}")
     if duration_us is not None and not duration_us > 0.0:
         raise ValueError(f"`duration_us` must be positive, but is {duration_us!r}")
-    effects = _chosen(effects_in(scene), only)
+    effects = {effect.name: effect for effect in effects_in(scene)}
+    for name in only or ():
+        if name not in effects:
+            raise ValueError(f"the scene has no effect {name!r}; it has {', '.join(effects) or 'none'}")
+    chosen = [effect for name, effect in effects.items() if only is None or name in only]
     view = _View(scene, start, duration_us)
     full = view.observed(scene)
     if view.settles and full.reading is None and (full.reason or "").startswith("nothing repeats"):
@@ -385,27 +351,18 @@ def study_effects(
         full = view.observed(scene)
     if full.reading is None:
         raise ValueError(f"the scene has no motion to compare with: {full.reason}; give it another start")
-    cost = view.cost(full)
     reports = []
-    for number, effect in enumerate(effects):
-        report(number + 1, len(effects) + 2)
+    for number, effect in enumerate(chosen, 1):
+        report(number, len(chosen) + 2)
         if effect.required is not None:
             reports.append(EffectReport(effect, Change(), f"required: {effect.required}", None))
             continue
         without = view.observed(effect.without(scene))
-        change, reason = view.change(full, without)
-        reports.append(EffectReport(effect, change, reason, view.cost(without)))
-    report(len(effects) + 1, len(effects) + 2)
+        reports.append(EffectReport(effect, *view.change(full, without), view.cost(without)))
+    report(len(chosen) + 1, len(chosen) + 2)
     reduction = _reduced(view, full, reports, accuracy)
-    return EffectStudy(full, view.lockin_frequency(full) / RAD_PER_US_PER_KHZ, cost, reports, accuracy, reduction)
-
-
-def _chosen(effects: list[SceneEffect], only: Sequence[str] | None) -> list[SceneEffect]:
-    names = [effect.name for effect in effects]
-    for name in only or ():
-        if name not in names:
-            raise ValueError(f"the scene has no effect {name!r}; it has {', '.join(names) or 'none'}")
-    return [effect for effect in effects if only is None or effect.name in only]
+    frequency_khz = view.drive.angular_frequency / _periods_read(full) / RAD_PER_US_PER_KHZ
+    return EffectStudy(full, frequency_khz, view.cost(full), reports, accuracy, reduction)
 
 
 def _reduced(view: "_View", full: Observed, reports: list[EffectReport], accuracy: float) -> Reduction:
@@ -432,44 +389,36 @@ class _View:
         self.start = default_start(scene) if start is None else start
         self.duration_us = PERIODS_AT_MOST * self.drive.period_us if duration_us is None else duration_us
         self._compiled: dict[Any, Compiled] = {}
-        self._costs: dict[Any, Cost] = {}
+        self._costs: dict[Any, float] = {}
 
     def observed(self, scene: Scene) -> Observed:
         """Return what a scene shows: its steady orbit, or the end of the duration if the full scene has none."""
-        run = partial(self._run, scene)
+        reason = drive_of(scene).aperiodic if self.settles else why_impossible(scene)
+        if reason is not None:
+            return Observed(scene, None, reason)
         if self.settles:
-            aperiodic = drive_of(scene).aperiodic
-            if aperiodic is not None:
-                return Observed(scene, None, aperiodic)
-            orbit, reason = follow_to_orbit(scene, self.start, self.duration_us, run)
+            orbit, reason = follow_to_orbit(scene, self.start, self.duration_us, partial(self._run, scene))
             if orbit is None:
                 return Observed(scene, None, reason)
             begin = float(orbit.start.time_us)
             found = Observed(scene, None, None, orbit)
-            window = begin, begin + orbit.period_us
-            return found._replace(reading=_read(scene, orbit.motion, window, self.lockin_frequency(found)))
-        first, reason, pieces = float(self.start.time_us), why_impossible(scene), []
-        if reason is not None:
-            return Observed(scene, None, reason)
-        end, piece_us = first + self.duration_us, _PERIODS_AT_ONCE * drive_of(scene).period_us
-        for piece in follow_in_pieces(scene, self.start, end, run, piece_us=piece_us):
-            reason = why_over(piece)
-            if reason is not None:
-                return Observed(scene, None, reason)
-            pieces = [*(done for done in pieces if done.goes_on), piece]
-        window = last_fifth(first, end, self.drive)
-        reading = _read(scene, joined(pieces), (window.from_us, window.to_us), self.drive.angular_frequency)
-        return Observed(scene, reading)
-
-    def lockin_frequency(self, observed: Observed) -> float:
-        """Return the angular frequency that a lock-in reads, in rad/us: the drive's over the `_periods_read`."""
-        return self.drive.angular_frequency / _periods_read(observed)
+            window, motion = (begin, begin + orbit.period_us), orbit.motion
+        else:
+            run = follow_long(scene, self.start, self.duration_us)
+            motion, found = run.simulation, Observed(scene, None)
+            outcome = MotionOutcome(int(motion.outcome))
+            if run.verdict.stuck or outcome != MotionOutcome.FINISHED:
+                return found._replace(reason="the sample holds the tip" if run.verdict.stuck else outcome.sentence)
+            first = float(self.start.time_us)
+            fifth = last_fifth(first, first + self.duration_us, self.drive)
+            window = fifth.from_us, fifth.to_us
+        return found._replace(reading=_read(scene, motion, window, self.drive.angular_frequency / _periods_read(found)))
 
     def change(self, full: Observed, without: Observed) -> tuple[Change, str | None]:
         """Return what changed, and what there is to say."""
         before, after = full.reading, without.reading
         if before is None or after is None:
-            return Change(), without.reason
+            return Change(), None if without.reason is None else f"without it: {without.reason}"
         # which of the N equivalent periods is locked is unknown
         turn = 360.0 / _periods_read(full)
         phase = (after.lockin_phase_deg - before.lockin_phase_deg + 0.5 * turn) % turn - 0.5 * turn
@@ -483,21 +432,20 @@ class _View:
         kinds = [None if one.orbit is None else (one.orbit.impacts, one.orbit.periods) for one in (full, without)]
         if kinds[0] == kinds[1]:
             return change, None
-        reason = f"another orbit: {kinds[1]} instead of {kinds[0]} (impacts, drive periods)"
+        reason = f"without it: another orbit, {kinds[1]} instead of {kinds[0]} (impacts, drive periods)"
         return change._replace(lockin_phase_deg=None), reason
 
-    def cost(self, observed: Observed) -> Cost | None:
+    def cost(self, observed: Observed) -> float | None:
         """Return what following a scene costs, its steady orbit if there is one; one program has one cost."""
         if observed.reading is None:
             return None
         structure = jax.tree.structure(observed.scene)
         if structure not in self._costs:
             start = self.start if observed.orbit is None else observed.orbit.start
-            duration = min(_PERIODS_AT_ONCE * self.drive.period_us, self.duration_us)
+            duration = min(_PERIODS_TIMED * self.drive.period_us, self.duration_us)
             program, arguments = self._program(observed.scene, start, duration)
             timing, _ = time_compiled(program, *arguments, repetitions=_REPETITIONS)
-            scale = 1e6 * self.drive.period_us / duration
-            self._costs[structure] = Cost(scale * timing.median_s, scale * (timing.median_s - timing.best_s))
+            self._costs[structure] = 1e6 * timing.median_s * self.drive.period_us / duration
         return self._costs[structure]
 
     def _run(self, scene: Scene, start: State, duration_us: float) -> Simulation:

@@ -17,8 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
-from importlib.util import find_spec
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -44,14 +43,13 @@ from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.results import Result, unit_of
+from afm_jax.results import unit_of
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_batch, scene_family
 from afm_jax.scenefile.scenefile import Start, scene_of_tables, scene_tables
 from afm_jax.solve.lanes import LANES, filled, in_blocks
 from afm_jax.strict_json import strict_json
 from afm_jax.version import __version__, version_of
 from afm_jax.whole_files import check_plain, whole_folder
-from afm_jax.words import counted
 
 if TYPE_CHECKING:
     import xarray
@@ -59,16 +57,16 @@ if TYPE_CHECKING:
 
 Columns = dict[str, Any]
 """Arrays of one row a point, by name."""
+Region = tuple[slice, ...]
+"""Of the grid: a slice for each axis."""
 STORE = "sweep.zarr"
 FORMAT_VERSION = 5
-_COMPUTED = "computed"
 
 # --- axes -------------------------------------------------------------------------------------------------------------
 
 KINDS = ("linear", "log", "list", "random")
-_MOST_HELD = 10_000_000
+_MOST = 10_000_000
 """Values of an axis."""
-_MOST_CHUNKS = 1_000_000
 _EXAMPLE = '{ parameter = "platform.reduced_frequency", linear = [0.9, 1.1, 100] }'
 
 
@@ -100,16 +98,16 @@ def axes_of(given: Sequence[Mapping[str, Any]]) -> tuple[Axis, ...]:
     if not given:
         raise ValueError(f"a sweep needs at least one axis; add [[axes]], as in {_EXAMPLE}")
     axes: list[Axis] = []
-    for number, table in enumerate(given):
-        samples = sum("random" in each for each in given[:number])
+    for number, table in enumerate(given, 1):
+        samples = sum(axis.dimension.startswith("sample") for axis in axes)
         try:
-            axes.append(_axis(dict(table), f"sample_{samples + 1}" if samples else "sample"))
+            axes.append(_axis(table, f"sample_{samples + 1}" if samples else "sample"))
         except (TypeError, ValueError) as error:
-            raise ValueError(f"axis {number + 1}: {error}") from error
-    names = [name for axis in axes for name in axis.columns]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"the parameter {twice[0]} changes along two axes: leave one of them out")
+            raise ValueError(f"axis {number}: {error}") from error
+    names = Counter(name for axis in axes for name in axis.columns)
+    for name, times in names.items():
+        if times > 1:
+            raise ValueError(f"the parameter {name} changes along two axes: leave one of them out")
     return tuple(axes)
 
 
@@ -118,75 +116,63 @@ def dimension_of(parameter: str) -> str:
     return parameter.replace(".", "_")
 
 
-def _axis(table: dict[str, Any], sample: str) -> Axis:
+def _axis(table: Mapping[str, Any], sample: str) -> Axis:
     kinds = [kind for kind in KINDS if kind in table]
     if len(kinds) != 1:
         raise ValueError(f"has {' and '.join(kinds) or 'no values'}; give one of {', '.join(KINDS)}, as in {_EXAMPLE}")
     kind = kinds[0]
-    known = (kind, "count", "seed") if kind == "random" else (kind, "parameter")
-    unknown = sorted(set(table) - set(known))
-    if unknown:
-        raise ValueError(f"unknown key {unknown[0]}; an axis of this kind has {', '.join(known)}")
+    keys = (kind, "count", "seed") if kind == "random" else (kind, "parameter")
+    for key in table:
+        if key not in keys:
+            raise ValueError(f"unknown key {key}; an axis of this kind has {', '.join(keys)}")
+    values = table[kind]
     if kind == "random":
-        return Axis(sample, _random(table))
+        if not isinstance(values, Mapping) or not values:
+            raise ValueError('`random` must name parameters with their ends, as in { "interaction.r" = [0.9, 0.99] }')
+        generator = np.random.default_rng(_whole(table.get("seed"), "seed", 0, 1 << 63))
+        shares = generator.random((len(values), _whole(table.get("count"), "count", 1, _MOST)))
+        pairs = zip(values.items(), shares, strict=True)
+        return Axis(sample, {parameter: _drawn(parameter, ends, share) for (parameter, ends), share in pairs})
     parameter = str(table.get("parameter", ""))
     if not parameter:
         raise ValueError(f"`parameter` is missing; name one, as in {_EXAMPLE}")
-    values = _listed(table["list"]) if kind == "list" else _ladder(kind, table[kind])
-    return Axis(dimension_of(parameter), {parameter: values})
+    if kind == "list":
+        column = _numbers(values, "`list`")
+        if len(set(column)) < len(column):
+            raise ValueError("a value of the list stands there twice: leave one of them out")
+        return Axis(dimension_of(parameter), {parameter: np.array(column)})
+    if not isinstance(values, list | tuple) or len(values) != 3:
+        raise ValueError(f"`{kind}` must be [low, high, count], but is {values}")
+    (low, high), count = _ends(values[:2], f"`{kind}`", log=kind == "log"), _whole(values[2], "count", 1, _MOST)
+    spread = np.geomspace if kind == "log" else np.linspace
+    return Axis(dimension_of(parameter), {parameter: spread(low, high, count)})
 
 
-def _listed(given: Any) -> np.ndarray:
-    if not isinstance(given, list | tuple):
-        raise TypeError(f"`list` must be [value, ...], but is {given}")
-    numbers = [_number(value, "a value of the list") for value in given]
-    if not 0 < len(numbers) <= _MOST_HELD:
-        raise ValueError(f"a list needs from 1 to {_MOST_HELD} values, but has {len(numbers)}")
-    if len(set(numbers)) < len(numbers):
-        raise ValueError("a value of the list stands there twice: leave one of them out")
-    return np.array(numbers)
+def _drawn(parameter: str, given: Any, share: np.ndarray) -> np.ndarray:
+    """Return values at random shares of the way between two ends."""
+    log = isinstance(given, Mapping) and list(given) == ["log"]
+    low, high = _ends(given["log"] if log else given, parameter, log=log)
+    return low * (high / low) ** share if log else low + share * (high - low)
 
 
-def _ladder(kind: str, given: Any) -> np.ndarray:
-    if not isinstance(given, list | tuple) or len(given) != 3:
-        raise ValueError(f"`{kind}` must be [low, high, count], but is {given}")
-    low, high = (_number(end, f"an end of `{kind}`") for end in given[:2])
-    count = _whole(given[2], "count", least=1, most=_MOST_HELD)
-    if not (low < high or (low == high and count == 1)):
-        raise ValueError(f"`{kind}` = {list(given)} does not rise: its first end must be below its second")
-    if kind == "log" and low <= 0.0:
-        raise ValueError(f"the ends of `log` must be positive, but one is {low:g}")
-    return np.geomspace(low, high, count) if kind == "log" else np.linspace(low, high, count)
+def _ends(given: Any, what: str, *, log: bool) -> list[float]:
+    ends = _numbers(given, what)
+    if len(ends) != 2 or not ends[0] < ends[1] or (log and ends[0] <= 0.0):
+        raise ValueError(f"{what}: {given} is no rising pair{' of positive numbers' if log else ''}")
+    return ends
 
 
-def _random(table: dict[str, Any]) -> dict[str, np.ndarray]:
-    chosen = table["random"]
-    if not isinstance(chosen, Mapping) or not chosen:
-        raise ValueError('`random` must name parameters with their ends, as in { "interaction.r" = [0.9, 0.99] }')
-    count = _whole(table.get("count"), "count", least=1, most=_MOST_HELD)
-    generator = np.random.default_rng(_whole(table.get("seed"), "seed", least=0, most=1 << 63))
-    columns = {}
-    for parameter, given in chosen.items():
-        log = isinstance(given, Mapping) and list(given) == ["log"]
-        ends = given["log"] if log else given
-        if not isinstance(ends, list | tuple) or len(ends) != 2:
-            raise ValueError(f"{parameter}: must be [low, high] or {{ log = [low, high] }}, but is {given}")
-        low, high = (_number(end, f"an end of {parameter}") for end in ends)
-        if not low < high or (log and low <= 0.0):
-            raise ValueError(f"{parameter}: {list(ends)} is no rising pair{' of positive numbers' if log else ''}")
-        share = generator.random(count)
-        columns[parameter] = low * (high / low) ** share if log else low + share * (high - low)
-    return columns
+def _numbers(given: Any, what: str) -> list[float]:
+    if not isinstance(given, list | tuple) or not 0 < len(given) <= _MOST:
+        raise ValueError(f"{what} must be a list of numbers, at most {_MOST}, but is {given}")
+    for value in given:
+        # JSON, in which inputs are kept, has null for infinity
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise ValueError(f"{what} must hold numbers, but one is {'not finite' if value is None else repr(value)}")
+    return [float(value) for value in given]
 
 
-def _number(value: Any, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        # JSON, in which inputs are kept, has no infinity
-        raise ValueError(f"{what} must be a number, but is {'not finite' if value is None else repr(value)}")
-    return float(value)
-
-
-def _whole(value: Any, name: str, *, least: int, most: int) -> int:
+def _whole(value: Any, name: str, least: int, most: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
         raise ValueError(f"`{name}` must be a whole number from {least} to {most}, but is {value!r}")
     return value
@@ -221,7 +207,7 @@ class Variable:
 
 
 MESSAGE = Variable("message", "why there is no result, or none to be trusted; empty where there is one", "string")
-_MARK = Variable(_COMPUTED, "this point has been computed", "bool")
+_MARK = Variable("computed", "this point has been computed", "bool")
 EXTRAPOLATED = "extrapolated"
 """The variable of scenes with a law that is a table."""
 APPROACH_SPEED = "approach_speed_nm_per_us"
@@ -252,7 +238,7 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
 
     Args:
         given: `scene` and perhaps `start`, tables as of a scene file; `record`, a table with `what` and its settings;
-            `accuracy`, a number or None.
+            perhaps `accuracy`.
         axes: of the sweep.
 
     Raises:
@@ -264,39 +250,39 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
     if what not in _RECORDERS:
         raise ValueError(f"[record]: `what` must be one of {', '.join(_RECORDERS)}, but is {what!r}")
     columns = {name: values for axis in axes for name, values in axis.columns.items()}
-    if what != "collide" and APPROACH_SPEED in columns:
-        raise ValueError(f"`{APPROACH_SPEED}` is an axis of `collide` alone")
-    columns.pop(APPROACH_SPEED, None)
+    if what == "collide":
+        columns.pop(APPROACH_SPEED, None)
     check_ranges(scene, *(ParameterRange(path, values.min(), values.max()) for path, values in columns.items()))
-    builder, settings = _RECORDERS[what]
-    unknown = sorted(set(record) - set(settings))
-    if unknown:
-        known = f"it has {', '.join(settings)}" if settings else "it has no settings"
-        raise ValueError(f"[record]: unknown key {unknown[0]} of {what!r}; {known}")
-    chosen = {key: _setting(key, record.get(key, usual), usual) for key, usual in settings.items()}
+    builder, usual = _RECORDERS[what]
+    for key in record:
+        if key not in usual:
+            raise ValueError(f"[record]: unknown key {key} of {what!r}; it has {', '.join(usual)}")
+    chosen = {key: _setting(key, record.get(key, value), value) for key, value in usual.items()}
     accuracy = given.get("accuracy")
-    if accuracy is not None and not isinstance(scene.interaction, Contact):
-        raise ValueError("`accuracy` is about resolved contacts, and this scene has none: leave `accuracy` out")
-    if accuracy is not None and not (isinstance(accuracy, float) and 0.0 < accuracy < 1.0):
-        raise ValueError(f"`accuracy` must be a number between 0 and 1, but is {accuracy!r}")
+    if accuracy is not None:
+        if not isinstance(scene.interaction, Contact):
+            raise ValueError("`accuracy` is about resolved contacts, and this scene has none: leave `accuracy` out")
+        if not (isinstance(accuracy, float) and 0.0 < accuracy < 1.0):
+            raise ValueError(f"`accuracy` must be a number between 0 and 1, but is {accuracy!r}")
+        chosen["accuracy"] = accuracy
     if given.get("start"):
         if what != "simulation":
             raise ValueError(f"a start is of use for simulations alone: leave it out for {what!r}")
         chosen["start"] = Start(**given["start"])
-    return builder(scene, tuple(columns), **chosen, **({} if accuracy is None else {"accuracy": accuracy}))
+    return builder(scene, tuple(columns), **chosen)
 
 
 def _setting(key: str, value: Any, usual: Any) -> Any:
-    if isinstance(usual, tuple):
-        if not (isinstance(value, list | tuple) and value and all(type(each) is int and each > 0 for each in value)):
-            raise ValueError(f"[record]: `{key}` must be a list of positive whole numbers, but is {value!r}")
-        if len(set(value)) < len(value):
-            raise ValueError(f"[record]: `{key}` must be different numbers, but is {value!r}")
-        return tuple(value)
-    wanted = int if isinstance(usual, int) else (int, float)
-    if isinstance(value, bool) or not isinstance(value, wanted) or not 0 < value < math.inf:
-        raise ValueError(f"[record]: `{key}` must be a positive {'whole ' if wanted is int else ''}number: {value!r}")
-    return value if wanted is int else float(value)
+    """Return a setting of the kind of its usual value: a number, a whole one, or several different whole ones."""
+    several = isinstance(usual, tuple)
+    numbers: list[Any] = list(value) if several and isinstance(value, list | tuple) else [value]
+    kinds = (int, float) if isinstance(usual, float) else (int,)
+    if not numbers or not all(type(each) in kinds and 0 < each < math.inf for each in numbers):
+        kind = "list of positive whole numbers" if several else f"positive {'whole ' * (len(kinds) == 1)}number"
+        raise ValueError(f"[record]: `{key}` must be a {kind}, but is {value!r}")
+    if len(set(numbers)) < len(numbers):
+        raise ValueError(f"[record]: `{key}` must be different numbers, but is {value!r}")
+    return tuple(numbers) if several else type(usual)(numbers[0])
 
 
 def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
@@ -343,39 +329,49 @@ def _beyond(scene: Scene, what: str, dimensions: tuple[str, ...] = ()) -> tuple[
     return (Variable(EXTRAPOLATED, meaning, "bool", dimensions),)
 
 
-def _variables(meanings: Mapping[str, str], dimension: str | None = None) -> tuple[Variable, ...]:
-    """Return variables that are numbers, from names and meanings."""
-    return tuple(
-        Variable(name, meaning, dimensions=() if dimension is None else (dimension,))
-        for name, meaning in meanings.items()
-    )
+def _variables(*dimensions: str, dtype: str = "float64", **meanings: str) -> tuple[Variable, ...]:
+    """Return variables of one kind, from names and meanings."""
+    return tuple(Variable(name, meaning, dtype, dimensions) for name, meaning in meanings.items())
 
 
+_PEAK = _variables("order", peak_amplitude_nm="largest height above the rest position")
+_MULTIPLIER = _variables("order", largest_multiplier="size of the larger multiplier of the map")
 _ORBIT_VARIABLES = (
-    *_variables({"peak_amplitude_nm": "largest height above the rest position"}, "order"),
-    Variable("stable_orbits", "number of admissible stable single-impact orbits", "int8", ("order",)),
-    Variable("admissible_orbits", "number of admissible single-impact orbits", "int8", ("order",)),
+    *_PEAK,
     *_variables(
-        {
-            "lockin_amplitude_nm": "amplitude at the response frequency omega/N",
-            "lockin_phase_deg": "its phase, modulo 360/N",
-            APPROACH_SPEED: "speed towards the platform before the impact",
-            "phase_rad": "drive phase just after the impact",
-            "velocity_after_nm_per_us": "velocity in the lab just after the impact",
-            "largest_multiplier": "size of the larger multiplier of the map",
-        },
         "order",
+        dtype="int8",
+        stable_orbits="number of admissible stable single-impact orbits",
+        admissible_orbits="number of admissible single-impact orbits",
     ),
+    *_variables(
+        "order",
+        lockin_amplitude_nm="amplitude at the response frequency omega/N",
+        lockin_phase_deg="its phase, modulo 360/N",
+        approach_speed_nm_per_us="speed towards the platform before the impact",
+        phase_rad="drive phase just after the impact",
+        velocity_after_nm_per_us="velocity in the lab just after the impact",
+    ),
+    *_MULTIPLIER,
 )
 _DRIVEN_ORBIT_VARIABLES = _variables(
-    {
-        "drive_lockin_amplitude_nm": "amplitude at the drive's frequency omega",
-        "drive_lockin_phase_deg": "its phase",
-        "phase_lag_deg": "lag of deflection or height behind base or force at omega",
-    },
     "order",
+    drive_lockin_amplitude_nm="amplitude at the drive's frequency omega",
+    drive_lockin_phase_deg="its phase",
+    phase_lag_deg="lag of deflection or height behind base or force at omega",
 )
 """What is recorded besides of orbits that base or force drives."""
+_CONTACT_ORBIT_VARIABLES = (
+    *_PEAK,
+    *_variables(
+        "order",
+        dtype="bool",
+        stable="an admissible single-impact orbit is stable",
+        admissible="there is an admissible single-impact orbit",
+        unresolved="the law closest to the contact has an orbit, but none was found",
+    ),
+    *_MULTIPLIER,
+)
 
 
 def _orbits(
@@ -388,45 +384,32 @@ def _orbits(
             raise ValueError(f"under a ramp no orbit repeats: {path} cannot be an axis of 'orbits'")
     extra = {"order": [float(order) for order in orders]}
     if isinstance(scene.interaction, Contact):
-        return _contact_orbits(scene, orders, accuracy, extra)
+        record = partial(_contact_orbits, scene, orders, accuracy)
+        return Recorder((*_CONTACT_ORBIT_VARIABLES, MESSAGE), _one_by_one(record), 16, extra, alone=True)
     law, made = impact_law_of(scene), _scenes(scene, paths)
     beyond = _beyond(scene, "the stable orbit's impact comes", ("order",))
 
-    def record(columns: Columns) -> Columns:
+    def record_batch(columns: Columns) -> Columns:
         scenes = made(columns)
         found = highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
-        if not beyond:
-            return found
-        laws, speeds = impact_law_of(scenes), found[APPROACH_SPEED]
-        return found | {EXTRAPOLATED: jax.vmap(lambda law, speed: law.extrapolated(speed))(laws, speeds)}
+        outside = jax.vmap(lambda law, speed: law.extrapolated(speed)) if beyond else None
+        return found | ({} if outside is None else {EXTRAPOLATED: outside(scenes.interaction, found[APPROACH_SPEED])})
 
     driven = () if scene.base is None and scene.force is None else _DRIVEN_ORBIT_VARIABLES
     points = 4096 if law.delay else 1 << 18
-    return Recorder((*_ORBIT_VARIABLES, *driven, *beyond), _in_batches(record), points, extra)
+    return Recorder((*_ORBIT_VARIABLES, *driven, *beyond), _in_batches(record_batch), points, extra)
 
 
-def _contact_orbits(
-    scene: Scene, orders: tuple[int, ...], accuracy: float, extra: Mapping[str, list[float]]
-) -> Recorder:
-    """Record single-impact orbits of resolved contacts."""
-    variables = (
-        _ORBIT_VARIABLES[0],
-        Variable("stable", "an admissible single-impact orbit is stable", "bool", ("order",)),
-        Variable("admissible", "there is an admissible single-impact orbit", "bool", ("order",)),
-        Variable("unresolved", "the law closest to the contact has an orbit, but none was found", "bool", ("order",)),
-        _ORBIT_VARIABLES[-1],
-    )
-    nothing = {each.name: np.full(len(orders), math.nan if each.dtype == "float64" else False) for each in variables}
-
-    def record(row: dict[str, float]) -> dict[str, Any]:
-        try:
-            one = sample_driven(scene_batch(scene, {name: np.array([value]) for name, value in row.items()}))
-            found = single_contact_orbits(one, orders, accuracy=accuracy)
-        except ValueError as error:
-            return nothing | {MESSAGE.name: str(error)}
-        return {each.name: found[each.name][0] for each in variables} | {MESSAGE.name: ""}
-
-    return Recorder((*variables, MESSAGE), _one_by_one(record), 16, extra, alone=True)
+def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row: dict[str, float]) -> dict[str, Any]:
+    """Return what is recorded of the single-impact orbits of one resolved contact."""
+    try:
+        one = sample_driven(scene_batch(scene, {name: np.array([value]) for name, value in row.items()}))
+        found = single_contact_orbits(one, orders, accuracy=accuracy)
+    except ValueError as error:
+        blank = {"float64": math.nan, "bool": False}
+        nothing = {each.name: np.full(len(orders), blank[each.dtype]) for each in _CONTACT_ORBIT_VARIABLES}
+        return nothing | {MESSAGE.name: str(error)}
+    return {each.name: found[each.name][0] for each in _CONTACT_ORBIT_VARIABLES} | {MESSAGE.name: ""}
 
 
 def _codes(kinds: Any) -> dict[int, str]:
@@ -435,23 +418,17 @@ def _codes(kinds: Any) -> dict[int, str]:
 
 _COLLISION_VARIABLES = (
     *_variables(
-        {
-            "rebound_speed_nm_per_us": "speed away from the sample; 0 where the tip is captured",
-            "collision_delay_us": "time between the crossings of gap 0 by the straight paths in and out, if it leaves",
-        }
+        rebound_speed_nm_per_us="speed away from the sample; 0 where the tip is captured",
+        collision_delay_us="time between the crossings of gap 0 by the straight paths in and out, if it leaves",
+        time_in_contact_us="from the formation of the bridge to its breaking",
+        time_in_junction_us="with the solids joined",
+        deepest_gap_nm="smallest gap",
+        bridge_hysteresis_aj="energy that the bridge takes",
+        junction_hysteresis_aj="energy that the junction takes",
+        viscous_loss_aj="energy that viscosity takes",
     ),
     Variable("captured", "the tip stays at the sample", "bool"),
     Variable("outcome", "how the collision ended", "int8", codes=_codes(CollisionOutcome)),
-    *_variables(
-        {
-            "time_in_contact_us": "from the formation of the bridge to its breaking",
-            "time_in_junction_us": "with the solids joined",
-            "deepest_gap_nm": "smallest gap",
-            "bridge_hysteresis_aj": "energy that the bridge takes",
-            "junction_hysteresis_aj": "energy that the junction takes",
-            "viscous_loss_aj": "energy that viscosity takes",
-        }
-    ),
 )
 
 
@@ -469,27 +446,24 @@ def _collisions(
         scenes = made(columns)
         found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
         trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
-
-        def known(variable: Variable) -> Any:
-            values, exists = getattr(found, variable.name), trusted
-            if variable.name in ONLY_FREE and variable.name != "rebound_speed_nm_per_us":
-                exists &= ~found.captured
-            return jnp.where(exists, values, jnp.nan) if variable.dtype == "float64" else values
-
-        return {variable.name: known(variable) for variable in _COLLISION_VARIABLES}
+        results = {variable.name: getattr(found, variable.name) for variable in _COLLISION_VARIABLES}
+        for each in _COLLISION_VARIABLES:
+            if each.dtype == "float64":
+                free = ~found.captured if each.name in ONLY_FREE else True
+                exists = trusted & (free | (each.name == "rebound_speed_nm_per_us"))
+                results[each.name] = jnp.where(exists, results[each.name], jnp.nan)
+        return results
 
     return Recorder(_COLLISION_VARIABLES, _in_batches(record), 16384)
 
 
 _EXPONENT_VARIABLES = (
     *_variables(
-        {
-            "exponents_per_impact": "Lyapunov exponents, larger first",
-            "exponents_per_us": "the same in time",
-            "exponents_per_impact_error": "their standard errors",
-            "exponents_per_us_error": "their standard errors",
-        },
         "exponent",
+        exponents_per_impact="Lyapunov exponents, larger first",
+        exponents_per_us="the same in time",
+        exponents_per_impact_error="their standard errors",
+        exponents_per_us_error="their standard errors",
     ),
     Variable("impacts", "how many the means are over", "int64"),
     Variable("kind", "what the motion has come to", "int8", codes=_codes(MotionKind)),
@@ -527,7 +501,7 @@ def _lyapunov(
 
 _REFUSED = -1
 _SIMULATION_VARIABLES = (
-    *_variables({observable.name: observable.meaning for observable in OBSERVABLES}),
+    *_variables(**{observable.name: observable.meaning for observable in OBSERVABLES}),
     Variable("settled", "the motion repeats", "bool"),
     Variable("stuck", "the sample holds the tip", "bool"),
     Variable("order", "drive periods of a repetition, 0 where nothing repeats", "int32"),
@@ -555,7 +529,6 @@ def _simulation(
             return nothing | {"outcome": _REFUSED, MESSAGE.name: str(error)}
         found, verdict = run.simulation, run.verdict
         outcome = MotionOutcome(int(found.outcome))
-        beyond = extrapolation_of(one.interaction, found.contacts.approach_speed_nm_per_us) is not None
         results = nothing | {
             "settled": verdict.settled,
             "stuck": verdict.stuck,
@@ -563,8 +536,10 @@ def _simulation(
             "contacts_per_response": verdict.contacts or 0,
             "impacts": int(found.count),
             "outcome": int(outcome),
-            **({EXTRAPOLATED: beyond} if EXTRAPOLATED in nothing else {}),
         }
+        if EXTRAPOLATED in nothing:
+            speeds = found.contacts.approach_speed_nm_per_us
+            results[EXTRAPOLATED] = extrapolation_of(one.interaction, speeds) is not None
         if outcome not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
             return results | {MESSAGE.name: outcome.sentence}
         seen = observe(one, found, verdict=verdict)
@@ -614,13 +589,13 @@ class SweepPlan:
             left = max(left // sizes[-1], 1)
         return tuple(reversed(sizes))
 
-    def regions(self) -> list[tuple[slice, ...]]:
+    def regions(self) -> list[Region]:
         """Return which part of the results each chunk is."""
         sides = zip(self.shape, self.block, strict=True)
         parts = [[slice(at, min(at + part, size)) for at in range(0, size, part)] for size, part in sides]
         return list(itertools.product(*parts))
 
-    def compute(self, region: tuple[slice, ...]) -> Columns:
+    def compute(self, region: Region) -> Columns:
         """Return the results of a chunk, arrays of its shape with the recorder's own dimensions behind."""
         names = [name for axis in self.axes for name in axis.columns]
         places = np.meshgrid(*(np.arange(part.start, part.stop) for part in region), indexing="ij")
@@ -645,34 +620,39 @@ def plan_of(
 ) -> SweepPlan:
     """Return the plan of an input, complete but for the versions, which are this process's.
 
+    Args:
+        given: `scene`, `axes` and `record`, and perhaps `start`, `accuracy` and `chunk`, as `SweepPlan` has them.
+        recorder_of: makes what is done at the points.
+
     Raises:
         ValueError: if it is none.
     """
     packages = ("afm-jax", "jax", "jaxlib", "numpy", "scipy")
     versions = {package: version_of(package) for package in packages} | {"device": jax.default_backend()}
     whole = json.loads(strict_json({**given, "versions": versions}))
-    chunk = whole.get("chunk")
-    if chunk is not None and (isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1):
-        raise ValueError(f"`chunk` must be a positive whole number of points, but is {chunk!r}")
-    axes = axes_of(whole["axes"])
+    axes = axes_of(whole.get("axes", ()))
     recorder = recorder_of(whole, axes)
     taken = [*recorder.extra, *(variable.name for variable in recorder.variables)]
     for axis in axes:
         if axis.dimension in taken or any(dimension_of(name) in taken for name in axis.columns):
             raise ValueError(f"the axis {axis.dimension} has the name of something that is recorded")
-    plan = SweepPlan(whole | {"chunk": chunk or recorder.points}, axes, recorder)
-    chunks = math.prod(-(-size // side) for size, side in zip(plan.shape, plan.block, strict=True))
-    if chunks > _MOST_CHUNKS:
-        raise ValueError(f"{chunks} chunks are too many: `chunk` must be larger, or take fewer values along the axes")
+    chunk = whole.get("chunk")
+    plan = SweepPlan(
+        whole | {"chunk": recorder.points if chunk is None else _whole(chunk, "chunk", 1, _MOST)}, axes, recorder
+    )
+    if math.prod(plan.shape) > _MOST_CHUNKS * math.prod(plan.block):
+        raise ValueError("that makes too many chunks: `chunk` must be larger, or take fewer values along the axes")
     return plan
+
+
+_MOST_CHUNKS = 1_000_000
 
 
 def _unit(name: str) -> str:
     """Return the unit that a name says; "1" for a number."""
     named = {"epsilon": "nm2/us2", "viscous_loss": "nm/us", "hertz": "us (nm/us)^(1/5)"}
     plain = name.rpartition(".")[2].removesuffix("_error")
-    unit = next((unit for ending, unit in named.items() if plain.endswith(ending)), "")
-    return unit or unit_of(plain).replace("^", "") or "1"
+    return named.get(plain) or unit_of(plain).replace("^", "") or "1"
 
 
 def _open(folder: Path, plan: SweepPlan) -> Any:
@@ -706,57 +686,46 @@ def _make(group: Any, plan: SweepPlan) -> None:
     """Make coordinates, and arrays of what is recorded."""
     about = {"format": "afm-jax sweep", "format_version": FORMAT_VERSION, "afm_jax": __version__}
     group.attrs.update({**about, "input": json.dumps(plan.given)})
-    fills = {"float64": math.nan, "string": ""}
-    along = {name: axis.dimension for axis in plan.axes for name in axis.columns}
-
-    def make(name: str, dimensions: Sequence[str], chunks: Sequence[int], each: Variable, **attributes: Any) -> Any:
-        sizes = dict(zip((axis.dimension for axis in plan.axes), plan.shape, strict=True))
-        sizes |= {extra: len(values) for extra, values in plan.recorder.extra.items()}
-        return group.create_array(
-            name,
-            shape=tuple(sizes[dimension] for dimension in dimensions),
-            chunks=tuple(chunks),
-            dtype=each.dtype,
-            fill_value=fills.get(each.dtype, 0),
-            dimension_names=tuple(dimensions),
-            attributes=attributes,
-        )
-
-    number = Variable("", "")
+    others = []
     for axis in plan.axes:
         for parameter, values in axis.columns.items():
-            attributes = {"parameter": parameter, "units": _unit(parameter)}
-            make(dimension_of(parameter), [axis.dimension], [axis.size], number, **attributes)[:] = values
+            name, attributes = dimension_of(parameter), {"parameter": parameter, "units": _unit(parameter)}
+            group.create_array(name, data=values, dimension_names=[axis.dimension], attributes=attributes)
+            others += [name] if name != axis.dimension else []
     for name, values in plan.recorder.extra.items():
-        make(name, [name], [len(values)], number)[:] = np.asarray(values)
-    others = " ".join(dimension_of(name) for name, dimension in along.items() if dimension_of(name) != dimension)
+        group.create_array(name, data=np.asarray(values), dimension_names=[name])
     for each in (*plan.recorder.variables, _MARK):
-        dimensions = (*(axis.dimension for axis in plan.axes), *each.dimensions)
-        chunks = (*plan.block, *(len(plan.recorder.extra[name]) for name in each.dimensions))
-        make(each.name, dimensions, chunks, each, **each.attributes(), coordinates=others)
+        further = tuple(len(plan.recorder.extra[name]) for name in each.dimensions)
+        group.create_array(
+            each.name,
+            shape=plan.shape + further,
+            chunks=plan.block + further,
+            dtype=each.dtype,
+            fill_value={"float64": math.nan, "string": ""}.get(each.dtype, 0),
+            dimension_names=[*(axis.dimension for axis in plan.axes), *each.dimensions],
+            attributes=each.attributes() | {"coordinates": " ".join(others)},
+        )
 
 
 def _check_same(folder: Path, plan: SweepPlan) -> None:
     try:
         attributes = json.loads((folder / STORE / "zarr.json").read_bytes())["attributes"]
-        found, version = json.loads(attributes["input"]), attributes["format_version"]
+        kept, version = json.loads(attributes["input"]), attributes["format_version"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{folder / STORE}: is not a sweep of afm-jax; choose another folder") from error
     if version != FORMAT_VERSION:
         raise ValueError(f"{folder / STORE}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
     for name, wanted in plan.given.items():
-        if found.get(name) != wanted:
-            old, new = (json.dumps(each) for each in (found.get(name), wanted))
-            difference = f"{name} is {old}, not {new}"
+        if kept.get(name) != wanted:
+            difference = f"{name} is {json.dumps(kept.get(name))}, not {json.dumps(wanted)}"
             raise ValueError(
                 f"{folder}: holds another sweep, in which {difference}: choose another folder, or restore the input"
             )
 
 
 class SweepRun(NamedTuple):
-    """What a run over a sweep did: chunks in all, those kept from before, those computed now, and its seconds."""
+    """What a run over a sweep did: chunks kept from before and those computed now, and its seconds."""
 
-    chunks: int
     kept: int
     computed: int
     seconds: float
@@ -782,26 +751,26 @@ def run_plan(
         what = "is no folder, or lies in none; choose another `out`"
         raise NotADirectoryError(errno.ENOTDIR, what, str(folder)) from error
     group = _open(folder, plan)
-    marks = group[_COMPUTED][...]
+    marks = group[_MARK.name][...]
     missing = [region for region in regions if not marks[region].all()]
     kept = len(regions) - len(missing)
     try:
         for region, results in _results(plan, missing, workers=workers, scheduler=scheduler):
-            for each in plan.recorder.variables:
-                group[each.name][(*region, ...)] = results[each.name]
-            group[_COMPUTED][region] = True
+            for name, values in results.items():
+                group[name][(*region, ...)] = values
+            group[_MARK.name][region] = True
             done += 1
             if report is not None:
                 report(round((kept + done) * marks.size / len(regions)), marks.size)
     except OSError as error:
         what = f"{error.strerror or error}: {kept + done} of {len(regions)} chunks are kept; mend that"
         raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
-    return SweepRun(len(regions), kept, done, time.monotonic() - begin)
+    return SweepRun(kept, done, time.monotonic() - begin)
 
 
 def _results(
-    plan: SweepPlan, regions: Sequence[tuple[slice, ...]], *, workers: int, scheduler: str | None
-) -> Iterator[tuple[tuple[slice, ...], Columns]]:
+    plan: SweepPlan, regions: Sequence[Region], *, workers: int, scheduler: str | None
+) -> Iterator[tuple[Region, Columns]]:
     """Give chunks with their results: in this process, or as workers have done them, two under way for each."""
     if not regions or (workers <= 1 and scheduler is None):
         yield from ((region, plan.compute(region)) for region in regions)
@@ -809,24 +778,17 @@ def _results(
     from distributed import as_completed  # noqa: PLC0415 (an extra package)
 
     with _client(min(workers, len(regions)), scheduler) as client:
-        text, waiting, under_way = json.dumps(plan.given), iter(regions), as_completed()
-        places: dict[Any, tuple[slice, ...]] = {}
-
-        def hand_out(count: int) -> None:
-            for region in itertools.islice(waiting, count):
-                future = client.submit(compute_chunk, text, region, pure=False)
-                places[future.key] = region
-                under_way.add(future)
-
+        work, waiting = partial(compute_chunk, json.dumps(plan.given)), iter(regions)
         threads: Any = client.ncores()
-        hand_out(2 * sum(threads.values()))
+        first = itertools.islice(waiting, 2 * sum(threads.values()))
+        under_way = as_completed(client.map(work, list(first), pure=False))
         for future in under_way:
-            yield places.pop(future.key), future.result()
-            hand_out(1)
+            yield future.result()
+            under_way.update(client.map(work, list(itertools.islice(waiting, 1)), pure=False))
 
 
-def compute_chunk(text: str, region: tuple[slice, ...]) -> Columns:
-    """Return the results of a chunk, for a process that knows nothing but the input.
+def compute_chunk(text: str, region: Region) -> tuple[Region, Columns]:
+    """Return a chunk with its results, for a process that knows nothing but the input.
 
     Args:
         text: `SweepPlan.given` as JSON.
@@ -835,7 +797,7 @@ def compute_chunk(text: str, region: tuple[slice, ...]) -> Columns:
     Raises:
         RuntimeError: if this process would compute otherwise than the one that asks.
     """
-    return _plan_of_worker(text).compute(region)
+    return region, _plan_of_worker(text).compute(region)
 
 
 @lru_cache(maxsize=4)
@@ -845,10 +807,10 @@ def _plan_of_worker(text: str) -> SweepPlan:
     given = json.loads(text)
     with jax.enable_x64(True):  # noqa: FBT003
         plan = plan_of(given)
-    for name, own in plan.given["versions"].items():
-        if own != given["versions"][name]:
-            other = given["versions"][name]
-            raise RuntimeError(f"a worker would compute otherwise than the others: {name} is {own}, not {other}")
+    for name, version in given["versions"].items():
+        if plan.given["versions"][name] != version:
+            difference = f"{name} is {plan.given['versions'][name]}, not {version}"
+            raise RuntimeError(f"a worker would compute otherwise than the others: {difference}")
     return plan
 
 
@@ -874,75 +836,6 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
         except (OSError, TimeoutError, ValueError) as error:
             raise ValueError(f"{scheduler}: no Dask scheduler with workers answers there ({error})") from error
         yield client
-
-
-def processes_for(plan: SweepPlan) -> int:
-    """Return how many processes use this machine best: one for batches, which take every core themselves."""
-    if not plan.recorder.alone or find_spec("distributed") is None:
-        return 1
-    return min(available_cores(), len(plan.regions()))
-
-
-# --- what is told, and Python's way -----------------------------------------------------------------------------------
-
-_MOST_MESSAGES = 3
-
-
-class Swept(NamedTuple):
-    """What `afm-jax sweep` tells of a sweep that is done."""
-
-    plan: SweepPlan
-    run: SweepRun
-    store: Path
-    messages: Counter[str]
-    """Why points have no result to be trusted, and how many each time."""
-    extrapolated: str | None
-    """A sentence on points whose law is asked at other speeds than it is known for; None without any."""
-
-    text = Result.text
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        return {
-            "store": self.store,
-            "points": math.prod(self.plan.shape),
-            "shape": self.plan.shape,
-            "chunks": self.run.chunks,
-            "chunks_kept": self.run.kept,
-            "chunks_computed": self.run.computed,
-            "seconds": self.run.seconds,
-            "without_result": sum(self.messages.values()),
-            "messages": dict(self.messages),
-            "extrapolated": self.extrapolated,
-        }
-
-    def printed(self) -> list[str | None]:
-        """Return what was computed, why points have no result, and how to open them."""
-        run, many = self.run, sum(self.messages.values())
-        grid = " x ".join(map(str, self.plan.shape))
-        took = f"Computed in {run.seconds:.1f} s: {run.computed}; done before and kept: {run.kept}."
-        lines: list[str | None] = [f"{grid} points in {counted(run.chunks, 'chunk')}. {took}"]
-        if many:
-            lines.append(f"{many} points have no result to be trusted (`message` says why), most of them:")
-            lines += [f"  {count}: {text}" for text, count in self.messages.most_common(_MOST_MESSAGES)]
-        return [*lines, f"Open them with xarray.open_zarr({str(self.store)!r}).", self.extrapolated]
-
-
-def swept(plan: SweepPlan, run: SweepRun, store: Path) -> Swept:
-    """Return what is told of a sweep whose results are in a store."""
-    import xarray  # noqa: PLC0415 (an extra package)
-
-    meanings = {variable.name: variable.meaning for variable in plan.recorder.variables}
-    messages, beyond = Counter[str](), None
-    with xarray.open_zarr(str(store)) as found:
-        if MESSAGE.name in meanings:
-            messages.update(text for text in found[MESSAGE.name].values.ravel().tolist() if text)
-        if EXTRAPOLATED in meanings:
-            points = math.prod(plan.shape)
-            outside = int(found[EXTRAPOLATED].values.reshape(points, -1).any(axis=1).sum())
-            if outside:
-                beyond = f"Extrapolated: at {outside} of {points} points {meanings[EXTRAPOLATED]}."
-    return Swept(plan, run, store, messages, beyond)
 
 
 @checked
@@ -993,29 +886,11 @@ def sweep(  # noqa: PLR0913
     require_float64(scene)
     check_count("workers", workers)
     table = {"what": record} if isinstance(record, str) else dict(record)
-    plan = plan_of(input_of(scene, axes, table, accuracy=accuracy, start=start, chunk=chunk))
+    given = {"scene": scene_tables(scene), "axes": [dict(axis) for axis in axes], "record": table}
+    begin = None if start is None else start._asdict()
+    plan = plan_of(given | {"start": begin, "accuracy": accuracy, "chunk": chunk})
     with ExitStack() as stack:
         folder = Path(out if out is not None else stack.enter_context(tempfile.TemporaryDirectory()))
         run_plan(plan, folder, workers=workers, scheduler=scheduler, report=report)
         found = xarray.open_zarr(str(folder / STORE))
         return found if out is not None else found.load()
-
-
-def input_of(
-    scene: Scene,
-    axes: Sequence[Mapping[str, Any]],
-    record: Mapping[str, Any],
-    *,
-    accuracy: float | None = None,
-    start: Start | None = None,
-    chunk: int | None = None,
-) -> dict[str, Any]:
-    """Return the input of a plan; arguments as of `sweep`."""
-    return {
-        "scene": scene_tables(scene),
-        "start": None if start is None else start._asdict(),
-        "axes": [dict(axis) for axis in axes],
-        "record": dict(record),
-        "accuracy": accuracy,
-        "chunk": chunk,
-    }

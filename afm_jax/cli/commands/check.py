@@ -4,7 +4,7 @@ import click
 
 from afm_jax.cli.command import Command
 from afm_jax.cli.options import flag
-from afm_jax.cli.values import Finite, SceneName
+from afm_jax.cli.values import SceneName
 
 VERIFY = Command(
     name="verify",
@@ -27,7 +27,7 @@ VERIFY = Command(
 ACCURACY = Command(
     name="accuracy",
     group="check",
-    summary="Show error against time, and the cheapest setting for a wanted accuracy.",
+    summary="Show error against time, beside SciPy and Diffrax.",
     runs="afm_jax.cli.accuracy:accuracy",
     help="""Show errors of a value and of its gradient against the time they take, beside SciPy and Diffrax.
 
@@ -41,13 +41,6 @@ ACCURACY = Command(
     options=(
         click.argument(
             "study", default="map", metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide")
-        ),
-        click.option(
-            "--wanted-error",
-            type=Finite(positive=True),
-            default=1e-9,
-            help="Error for which to find the cheapest setting, beside 1e-3, 1e-6, 1e-9 and 1e-11: of times in us, of "
-            "speeds and gradients relative.",
         ),
         click.option(
             "--contacts",
