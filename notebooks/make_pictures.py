@@ -30,7 +30,6 @@ PICTURES = {
     "branches": "continue scene.toml --order 1 --parameter platform.amplitude_nm=0.5:6 --out branches",
     "basins": "basins scene.toml --grid 100x100 --out basins",
     "tapping": "tapping fitting/examples/tapping_resonance.csv --out report",
-    "tapping_frames": "tapping fitting/examples/tapping_resonance.csv --out report",
     "sweep": "sweep sweep.toml --out swept --plot",
     "collide": "collide --speeds 6:10:1,11:14:0.25,15:60:1 --out collide",
 }

@@ -71,9 +71,9 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
         # the sign of the virial says which side it is
         assert (along["virial_aj"].mean() > 0.0) != branch["repulsive"]
     assert [round(one["amplitude_ratio"], 2) for one in answer["energies_at"]] == [0.95, 0.9, 0.8]
-    (turn,) = answer["turning_points"]
-    assert min(turn["amplitude_ratio"]) < 0.916
-    assert max(turn["amplitude_ratio"]) > 0.908
+    (turn,) = [one for one in answer["hysteresis"] if one["change"] == "branch"]
+    ratio = np.interp(turn["approach"]["offset_nm"], truth.height_nm, truth.amplitude_nm / 13.4)
+    assert ratio == pytest.approx(0.912, abs=0.004)
     assert answer["largest_energy_aj"]["value"] == pytest.approx(12.0, rel=0.08)
     assert re.search(
         r"Energy of a tap: 1[12].\d+ \+- 0.\d+ aJ at 0.[78]\d of the free amplitude", tapping_summary(result)
@@ -367,8 +367,8 @@ def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_pa
         tapping_together([tables[0], replace(tables[1], quality_factor=150.0)])
 
 
-@pytest.mark.parametrize(("restitution", "viscous", "number"), [(0.95, 0.0, 0), (1.0, 1.0, 1)])
-def test_energies_against_speed_stand_beside_the_law_that_made_them(restitution: float, viscous: float, number: int):
+@pytest.mark.parametrize(("restitution", "viscous"), [(0.95, 0.0), (1.0, 1.0)])
+def test_speeds_of_taps_are_those_of_the_law_that_made_them(restitution: float, viscous: float):
     tip = Tip(free_nm=80.0, ratio=1.05)
 
     def rebound(u: np.ndarray) -> np.ndarray:
@@ -376,18 +376,15 @@ def test_energies_against_speed_stand_beside_the_law_that_made_them(restitution:
 
     truth = curve_of_law(tip, -80.0 * np.linspace(0.95, 0.12, 60), rebound)
     result = tapping(table_of(tip, truth, Stated(), np.random.default_rng(2)), law=False)
-    answer = result.to_dict()["energy_by_speed"]
-    assert answer["reason"] is None
-    assert len(answer["approach_speed_nm_per_us"]) > 40
-    law = answer["laws"][number]
-    true = {"one_less_r_squared": 1.0 - restitution**2, "viscous_loss_nm_per_us": viscous, "epsilon_nm2_per_us2": 0.3}
-    for name, one in law["parameters"].items():
-        assert abs(one["value"] - true[name]) < 3.0 * one["standard_error"]
-    assert law["chi2"] < 2.0 * law["degrees_of_freedom"]
+    assert result.speeds is not None
+    u = result.speeds.approach_speed_nm_per_us
+    known = np.isfinite(u)
+    assert known.sum() > 40
+    np.testing.assert_allclose(result.speeds.rebound_speed_nm_per_us[known], rebound(u[known]), rtol=0.05)
+    assert result.law_allowed
 
 
 def test_on_resonance_the_speed_of_a_tap_cannot_be_told():
     still = tapping(table_of(Tip(), one_energy(), Stated(), np.random.default_rng(2)), law=False)
-    unknown = still.to_dict()["energy_by_speed"]
-    assert unknown["laws"] == []
-    assert "driven at 1.000 of the free frequency" in unknown["reason"]
+    assert not still.law_allowed
+    assert "driven at 1.000 of the free frequency" in still.to_dict()["reason"]

@@ -47,7 +47,6 @@ from fitting.tapping_curves.curve import (
     motion_of,
 )
 
-_TRIALS = 361
 _HARMONICS = 40
 """The sum of those of a brief impact converges like 1/n; beyond them a contact lasts too long to excite them."""
 Z95 = 1.959964
@@ -145,27 +144,6 @@ def virial_noise_of(curve: TappingCurve, found: Energies) -> Rows:
     """Return the standard error of each virial from the noise of its own row, in aJ."""
     by_amplitude = found.virial_amplitude_slope * curve.amplitude_error_nm
     return np.hypot(by_amplitude, found.virial_lag_slope * curve.lag_error_deg)
-
-
-def lags_of(curve: TappingCurve, instrument: Instrument, energy_aj: Rows) -> Rows:
-    """Return the lag in degrees at which each row's tap takes an energy, the nearest to that read; NaN where none does.
-
-    Args:
-        curve: the curve, with a phase.
-        instrument: what turns its readings into motion.
-        energy_aj: wanted of each row, NaN where none is.
-    """
-    turns = np.linspace(-180.0, 180.0, _TRIALS)
-    off = np.stack([energies(replace(curve, lag_deg=curve.lag_deg + turn), instrument).energy_aj for turn in turns])
-    off -= energy_aj
-    found = np.full(curve.rows, np.nan)
-    for row in range(curve.rows):
-        place = np.flatnonzero(off[:-1, row] * off[1:, row] <= 0.0)
-        if place.size:
-            before, after = off[place, row], off[place + 1, row]
-            crossing = turns[place] + (turns[1] - turns[0]) * before / np.where(before == after, 1.0, before - after)
-            found[row] = curve.lag_deg[row] + crossing[np.argmin(np.abs(crossing))]
-    return found
 
 
 FEWEST_FREE_ROWS = 3
@@ -1259,61 +1237,3 @@ def _budget(lever: Lever, minimum: Solution, place: int) -> dict[str, float]:
     noise = float(minimum.covariance[place, place]) - sum(parts.values())
     relative = {name: (share * minimum.at[place]) ** 2 for name, share in lever.curves[0].relative_errors.items()}
     return {"noise": max(noise, 0.0)} | parts | relative
-
-
-_LAW_ROUNDS = 3
-FEWEST_SPEEDS = 4
-"""Rows of known speed from which a line is drawn through their energies."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class LawOfEnergies:
-    """A law's line through energies against the tip's speed at the sample.
-
-    A law with restitution and adhesion, u_out^2 = r^2 u^2 - epsilon, takes E = m ((1 - r^2) u^2 + epsilon)/2, one with
-    a loss linear in speed E = m (viscous_loss u + epsilon)/2. Both are straight lines, in u^2 and in u.
-
-    Attributes:
-        formula: of the energy.
-        parameters: value and standard error of each, from noise and speeds alone.
-        chi2: of the rows about it.
-        degrees_of_freedom: of chi2.
-        energy_aj: at the rows' speeds.
-    """
-
-    formula: str
-    parameters: dict[str, tuple[float, float]]
-    chi2: float
-    degrees_of_freedom: int
-    energy_aj: Float[np.ndarray, " rows"]
-
-
-def laws_of_energies(
-    speed: Rows, speed_error: Rows, energy: Rows, energy_error: Rows, mass: float
-) -> list[LawOfEnergies]:
-    """Return the two laws' lines through energies in aJ at speeds in nm/us, with errors in both, the mass in ng."""
-    found = []
-    for formula, power, name in (
-        ("E = m ((1 - r^2) u^2 + epsilon)/2", 2, "one_less_r_squared"),
-        ("E = m (viscous_loss u + epsilon)/2", 1, "viscous_loss_nm_per_us"),
-    ):
-        basis = 0.5 * mass * np.stack([speed**power, np.ones_like(speed)], axis=1)
-        error = energy_error
-        at, covariance = np.zeros(2), np.zeros((2, 2))
-        for _ in range(_LAW_ROUNDS):
-            whitened = basis / error[:, None]
-            covariance = np.linalg.inv(whitened.T @ whitened)
-            at = covariance @ (whitened.T @ (energy / error))
-            slope = 0.5 * mass * at[0] * power * speed ** (power - 1)
-            error = np.hypot(energy_error, slope * speed_error)
-        pairs = zip(at.tolist(), np.sqrt(np.diag(covariance)).tolist(), strict=True)
-        found.append(
-            LawOfEnergies(
-                formula=formula,
-                parameters=dict(zip((name, "epsilon_nm2_per_us2"), pairs, strict=True)),
-                chi2=float(np.sum(((energy - basis @ at) / error) ** 2)),
-                degrees_of_freedom=len(speed) - 2,
-                energy_aj=basis @ at,
-            )
-        )
-    return found

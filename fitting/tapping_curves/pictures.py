@@ -1,45 +1,20 @@
-"""Pictures of a tapping curve: amplitude, phase and energy over height, and the change of frame behind it."""
+"""Pictures of a tapping curve: amplitude, phase and energy over height; several curves together."""
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
-from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.branches import side_of, way_of
-from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
-from fitting.tapping_curves.energy import Z95, lags_of
+from fitting.tapping_curves.energy import Z95
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
 _SMALL = 9
-_PERIODS = 2.0
-
-
-def tapping_figures(result: Tapping) -> dict[str, Figure]:
-    """Return the curve, the two frames, energy against speed and the law if they are known, by what is to be seen."""
-    figures = {
-        "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch with "
-        "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free.": (
-            curve_figure(result)
-        ),
-        "The same motion in two frames. Left, the lab: a shaken tip meets a sample at rest. Right, with its free "
-        "motion taken away: the tip flies freely, and the sample moves up and down with the free amplitude.": (
-            frames_figure(result)
-        ),
-    }
-    if result.laws_of_energies:
-        shows = "Energy of a tap against the tip's speed at the sample, with the lines of two impact laws through it."
-        figures[shows] = speed_figure(result)
-    if result.law is not None:
-        from fitting.report.plots import law_figure  # noqa: PLC0415 - it imports JAX
-
-        figures["The impact law from the rows with fast impacts, with its 95 % band."] = law_figure(result.law)
-    return figures
 
 
 def curve_figure(result: Tapping) -> Figure:
-    """Return amplitude, phase and energy of a tap over the height of the sample, with what the fit predicts."""
+    """Return amplitude, phase and energy of a tap over the height of the sample."""
     curve, rows = result.curve, result.rows
     panels = 3 if curve.has_phase else 2
     figure = new_figure(7.5, 0.5 + 3.0 * panels)
@@ -54,7 +29,6 @@ def curve_figure(result: Tapping) -> Figure:
     if between:
         middle = between[0]
         _points(middle, result, curve.lag_deg, curve.lag_error_deg)
-        _predicted_lag(middle, result)
         label_axes(middle, x="", y="lag (degrees)")
         _points(bottom, result, rows.energy_of_fit_aj, rows.energy_noise_aj)
         bottom.plot(curve.offset_nm, rows.energy_aj, "+", color=GRID, ms=4, label="instrument as given")
@@ -102,18 +76,6 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
                 )
 
 
-def _predicted_lag(axes: Axes, result: Tapping) -> None:
-    """Draw the lag at which a tap of the fitted energy leaves the amplitude that was read."""
-    if result.functions is None:
-        return
-    curve = result.curve
-    lags = lags_of(curve, result.functions.instrument, result.energy_along_branches_aj)
-    for branch in result.branches:
-        rows = branch.rows[np.isfinite(lags[branch.rows])]
-        rows = rows[np.argsort(curve.offset_nm[rows])]
-        axes.plot(curve.offset_nm[rows], lags[rows], color=ACCENT if branch.retract else BLUE, lw=1.0, alpha=0.7)
-
-
 def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
     """Draw the energy along the branches with its 95 % band, and where there is one energy that; return their range."""
     ends = [0.0]
@@ -139,32 +101,6 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def speed_figure(result: Tapping) -> Figure:
-    """Return the energy of a tap against the tip's speed at the sample, with the lines of the laws."""
-    figure = new_figure(6.5, 4.5)
-    axes = figure.subplots()
-    rows, found = result.rows_of_known_speed, result.speeds
-    assert found is not None  # noqa: S101
-    u = found.approach_speed_nm_per_us[rows]
-    axes.errorbar(
-        u,
-        result.rows.energy_of_fit_aj[rows],
-        result.rows.energy_noise_aj[rows],
-        found.approach_speed_error_nm_per_us[rows],
-        fmt="o",
-        ms=4,
-        lw=0.8,
-        color=DARK,
-        label="rows of known speed",
-    )
-    for one, colour, style in zip(result.laws_of_energies, (BLUE, ACCENT), ("-", "--"), strict=False):
-        axes.plot(u, one.energy_aj, style, color=colour, label=one.formula)
-    label_axes(axes, x="speed of approach (nm/µs)", y="energy of a tap (aJ)")
-    axes.legend(fontsize=_SMALL)
-    axes.grid(color=GRID, alpha=0.25)
-    return figure
-
-
 def together_figure(result: TappingTogether) -> Figure:
     """Return the energies of all curves over the amplitude, a panel a side, with their mean and its common error."""
     sides = [state for state in (False, True) if any(b.repulsive == state for c in result.curves for b in c.branches)]
@@ -188,57 +124,3 @@ def together_figure(result: TappingTogether) -> Figure:
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=_SMALL)
     return figure
-
-
-def frames_figure(result: Tapping) -> Figure:
-    """Return the motion of one row in two frames: the lab's, and that of the free motion."""
-    curve = result.curve
-    row = _example_row(result)
-    fit = result.functions or result.fit
-    given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value)
-    instrument = given if fit is None else fit.instrument
-    motion = motion_of(curve, instrument)
-    free = float(motion.free_amplitude_nm[row])
-    omega = RAD_PER_US_PER_KHZ * float(curve.drive_frequency_khz[row])
-    time = np.linspace(0.0, _PERIODS * 2.0 * np.pi / omega, 801)
-    z_free = -free * np.cos(omega * time)
-    flight = _flight(motion, row, omega, instrument, time)
-    sample = float(curve.offset_nm[row])
-    figure = new_figure(10.0, 4.2)
-    left, right = figure.subplots(1, 2)
-    left.plot(time, z_free, "--", color=GRID, label="free tip")
-    left.plot(time, z_free + flight, color=BLUE, label="tip")
-    left.axhline(sample, color=ACCENT, label="sample, at rest")
-    left.set_title("lab: a shaken tip, a resting sample", fontsize=_SMALL + 1)
-    right.plot(time, flight, color=BLUE, label="tip less its free motion")
-    right.plot(time, sample - z_free, color=ACCENT, label="sample, moving with the free amplitude")
-    right.set_title("the free tip's frame: free flights between impacts", fontsize=_SMALL + 1)
-    for axes in (left, right):
-        label_axes(axes, x="time (µs)", y="height (nm)")
-        axes.set_ylim(top=axes.get_ylim()[1] + 0.35 * np.ptp(axes.get_ylim()))
-        axes.legend(fontsize=_SMALL, loc="upper right")
-        axes.grid(color=GRID, alpha=0.25)
-    return figure
-
-
-def _example_row(result: Tapping) -> int:
-    """Return the row to show: of those used the one whose amplitude is nearest to two thirds of the free one."""
-    curve = result.curve
-    wanted = np.abs(curve.amplitude_nm / curve.free_amplitude_nm - 2.0 / 3.0)
-    repulsive = result.rows.used & np.isin(result.group_of_rows, result.chief)
-    return int(np.argmin(np.where(repulsive, wanted, np.inf) if repulsive.any() else wanted))
-
-
-def _flight(motion: TipMotion, row: int, omega: float, instrument: Instrument, time: np.ndarray) -> np.ndarray:
-    """Return the motion that one brief impact a period keeps up, of the impulse and moment that were read."""
-    force = motion.gamma[row] * (motion.height[row] + motion.free_amplitude_nm[row])
-    own = RAD_PER_US_PER_KHZ * instrument.free_frequency_khz
-    rate = -0.5 * own / instrument.quality_factor + 1j * own * np.sqrt(1.0 - 0.25 / instrument.quality_factor**2)
-    period = 2.0 * np.pi / omega
-    kick = own**2 * abs(force) * period / 2.0
-    # w(0) = w(period) and w'(0) - w'(period) = kick, w = Re(c exp(rate t)) from one impact to the next
-    turn = 1.0 - np.exp(rate * period)
-    sides = np.array([[turn.real, -turn.imag], [(rate * turn).real, -(rate * turn).imag]])
-    c = np.linalg.solve(sides, [0.0, kick])
-    since = (time + np.angle(force) / omega) % period
-    return np.real((c[0] + 1j * c[1]) * np.exp(rate * since))

@@ -3,12 +3,10 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from afm_jax.strict_json import plain
-from afm_jax.whole_files import write_whole
 from afm_jax.words import broken, interval, percent, with_error
 from fitting.report.sections import (
     Bullets,
@@ -17,7 +15,6 @@ from fitting.report.sections import (
     Table,
     Text,
     page_of,
-    pairs,
     pictures_of,
     text_of,
 )
@@ -27,6 +24,9 @@ from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 from fitting.tapping_curves.verdict import ORIGINS
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _EV_PER_AJ = 6.241509
 _WIDTH = 150
 _CHANGES = {
@@ -34,31 +34,18 @@ _CHANGES = {
     "half": "half of the free amplitude is left",
     "branch": "from the attractive to the repulsive branch",
 }
-_ROW_COLUMNS = (
-    ("line", "line", "d"),
-    ("way", "branch", ""),
-    ("branch", "state", ""),
-    ("height (nm)", "offset_nm", ".5g"),
-    ("amplitude (nm)", "lockin_amplitude_nm", ".5g"),
-    ("lag (°)", "phase_lag_deg", ".2f"),
-    ("E (aJ)", "energy_aj", ".3g"),
-    ("± noise", "energy_noise_aj", ".2g"),
-    ("± shared", "energy_systematic_aj", ".2g"),
-    ("E, fitted (aJ)", "energy_of_fit_aj", ".3g"),
-    ("residual", "residual", "+.1f"),
-    ("virial (aJ)", "virial_aj", ".3g"),
-    ("u_in (nm/µs)", "approach_speed_nm_per_us", ".3g"),
-    ("remarks", "note", ""),
-)
-"""Columns of the page's rows: heading, key of `Tapping.records`, format."""
-
 WriteTable = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
 
 
 def tapping_summary(result: Tapping) -> str:
     """Return the result as text: verdict, energy, thresholds, speeds, law or what to record instead, notes."""
-    lines = text_of(tapping_report(result)).split("\n")
-    return result.in_unit("\n".join(piece for line in lines for piece in broken(line, _WIDTH, "    ")))
+    return _printed(tapping_report(result), result.in_unit)
+
+
+def _printed(report: Report, in_unit: Callable[[str], str]) -> str:
+    """Return a report as text, long lines broken, in the unit that energies have."""
+    lines = text_of(report).split("\n")
+    return in_unit("\n".join(piece for line in lines for piece in broken(line, _WIDTH, "    ")))
 
 
 def tapping_report(result: Tapping) -> Report:
@@ -133,11 +120,6 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
             ]
         )
     lines = [
-        f"  {one['branch']}: attractive turns repulsive at A/A0 = {min(one['amplitude_ratio']):.3f} to "
-        f"{max(one['amplitude_ratio']):.3f}, height {min(one['height_nm']):.4g} to {max(one['height_nm']):.4g} nm"
-        for one in result.turning_points
-    ]
-    lines += [
         f"  retract less approach, {result.branches[i].side}: {with_error(one.energy_aj, one.standard_error)} aJ "
         f"at A/A0 = {one.amplitude_ratio:.2f}, where the difference is largest in units of its error"
         for (i, _), one in result.way_differences.items()
@@ -258,7 +240,7 @@ def _between(found: Hysteresis) -> str:
 
 
 def _speeds(result: Tapping) -> list[ReportSection]:
-    """Return the speeds of the impacts, and the laws' lines through the energies against them."""
+    """Return the speeds of the impacts."""
     found = result.speeds
     if found is None:
         return []
@@ -270,14 +252,8 @@ def _speeds(result: Tapping) -> list[ReportSection]:
     in_capture = f" ({many.min():.2g} to {many.max():.2g} capture speeds)" if len(many) else ""
     known = percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))
     speeds = f"{u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows"
-    lines = [f"Impact speeds: {speeds}{in_capture}, known to {known} in the median"]
-    for one in result.laws_of_energies:
-        values = ", ".join(f"{name} {with_error(*pair)}" for name, pair in one.parameters.items())
-        lines.append(
-            f"  energy against speed: {one.formula} with {values}, chi2 {one.chi2:.1f} for {one.degrees_of_freedom} "
-            "(errors of noise and speeds alone)"
-        )
-    return [ReportSection("Speeds of the impacts", _lines(lines), "Speeds")]
+    words = f"Impact speeds: {speeds}{in_capture}, known to {known} in the median"
+    return [ReportSection("Speeds of the impacts", [Text(words)], "Speeds")]
 
 
 def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> list[Path]:
@@ -294,26 +270,14 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     Raises:
         OSError: if a file cannot be written.
     """
-    # a call without --out needs neither matplotlib nor JAX
-    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.files import write_report_files  # noqa: PLC0415
-    from fitting.tapping_curves.pictures import tapping_figures  # noqa: PLC0415
-
-    figures = tapping_figures(result)
-    # SVG files have the layout of the PNG drawn before
-    curve, frames, *_ = [png_of(figure) for figure in figures.values()]
-    written = write_report_files(
-        folder,
-        "tapping",
-        text=tapping_summary(result),
-        data={"format": "afm-jax tapping", "format_version": 1, **result.to_dict()},
-        picture=curve,
-        page=tapping_page(result, [svg_of(figure) for figure in figures.values()], list(figures)),
+    shows = (
+        "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch with "
+        "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free."
     )
-    write_whole(folder / "tapping_frames.png", frames)
+    data = {"format": "afm-jax tapping", "format_version": 1, **result.to_dict()}
+    written = _write(folder, "tapping", result.in_unit, tapping_report(result), result.plot(), shows, data)
     records = result.keyed(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
-    written.append(folder / "tapping_frames.png")
     if result.law is None:
         return written
     from fitting.report.report import write_report  # noqa: PLC0415
@@ -321,41 +285,25 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     return [*written, *write_report(result.law, folder, write_table)]
 
 
-def tapping_page(result: Tapping, pictures: Sequence[bytes], shows: Sequence[str]) -> str:
-    """Return the result as one HTML page: the report's sections, pictures, rows and inputs.
+def _write(
+    folder: Path,
+    name: str,
+    in_unit: Callable[[str], str],
+    report: Report,
+    figure: "Figure",
+    shows: str,
+    data: dict[str, Any],
+) -> list[Path]:
+    """Write page, text, JSON and picture of a report; texts in the unit that energies have."""
+    # a call without --out needs neither matplotlib nor JAX
+    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
+    from fitting.report.files import write_report_files  # noqa: PLC0415
 
-    Args:
-        result: what was found.
-        pictures: SVG files.
-        shows: what is to be seen in each.
-    """
-    report, records = tapping_report(result), result.records()
-    rows = [[_cell(record.get(key), form) for _, key, form in _ROW_COLUMNS] for record in records]
-    excluded = {i for i, record in enumerate(records) if (record["note"] or "").startswith("excluded")}
-    head, words = [name for name, *_ in _ROW_COLUMNS], ("way", "branch", "remarks")
-    inputs = {name: value for name, value in plain(result.to_dict()["input"]).items() if not isinstance(value, list)}
-    if result.law is not None:
-        in_its_file = ReportSection("Impact law", [Text("The impact law is in fit.html.")], "Impact law")
-        report = replace(report, sections=[in_its_file if s.link == "Impact law" else s for s in report.sections])
-    more = [
-        ReportSection("Rows", [Table("Shaded: excluded", head, rows, words=words, marked=excluded)], "Rows"),
-        ReportSection(
-            "Inputs and versions",
-            [
-                pairs("What the table says", ("", "value"), inputs),
-                pairs("Versions of what computed it", ("package", "version"), result.versions),
-            ],
-            "Inputs",
-        ),
-    ]
-    seen = ReportSection("Pictures", pictures_of(pictures, shows), "Pictures")
-    return result.in_unit(page_of(replace(report, sections=[seen, *report.sections, *more])))
-
-
-def _cell(value: Any, form: str) -> str:
-    if value is None:
-        return "-"
-    return str(value) if isinstance(value, str) else f"{value:{form}}"
+    # SVG files have the layout of the PNG drawn before
+    picture = png_of(figure)
+    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
+    page = in_unit(page_of(replace(report, sections=[seen, *report.sections])))
+    return write_report_files(folder, name, text=_printed(report, in_unit), data=data, picture=picture, page=page)
 
 
 def together_report(result: TappingTogether) -> Report:
@@ -387,8 +335,7 @@ def together_report(result: TappingTogether) -> Report:
 
 def together_summary(result: TappingTogether) -> str:
     """Return what several curves of one lever say together as text."""
-    text = text_of(together_report(result))
-    return result.curves[0].in_unit(text) if result.curves else text
+    return _printed(together_report(result), result.curves[0].in_unit)
 
 
 def write_together(result: TappingTogether, folder: Path) -> list[Path]:
@@ -404,21 +351,9 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
     Raises:
         OSError: if a file cannot be written.
     """
-    from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.files import write_report_files  # noqa: PLC0415
-    from fitting.tapping_curves.pictures import together_figure  # noqa: PLC0415
-
-    figure, report = together_figure(result), together_report(result)
-    picture = png_of(figure)
     shows = (
         "Energy over the amplitude, each curve and their mean, with the scatter and the error that all have in common."
     )
-    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]))
-    return write_report_files(
-        folder,
-        "together",
-        text=together_summary(result),
-        data={"format": "afm-jax tapping together", "format_version": 1, **result.to_dict()},
-        picture=picture,
-        page=result.curves[0].in_unit(page_of(replace(report, sections=[seen, *report.sections]))),
-    )
+    data = {"format": "afm-jax tapping together", "format_version": 1, **result.to_dict()}
+    report = together_report(result)
+    return _write(folder, "together", result.curves[0].in_unit, report, result.plot(), shows, data)

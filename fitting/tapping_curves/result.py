@@ -16,12 +16,10 @@ from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
 from fitting.tapping_curves.curve import Rows, TappingCurve
 from fitting.tapping_curves.energy import (
-    FEWEST_SPEEDS,
     HEADLINE,
     MEASURED,
     Z95,
     EnergyFunctions,
-    LawOfEnergies,
     LeastOnFrequency,
     Nuisance,
     OneEnergy,
@@ -29,7 +27,6 @@ from fitting.tapping_curves.energy import (
     WayDifference,
     differences_of_ways,
     largest_of,
-    laws_of_energies,
     least_on_frequency,
     said_of,
 )
@@ -193,12 +190,6 @@ class Tapping(Result):
             found[here & (np.array(self.rows.state) == side_of(group.repulsive))] = i
         return found
 
-    @property
-    def chief(self) -> list[int]:
-        """Numbers of the groups that the energy of a tap is taken from: the repulsive ones, if there are any."""
-        repulsive = [i for i, group in enumerate(self.groups) if group.repulsive]
-        return repulsive or list(range(len(self.groups)))
-
     def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
         """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
         assert self.fit is not None  # noqa: S101
@@ -252,7 +243,8 @@ class Tapping(Result):
             return blank | {"interval95": (0.0, self.bound_aj), "kind": "upper bound", "reason": ""}
         if self.fit is None or self.why_not_constant:
             return blank | {"kind": "none", "reason": self.why_not_constant}
-        chosen = self.chief
+        repulsive = [i for i, group in enumerate(self.groups) if group.repulsive]
+        chosen = repulsive or list(range(len(self.groups)))
         if len(chosen) > 1:
             each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
             return blank | {"kind": "several", "reason": f"each drive has its own: {each}"}
@@ -280,19 +272,6 @@ class Tapping(Result):
     def described(self) -> bool:
         """Whether one energy a branch describes the rows."""
         return not self.why_not_constant
-
-    @property
-    def plain_energy(self) -> dict[str, Any]:
-        """Mean and scatter in aJ of the energies of single rows, with the instrument as given."""
-        chosen = self.rows.used & np.isin(self.group_of_rows, self.chief)
-        if not chosen.any():
-            return {"mean": None, "standard_deviation": None, "systematic_error": None}
-        values = self.rows.energy_aj[chosen]
-        return {
-            "mean": float(values.mean()),
-            "standard_deviation": float(values.std(ddof=1)) if chosen.sum() > 1 else None,
-            "systematic_error": float(self.rows.energy_systematic_aj[chosen].mean()),
-        }
 
     @property
     def largest(self) -> dict[str, Any] | None:
@@ -344,28 +323,6 @@ class Tapping(Result):
         ]
 
     @property
-    def turning_points(self) -> list[dict[str, Any]]:
-        """Where attraction gives way to repulsion on each drive and way: between which amplitudes and heights."""
-        found = []
-        for drive, retract in dict.fromkeys((b.drive, b.retract) for b in self.branches):
-            here = [b for b in self.branches if (b.drive, b.retract) == (drive, retract)]
-            attractive, repulsive = ([b.curve for b in here if b.repulsive == side] for side in (False, True))
-            if not (attractive and repulsive):
-                continue
-            before, after = attractive[-1], repulsive[0]
-            last, first = int(np.argmax(before.height_nm)), int(np.argmin(after.height_nm))
-            found.append(
-                {
-                    "drive_frequency_khz": drive[0],
-                    "free_amplitude_nm": drive[1],
-                    "branch": way_of(retract),
-                    "amplitude_ratio": [float(after.amplitude_ratio[first]), float(before.amplitude_ratio[last])],
-                    "height_nm": [float(before.height_nm[last]), float(after.height_nm[first])],
-                }
-            )
-        return found
-
-    @property
     def way_differences(self) -> dict[tuple[int, int], WayDifference]:
         """By how much the energy differs between approach and retract, by the numbers of the branches."""
         return {} if self.functions is None else differences_of_ways(self.functions)
@@ -399,46 +356,6 @@ class Tapping(Result):
         }
 
     @property
-    def rows_of_known_speed(self) -> Int[np.ndarray, " some"]:
-        """Numbers of the rows in which the tip's speed at the sample is known, in the order of the speeds."""
-        if self.speeds is None:
-            return np.zeros(0, int)
-        u = self.speeds.approach_speed_nm_per_us
-        known = np.flatnonzero(np.isfinite(u) & np.isfinite(self.rows.energy_of_fit_aj))
-        return known[np.argsort(u[known])]
-
-    @property
-    def laws_of_energies(self) -> list[LawOfEnergies]:
-        """Fits of impact laws to the energies against the approach speed; empty where too few speeds are known."""
-        rows = self.rows_of_known_speed
-        if self.speeds is None or len(rows) < FEWEST_SPEEDS:
-            return []
-        u, error = self.speeds.approach_speed_nm_per_us, self.speeds.approach_speed_error_nm_per_us
-        energy, noise = self.rows.energy_of_fit_aj, self.rows.energy_noise_aj
-        return laws_of_energies(u[rows], error[rows], energy[rows], noise[rows], self.mass_ng)
-
-    @property
-    def energy_by_speed(self) -> dict[str, Any]:
-        """Energies against the tip's speed at the sample, beside the laws'; a reason where they are not known."""
-        rows, laws = self.rows_of_known_speed, self.laws_of_energies
-        return {
-            "approach_speed_nm_per_us": [] if self.speeds is None else self.speeds.approach_speed_nm_per_us[rows],
-            "energy_aj": self.rows.energy_of_fit_aj[rows],
-            "energy_noise_aj": self.rows.energy_noise_aj[rows],
-            "laws": [
-                {
-                    "formula": one.formula,
-                    "parameters": {n: {"value": v, "standard_error": e} for n, (v, e) in one.parameters.items()},
-                    "chi2": one.chi2,
-                    "degrees_of_freedom": one.degrees_of_freedom,
-                    "energy_aj": one.energy_aj,
-                }
-                for one in laws
-            ],
-            "reason": None if laws else self.reason or "the tip's speed at the sample is known in too few rows",
-        }
-
-    @property
     def law_allowed(self) -> bool:
         """Whether enough rows have impacts that a law describes."""
         return self.speeds is not None and not self.speeds.why_not
@@ -462,10 +379,6 @@ class Tapping(Result):
             for i, note in enumerate(self.rows.note)
             if note.startswith("excluded")
         ]
-
-    def _named(self, *names: str) -> dict[str, Any]:
-        """Return attributes of the result by their names."""
-        return {name: getattr(self, name) for name in names}
 
     def _branches(self) -> list[dict[str, Any]]:
         """Return what is known of each branch: its rows, its one energy if it has one, and its curve."""
@@ -549,18 +462,19 @@ class Tapping(Result):
         energy, law = self.energy, None if self.law is None else self.law.to_dict()
         payload = plain(
             {
-                **self._named("valid", "reasons", "warnings"),
+                "valid": self.valid,
+                "reasons": self.reasons,
+                "warnings": self.warnings,
                 "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
                 "energy_per_tap_reason": energy["reason"] or None,
                 "largest_energy_aj": self.largest,
                 "least_on_frequency": None if self.least_on_frequency is None else vars(self.least_on_frequency),
-                **self._named("energies_at", "turning_points"),
+                "energies_at": self.energies_at,
                 "way_differences": [
                     {"approach": i, "retract": j, **vars(one)} for (i, j), one in self.way_differences.items()
                 ],
-                "plain_energy_aj": self.plain_energy,
                 "epsilon_nm2_per_us2": self.epsilon,
-                **self._named("energy_by_speed", "assumptions"),
+                "assumptions": self.assumptions,
                 "phase_sense": {**self.curve.phase._asdict(), "assumed": self.curve.phase.assumed},
                 "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
                 "branches": self._branches(),
@@ -570,7 +484,8 @@ class Tapping(Result):
                 "reason": self.reason,
                 "fit": law,
                 "rows": self.records(),
-                **self._named("set_aside", "versions"),
+                "set_aside": self.set_aside,
+                "versions": self.versions,
                 "input": {name: value for name, value in vars(self.table).items() if value is not None},
             }
         )
