@@ -8,7 +8,7 @@ first harmonic of the sample's force. Free, Z = -A0: that sets the time. Measure
   and A0 = A_free/|1 - gamma| with A_free the amplitude of the free deflection.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -66,7 +66,6 @@ class TappingCurve:
         phase_zero_deg: lag that the instrument adds; None: nothing is known of it.
         height_known: whether heights count from the tip's rest position.
         origin_error_nm: standard error of that position.
-        harmonic_amplitudes_nm: amplitudes at multiples of the drive's frequency, by multiple.
         lines: where each row stands in its file.
         time: place of each row in the order of measurement, from -1/2 to 1/2; None: that order is not known.
         phase: sign and zero of the phase as read, and how they are known.
@@ -93,7 +92,6 @@ class TappingCurve:
     phase_zero_deg: Given | None = None
     height_known: bool = True
     origin_error_nm: float = 0.3
-    harmonic_amplitudes_nm: dict[int, Rows] = field(default_factory=dict)
     lines: Int[np.ndarray, " rows"]
     time: Rows | None = None
     phase: PhaseSense = AS_STATED
@@ -118,10 +116,10 @@ class TappingCurve:
             "spring_constant_n_per_m": spring.error / spring.value,
         }
 
-    def part(self, chosen: Bool[np.ndarray, " rows"]) -> "TappingCurve":
-        """Return the rows chosen, as a curve."""
-        harmonics = {n: column[chosen] for n, column in self.harmonic_amplitudes_nm.items()}
-        return replace(part_of(self, chosen), harmonic_amplitudes_nm=harmonics)
+    @property
+    def relative_error(self) -> float:
+        """Relative standard error that all energies and virials have in common."""
+        return float(np.linalg.norm(list(self.relative_errors.values())))
 
 
 def part_of(rows: R, chosen: Bool[np.ndarray, " rows"]) -> R:
@@ -146,7 +144,7 @@ class Instrument(NamedTuple):
         quality_factor: Q.
         phase_zero_deg: what the instrument adds to each lag.
         free_amplitude_factor: true over stated free amplitude.
-        harmonics_factor: what the air takes at harmonics not measured, over that of one brief impact a period.
+        harmonics_factor: what the air takes at harmonics, over that of one brief impact a period.
     """
 
     free_frequency_khz: float

@@ -5,9 +5,9 @@
     E = -pi Im(F_1 conj Z) - (pi k s/Q) sum_{n >= 2} n^2 |Z_n|^2,      virial = Re(F_1 conj Z)/2.
 
 The first term is what the drive gives less what the air takes at the drive's frequency, for a force on the tip
-pi k A (A0 |gamma| sin phi - s A/Q); the sum is what the air takes at the harmonics. Those not measured are taken
-as of one brief impact a period, F_n = F_1, a tenth less: on resonance they do not matter, 3 to 10 % above it they
-take as much as the tap.
+pi k A (A0 |gamma| sin phi - s A/Q); the sum is what the air takes at the harmonics. They are taken as of one brief
+impact a period, F_n = F_1, a tenth less: on resonance they do not matter, 3 to 10 % above it they take as much as
+the tap.
 
 *The instrument* x (f0, Q, the harmonics' factor; of each curve the lag and the amplitude of its free tip, and drifts)
 comes from what is stated and from rows of the free tip alone. Rows in contact tell nothing of it: a change of f0 turns
@@ -33,7 +33,7 @@ from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
 from scipy.special import ndtr
 
-from afm_jax.least_squares import IMPROBABLE, TORN, Box, Searches, chi2_tail, covariance_of, descended, distance
+from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, covariance_of, descended, distance
 from fitting.instruments.lag import free_lag_deg, turned
 from fitting.parameters import USUAL_DRIFTS
 from fitting.tapping_curves.branches import CurveBranch, free_ends, ways
@@ -107,21 +107,12 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
 
 
 def _lost_at_harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> Rows:
-    """Return what the air takes at the harmonics over k, in nm^2: (pi s/Q) sum n^2 |Z_n|^2.
-
-    Measured ones as they are, |Z_n| = |F_1/k|/|gamma(n s)| for the others.
-    """
+    """Return what the air takes at the harmonics over k, in nm^2: (pi s/Q) sum n^2 |F_1/k|^2/|gamma(n s)|^2."""
     n, q = np.arange(2, _HARMONICS + 1)[:, None], instrument.quality_factor
     frequencies, row = np.unique(curve.drive_frequency_khz, return_inverse=True)
     s = frequencies / instrument.free_frequency_khz
     each = max(instrument.harmonics_factor, 0.0) * n**2 / np.abs(1.0 - (n * s) ** 2 + 1j * n * s / q) ** 2
-    of_force, measured = each.sum(axis=0)[row], np.zeros(curve.rows)
-    for multiple, amplitude in curve.harmonic_amplitudes_nm.items():
-        if 2 <= multiple <= _HARMONICS:
-            here = np.isfinite(amplitude)
-            measured[here] += multiple**2 * amplitude[here] ** 2
-            of_force[here] -= each[multiple - 2, row[here]]
-    return np.pi * s[row] / q * (measured + of_force * force**2)
+    return np.pi * s[row] / q * each.sum(axis=0)[row] * force**2
 
 
 def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:
@@ -135,15 +126,11 @@ def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:
     return middle + np.hypot(first[1] - middle, 0.5 * (first[0] - first[2]))
 
 
-def noise_of(curve: TappingCurve, found: Energies) -> Rows:
-    """Return the standard error of each energy from the noise of its own row, in aJ."""
-    return np.hypot(found.amplitude_slope * curve.amplitude_error_nm, found.lag_slope * curve.lag_error_deg)
-
-
-def virial_noise_of(curve: TappingCurve, found: Energies) -> Rows:
-    """Return the standard error of each virial from the noise of its own row, in aJ."""
-    by_amplitude = found.virial_amplitude_slope * curve.amplitude_error_nm
-    return np.hypot(by_amplitude, found.virial_lag_slope * curve.lag_error_deg)
+def noise_of(curve: TappingCurve, found: Energies) -> tuple[Rows, Rows]:
+    """Return the standard error of each energy and each virial from the noise of its own row, in aJ."""
+    amplitude, lag = curve.amplitude_error_nm, curve.lag_error_deg
+    energy = np.hypot(found.amplitude_slope * amplitude, found.lag_slope * lag)
+    return energy, np.hypot(found.virial_amplitude_slope * amplitude, found.virial_lag_slope * lag)
 
 
 FEWEST_FREE_ROWS = 3
@@ -359,23 +346,17 @@ class Lever:
         energy, virial = _slopes(of, x, len(self.unknowns))
         return energy, virial
 
-    def errors_of_rows(self, number: int) -> tuple[dict[str, Rows], dict[str, Rows]]:
-        """Return by how much each energy and each virial moves with one standard error of what all rows share.
+    def errors_of_rows(self, number: int) -> tuple[Rows, Rows]:
+        """Return the standard error of each energy and each virial from what all rows share.
 
         With the instrument as given: frequency, Q and harmonics by what is stated of them, the rest by free rows.
         """
         given, errors = self.stated, np.sqrt(np.diag(self.minimum.covariance))
         errors[: len(COMMON)] = 1.0
         curve, found = self.curves[number], energies(self.curves[number], self.instrument(number, given))
-        parts: tuple[dict[str, Rows], dict[str, Rows]] = ({}, {})
-        columns = (found.energy_aj, found.virial_aj)
-        for named, by, column in zip(parts, self.slopes(curve, number, given), columns, strict=True):
-            for unknown, part in zip(self.unknowns, np.abs(by * errors).T, strict=True):
-                if unknown.curve in {None, number}:
-                    name = _NAMES.get(unknown.kind, unknown.kind)
-                    named[name] = np.hypot(named.get(name, 0.0), part)
-            named |= {name: share * np.abs(column) for name, share in curve.relative_errors.items()}
-        return parts
+        energy, virial = (np.linalg.norm(by * errors, axis=1) for by in self.slopes(curve, number, given))
+        share = curve.relative_error
+        return np.hypot(energy, share * found.energy_aj), np.hypot(virial, share * found.virial_aj)
 
     def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
         """Return what is stated of the instrument of a curve and where a least squares ends."""
@@ -401,8 +382,6 @@ class Lever:
 
 
 _NUMBERED = ("phase_zero_deg", "free_amplitude")
-_NAMES = {"free_lag_deg": "phase_zero_deg", "harmonics_factor": "harmonics"}
-"""What parts of the errors of rows are called."""
 
 
 def _of_logarithm(given: Given) -> Given:
@@ -735,11 +714,6 @@ class EnergyFunctions:
         """Where statements and free rows put it."""
         return self.lever.instrument(self.number)
 
-    @property
-    def torn(self) -> list[Nuisance]:
-        """Nuisances that had to go beyond three of their errors."""
-        return [one for one in self.nuisances if abs(one.pull) > TORN]
-
 
 def energies_along(
     lever: Lever, stretches: Sequence[Sequence[np.ndarray]], repulsive: Sequence[Bool[np.ndarray, " rows"]]
@@ -761,7 +735,7 @@ def energies_along(
     root = axes * np.sqrt(np.maximum(size, 0.0))
     by_instrument = np.concatenate([c.by_instrument for c in curves]) @ root
     low, high, possible = positive_bands(estimate, noise, certain, by_instrument)
-    share = float(np.linalg.norm(list(lever.curves[0].relative_errors.values())))
+    share = lever.curves[0].relative_error
     middle, common = 0.5 * (low + high), Z95 * share * 0.5 * (low + high)
     low, high = np.maximum(middle - np.hypot(middle - low, common), 0.0), middle + np.hypot(high - middle, common)
     ends = np.cumsum([len(c.noise_aj) for c in curves])[:-1]
@@ -792,7 +766,7 @@ def _along(
     found, at_smooth = energies(curve, at), energies(smooth, at)
     energy_slopes, virial_slopes = lever.slopes(smooth, number, x)
     outliers, branches, chi2, freedom, scales = np.zeros(curve.rows, bool), [], 0.0, 0.0, [1.0]
-    share = float(np.linalg.norm(list(curve.relative_errors.values())))
+    share = curve.relative_error
     for rows in stretches:
         fit = _stretch(curve, rows, place, found.energy_aj, at_smooth.amplitude_slope, at_smooth.lag_slope)
         by_reading = at_smooth.virial_amplitude_slope, at_smooth.virial_lag_slope
@@ -976,39 +950,26 @@ def _densest(mean: float, error: float, low: float, high: float) -> tuple[float,
     return mean + error * ends[0], mean + error * ends[1]
 
 
-@dataclass(frozen=True)
-class LeastOnFrequency:
-    """The energy of a curve that hangs least on the free frequency, relative to itself.
+def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
+    """Return the energy of a curve that hangs least on the free frequency, relative to itself, and where.
 
-    Attributes:
-        branch: its number.
-        amplitude_ratio: where.
-        energy_aj: there, the middle of its band.
-        interval95_aj: the band.
-        by_frequency_aj: how much of that a standard error of the frequency, as known, is.
+    It is the middle of its band, beside how much of it a standard error of the frequency, as known, is; None where no
+    energy is above nothing.
     """
-
-    branch: int
-    amplitude_ratio: float
-    energy_aj: float
-    interval95_aj: tuple[float, float]
-    by_frequency_aj: float
-
-
-def least_on_frequency(functions: EnergyFunctions) -> LeastOnFrequency | None:
-    """Return the energy of a curve that hangs least on the free frequency; None where no energy is above nothing."""
     known, found = float(np.sqrt(functions.lever.minimum.covariance[0, 0])), []
     for number, branch in enumerate(functions.branches):
         c = branch.curve
         by = known * np.abs(c.by_instrument[:, 0])
-        with np.errstate(divide="ignore"):
-            share = np.where(c.certain & (c.energy_low_aj > 0.0), by / np.maximum(c.energy_aj, 1e-300), np.inf)
-        n = int(np.argmin(share))
-        band = float(c.energy_low_aj[n]), float(c.energy_high_aj[n])
-        at = LeastOnFrequency(number, float(c.amplitude_ratio[n]), float(c.energy_aj[n]), band, float(by[n]))
-        found.append((float(share[n]), at))
-    share, at = min(found, key=lambda pair: pair[0], default=(np.inf, None))
-    return at if np.isfinite(share) else None
+        for n in np.flatnonzero(c.certain & (c.energy_low_aj > 0.0)):
+            at = {
+                "branch": number,
+                "amplitude_ratio": float(c.amplitude_ratio[n]),
+                "energy_aj": float(c.energy_aj[n]),
+                "interval95_aj": (float(c.energy_low_aj[n]), float(c.energy_high_aj[n])),
+                "by_frequency_aj": float(by[n]),
+            }
+            found.append(at)
+    return min(found, key=lambda at: at["by_frequency_aj"] / at["energy_aj"], default=None)
 
 
 def largest_of(branches: Sequence[TappingBranch]) -> tuple[int, int]:
@@ -1059,31 +1020,20 @@ def what_narrows(functions: EnergyFunctions) -> str:
     return f"state {words}, which would leave +- {half[words]:.2g} aJ"
 
 
-@dataclass(frozen=True)
-class WayDifference:
-    """Retract less approach at the same amplitude and on the same side of the phase.
+def differences_of_ways(functions: EnergyFunctions) -> list[dict[str, Any]]:
+    """Return by how much retract differs from approach at the same amplitude and on the same side of the phase.
 
-    Attributes:
-        amplitude_ratio: where they differ most, in errors.
-        energy_aj: by how much there.
-        standard_error: its error; what both have in common cancels.
+    Of each two branches, by their numbers, where they differ most in errors; what both have in common cancels.
     """
-
-    amplitude_ratio: float
-    energy_aj: float
-    standard_error: float
-
-
-def differences_of_ways(functions: EnergyFunctions) -> dict[tuple[int, int], WayDifference]:
-    """Return by how much retract differs from approach, by the numbers of the two branches."""
-    found, covariance = {}, functions.lever.minimum.covariance
-    share = float(np.linalg.norm(list(functions.lever.curves[functions.number].relative_errors.values())))
+    found, covariance = [], functions.lever.minimum.covariance
+    share = functions.lever.curves[functions.number].relative_error
     for i, one in enumerate(functions.branches):
         for j, other in enumerate(functions.branches):
             if one.retract or not other.retract or (one.drive, one.repulsive) != (other.drive, other.repulsive):
                 continue
-            ends = [(b.curve.amplitude_ratio[0], b.curve.amplitude_ratio[-1]) for b in (one, other)]
-            low, high = max(end[0] for end in ends), min(end[1] for end in ends)
+            low, high = (
+                end(b.curve.amplitude_ratio[place] for b in (one, other)) for end, place in ((max, 0), (min, -1))
+            )
             if not low < high:
                 continue
             ratio = np.linspace(low, high, _POINTS)
@@ -1092,7 +1042,8 @@ def differences_of_ways(functions: EnergyFunctions) -> dict[tuple[int, int], Way
             variance = of_a**2 + of_b**2 + np.einsum("nu,uv,nv->n", by, covariance, by) + (share * off) ** 2
             error = np.sqrt(variance)
             most = int(np.argmax(np.abs(off) / error))
-            found[i, j] = WayDifference(float(ratio[most]), float(off[most]), float(error[most]))
+            at = {"amplitude_ratio": ratio[most], "energy_aj": off[most], "standard_error": error[most]}
+            found.append({"approach": i, "retract": j} | at)
     return found
 
 
@@ -1113,7 +1064,7 @@ class OneEnergy:
     Attributes:
         energy_aj: of each group.
         error_aj: its standard error but for spring constant and calibration.
-        relative_error: what these add, by name.
+        relative_error: what these add.
         budget: of each group what its variance comes from, in aJ^2.
         nuisances: of the instrument.
         instrument: at the minimum.
@@ -1126,7 +1077,7 @@ class OneEnergy:
 
     energy_aj: Float[np.ndarray, " groups"]
     error_aj: Float[np.ndarray, " groups"]
-    relative_error: dict[str, float]
+    relative_error: float
     budget: tuple[dict[str, float], ...]
     nuisances: tuple[Nuisance, ...]
     instrument: Instrument
@@ -1135,16 +1086,6 @@ class OneEnergy:
     residual: Rows
     minimum: Solution
     scale: float
-
-    @property
-    def share(self) -> float:
-        """Relative error that all energies have in common, from spring constant and calibration."""
-        return float(np.linalg.norm(list(self.relative_error.values())))
-
-    @property
-    def torn(self) -> list[Nuisance]:
-        """Nuisances that had to go beyond three of their errors."""
-        return [one for one in self.nuisances if abs(one.pull) > TORN]
 
 
 def one_energy(
@@ -1186,7 +1127,7 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
     def off(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return how far the rows' energies are from those of their groups, and their noise."""
         at = lever.instrument(0, x)
-        noise = scale * noise_of(smooth, energies(smooth, at))[rows]
+        noise = scale * noise_of(smooth, energies(smooth, at))[0][rows]
         return energies(curve, at).energy_aj[rows] - x[count:][group], noise
 
     def residual(x: np.ndarray) -> np.ndarray:
@@ -1216,7 +1157,7 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
     return OneEnergy(
         energy_aj=minimum.at[count:],
         error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
-        relative_error=curve.relative_errors,
+        relative_error=curve.relative_error,
         budget=tuple(_budget(lever, minimum, count + i) for i in range(len(groups))),
         nuisances=lever.nuisances(0, minimum),
         instrument=lever.instrument(0, minimum.at),

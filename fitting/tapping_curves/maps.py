@@ -21,7 +21,7 @@ from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_number
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve
-from fitting.tapping_curves.energy import energies, noise_of, virial_noise_of
+from fitting.tapping_curves.energy import energies, noise_of
 
 _BEYOND = 3.0
 """Standard errors beyond which a pixel is out of range."""
@@ -328,7 +328,7 @@ def _of_rows(
         lines=np.arange(len(amplitude)),
     )
     found = energies(curve, Instrument(f0, q, harmonics_factor=value["harmonics_factor"]))
-    return np.array([[found.energy_aj, found.virial_aj], [noise_of(curve, found), virial_noise_of(curve, found)]])
+    return np.array([(found.energy_aj, found.virial_aj), noise_of(curve, found)])
 
 
 def _reasons(

@@ -120,16 +120,17 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
             ]
         )
     lines = [
-        f"  retract less approach, {result.branches[i].side}: {with_error(one.energy_aj, one.standard_error)} aJ "
-        f"at A/A0 = {one.amplitude_ratio:.2f}, where the difference is largest in units of its error"
-        for (i, _), one in result.way_differences.items()
+        f"  retract less approach, {result.branches[one['approach']].side}: "
+        f"{with_error(one['energy_aj'], one['standard_error'])} aJ at A/A0 = {one['amplitude_ratio']:.2f}, where the "
+        "difference is largest in units of its error"
+        for one in result.way_differences
     ]
     least = result.least_on_frequency
     if least is not None:
         lines.append(
-            f"  hangs least on the free frequency at A/A0 = {least.amplitude_ratio:.3f} "
-            f"({result.branches[least.branch].name}): {_band_in_words(*least.interval95_aj)} aJ, of which the error of "
-            f"the frequency is {least.by_frequency_aj:.2g}"
+            f"  hangs least on the free frequency at A/A0 = {least['amplitude_ratio']:.3f} "
+            f"({result.branches[least['branch']].name}): {_band_in_words(*least['interval95_aj'])} aJ, of which the "
+            f"error of the frequency is {least['by_frequency_aj']:.2g}"
         )
     caption = (
         "Energy of a tap by the amplitude over the free one: value and standard error where measured, else the band of "

@@ -20,11 +20,9 @@ from fitting.tapping_curves.energy import (
     MEASURED,
     Z95,
     EnergyFunctions,
-    LeastOnFrequency,
     Nuisance,
     OneEnergy,
     TappingBranch,
-    WayDifference,
     differences_of_ways,
     largest_of,
     least_on_frequency,
@@ -67,12 +65,12 @@ class TapRows:
         lag_departure_deg: lag less that of the free tip.
         energy_aj: of a tap, with the instrument as given.
         energy_noise_aj: its standard error from the row's own noise.
-        energy_errors_aj: by how much it moves with one standard error of what all rows share, by name.
+        energy_systematic_aj: its standard error from what all rows share.
         energy_of_fit_aj: with the instrument as fitted.
         virial_aj: mean of force times height, of the first harmonic, with the instrument as given; positive where
             attraction prevails, negative where repulsion does.
         virial_noise_aj: its standard error from the row's own noise.
-        virial_errors_aj: by how much it moves with one standard error of what all rows share, by name.
+        virial_systematic_aj: its standard error from what all rows share.
         virial_of_fit_aj: with the instrument as fitted.
         largest_energy_aj: the most that a tap can take at this amplitude, whatever the phase.
         used: whether it is in the fit of one energy.
@@ -83,11 +81,11 @@ class TapRows:
     lag_departure_deg: Rows
     energy_aj: Rows
     energy_noise_aj: Rows
-    energy_errors_aj: dict[str, Rows]
+    energy_systematic_aj: Rows
     energy_of_fit_aj: Rows
     virial_aj: Rows
     virial_noise_aj: Rows
-    virial_errors_aj: dict[str, Rows]
+    virial_systematic_aj: Rows
     virial_of_fit_aj: Rows
     largest_energy_aj: Rows
     used: Bool[np.ndarray, " rows"]
@@ -97,16 +95,6 @@ class TapRows:
     def free(self) -> Bool[np.ndarray, " rows"]:
         """Rows of the free tip."""
         return np.array([state == "free" for state in self.state])
-
-    @property
-    def energy_systematic_aj(self) -> Rows:
-        """Standard error of each energy from what all rows share."""
-        return np.sqrt(np.sum(np.square(list(self.energy_errors_aj.values())), axis=0))
-
-    @property
-    def virial_systematic_aj(self) -> Rows:
-        """Standard error of each virial from what all rows share."""
-        return np.sqrt(np.sum(np.square(list(self.virial_errors_aj.values())), axis=0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +181,11 @@ class Tapping(Result):
     def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
         """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
         assert self.fit is not None  # noqa: S101
-        value, alone, share = float(self.fit.energy_aj[number]), float(self.fit.error_aj[number]), self.fit.share
+        value, alone, share = (
+            float(self.fit.energy_aj[number]),
+            float(self.fit.error_aj[number]),
+            self.fit.relative_error,
+        )
         return value, float(np.hypot(alone, share * value)), _interval(value, alone, share)
 
     @property
@@ -291,7 +283,7 @@ class Tapping(Result):
         }
 
     @property
-    def least_on_frequency(self) -> LeastOnFrequency | None:
+    def least_on_frequency(self) -> dict[str, Any] | None:
         """The energy that hangs least on the free frequency, and where; None where none is above nothing."""
         return None if self.functions is None else least_on_frequency(self.functions)
 
@@ -323,9 +315,9 @@ class Tapping(Result):
         ]
 
     @property
-    def way_differences(self) -> dict[tuple[int, int], WayDifference]:
+    def way_differences(self) -> list[dict[str, Any]]:
         """By how much the energy differs between approach and retract, by the numbers of the branches."""
-        return {} if self.functions is None else differences_of_ways(self.functions)
+        return [] if self.functions is None else differences_of_ways(self.functions)
 
     def in_unit(self, text: str) -> str:
         """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant.
@@ -443,9 +435,6 @@ class Tapping(Result):
             "virial_aj": rows.virial_aj,
             "virial_noise_aj": rows.virial_noise_aj,
             "virial_systematic_aj": rows.virial_systematic_aj,
-        }
-        columns |= {f"energy_error_of_{name}_aj": part for name, part in rows.energy_errors_aj.items()}
-        columns |= {
             "energy_of_fit_aj": rows.energy_of_fit_aj,
             "virial_of_fit_aj": rows.virial_of_fit_aj,
             "residual": np.full(curve.rows, np.nan) if self.fit is None else self.fit.residual,
@@ -468,11 +457,9 @@ class Tapping(Result):
                 "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
                 "energy_per_tap_reason": energy["reason"] or None,
                 "largest_energy_aj": self.largest,
-                "least_on_frequency": None if self.least_on_frequency is None else vars(self.least_on_frequency),
+                "least_on_frequency": self.least_on_frequency,
                 "energies_at": self.energies_at,
-                "way_differences": [
-                    {"approach": i, "retract": j, **vars(one)} for (i, j), one in self.way_differences.items()
-                ],
+                "way_differences": self.way_differences,
                 "epsilon_nm2_per_us2": self.epsilon,
                 "assumptions": self.assumptions,
                 "phase_sense": {**self.curve.phase._asdict(), "assumed": self.curve.phase.assumed},

@@ -12,12 +12,13 @@ back what a Hertz contact does to tip and readings. Here the tip counts as resti
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 
 from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.curve import Instrument, Rows, TappingCurve, motion_of
 
+_STEP = 1e-5
+"""Of differences by the unknowns, in units of their own."""
 _CLOSING = Newton(rounds=120, residual_tolerance=5e-10, halvings=6)
 """Of the free amplitude, each of three equations: 1e-9 together."""
 
@@ -77,9 +78,20 @@ def speeds(
     force = motion.gamma * lockin
     change = own**2 * np.abs(force) * np.pi / omega
     x = np.stack([-np.angle(force), 0.5 * change, np.zeros(curve.rows)])
+    unit = np.stack([np.ones(curve.rows), free * omega, 1.0 / omega])
+
+    def linearised(unknowns: np.ndarray, rows: np.ndarray) -> LinearisedRows:
+        here, steps = seen.of(rows), _STEP * np.eye(3)[:, :, None]
+        at = unknowns.T * unit[:, rows]
+        left = [_flight(here, at + way * step * unit[:, rows]).left for step in steps for way in (1.0, -1.0)]
+        slopes = np.stack([(left[2 * i] - left[2 * i + 1]).T / (2.0 * _STEP) for i in range(3)], axis=2)
+        return LinearisedRows(_flight(here, at).left.T, slopes)
+
     # rows that no flight fits run away
     with np.errstate(all="ignore"):
-        x, found = _solve(seen, x)
+        roots = newton_rows(linearised, (x / unit).T, _CLOSING)
+        x = roots.x.T * unit
+        found = roots.converged & (np.abs(x[2]) < np.pi / omega)
         at = _flight(seen, x)
     good = found & (at.approach > 0.0) & (x[1] > 0.0)
     columns = (at.approach, x[1], x[2], at.pull * x[2] / at.approach)
@@ -91,13 +103,11 @@ class _Flight(NamedTuple):
 
     Attributes:
         left: of the three equations, over the free amplitude, shape (3, rows).
-        slopes: change of `left` by the unknowns, shape (rows, 3, 3).
         approach: relative speed at the end.
         pull: of lever and drive during the contact.
     """
 
     left: np.ndarray
-    slopes: np.ndarray
     approach: Rows
     pull: Rows
 
@@ -121,41 +131,14 @@ def _flight(seen: _Seen, x: np.ndarray) -> _Flight:
     velocity = rebound - seen.free * omega * leaving.imag
     # w = Re(c exp(rate t)) = (c exp(rate t) + its conjugate)/2
     c = start - 1j * (velocity + seen.decay * start) / ring
-    c_by_phase = -seen.free * (leaving.imag - 1j * (omega * leaving.real + seen.decay * leaving.imag) / ring)
-    c_by_rebound = -1j / ring
     grown, back = np.exp(rate * flown), np.exp(-1j * omega * flown)
     up, down = (grown * back - 1.0) / (rate - 1j * omega), (grown.conj() * back - 1.0) / (rate.conjugate() - 1j * omega)
-
-    def flight_of(c):
-        return 0.5 * leaving.conj() * (c * up + np.conj(c) * down)
-
     height, speed = np.real(c * grown), np.real(rate * c * grown)
     sample, rise = seen.sigma + seen.free * resting.real, -seen.free * omega * resting.imag
-    of_flight, of_contact = flight_of(c), sample * resting.conj()
-    turning = (rise / omega - 1j * sample) * resting.conj()
-    missing = 2.0 / period * (of_flight + contact * of_contact) - seen.lockin
+    of_flight = 0.5 * leaving.conj() * (c * up + np.conj(c) * down)
+    missing = 2.0 / period * (of_flight + contact * sample * resting.conj()) - seen.lockin
     gap = height - seen.sigma - seen.free * ending.real
     approach = -seen.free * omega * ending.imag - speed
-    by = [
-        (
-            -1j * of_flight + flight_of(c_by_phase) + contact * turning,
-            np.real(c_by_phase * grown) + seen.free * ending.imag,
-        ),
-        (flight_of(c_by_rebound), np.real(c_by_rebound * grown)),
-        (of_contact - height * back * leaving.conj() - 0.5 * omega * contact * turning, approach),
-    ]
-    slopes = np.stack([np.stack([2.0 / period * m.real, 2.0 / period * m.imag, g], axis=1) for m, g in by], axis=2)
     pull = -(seen.free_omega**2) * sample - 2.0 * seen.decay * rise + omega**2 * seen.free * resting.real
     left = np.stack([missing.real, missing.imag, gap]) / seen.free
-    return _Flight(left, slopes / seen.free[:, None, None], approach, pull)
-
-
-def _solve(seen: _Seen, x: np.ndarray) -> tuple[np.ndarray, Bool[np.ndarray, " rows"]]:
-    """Return the unknowns by Newton's method, shape (3, rows), and which rows are solved."""
-
-    def linearised(unknowns: np.ndarray, rows: np.ndarray) -> LinearisedRows:
-        flight = _flight(seen.of(rows), unknowns.T)
-        return LinearisedRows(flight.left.T, flight.slopes)
-
-    roots = newton_rows(linearised, x.T, _CLOSING)
-    return roots.x.T, roots.converged & (np.abs(roots.x[:, 2]) < np.pi / seen.omega)
+    return _Flight(left, approach, pull)

@@ -21,7 +21,6 @@ from fitting.tapping_curves.branches import (
     held_rows,
     repulsive_rows,
     rough_rows,
-    side_of,
     smooth_stretches,
     ways,
 )
@@ -37,7 +36,6 @@ from fitting.tapping_curves.curve import (
 )
 from fitting.tapping_curves.energy import (
     FEWEST_ROWS,
-    Energies,
     Lever,
     OneEnergy,
     energies,
@@ -45,7 +43,6 @@ from fitting.tapping_curves.energy import (
     largest_energies,
     noise_of,
     one_energy,
-    virial_noise_of,
 )
 from fitting.tapping_curves.result import EnergyGroup, MeasuredSpeeds, Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
@@ -148,7 +145,7 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         lines=np.asarray(table.lines),
         time=np.linspace(-0.5, 0.5, table.rows) if table.rows_in_order_of_time and table.rows > 1 else None,
     )
-    return whole.part(rows)
+    return part_of(whole, rows)
 
 
 def _lever_of(table: AmplitudeTable, quality_factor: float) -> dict[str, Any]:
@@ -300,14 +297,21 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     believed = functions or fitted
     alone = kind.touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
     nothing = np.zeros(curve.rows, bool)
-    rows = _tap_rows(
-        curve,
-        kind,
-        plain,
-        lever.errors_of_rows(0),
-        largest_energy_aj=largest_energies(curve, given),
+    states = [kind.free, kind.held, np.isnan(kind.lag_departure_deg), kind.repulsive]
+    state = np.select(states, ["free", "held", "touching", "repulsive"], "attractive")
+    (energy_noise, virial_noise), (energy_error, virial_error) = noise_of(curve, plain), lever.errors_of_rows(0)
+    rows = TapRows(
+        state=tuple(state.tolist()),
+        lag_departure_deg=kind.lag_departure_deg,
+        energy_aj=plain.energy_aj,
+        energy_noise_aj=energy_noise,
+        energy_systematic_aj=energy_error,
         energy_of_fit_aj=found.energy_aj,
+        virial_aj=plain.virial_aj,
+        virial_noise_aj=virial_noise,
+        virial_systematic_aj=virial_error,
         virial_of_fit_aj=found.virial_aj,
+        largest_energy_aj=largest_energies(curve, given),
         used=nothing if fitted is None else fitted.used,
         note=_notes(curve, kind, far=nothing if believed is None else believed.outliers, alone=alone),
     )
@@ -366,29 +370,6 @@ def _kinds_of_rows(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray
     return _KindsOfRows(free, held, touching, repulsive, rough, early, departure)
 
 
-def _tap_rows(
-    curve: TappingCurve,
-    kind: _KindsOfRows,
-    plain: Energies,
-    errors: tuple[dict[str, Rows], dict[str, Rows]],
-    **of_fit: Any,
-) -> TapRows:
-    """Return the rows one by one: what the instrument as given makes of them, beside what a fit does."""
-    states = zip(kind.free, kind.held, np.isfinite(kind.lag_departure_deg), kind.repulsive, strict=True)
-    energy_errors, virial_errors = errors
-    return TapRows(
-        state=tuple(_state(*row) for row in states),
-        lag_departure_deg=kind.lag_departure_deg,
-        energy_aj=plain.energy_aj,
-        energy_noise_aj=noise_of(curve, plain),
-        energy_errors_aj=energy_errors,
-        virial_aj=plain.virial_aj,
-        virial_noise_aj=virial_noise_of(curve, plain),
-        virial_errors_aj=virial_errors,
-        **of_fit,
-    )
-
-
 def _followed(
     curve: TappingCurve, alike: list[np.ndarray], stretches: list[np.ndarray], free: Bool[np.ndarray, " rows"]
 ) -> OneEnergy | None:
@@ -423,16 +404,6 @@ def _groups(
     return groups, rows
 
 
-def _state(free: np.bool_, held: np.bool_, phase: np.bool_, repulsive: np.bool_) -> str:
-    if free:
-        return "free"
-    if held:
-        return "held"
-    if not phase:
-        return "touching"
-    return side_of(repulsive)
-
-
 def _notes(curve: TappingCurve, kind: _KindsOfRows, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
     """Return why each row is not in the fit, or what it is for; the first reason that holds."""
     said = {
@@ -445,7 +416,7 @@ def _notes(curve: TappingCurve, kind: _KindsOfRows, **which: Bool[np.ndarray, " 
         "alone": f"excluded: fewer than {FEWEST_ROWS} rows of this branch",
     }
     which |= kind._asdict() | {"silent": np.isnan(curve.lag_deg)}
-    return tuple(next((words for name, words in said.items() if which[name][i]), "") for i in range(curve.rows))
+    return tuple(np.select([which[name] for name in said], list(said.values()), "").tolist())
 
 
 def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> float | None:

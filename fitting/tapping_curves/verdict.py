@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN
 from afm_jax.outcomes import Rule, Rules
 from afm_jax.words import interval
 from fitting.instruments.lag import turned
@@ -42,7 +42,6 @@ ORIGINS = {
     "phase_zero_deg": "zero of phase",
     "free_amplitude": "free amplitude",
     "harmonics_factor": "harmonics",
-    "harmonics": "harmonics",
     "phase_drift_deg": "drift of the phase",
     "free_amplitude_drift": "drift of the free amplitude",
 }
@@ -51,7 +50,8 @@ ORIGINS = {
 
 def _torn(fit: EnergyFunctions | OneEnergy) -> list[str]:
     """Return which nuisances had to go too far, in words."""
-    parts = [f"{ORIGINS[n.kind]} {n.pull:+.1f} of its errors from what was given" for n in fit.torn]
+    torn = [n for n in fit.nuisances if abs(n.pull) > TORN]
+    parts = [f"{ORIGINS[n.kind]} {n.pull:+.1f} of its errors from what was given" for n in torn]
     return [f"{' and '.join(parts)} would be needed"] if parts else []
 
 
@@ -293,9 +293,6 @@ ASSUMPTIONS: Rules[Any] = [
     ),
     Rule(lambda e: list(e.curve.phase.notes), "{case}"),
     Rule(lambda e: [_lag(e)] if e.curve.has_phase else [], "{case}"),
-    Rule(
-        lambda e: not e.curve.harmonic_amplitudes_nm,
-        "harmonics were not measured: those of one brief impact a period, to 10 %",
-    ),
+    Rule(lambda _: True, "harmonics were not measured: those of one brief impact a period, to 10 %"),
 ]
 """What the numbers take for granted."""
