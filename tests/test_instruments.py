@@ -303,16 +303,6 @@ def test_signs_and_units_of_the_phase_that_the_caller_gives_stay(curve_of):
     assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(LAG), rel=1e-4)
 
 
-def test_a_free_part_that_wavers_is_told(curve_of):
-    # as interference of the detector's light does: a period of 8 nm, amplitude 3 %, standard deviation 2.1 %
-    height = np.linspace(0.0, 60.0, 400)
-    noise = 1.0 + 0.002 * np.random.default_rng(2).normal(size=400)
-    for waver, wanted in ((0.03, [pytest.approx(2.1, abs=0.3)]), (0.0, [])):
-        amplitude = np.where(height > 50.0, 63.0 - height, 13.0 * (1.0 + waver * np.sin(2.0 * np.pi * height / 8.0)))
-        notes = curve_of(height, amplitude * noise, 90.0 + 0.0 * height).notes
-        assert [float(share) for share in re.findall(r"Free part: .*wavers by ([\d.]+)%", "\n".join(notes))] == wanted
-
-
 def test_approach_and_retract_that_are_mixed_are_named(curve_of):
     made = raw_curve(400, drift=0.0)
     height, amplitude = made.height_nm[0], 42.0 * made.amplitude_v[0]

@@ -16,8 +16,6 @@ _FLAT, _FLAT_DEG = 0.005, 1.0
 """What blocks of the free tip may differ by: of the amplitude, and in degrees."""
 _TURNS_DEG = 3.0
 """Change of the lag with which a change of the amplitude is that of first contact."""
-_WAVERS = 3.0
-"""Scatter of blocks, over that of their noise, from which the free amplitude is not flat."""
 _SLOPING = 0.01
 """Change of the amplitude over the farthest quarter of the rows, of the amplitude, from which there is no free part."""
 _WINDOW_NM = 1.0
@@ -64,7 +62,6 @@ class BranchLook:
         onset_nm: height at which the line through the rows in contact meets the free level; None without such rows.
         jump: levels before and after the largest jump of the free amplitude along the heights, None without one.
         change: of the amplitude over the farthest quarter of the rows, of the amplitude, if that is no free part.
-        waver: standard deviation of the free amplitude along the heights beyond its noise, of it, if it is not flat.
     """
 
     free: Bool[np.ndarray, " rows"]
@@ -75,7 +72,6 @@ class BranchLook:
     onset_nm: float | None
     jump: tuple[float, float] | None
     change: float | None = None
-    waver: float | None = None
 
 
 def look_at(
@@ -115,7 +111,7 @@ def look_at(
     mask[order] = free
     noise = _scatter(rows) if len(rows) >= _FEWEST else float("nan")
     error = float(np.std(rows) / np.sqrt(len(rows)))
-    return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change, _waver(rows))
+    return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change)
 
 
 def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " rows"] | None) -> int:
@@ -159,20 +155,6 @@ def _change(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows
     of_line = float(np.sum((far - far.mean() - slope * place) ** 2))
     of_step = min(float(np.var(far[:k]) * k + np.var(far[k:]) * (rows - k)) for k in range(1, rows))
     return change if steep and of_line < of_step else None
-
-
-def _waver(values: Float[np.ndarray, " rows"]) -> float | None:
-    """Return how much blocks of free rows scatter about a straight line, of their mean; None where it is as noise does.
-
-    Noise is what neighbours differ by.
-    """
-    size = max(len(values) // _PARTS, _FEWEST)
-    if len(values) < 4 * size:
-        return None
-    parts = np.array([part.mean() for part in np.array_split(values, len(values) // size)])
-    noise = float(np.std(np.diff(values)) / np.sqrt(2.0 * size))
-    waver, level = _scatter(parts), float(np.mean(values))
-    return waver / level if waver > max(_FLAT * level, _WAVERS * noise) else None
 
 
 def _scatter(values: Float[np.ndarray, " rows"]) -> float:

@@ -477,8 +477,10 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
     curve = replace(curve, known=_with_errors(replace(curve, known=known), looks))
     curve = _with_origin(curve, looks)
     curve = _with_sense_of_phase(curve, looks, stated_sense)
-    missing = [key for key in _NEEDED if _is_missing(curve, key)] + [key for key in _WANTED if key not in curve.known]
-    notes = (*curve.notes, *_free_notes(looks), *_scale_notes(curve), *_phase_notes(curve, stated_sense))
+    # in volts the sensitivity comes first
+    there = {*curve.known, "free_amplitude_nm" if curve.amplitude_unit == "V" else "nm_per_volt"}
+    missing = [key for key in (*_NEEDED, *_WANTED) if key not in there]
+    notes = (*curve.notes, *_scale_notes(curve), *_phase_notes(curve, stated_sense))
     return replace(curve, notes=notes, missing=tuple(missing))
 
 
@@ -683,24 +685,6 @@ def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Ph
         free=curve.free,
         ways=[rows[np.argsort(curve.offset_nm[rows], kind="stable")] for rows in here],
     )
-
-
-def _is_missing(curve: MeasuredCurve, key: str) -> bool:
-    if key == "nm_per_volt":
-        return curve.amplitude_unit == "V"
-    if key == "free_amplitude_nm" and curve.amplitude_unit == "V":
-        return False
-    return key not in curve.known
-
-
-def _free_notes(looks: Mapping[str, BranchLook]) -> list[str]:
-    """Say where the free tip's amplitude wavers along the heights, as interference of the detector's light does."""
-    return [
-        f"Free part: in the {branch} the amplitude is not flat, it wavers by {look.waver:.1%} along the heights; that "
-        "is taken for the error of every amplitude, and widens the bands."
-        for branch, look in looks.items()
-        if look.waver is not None
-    ]
 
 
 def _scale_notes(curve: MeasuredCurve) -> list[str]:

@@ -270,13 +270,12 @@ class Lever:
         self._unit = np.array([unknown.given.error for unknown in unknowns])
         # the zero that several curves or frequencies state is one and the same, and counts once
         self._zeros = [
-            (i, zero) for i, one in enumerate(unknowns) if one.kind == "free_lag_deg" and (zero := self._zero(one))
+            (i, zero)
+            for i, one in enumerate(unknowns)
+            if one.kind == "free_lag_deg" and (zero := self.curves[one.curve or 0].phase_zero_deg)
         ]
         # all but linear: a few steps more are as good as none
         self.minimum = _minimum(self.residual, self.jacobian, np.zeros(len(unknowns)), until=1e-20)
-
-    def _zero(self, unknown: _Unknown) -> Given | None:
-        return None if unknown.curve is None else self.curves[unknown.curve].phase_zero_deg
 
     def values(self, x: np.ndarray) -> np.ndarray:
         """Return the unknowns in their own units."""
@@ -567,14 +566,24 @@ def _size_of(values: np.ndarray, noise: np.ndarray) -> float:
     return _SIZE * max(float(np.ptp(means)), float(np.median(noise)))
 
 
-def _smooth_readings(curve: TappingCurve, stretches: Sequence[np.ndarray], place: Rows) -> TappingCurve:
-    """Return a curve with its readings smoothed along stretches of rows: errors of energies are taken there."""
+def _smoothed(
+    curve: TappingCurve, stretches: Sequence[np.ndarray], factor: float | Rows
+) -> tuple[TappingCurve, Rows, list[np.ndarray]]:
+    """Return a curve with smooth readings, at which errors of energies are taken, places of its rows, and stretches.
+
+    Args:
+        curve: the curve.
+        stretches: rows along which readings are smooth; they are returned in the order of their places.
+        factor: true over stated free amplitude.
+    """
+    place = losses(curve, factor)
+    stretches = [rows[np.argsort(place[rows], kind="stable")] for rows in stretches]
     amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
     for rows in stretches:
         for readings, errors in ((amplitude, curve.amplitude_error_nm), (lag, curve.lag_error_deg)):
             smoother = Smoother.of(place[rows], errors[rows], _size_of(readings[rows], errors[rows]))
             readings[rows], _ = smoother.of_rows(place[rows], readings[rows])
-    return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
+    return replace(curve, amplitude_nm=amplitude, lag_deg=lag), place, stretches
 
 
 FEWEST_ROWS = 3
@@ -760,9 +769,7 @@ def _along(
     # where the instrument's search did not settle there is no energy
     stretches = stretches if lever.minimum.settled else ()
     curve, x, at = lever.curves[number], lever.minimum.at, lever.instrument(number)
-    place = losses(curve, at.free_amplitude_factor)
-    stretches = [rows[np.argsort(place[rows], kind="stable")] for rows in stretches]
-    smooth = _smooth_readings(curve, stretches, place)
+    smooth, place, stretches = _smoothed(curve, stretches, at.free_amplitude_factor)
     found, at_smooth = energies(curve, at), energies(smooth, at)
     energy_slopes, virial_slopes = lever.slopes(smooth, number, x)
     outliers, branches, chi2, freedom, scales = np.zeros(curve.rows, bool), [], 0.0, 0.0, [1.0]
@@ -979,7 +986,6 @@ def largest_of(branches: Sequence[TappingBranch]) -> tuple[int, int]:
     return branch, tops[branch]
 
 
-_FREQUENCY_TO, _ZERO_TO_DEG = 1e-5, 0.2
 _NARROWS = 0.7
 """Half of a band over that of today up to which something more that is known narrows it."""
 
@@ -997,17 +1003,10 @@ def what_narrows(functions: EnergyFunctions) -> str:
     lag = next(i for i in places if lever.unknowns[i].kind == "free_lag_deg")
     of_zero = _slopes(lambda y: np.array([lever.zero_at(y, lag)]), x, len(x))[0]
     of_frequency = lever.unknowns[0].given.error * np.eye(len(x))[0]
-    frequency = np.exp(lever.values(x)[0])
-    more = {
-        f"the zero of the phase to {_ZERO_TO_DEG:g} degrees ('# phase_zero_deg = VALUE +- {_ZERO_TO_DEG:g}')": (
-            of_zero,
-            _ZERO_TO_DEG,
-        ),
-        f"the free frequency to 1e-5 of itself ('# free_frequency_khz = VALUE +- {_FREQUENCY_TO * frequency:.1g}')": (
-            of_frequency,
-            _FREQUENCY_TO,
-        ),
-    }
+    zero = "the zero of the phase to 0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')"
+    error = f"{1e-5 * np.exp(lever.values(x)[0]):.1g}"
+    free = f"the free frequency to 1e-5 of itself ('# free_frequency_khz = VALUE +- {error}')"
+    more = {zero: (of_zero, 0.2), free: (of_frequency, 1e-5)}
     today = float(by @ covariance @ by)
     half = {
         words: Z95 * np.sqrt(max(today - (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g), 0.0) + noise**2)
@@ -1104,9 +1103,7 @@ def one_energy(
         scale_errors: multiply the rows' own errors such that chi2 is as large as its degrees of freedom, if larger.
     """
     curve = lever.curves[0]
-    place = losses(curve, lever.instrument(0).free_amplitude_factor)
-    sorted_stretches = [rows[np.argsort(place[rows], kind="stable")] for rows in stretches]
-    smooth = _smooth_readings(curve, sorted_stretches, place)
+    smooth, _, _ = _smoothed(curve, stretches, lever.instrument(0).free_amplitude_factor)
     found = _one_energy(lever, groups, smooth, 1.0)
     far = np.abs(np.nan_to_num(found.residual)) > _FAR
     kept = [rows[~far[rows]] for rows in groups]

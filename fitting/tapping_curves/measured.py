@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from afm_jax.whole_files import first_bytes
 from fitting.instruments.curve import MeasuredCurve, read_curves, table_text
@@ -90,27 +89,20 @@ def _notes(curve: MeasuredCurve) -> list[str]:
 
 
 def half_width(curve: MeasuredCurve) -> float | None:
-    """Return by how many nm later the amplitude comes back to half of the free one, None where that does not show."""
-    if curve.amplitude is None:
-        return None
+    """Return by how many nm later the amplitude comes back to half of the free one, None where that does not show.
+
+    It is half from where on the amplitude stays below, between two rows by the straight line.
+    """
     heights = []
     for branch in ("approach", "retract"):
-        here = curve.branch == branch
-        free = here & curve.free
-        if not free.any():
+        rows = np.flatnonzero(curve.branch == branch)
+        rows = rows[np.argsort(curve.offset_nm[rows], kind="stable")]
+        if curve.amplitude is None or not curve.free[rows].any():
             return None
-        height = _crossing(curve.offset_nm[here], curve.amplitude[here], 0.5 * float(np.median(curve.amplitude[free])))
-        if height is None:
+        level = 0.5 * float(np.median(curve.amplitude[rows[curve.free[rows]]]))
+        last = last_above(curve.amplitude[rows], level)
+        if last is None:
             return None
-        heights.append(height)
+        pair = rows[last : last + 2]
+        heights.append(float(np.interp(-level, -curve.amplitude[pair], curve.offset_nm[pair])))
     return heights[0] - heights[1]
-
-
-def _crossing(offset: Float[np.ndarray, " n"], amplitude: Float[np.ndarray, " n"], level: float) -> float | None:
-    """Return the height beyond which the amplitude stays below a level, between two rows by the straight line."""
-    order = np.argsort(offset, kind="stable")
-    offset, amplitude = offset[order], amplitude[order]
-    last = last_above(amplitude, level)
-    if last is None:
-        return None
-    return float(np.interp(-level, -amplitude[last : last + 2], offset[last : last + 2]))

@@ -294,6 +294,11 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     stretches = [rows for rows in smooth_stretches(curve, kind.touching, kind.repulsive) if len(rows) >= FEWEST_ROWS]
     fitted = one_energy(lever, alike, stretches, scale_errors=scale_errors) if groups else None
     functions = energies_along(lever, [stretches], [kind.repulsive])[0] if stretches else None
+    followed = None
+    if curve.time is None and sum(map(len, alike)) >= _FEWEST_TO_FOLLOW:
+        # with drifts, as if the rows stood in the order of time
+        in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
+        followed = one_energy(Lever([in_order], [free]), alike, stretches)
     believed = functions or fitted
     alone = kind.touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
     nothing = np.zeros(curve.rows, bool)
@@ -324,7 +329,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         fit=fitted,
         functions=functions,
         scale_errors=scale_errors,
-        followed=_followed(curve, alike, stretches, free) if groups and curve.time is None else None,
+        followed=followed,
         bound_aj=None if curve.has_phase else _bound(curve, given, free),
         hysteresis=tuple(
             changes(curve, free=free, repulsive=kind.repulsive, energy=energy, noise=rows.energy_noise_aj)
@@ -368,16 +373,6 @@ def _kinds_of_rows(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray
     if (touching & ~rough & ~early).sum() < FEWEST_ROWS:
         early = np.zeros(curve.rows, bool)
     return _KindsOfRows(free, held, touching, repulsive, rough, early, departure)
-
-
-def _followed(
-    curve: TappingCurve, alike: list[np.ndarray], stretches: list[np.ndarray], free: Bool[np.ndarray, " rows"]
-) -> OneEnergy | None:
-    """Return the fit of one energy with drifts as if the rows stood in the order of time; None for very few."""
-    if sum(map(len, alike)) < _FEWEST_TO_FOLLOW:
-        return None
-    in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
-    return one_energy(Lever([in_order], [free]), alike, stretches)
 
 
 def _energies_along(result: Tapping) -> np.ndarray:
@@ -457,11 +452,11 @@ def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
         approach_speed_error_nm_per_us=error * blank,
         in_capture_speeds=in_capture,
         fast=fast,
-        why_not=_why_not(curve, fast, known, in_capture, start.pull),
+        why_not=_why_not(curve, fast, known, in_capture),
     )
 
 
-def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_capture: np.ndarray, pull: np.ndarray) -> str:
+def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_capture: np.ndarray) -> str:
     """Return why the rows do not allow a law, and what to record instead; empty where they do."""
     if fast.sum() >= _FEWEST_FOR_LAW:
         return ""
@@ -478,8 +473,6 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
         what = "its capture speed is not known, for no energy of a tap is"
     elif np.nanmax(in_capture) < _SLOWEST:
         what = f"its impacts are slow, {np.nanmax(in_capture):.2g} times the capture speed at most"
-    elif not (np.abs(pull[known]) < _PULLED).any():
-        what = "lever and drive change the tip's speed during an impact by as much as it has"
     else:
         what = (
             f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
