@@ -9,10 +9,10 @@ from fitting.calibration.stiffness import sader as sader
 from fitting.calibration.sweep import ResonanceSweep as ResonanceSweep
 from fitting.calibration.sweep import read_sweep as read_sweep
 from fitting.experiments.candidates import drive_grid as drive_grid
+from fitting.experiments.design import Design as Design
 from fitting.experiments.design import design as design
 from fitting.experiments.prior import Prior as Prior
 from fitting.experiments.prior import prior_of_values as prior_of_values
-from fitting.experiments.result import Design as Design
 from fitting.fits.comparison import Comparison as Comparison
 from fitting.fits.comparison import compare as compare
 from fitting.fits.fit import fit as fit

@@ -201,6 +201,8 @@ NUISANCES = (
 """What the instrument adds; each has a Gaussian constraint."""
 DRIFT_NAMES = ("phase_drift_deg", "free_amplitude_drift")
 """Those that are only of a table whose rows stand in order of time."""
+PRIOR_NUISANCES = tuple(nuisance for nuisance in NUISANCES if nuisance.name not in DRIFT_NAMES)
+"""Those that may be known before anything is measured."""
 
 SHAPES = (
     Parameter(
@@ -317,6 +319,7 @@ DELAY_LAW = LawFormula(
     meaning="the collision delay, which amplitudes near resonance need",
 )
 DELAY_NAMES = tuple(DELAY_LAW.paper)
+LAW_NAMES = tuple(parameter.name for parameter in (*LAW, *DELAY))
 LOSS_SHAPE, DELAY_SHAPE = tuple(parameter.name for parameter in SHAPES)
 NUISANCE_NAMES = tuple(parameter.name for parameter in NUISANCES)
 CONTACT_NAMES = tuple(parameter.name for parameter in CONTACT)

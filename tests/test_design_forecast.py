@@ -10,7 +10,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from fitting import design, drive_grid, fit, prior_of_values, simulate_experiment
 from fitting.experiments.candidates import standard_errors
-from fitting.experiments.result import Design
+from fitting.experiments.design import Design
 from fitting.fits.objective import BATCH, Objective
 from fitting.models import measurement_of
 from fitting.tables.table import AmplitudeTable
@@ -56,7 +56,7 @@ def exact_table(result: Design) -> AmplitudeTable:
     """Return the readings that the prior expects at the points, without noise."""
     drives, chosen = result.drives, result.chosen
     amplitude, error = result.candidates.amplitude_nm[chosen], result.candidates.error_nm[chosen]
-    if not result.tapping:
+    if not result.prior.problem.tapping:
         return table_of(drives, amplitude, error, quality_factor_error=0.4)
     return AmplitudeTable(
         drive="force",
@@ -104,7 +104,7 @@ def refitted(designed) -> np.ndarray:
 def test_the_forecast_is_what_a_fit_states(designed):
     assert designed.valid
     assert np.all(designed.errors[-1] >= by_noise(designed) * (1.0 - 1e-9))
-    if designed.tapping:
+    if designed.prior.problem.tapping:
         return
     exact = designed.candidates.amplitude_nm[designed.chosen]
     result = fit(table_of(designed.drives, exact, 0.003 * exact, quality_factor_error=0.4), "law+delay")
@@ -130,7 +130,7 @@ def test_scatter_is_the_forecast(designed, refitted):
 
 
 def test_readings_of_tapping_points_are_those_of_the_motion_in_time(designed):
-    if not designed.tapping:
+    if not designed.prior.problem.tapping:
         pytest.skip("of a cantilever that is driven itself")
     delay = CollisionDelay(TAPPED["delay_hertz"], TAPPED["delay_lead_nm"], TAPPED["delay_offset_nm"])
     law = ImpactLaw(1.0, TAPPED["epsilon"], TAPPED["viscous_loss"], delay)

@@ -2,13 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
-from fitting.experiments.prior import Prior, size_of
+from fitting.experiments.prior import Prior
 from fitting.fits.discrepancy import ModelDiscrepancy
 from fitting.fits.law_after import member_after, speed_range
 from fitting.fits.minimum import model_errors_of, padding
@@ -61,62 +62,39 @@ def drive_grid(  # noqa: PLR0913
     """
     check_drive(drive)
     check_parameter("free_frequency_khz", free_frequency_khz, "positive", optional=True)
-    _check_list("orders", orders, positive=True)
-    if any(order != int(order) for order in orders):
-        raise ValueError(f"`orders` must hold whole numbers, but is {list(orders)}")
-    _check_list("amplitudes_nm", amplitudes_nm, positive=True)
-    _check_list("offsets_nm", offsets_nm, positive=False)
-    resonance = 2.0
-    if drive != "sample":
-        if any(order != 1 for order in orders):
-            raise ValueError(f"`orders` must be 1 where the {drive} is driven, but is {list(orders)}")
-        resonance = 1.0
-    if heights is not None:
-        if drive == "sample":
-            raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
-        _check_list("heights", heights, positive=False)
-    if (frequencies_khz is None) == (detunings is None):
-        raise ValueError("give either `frequencies_khz` or `detunings`, what the drive frequency can be")
-    for name, numbers in (("frequencies_khz", frequencies_khz), ("detunings", detunings)):
+    lists = {"orders": orders, "amplitudes_nm": amplitudes_nm, "offsets_nm": offsets_nm, "heights": heights}
+    for name, numbers in (lists | {"frequencies_khz": frequencies_khz, "detunings": detunings}).items():
         if numbers is not None:
-            _check_list(name, numbers, positive=True)
-    rows = [
-        (order, frequency, amplitude, offset)
-        for order in map(int, orders)
-        for frequency in _frequencies(resonance * order, frequencies_khz, detunings, free_frequency_khz)
-        for amplitude in amplitudes_nm
-        for offset in (offsets_nm if heights is None else [round(-height * amplitude, 6) for height in heights])
-    ]
-    rows = list(dict.fromkeys((order, *map(float, rest)) for order, *rest in rows))
+            _check_list(name, numbers, positive=name not in {"offsets_nm", "heights"})
+    sample = drive == "sample"
+    if any(order != int(order) or not (sample or order == 1) for order in orders):
+        allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
+        raise ValueError(f"`orders` must hold {allowed}, but is {list(orders)}")
+    if heights is not None and sample:
+        raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
+    if detunings is None and frequencies_khz is not None:
+        frequencies, resonance = frequencies_khz, 0.0
+    elif frequencies_khz is None and detunings is not None:
+        if free_frequency_khz is None:
+            raise ValueError("`detunings` need `free_frequency_khz`, the cantilever's resonance")
+        frequencies, resonance = detunings, (2.0 if sample else 1.0) * free_frequency_khz
+    else:
+        raise ValueError("give either `frequencies_khz` or `detunings`, what the drive frequency can be")
+    places = offsets_nm if heights is None else heights
+    # rounded to what an instrument is told: a thousandth of a hertz, a femtometre
+    rows = {
+        (
+            order,
+            round(resonance * order * frequency, 6) if resonance else float(frequency),
+            float(amplitude),
+            float(place) if heights is None else round(-place * amplitude, 6),
+        )
+        for order, frequency, amplitude, place in product(orders, frequencies, amplitudes_nm, places)
+    }
     if len(rows) > MOST:
         raise ValueError(f"these are {len(rows)} drives, more than the {MOST} a design looks at; take coarser steps")
-    columns = np.array(rows, float).T
+    columns = np.array(sorted(rows), float).T
     return Drives(columns[0].astype(np.int64), *columns[1:])
-
-
-def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.ndarray:
-    """Say which drives are among others, given as rows of order, frequency, amplitude and offset."""
-    known = {_key(row) for row in others.tolist()}
-    return np.array([_key(row) in known for row in zip(*(column.tolist() for column in drives), strict=True)])
-
-
-def _key(row: Sequence[int | float]) -> tuple[float, ...]:
-    """Return a drive as rounding cannot change it: an instrument sets nothing to twelve digits."""
-    return tuple(float(f"{number:.9g}") + 0.0 for number in row)
-
-
-def _frequencies(
-    resonance: float,
-    frequencies_khz: Numbers | None,
-    detunings: Numbers | None,
-    free_frequency_khz: float | None,
-) -> list[float]:
-    if detunings is None:
-        return [] if frequencies_khz is None else [float(frequency) for frequency in frequencies_khz]
-    if free_frequency_khz is None:
-        raise ValueError("`detunings` need `free_frequency_khz`, the cantilever's resonance")
-    # Rounded to what an instrument is told: a thousandth of a hertz.
-    return [round(resonance * free_frequency_khz * detuning, 6) for detuning in detunings]
 
 
 def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
@@ -129,8 +107,13 @@ def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
             raise ValueError(f"`{name}` must hold {'positive' if positive else 'finite'} numbers, but one is {number}")
 
 
-AMPLITUDES = ("both", "peak", "lockin")
-USABLE = ""
+def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.ndarray:
+    """Say which drives are among others, given as rows of order, frequency, amplitude and offset."""
+    # no instrument sets nine digits
+    places = np.stack(drives, axis=1)[:, None]
+    return np.isclose(places, others, rtol=1e-9, atol=1e-12).all(axis=2).any(axis=1)
+
+
 LEFT_OUT = {
     "measured": "already measured",
     "no orbit": "no steady single-impact orbit",
@@ -167,7 +150,7 @@ class Candidates:
     @property
     def usable(self) -> Bool[np.ndarray, " rows"]:
         """Which drives can be planned with."""
-        return np.array([reason == USABLE for reason in self.why_not], dtype=bool)
+        return np.array([not reason for reason in self.why_not], dtype=bool)
 
     @property
     def information(self) -> Float[np.ndarray, "rows p p"]:
@@ -214,8 +197,7 @@ def candidates_of(
     )
     amplitude, kinds = expected[:count], expected.shape[1]
     own = padding(model_errors.model_error, expected)[:count]
-    stated = _stated(amplitude, noise, phase_noise_deg)
-    error = np.where(read, np.hypot(stated, own), np.inf)
+    error = np.where(read, np.hypot(_noise_of(amplitude, noise, phase_noise_deg), own), np.inf)
     raw = np.asarray(linear.jacobian)[0, : kinds * count].reshape(count, kinds, -1)
     orbits = np.asarray(prediction.orbits)[:, :count]
     fold = np.asarray(prediction.near_fold)[:, :count]
@@ -228,8 +210,8 @@ def candidates_of(
         "too large": (drives.amplitude_nm if tapping else amplitude[:, 0]) > largest_nm,
         "inaccurate": model_errors.set_aside[:count],
     }
-    why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), USABLE) for row in range(count))
-    usable = np.array([reason == USABLE for reason in why_not])
+    why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), "") for row in range(count))
+    usable = np.array([not reason for reason in why_not])
     safe = np.where(usable[:, None] & np.isfinite(error), error, np.inf)
     return Candidates(
         drives=drives,
@@ -241,7 +223,7 @@ def candidates_of(
     )
 
 
-def _stated(
+def _noise_of(
     amplitude: Float[np.ndarray, "rows k"], noise: float, phase_noise_deg: float
 ) -> Float[np.ndarray, "rows k"]:
     """Return the errors of amplitudes, and of lags if there are any."""
@@ -279,9 +261,9 @@ def _measured(
     return found._replace(rows=found.rows._replace(measured=measured, free=np.zeros_like(there)))
 
 
-def standard_errors(information: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
+def standard_errors(information: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p"]:
     """Return the standard error of every parameter, the others unknown; infinite where it is not determined."""
-    return np.sqrt(np.diag(covariance_of(information)))
+    return np.sqrt(np.diagonal(covariance_of(information), axis1=-2, axis2=-1))
 
 
 def forecast(
@@ -305,19 +287,18 @@ def forecast(
     """
     problem, each = prior.problem, candidates.information[chosen]
     steps = prior.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
-    errors = np.array([np.sqrt(np.diag(covariance_of(information))) for information in steps])
+    errors = standard_errors(steps)
     if not problem.lasting or not chosen.size:
         return errors
     drives = Drives(*(column[chosen] for column in candidates.drives))
     amplitude = candidates.amplitude_nm[chosen]
     read = np.where(np.isfinite(candidates.error_nm[chosen]), amplitude, np.nan)
-    stated = _stated(amplitude, noise, phase_noise_deg)
-    objective = Objective(_measured(prior, drives, read, stated), problem)
+    objective = Objective(_measured(prior, drives, read, _noise_of(amplitude, noise, phase_noise_deg)), problem)
     model_errors = model_errors_of(objective, prior.values)
     rows = rows_of_fit(objective, objective.following(prior.values), prior.values, model_errors, 1.0)
     values = prior.fixed | dict(zip(problem.names, prior.values.tolist(), strict=True))
     discrepancy = ModelDiscrepancy(problem, values, speed_range(rows.approach[: len(chosen)]), prior.mass_ng or 1.0)
-    size = np.array([size_of(p, v) for p, v in zip(problem.parameters, prior.values.tolist(), strict=True)])
+    size = prior.sizes
     known, axes = np.linalg.eigh(size[:, None] * prior.information * size)
     known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size
     readings, free = rows.measurement_error.shape, np.ones(len(size), dtype=bool)

@@ -1,32 +1,217 @@
 """The design of an experiment: which drives to measure next, so that the law is known best.
 
-What a set of measurements says of the parameters is its Fisher information; its inverse says how good the set is.
-Points are chosen greedily, then exchanged one by one until no exchange helps (Fedorov), then put into the best order.
+What a set of measurements says of the parameters is its Fisher information. Points are chosen greedily, so that the
+joint confidence region of the parameters that matter becomes smallest (D-optimal), exchanged one by one until no
+exchange helps (Fedorov), then put into the best order.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.version import version_of
-from fitting.experiments.candidates import AMPLITUDES, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
-from fitting.experiments.prior import Prior, prior_of_fit, size_of
-from fitting.experiments.result import Design
-from fitting.experiments.verdict import DesignEvidence, judge_design
+from afm_jax.columns import printed_table
+from afm_jax.impact.law import extrapolation_of
+from afm_jax.results import Result, public_result
+from afm_jax.units import TWO_SIDED_95
+from afm_jax.words import bullets, interval, value_alone
+from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
+from fitting.experiments.prior import Prior, prior_of_fit
 from fitting.fits.result import FitResult
-from fitting.parameters import DELAY_NAMES
+from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES, Parameter
 from fitting.simulated.experiment import Drives
 
-CRITERIA = ("D", "A")
+FORMAT_VERSION = 2
+"""Version of the JSON layout; raised when a key changes its meaning or goes."""
+AMPLITUDES = ("both", "peak", "lockin")
 _RIDGE = 1e-9
 """Information added to every parameter, relative to that of all candidates together, while points are chosen: with it
 the first points, which alone determine nothing, can be compared."""
+_ROUNDS = 50
+_BETTER = 1e-9
+"""Gain below which an exchange is rounding."""
 
 
-_PACKAGES = ("afm-jax", "jax", "numpy")
+@public_result(picture="fitting.experiments.picture:design_figure", rows="points")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Design(Result):
+    """The drives to measure next and the errors to expect: what `design` returns, named like the keys of its JSON.
+
+    Attributes:
+        prior: what the design rests on.
+        interest: names of the parameters that are to be known well.
+        noise: standard error of an amplitude relative to it.
+        candidates: every drive that was looked at.
+        chosen: numbers of the points among the candidates, the most useful first.
+        errors: standard error of every parameter so far and after each point, as a fit will state it, shape
+            (points + 1, p); infinite where not determined.
+        valid: there is something to measure, and it determines the parameters of interest.
+        reasons: what makes the design invalid.
+        warnings: what a reader should know besides.
+    """
+
+    prior: Prior
+    interest: tuple[str, ...]
+    noise: float
+    candidates: Candidates
+    chosen: Int[np.ndarray, " points"]
+    errors: Float[np.ndarray, "steps p"]
+    valid: bool
+    reasons: list[str]
+    warnings: list[str]
+
+    @property
+    def drives(self) -> Drives:
+        """What to drive, the most useful first; `fitting.simulate_experiment` takes them."""
+        return Drives(*(column[self.chosen] for column in self.candidates.drives))
+
+    @property
+    def reason(self) -> str | None:
+        """Why the design must not be followed; None if it may."""
+        return next(iter(self.reasons), None)
+
+    @property
+    def drive_columns(self) -> tuple[str, ...]:
+        """The columns of a table that say how a row is driven."""
+        return "order", "drive_frequency_khz", f"{'free' if self._tapping else 'drive'}_amplitude_nm", "offset_nm"
+
+    @property
+    def _tapping(self) -> bool:
+        return self.prior.problem.tapping
+
+    def points(self) -> list[dict[str, Any]]:
+        """Return the points as mappings: the drive, what is expected to be read, and the errors once it is."""
+        found, answer = self.candidates, []
+        readings = ("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg")
+        for row, errors in zip(self.chosen.tolist(), self.errors[1:].tolist(), strict=True):
+            point: dict[str, Any] = {
+                name: column[row].item() for name, column in zip(self.drive_columns, found.drives, strict=True)
+            }
+            for (name, unit), value, error in zip(readings, found.amplitude_nm[row], found.error_nm[row], strict=False):
+                if np.isfinite(error):
+                    point[f"expected_{name}_{unit}"] = float(value) % 360.0 if unit == "deg" else float(value)
+                    point[f"expected_{name}_error_{unit}"] = float(error)
+            point["expected_approach_speed_nm_per_us"] = float(found.approach_speed_nm_per_us[row])
+            point["standard_errors"] = dict(zip(self.prior.problem.names, map(_finite, errors), strict=True))
+            answer.append(point)
+        return answer
+
+    def expected(self, after: int = -1) -> dict[str, dict[str, Any]]:
+        """Return value, unit, standard error and 95 % interval of every parameter after some points; -1: after all."""
+        columns = zip(self.prior.problem.parameters, self.prior.values.tolist(), self.errors[after], strict=True)
+        return {parameter.name: _expected(parameter, value, float(error)) for parameter, value, error in columns}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of `afm-jax design`; what is not known is None."""
+        prior = self.prior
+        return {
+            "format": "afm-jax design",
+            "format_version": FORMAT_VERSION,
+            "drive": prior.problem.drive,
+            "model": prior.problem.model,
+            "valid": self.valid,
+            "reasons": self.reasons,
+            "warnings": self.warnings,
+            "interest": list(self.interest),
+            "noise": self.noise,
+            "points": self.points(),
+            "expected": self.expected(),
+            "measured_so_far": self.expected(0),
+            "candidates": int(self.candidates.usable.sum()),
+            "left_out": self.candidates.left_out,
+            "prior": {
+                "source": prior.source,
+                "values": dict(zip(prior.problem.names, prior.values.tolist(), strict=True)),
+                "fixed": prior.fixed,
+                "free_frequency_khz": prior.free_frequency_khz,
+                "quality_factor": prior.quality_factor,
+                "mass_ng": prior.mass_ng,
+                "rows_measured": len(prior.measured),
+            },
+        }
+
+    def tables(self) -> dict[str, dict[str, Any]]:
+        """Return the columns of design.csv: the drive, then what is expected."""
+        points = self.points()
+        names = [name for name in (points[0] if points else self.drive_columns) if name != "standard_errors"]
+        return {"design.csv": {name: [point[name] for point in points] for name in names}}
+
+    def printed(self) -> list[Any]:
+        """Return the verdict, the points, what they will determine, and notes."""
+        found = self.candidates
+        cells: dict[str, Any] = {"N": "order:d", "kHz": "drive_frequency_khz:.8g"}
+        cells |= {"free nm" if self._tapping else "drive nm": self.drive_columns[2], "offset nm": "offset_nm:.4g"}
+        cells |= {} if self._tapping else {"peak\nnm": _reading("peak_amplitude", "nm")}
+        cells |= {"lock-in\nnm": _reading("lockin_amplitude", "nm")}
+        cells |= {"lag\ndegrees": _reading("phase_lag", "deg")} if self._tapping else {}
+        cells |= {"u_in\nnm/us": "expected_approach_speed_nm_per_us:.1f"}
+        cells |= {f"+- {name}": f"{name}:.2g" for name in self.interest[:4]}
+        now, then = self.expected(0), self.expected()
+        forecast = [
+            {"name": name, "value": value_alone(entry["value"], entry["standard_error"], unknown=".6g")}
+            | {"now": now[name]["standard_error"], "then": entry["standard_error"], "interval": _interval(entry)}
+            for name, entry in then.items()
+        ]
+        names = {"": "name", "prior": "value", "+- now": "now:.2g", "+- then": "then:.2g"}
+        title = f"{len(self.chosen)} points to measure next for {', '.join(self.interest)}"
+        left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in found.left_out.items()]
+        return [
+            f"{'VALID' if self.valid else 'NOT VALID'}: {title} ({self.prior.problem.model}, {self.prior.source})",
+            *bullets("Reasons:", self.reasons),
+            printed_table("", cells, [point | point["standard_errors"] for point in self.points()]),
+            "+-: standard errors expected once the point and those above are measured",
+            printed_table("", names | {"95 % interval then": "interval"}, forecast),
+            *bullets(f"{found.usable.sum()} of {len(found.why_not)} drives can be planned with.", left_out),
+            *bullets("Notes:", self.warnings),
+        ]
+
+    def table_to_fill_in(self) -> str:
+        """Return an amplitude table of the points, the measured columns empty."""
+        prior, known_before = self.prior, self.prior.constraints
+        lines = [f"# drive = {prior.problem.drive}"]
+        if "free_frequency_khz" not in known_before:
+            lines.append(f"# free_frequency_khz = {prior.free_frequency_khz!r}")
+        if prior.mass_ng is not None:
+            lines.append(f"# mass_ng = {prior.mass_ng!r}")
+        if "quality_factor" not in known_before:
+            lines.append(f"# quality_factor = {'none' if prior.quality_factor is None else prior.quality_factor}")
+        instrument = [(name, *known_before[name]) for name in NUISANCE_NAMES if name in known_before]
+        lines += [f"# {name} = {value!r} +- {error!r}" for name, value, error in instrument]
+        (columns,) = self.tables().values()
+        read = [name.removeprefix("expected_") for name in columns if name.startswith("expected_")][:-1]
+        lines.append(",".join([*self.drive_columns, *read]))
+        rows = [",".join(repr(point[name]) for name in self.drive_columns) for point in self.points()]
+        return "\n".join([*lines, *(row + "," * len(read) for row in rows)]) + "\n"
+
+
+def _reading(name: str, unit: str) -> Callable[[dict[str, Any]], str | None]:
+    """Return what makes a cell of a reading and its error."""
+
+    def cell(point: dict[str, Any]) -> str | None:
+        value = point.get(f"expected_{name}_{unit}")
+        return None if value is None else f"{value:.2f} +- {point[f'expected_{name}_error_{unit}']:.2f}"
+
+    return cell
+
+
+def _expected(parameter: Parameter, value: float, error: float) -> dict[str, Any]:
+    entry = {"value": value, "unit": parameter.unit, "standard_error": _finite(error)}
+    if not np.isfinite(error):
+        return entry | {"interval95": [None, None], "reason": "the measurements do not determine it"}
+    half = TWO_SIDED_95 * error
+    return entry | {"interval95": [max(value - half, parameter.lowest), min(value + half, parameter.highest)]}
+
+
+def _finite(number: float) -> float | None:
+    return number if np.isfinite(number) else None
+
+
+def _interval(entry: dict[str, Any]) -> str:
+    low, high = entry["interval95"]
+    return "none" if low is None or high is None else f"{interval(low, high)} {entry['unit']}".rstrip()
 
 
 @checked
@@ -37,7 +222,6 @@ def design(  # noqa: PLR0913
     points: int = 8,
     noise: float = 0.01,
     interest: Sequence[str] | None = None,
-    criterion: str = "D",
     amplitudes: str = "both",
     largest_nm: float | None = None,
     phase_noise_deg: float = PHASE_NOISE_DEG,
@@ -55,8 +239,6 @@ def design(  # noqa: PLR0913
         points: how many to choose.
         noise: standard error of an amplitude relative to it (0.01 stands for 1 %).
         interest: the parameters to be known well, all others being unknown too; None: those of the law.
-        criterion: "D": the smallest volume of their joint confidence region; "A": the smallest sum of their variances,
-            each relative to the parameter (to the loss 1 - r for r).
         amplitudes: what is read of each point: "peak", "lockin" or "both"; of a cantilever that is driven itself always
             the lock-in amplitude and the lag.
         largest_nm: peak amplitude that the instrument takes (of a cantilever that is driven itself the free one); None:
@@ -72,174 +254,57 @@ def design(  # noqa: PLR0913
     """
     require_float64()
     prior = prior_of_fit(prior) if isinstance(prior, FitResult) else prior
-    wanted = _interest(prior, interest)
-    _check_options(points, noise, criterion, amplitudes, largest_nm, phase_noise_deg)
+    names = prior.problem.names
+    if interest is None:
+        interest = [name for name in prior.problem.own if name not in DELAY_NAMES]
+    for name in interest:
+        if name not in names:
+            raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(names)}")
+    if not interest or len(set(interest)) < len(interest):
+        raise ValueError("`interest` must name at least one parameter, and none twice")
+    _check_options(points, noise, amplitudes, largest_nm, phase_noise_deg)
     largest = np.inf if largest_nm is None else float(largest_nm)
     candidates = candidates_of(
         prior, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
     )
-    measure = _criterion(prior, candidates, wanted, criterion)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
-    chosen = usable[choose_points(prior.information, each[usable], points, measure)]
-    reached = prior.information + each[chosen].sum(axis=0)
+    matters = np.array([name in interest for name in names])
+    chosen = usable[choose_points(prior.information, each[usable], points, matters)]
     errors = forecast(prior, candidates, chosen, float(noise), phase_noise_deg)
-    reasons, warnings = judge_design(
-        DesignEvidence(prior, candidates, chosen, points, wanted, reached, forecasts=errors[-1])
-    )
+    undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
+    reasons, warnings = [], list(prior.notes)
+    if not len(chosen):
+        left_out = "; ".join(f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items())
+        reasons.append(f"No drive can be planned with ({left_out}); try others.")
+    elif undetermined:
+        reasons.append(
+            f"The chosen points do not determine {' and '.join(undetermined)}: choose more points, or drives at more "
+            "frequencies, amplitudes, orders or offsets."
+        )
+    if 0 < len(chosen) < points:
+        warnings.append(f"Only {len(chosen)} of the {points} points asked for can be planned with: all are chosen.")
+    beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
+    warnings += [beyond] if beyond else []
     return Design(
         prior=prior,
-        interest=wanted,
-        criterion=criterion,
+        interest=tuple(interest),
         noise=float(noise),
         candidates=candidates,
         chosen=chosen,
         errors=errors,
-        gain=_gain(measure, reached, candidates),
         valid=not reasons,
         reasons=reasons,
         warnings=warnings,
-        settings={
-            "points": points,
-            "noise": noise,
-            "interest": list(wanted),
-            "criterion": criterion,
-            "amplitudes": amplitudes,
-            "largest_nm": largest_nm,
-            "phase_noise_deg": phase_noise_deg if prior.problem.tapping else None,
-            "drive": prior.problem.drive,
-            "uncertainty": prior.uncertainty,
-            "drives": len(drives.order),
-        },
-        versions={name: version_of(name) for name in _PACKAGES},
     )
 
 
-class Criterion(NamedTuple):
-    """How good an information matrix is for the parameters that matter; more is better.
-
-    D: log det of the information about them, the others marginalised, log det F - log det F_nuisances. A: minus the sum
-    of their variances, each in units of the parameter's size squared.
-    """
-
-    kind: str
-    matters: Bool[np.ndarray, " p"]
-    size: Float[np.ndarray, " p"]
-    ridge: Float[np.ndarray, " p"]
-
-    def __call__(self, information: Float[np.ndarray, "n p p"]) -> Float[np.ndarray, " n"]:
-        """Return the score of every information matrix."""
-        unit = 1.0 / np.sqrt(self.ridge / _RIDGE)
-        scaled = unit[:, None] * information * unit + _RIDGE * np.eye(len(unit))
-        if self.kind == "A":
-            variance = np.diagonal(np.linalg.inv(scaled), axis1=1, axis2=2) * unit**2
-            return -np.sum((variance / self.size**2)[:, self.matters], axis=1)
-        nuisances = np.flatnonzero(~self.matters)
-        whole = np.linalg.slogdet(scaled)[1]
-        if nuisances.size == 0:
-            return whole
-        return whole - np.linalg.slogdet(scaled[:, nuisances[:, None], nuisances])[1]
-
-
-def criterion_of(
-    kind: str,
-    matters: Bool[np.ndarray, " p"],
-    size: Float[np.ndarray, " p"],
-    largest: Float[np.ndarray, "p p"],
-) -> Criterion:
-    """Return the criterion for choosing among candidates.
-
-    Args:
-        kind: "D" or "A".
-        matters: which parameters are to be known well.
-        size: of every parameter, what a relative error refers to.
-        largest: information of all candidates and all that is known, together: it sets the scale of the ridge.
-    """
-    strength = np.diag(largest)
-    return Criterion(kind, matters, size, _RIDGE * np.where(strength > 0.0, strength, size**-2.0))
-
-
-_ROUNDS = 50
-_BETTER = 1e-9
-"""Gain below which an exchange is rounding."""
-
-
-def choose_points(
-    prior: Float[np.ndarray, "p p"], each: Float[np.ndarray, "n p p"], points: int, criterion: Criterion
-) -> Int[np.ndarray, " points"]:
-    """Return the numbers of the chosen candidates, each once, in the order in which they help most.
-
-    Args:
-        prior: information of what is known already.
-        each: information of a measurement at every candidate.
-        points: how many to choose; at most n are.
-        criterion: what makes an information matrix good.
-    """
-    points = min(points, len(each))
-    if points == 0:
-        return np.zeros(0, dtype=np.int64)
-    chosen = _greedy(prior, each, np.arange(len(each)), points, criterion)
-    chosen = _exchanged(prior, each, chosen, criterion)
-    return np.array(_greedy(prior, each, np.sort(chosen), points, criterion), dtype=np.int64)
-
-
-def _greedy(
-    prior: Float[np.ndarray, "p p"],
-    each: Float[np.ndarray, "n p p"],
-    among: Int[np.ndarray, " k"],
-    points: int,
-    criterion: Criterion,
-) -> list[int]:
-    """Return candidates taken one after another, each the best addition to those before."""
-    left, chosen, information = among.tolist(), [], prior
-    for _ in range(points):
-        best = left.pop(int(np.argmax(criterion(information + each[left]))))
-        chosen.append(best)
-        information = information + each[best]
-    return chosen
-
-
-def _exchanged(
-    prior: Float[np.ndarray, "p p"], each: Float[np.ndarray, "n p p"], chosen: list[int], criterion: Criterion
-) -> list[int]:
-    """Return a choice that no exchange of one of its points makes better."""
-    chosen = list(chosen)
-    for _ in range(_ROUNDS):
-        before = chosen.copy()
-        for place in range(len(chosen)):
-            others = [point for point in chosen if point != chosen[place]]
-            score = criterion(prior + each[others].sum(axis=0) + each)
-            current = score[chosen[place]]
-            score[others] = -np.inf
-            best = int(np.argmax(score))
-            if score[best] > current + _BETTER * abs(current):
-                chosen[place] = best
-        if chosen == before:
-            break
-    return chosen
-
-
-def _interest(prior: Prior, interest: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the parameters that matter: those asked for, or the law's without its delay."""
-    problem = prior.problem
-    if interest is None:
-        return tuple(name for name in problem.own if name not in DELAY_NAMES)
-    for name in interest:
-        if name not in problem.names:
-            raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(problem.names)}")
-    if not interest or len(set(interest)) < len(interest):
-        raise ValueError("`interest` must name at least one parameter, and none twice")
-    return tuple(interest)
-
-
 def _check_options(
-    points: int, noise: float, criterion: str, amplitudes: str, largest_nm: float | None, phase_noise_deg: float
+    points: int, noise: float, amplitudes: str, largest_nm: float | None, phase_noise_deg: float
 ) -> None:
     if points < 1:
         raise ValueError(f"`points` must be at least 1, but is {points}")
     if not 0.0 < noise < 1.0:
         raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
-    if criterion not in CRITERIA:
-        raise ValueError(f"`criterion` must be one of {', '.join(CRITERIA)}, but is {criterion!r}")
     if amplitudes not in AMPLITUDES:
         raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
     if not 0.0 < phase_noise_deg < 90.0:
@@ -248,18 +313,47 @@ def _check_options(
         raise ValueError(f"`largest_nm` must be positive, but is {largest_nm!r}")
 
 
-def _criterion(prior: Prior, candidates: Candidates, wanted: tuple[str, ...], kind: str) -> Criterion:
-    problem = prior.problem
-    return criterion_of(
-        kind,
-        matters=np.array([name in wanted for name in problem.names]),
-        size=np.array([size_of(p, v) for p, v in zip(problem.parameters, prior.values.tolist(), strict=True)]),
-        largest=prior.information + candidates.information.sum(axis=0),
-    )
+def choose_points(
+    prior: Float[np.ndarray, "p p"], each: Float[np.ndarray, "n p p"], points: int, matters: Bool[np.ndarray, " p"]
+) -> Int[np.ndarray, " points"]:
+    """Return the numbers of the chosen candidates, each once, in the order in which they help most.
 
+    Args:
+        prior: information of what is known already.
+        each: information of a measurement at every candidate.
+        points: how many to choose; at most n are.
+        matters: which parameters are to be known well.
+    """
+    strength = np.diag(prior + each.sum(axis=0))
+    unit = 1.0 / np.sqrt(np.where(strength > 0.0, strength, 1.0))
+    start, gains = unit[:, None] * prior * unit + _RIDGE * np.eye(len(unit)), unit[:, None] * each * unit
+    nuisances = np.flatnonzero(~matters)
 
-def _gain(criterion: Criterion, reached: Float[np.ndarray, "p p"], candidates: Candidates) -> Float[np.ndarray, " n"]:
-    """Return what one more measurement at each candidate would add to what was reached."""
-    before, after = criterion(reached[None]), criterion(reached + candidates.information)
-    gain = after - before if criterion.kind == "D" else 1.0 - after / before
-    return np.where(candidates.usable, gain, np.nan)
+    def score(information: Float[np.ndarray, "n p p"]) -> Float[np.ndarray, " n"]:
+        """Return log det of the information about what matters: log det F - log det F_nuisances."""
+        whole = np.linalg.slogdet(information)[1]
+        return whole - np.linalg.slogdet(information[:, nuisances[:, None], nuisances])[1] if nuisances.size else whole
+
+    def greedy(among: Sequence[int], count: int) -> list[int]:
+        """Return candidates taken one after another, each the best addition to those before."""
+        left, taken, information = list(among), [], start
+        for _ in range(count):
+            best = left.pop(int(np.argmax(score(information + gains[left]))))
+            taken.append(best)
+            information = information + gains[best]
+        return taken
+
+    chosen = greedy(range(len(each)), min(points, len(each)))
+    for _ in range(_ROUNDS):
+        before = chosen.copy()
+        for place, point in enumerate(before):
+            others = [other for other in chosen if other != point]
+            better = score(start + gains[others].sum(axis=0) + gains)
+            current = better[point]
+            better[others] = -np.inf
+            best = int(np.argmax(better))
+            if better[best] > current + _BETTER * abs(current):
+                chosen[place] = best
+        if chosen == before:
+            break
+    return np.array(greedy(sorted(chosen), len(chosen)), dtype=np.int64)

@@ -129,8 +129,8 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> F
     return FlightEnd(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
 
 
-def _residual(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
-    apart = readings(flight_of(unknowns, row, cantilever), row, cantilever) - row.value
+def _residual(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
+    apart = readings(flight, row, cantilever) - row.value
     # the phase is known modulo a drive period
     turn = 360.0 / row.order
     apart = apart.at[2].set((apart[2] + 0.5 * turn) % turn - 0.5 * turn)
@@ -139,32 +139,18 @@ def _residual(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantil
 
 @compiled_quickly()
 @partial(jax.vmap, in_axes=(0, 0, None))
-def _look(
+def _evaluate(
     unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever
-) -> tuple[Float[Array, " 3"], Float[Array, "3 2"]]:
-    """Return the residuals of a place and their derivatives by the unknowns."""
+) -> tuple[Float[Array, " 6"], Float[Array, "6 2"]]:
+    """Return the residuals of a place, then the impact that it says, and their derivatives by the unknowns."""
 
     def twice(unknowns):
-        residual = _residual(unknowns, row, cantilever)
-        return residual, residual
+        flight = flight_of(unknowns, row, cantilever)
+        both = jnp.concatenate([_residual(flight, row, cantilever), jnp.stack(impact_of(flight, row, cantilever))])
+        return both, both
 
-    slopes, residual = jax.jacfwd(twice, has_aux=True)(unknowns)
-    return residual, slopes
-
-
-@compiled_quickly()
-@partial(jax.vmap, in_axes=(0, 0, None))
-def _impacts(
-    unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever
-) -> tuple[Float[Array, " 3"], Float[Array, "3 2"]]:
-    """Return the impact that unknowns say, and its derivatives by them."""
-
-    def twice(unknowns):
-        impact = jnp.stack(impact_of(flight_of(unknowns, row, cantilever), row, cantilever))
-        return impact, impact
-
-    slopes, impact = jax.jacfwd(twice, has_aux=True)(unknowns)
-    return impact, slopes
+    slopes, both = jax.jacfwd(twice, has_aux=True)(unknowns)
+    return both, slopes
 
 
 def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
@@ -184,13 +170,13 @@ def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
     def look(places: Float[np.ndarray, "some 2"], some: Int[np.ndarray, " some"]) -> Searches:
         # all places at once, so that one program serves: what the others have is known already
         kept[some] = places
-        residual, slopes = (np.asarray(part)[some] for part in _look(kept, each, cantilever))
+        residual, slopes = (np.asarray(part)[some, :3] for part in _evaluate(kept, each, cantilever))
         chi2 = np.sum(residual**2, axis=1)
         return Searches(places, residual, slopes, np.where(np.isfinite(chi2), chi2, np.inf))
 
     box = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros(kept.shape, dtype=bool), _LONGEST_MOVE)
     ends = descended(look, look(kept.copy(), np.arange(len(kept))), box, settled=_SETTLED, most=_ITERATIONS)
-    impact, slopes = (np.asarray(part) for part in _impacts(ends.place, each, cantilever))
+    impact, slopes = (np.asarray(part)[:, 3:] for part in _evaluate(ends.place, each, cantilever))
     covariance = (
         slopes
         @ whole_covariance_of(np.einsum("snp,snq->spq", ends.jacobian, ends.jacobian))

@@ -1,7 +1,8 @@
 """Direct inversion: amplitude and phase of each row give the speeds of its impact and the collision delay, no law."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,6 @@ from afm_jax.checks import checked, require_float64
 from afm_jax.columns import printed_table
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import filled
 from afm_jax.words import bullets, with_error
@@ -33,15 +33,8 @@ POWERS = {"viscous": 1, "restitution": 2}
 """By the law the power n of u_in in u_in^2 - u_out^2 = epsilon + slope u_in^n; slopes are viscous_loss and 1 - r^2."""
 
 
-class _Instrument(NamedTuple):
-    """What all rows share."""
-
-    free_frequency_khz: float
-    quality_factor: float | None
-    tip_calibration: float = 1.0
-    drive_calibration: float = 1.0
-    offset_origin_nm: float = 0.0
-    phase_zero_deg: float = 0.0
+_EXACT = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}
+"""What all rows share, where the table does not say it."""
 
 
 @dataclass(frozen=True)
@@ -210,9 +203,9 @@ def invert(table: TableLike, *, frequency_error_khz: float | None = None) -> Inv
     values = {name: value for name, (value, _) in table.calibration.items()}
     errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": frequency_error_khz}
     errors = {name: e for name, e in (errors | {k: e for k, (_, e) in table.calibration.items()}).items() if e}
-    at = _Instrument(float(table.free_frequency_khz), table.quality_factor, **values)
+    at = _EXACT | {"free_frequency_khz": table.free_frequency_khz, "quality_factor": table.quality_factor} | values
     found = _at(table, chosen, at)
-    moved = [_at(table, chosen, at._replace(**{name: getattr(at, name) + e})) for name, e in errors.items()]
+    moved = [_at(table, chosen, at | {name: at[name] + error}) for name, error in errors.items()]
     impact, covariance = np.full((table.rows, 3), np.nan), np.full((table.rows, 3, 3), np.nan)
     shared = np.full((table.rows, 3, len(moved)), np.nan)
     good = np.logical_and.reduce([one.converged for one in (found, *moved)])
@@ -242,8 +235,33 @@ def invert(table: TableLike, *, frequency_error_khz: float | None = None) -> Inv
         lines=lines,
         table=table,
     )
-    reasons, warnings = tuple(judge(REASONS, result)), tuple(judge(WARNINGS, result))
-    return replace(result, valid=not reasons, reasons=reasons, warnings=warnings)
+    reason = _why_not_valid(result)
+    return replace(result, valid=reason is None, reasons=(reason,) if reason else (), warnings=_warnings(result))
+
+
+def _why_not_valid(e: Inversion) -> str | None:
+    if not np.isfinite(e.approach_speed_nm_per_us).any():
+        return "no row could be inverted: check the phases' sign and zero (t = 0 when the platform is highest)"
+    lines = e.lines.values()
+    if not lines:
+        return f"{e.in_lines.sum()} rows do not determine a line of two coefficients: measure at more drives"
+    if max(one.p_value for one in lines) < IMPROBABLE:
+        return "neither line explains the rows: check the errors, Q, and the calibration of tip and drive"
+    if all(abs(one.epsilon) < 2 * one.epsilon_error and abs(one.slope) < 2 * one.slope_error for one in lines):
+        return "the rows determine no coefficient of either line to two standard errors: measure more finely"
+    return None
+
+
+def _warnings(e: Inversion) -> tuple[str, ...]:
+    warnings = []
+    if e.table.quality_factor is not None and e.table.quality_factor_error is None:
+        warnings.append("Q comes without an error: its uncertainty is not in the errors here")
+    lost, wrong = (sum(word in note for note in e.note) for word in ("no flight", "contradict"))
+    if 0 < lost < e.table.rows:
+        warnings.append(f"{lost} rows could not be inverted (see their notes)")
+    if wrong:
+        warnings.append(f"{wrong} rows contradict themselves by more than 4 standard errors (see their notes)")
+    return tuple(warnings)
 
 
 def _numbers(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"]]:
@@ -259,19 +277,19 @@ def _numbers(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows 3"], Float[
     return np.where(there, value, 1.0), np.where(there, error, np.inf)
 
 
-def _at(table: AmplitudeTable, chosen: Int[np.ndarray, " chosen"], instrument: _Instrument) -> Inverted:
+def _at(table: AmplitudeTable, chosen: Int[np.ndarray, " chosen"], instrument: Mapping[str, Any]) -> Inverted:
     """Return some rows inverted with an instrument."""
     value, error = _numbers(table)
-    per_nm = np.array([instrument.tip_calibration, instrument.tip_calibration, 1.0])
-    zero = np.array([0.0, 0.0, instrument.phase_zero_deg])
+    per_nm = np.array([instrument["tip_calibration"], instrument["tip_calibration"], 1.0])
+    zero = np.array([0.0, 0.0, instrument["phase_zero_deg"]])
     fill = filled(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
-    amplitude = instrument.drive_calibration * table.excitation_nm
+    amplitude = instrument["drive_calibration"] * table.excitation_nm
     # every field an array of the rows' shape, for `vmap`
-    drive = (amplitude, table.drive_frequency_khz, instrument.offset_origin_nm + table.offset_nm)
+    drive = (amplitude, table.drive_frequency_khz, instrument["offset_origin_nm"] + table.offset_nm)
     platform = Platform(*(jnp.asarray(part[fill]) for part in drive), offset_rate_nm_per_us=jnp.zeros(fill.size))
     readings = (jnp.asarray(part[fill]) for part in ((value - zero) / per_nm, error / per_nm))
     rows = MeasuredRow(platform, jnp.asarray(table.order[fill], float), *readings)
-    cantilever = Cantilever(instrument.free_frequency_khz, instrument.quality_factor, table.mass_ng)
+    cantilever = Cantilever(instrument["free_frequency_khz"], instrument["quality_factor"], table.mass_ng)
     return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
 
 
@@ -329,48 +347,3 @@ def line(
     for _ in range(_PASSES):
         found = at(found.slope)
     return found
-
-
-def _inverted(e: Inversion) -> int:
-    return int(np.isfinite(e.approach_speed_nm_per_us).sum())
-
-
-REASONS: Rules[Inversion] = [
-    (
-        Rule(
-            lambda e: not _inverted(e),
-            "no row could be inverted: check the phases' sign and zero (t = 0 when the platform is highest)",
-        ),
-        Rule(
-            lambda e: [] if e.lines else [int(e.in_lines.sum())],
-            "{case} rows do not determine a line of two coefficients: measure at more drives",
-        ),
-        Rule(
-            lambda e: max(one.p_value for one in e.lines.values()) < IMPROBABLE,
-            "neither line explains the rows: check the errors, Q, and the calibration of tip and drive",
-        ),
-        Rule(
-            lambda e: all(
-                abs(one.epsilon) < 2.0 * one.epsilon_error and abs(one.slope) < 2.0 * one.slope_error
-                for one in e.lines.values()
-            ),
-            "the rows determine no coefficient of either line to two standard errors: measure more finely",
-        ),
-    )
-]
-"""What makes an inversion invalid."""
-WARNINGS: Rules[Inversion] = [
-    Rule(
-        lambda e: e.table.quality_factor is not None and e.table.quality_factor_error is None,
-        "Q comes without an error: its uncertainty is not in the errors here",
-    ),
-    Rule(
-        lambda e: [lost for lost in [sum(note.startswith("no flight") for note in e.note)] if lost and _inverted(e)],
-        "{case} rows could not be inverted (see their notes)",
-    ),
-    Rule(
-        lambda e: [many for many in [sum("contradict" in note for note in e.note)] if many],
-        "{case} rows contradict themselves by more than 4 standard errors (see their notes)",
-    ),
-]
-"""What a reader should know besides."""

@@ -7,12 +7,20 @@ from typing import Any
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.design_prior import PRIOR_OPTIONS
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
 from afm_jax.cli.session import FIT_PROGRAMS, Session
-from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError
-from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
+from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError, option_of
+from fitting.parameters import (
+    CONTACT_DEFAULT,
+    DELAY_LAW,
+    LAW_NAMES,
+    LAWS,
+    MODELS,
+    NUISANCE_NAMES,
+    PARAMETERS,
+    PRIOR_NUISANCES,
+)
 
 
 def _number(name: str, unit: str, text: str) -> Any:
@@ -92,9 +100,8 @@ DESIGN = Command(
     --epsilon, ...), or a fit of what was measured so far (--fit); and what can be driven: every combination of
     orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
     itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
-    or 170:190:1. With --out the report: design.csv, to_fill_in.csv (a table for `afm-jax fit`, readings left blank),
-    candidates.csv, design.html, .txt, .json, .png. Exit code 3 if no drive can be planned with, or the points do not
-    determine the law.
+    or 170:190:1. With --out design.csv, .json, .png and to_fill_in.csv (a table for `afm-jax fit`, readings left
+    blank). Exit code 3 if no drive can be planned with, or the points do not determine the law.
     """,
     options=(
         click.option(
@@ -133,12 +140,6 @@ DESIGN = Command(
             "--for", "interest", metavar="NAMES", help="Parameters to be known well, as r,epsilon; else the law's."
         ),
         click.option(
-            "--criterion",
-            type=click.Choice(("D", "A")),
-            default="D",
-            help="Smallest joint region, or sum of variances.",
-        ),
-        click.option(
             "--noise",
             type=Share("a relative error"),
             default="1%",
@@ -159,7 +160,37 @@ DESIGN = Command(
             metavar="SHARE",
             help="How far the law may be off where no fit says.",
         ),
-        *PRIOR_OPTIONS,
+        click.option(
+            "--fit",
+            type=click.Path(path_type=Path),
+            metavar="JSON",
+            help="A fit to add to, as `afm-jax fit --json` writes it, or its folder.",
+        ),
+        click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
+        click.option("--mass-ng", type=Finite(), metavar="X", help="Effective mass of the tip."),
+        click.option(
+            "--drive",
+            type=click.Choice(("sample", "force", "base")),
+            help="What is driven: the sample, or the cantilever itself; else the sample.",
+        ),
+        *(
+            click.option(
+                option_of(name),
+                type=Finite(),
+                metavar="X",
+                help=f"{', '.join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))}; else the paper's.",
+            )
+            for name in LAW_NAMES
+        ),
+        *(
+            click.option(
+                option_of(nuisance.name),
+                type=ValueAndError(none=nuisance.name == "quality_factor"),
+                metavar="X",
+                help=f"{nuisance.meaning}, such as '{nuisance.example}'.",
+            )
+            for nuisance in PRIOR_NUISANCES
+        ),
     ),
     check=_check_lists,
 )
