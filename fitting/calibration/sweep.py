@@ -20,6 +20,7 @@ passed over.
 """
 
 import contextlib
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,14 +35,12 @@ from afm_jax.whole_files import first_bytes
 from fitting.instruments.formats import holds_curves, read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
-    NUMBER,
     Column,
     Faults,
     FileSetting,
     Form,
     TableError,
     column_of,
-    columns_of_rows,
     fault_in_number,
     read_columns,
     read_text,
@@ -90,57 +89,6 @@ _SETTINGS = {
     )
 }
 """What comments of a CSV file say, in place of options of `calibrate`."""
-
-_MARK = "[DATA]"
-"""The line above the block of data of Nanonis text."""
-_SHIFT, _CENTRE = "Frequency Shift (Hz)", "Center Frequency (Hz)"
-NANONIS = Form(
-    (
-        Column("Frequency (Hz)", meaning="frequency_khz", needed="frequency", convert=_in_khz),
-        Column(_SHIFT, needed="frequency"),
-        Column(_CENTRE),
-        Column("Amplitude (m)", meaning="amplitude", needed="amplitude", convert=lambda metres: metres * 1e9),
-        Column("Phase (deg)", meaning="phase_deg"),
-    ),
-    "point",
-    open=True,
-    separator="\t",
-)
-"""The columns of Nanonis text that are read."""
-_FOUND = {"f_res (Hz)": ("frequency_khz", HZ_PER_KHZ), "Q": ("quality_factor", 1.0)}
-_REMARKS = ("Experiment", "Date", "User", "Comment01")
-
-
-def _parse_nanonis(text: str, faults: Faults) -> dict[str, Any]:
-    """Return what a Nanonis file says, by the names of `ResonanceSweep`.
-
-    Args:
-        text: all of it; one of its lines is `[DATA]`.
-        faults: where faults are noted; with any, the result is not to be used.
-
-    Raises:
-        TableError: at once where a column is missing: the cells cannot be judged then.
-    """
-    lines = list(enumerate(text.split("\n"), start=1))
-    start = next(position for position, (_, line) in enumerate(lines) if line.strip() == _MARK)
-    header = [[cell.strip() for cell in line.split("\t")] for _, line in lines[:start]]
-    settings = {cells[0]: cells[1] for cells in header if len(cells) > 1 and cells[1]}
-    rows = [(number, line) for number, line in lines[start + 1 :] if line.strip()]
-    if not rows:
-        faults.fail(f"there is nothing below {_MARK}; export the sweep again", line=lines[start][0])
-    columns, names, numbers = columns_of_rows(rows, NANONIS, faults)
-    if "frequency_khz" not in columns:
-        if _CENTRE not in names:
-            faults.fail(f'the column "{_CENTRE}" is missing; add it', line=rows[0][0])
-        columns["frequency_khz"] = _in_khz(columns[_SHIFT] + columns[_CENTRE])
-    found = {
-        key: float(settings[name]) / unit
-        for name, (key, unit) in _FOUND.items()
-        if NUMBER.fullmatch(settings.get(name, ""))
-    }
-    remarks = tuple(f"{name}: {settings[name]}" for name in _REMARKS if name in settings)
-    own = {name: columns[name] for name in _COLUMNS if name in columns}
-    return own | {"amplitude_unit": "nm", "instrument": found, "lines": numbers, "remarks": remarks}
 
 
 def _parse_csv(text: str, faults: Faults) -> dict[str, Any]:
@@ -262,51 +210,63 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
     Raises:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
-    faults = Faults(str(path))
+    text = b""
     with contextlib.suppress(OSError):
-        head = first_bytes(path, 4096)
-        if head.startswith(b"[DataSet]"):
-            return _spectrum_of(read_recording(path))
-        if holds_curves(head, str(path)):
-            raise TableError(
-                f"{path}: holds curves against height, no resonance sweep; `afm-jax tapping` reads the energy of a tap "
-                "off amplitude and phase"
-            )
-    text = read_text(path)
-    parse = _parse_nanonis if any(line.strip() == _MARK for line in text.split("\n")) else _parse_csv
-    found = parse(text, faults)
+        text = first_bytes(path, 1 << 16)
+    if text.startswith(b"[DataSet]") or _NANONIS.search(text):
+        return _sweep_of(read_recording(path))
+    if text and holds_curves(text[:4096], str(path)):
+        raise TableError(
+            f"{path}: holds curves against height, no resonance sweep; `afm-jax tapping` reads the energy of a tap "
+            "off amplitude and phase"
+        )
+    faults = Faults(str(path))
+    found = _parse_csv(read_text(path), faults)
     faults.raise_any()
     return ResonanceSweep(**found, source=str(path))
 
 
-def _spectrum_of(recording: Recording) -> ResonanceSweep:
-    """Return the thermal spectrum that a file of an instrument holds.
+_NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)
+_SHIFT, _CENTRE = "Frequency Shift", "Center Frequency"
+_FOUND = ("frequency_khz", "quality_factor", "spring_constant_n_per_m")
+
+
+def _sweep_of(recording: Recording) -> ResonanceSweep:
+    """Return the thermal spectrum, or the scan in Nanonis text, that a file of an instrument holds.
 
     Raises:
-        TableError: if it holds none.
+        TableError: if it holds neither.
     """
     units, channels = recording.units, recording.segments[0].channels
-    density = next((name for name in channels if UNITS.get(units[name], ("",))[0] == "spectrum"), None)
-    frequency = next((name for name in channels if UNITS.get(units[name], ("",))[0] == "frequency"), None)
-    if density is None or frequency is None:
-        raise TableError(f"{recording.source}: holds no thermal spectrum, but {', '.join(channels)}")
-    khz, amplitude = (channels[name] * UNITS[units[name]][1] for name in (frequency, density))
-    used = (khz > 0.0) & (amplitude > 0.0)
+    kinds = {name: UNITS.get(units[name], ("", 1.0)) for name in channels}
+
+    def first(kind: str, word: str = "") -> Float[np.ndarray, " points"] | None:
+        """Return the first channel of a kind and a name, in this package's unit."""
+        name = next((name for name in channels if kinds[name][0] == kind and name.startswith(word)), None)
+        return None if name is None else channels[name] * kinds[name][1]
+
+    density, amplitude, phase = first("spectrum"), first("length", "Amplitude"), first("angle", "Phase")
+    khz, shift, centre = first("frequency"), first("frequency", _SHIFT), first("frequency", _CENTRE)
+    khz = khz if shift is None else None if centre is None else shift + centre
+    size = amplitude if density is None else density
+    if khz is None or size is None:
+        raise TableError(
+            f"{recording.source}: holds neither a thermal spectrum nor an amplitude in m over the frequency (or its "
+            f"shift and the center frequency), but {', '.join(channels)}"
+        )
     known = {key.removeprefix("free_"): one.value for key, one in recording.known.items()}
-    found = {key: float(known[key]) for key in _FOUND_IN_SPECTRA if key in known}
     errors = {"averages": None, "temperature_k": 3.0}
-    settings = {key: (float(known[key]), error) for key, error in errors.items() if key in known}
+    spectrum = density is not None
+    used = (khz > 0.0) & (size > 0.0) if spectrum else np.ones(len(khz), dtype=bool)
     return ResonanceSweep(
         frequency_khz=khz[used],
-        amplitude=amplitude[used],
-        amplitude_unit=DENSITY,
-        instrument=found,
-        settings=settings,
+        amplitude=size[used],
+        phase_deg=None if spectrum or phase is None else phase[used],
+        amplitude_unit=DENSITY if spectrum else "nm",
+        instrument={key: float(known[key]) for key in _FOUND if key in known},
+        settings={key: (float(known[key]), error) for key, error in errors.items() if key in known},
         source=recording.source,
     )
-
-
-_FOUND_IN_SPECTRA = ("frequency_khz", "quality_factor", "spring_constant_n_per_m")
 
 
 def stated_settings(
