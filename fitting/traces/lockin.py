@@ -16,7 +16,6 @@ from jaxtyping import Complex, Float, Int
 
 from afm_jax.checks import checked
 from afm_jax.columns import printed_table
-from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.units import within_turn
 from afm_jax.words import bullets
@@ -190,7 +189,8 @@ def lockin(
         # the first harmonic that sampling turns into a slow line; the k-th of a bounce is 3/(4 k^2)
         largest_share=max(SHARE, 0.75 / (order * (period / float(np.median(np.diff(time))) - 1.0)) ** 2),
     )
-    reasons = tuple(judge(REASONS, found))
+    why = _why_not_periodic(found)
+    reasons = (f"not periodic at order {order}: {why}",) if why else ()
     warnings = []
     unseen = ", ".join(str(n) for n in orders[np.isnan(size)])
     if unseen:
@@ -292,45 +292,32 @@ def _check_wave(wave: Complex[np.ndarray, " blocks"], drive_frequency_khz: float
         )
 
 
-def _lines(found: LockinResult, *, within: bool) -> list[tuple[int, float]]:
-    """Return other orders with their amplitudes: divisors of the order (``within``), or the rest."""
-    rows = zip(found.orders.tolist(), found.amplitudes_nm.tolist(), strict=True)
-    return [row for row in rows if row[0] != found.order and (found.order % row[0] == 0) == within]
-
-
-def _others(found: LockinResult) -> list[tuple[int, float]]:
-    """Return the strongest line at which a motion of the order has none, and its amplitude, if it is too strong."""
+def _why_not_periodic(found: LockinResult) -> str | None:
+    """Return why a motion is not periodic at the order asked for; None if it is."""
+    order, amplitude, sizes = found.order, found.lockin_amplitude_nm, np.nan_to_num(found.amplitudes_nm)
+    # lines of a motion of the order are at its divisors
+    own = order % found.orders == 0
     # errors of few blocks are uncertain: noise is alike at all lines
     noise = _SEEN * float(np.nanmax(found.amplitude_errors_nm))
-    least = max(found.largest_share * found.lockin_amplitude_nm, noise, _SILENT_NM)
-    seen = [(a, n) for n, a in _lines(found, within=False) if a > least]
-    return [(n, a) for a, n in sorted(seen)[-1:]]
+    other, most = (int(np.argmax(np.where(own == which, sizes, -1.0))) for which in (False, True))
+    if sizes[other] > max(found.largest_share * amplitude, noise, _SILENT_NM):
+        n = found.orders[other]
+        return (
+            f"{sizes[other]:.3g} nm at the drive's frequency over {n}, beside {amplitude:.3g} nm over {order} (at most "
+            f"{found.largest_share:.1%} of it); is it `order={n}`?"
+        )
+    if not amplitude > max(_SEEN * found.lockin_amplitude_error_nm, _SILENT_NM):
+        return f"no response at the drive's frequency over it, {amplitude:.3g} nm are noise"
+    if found.scatter > SHARE:
+        return (
+            f"parts of the trace differ by {found.scatter:.1%} (at most {SHARE:.0%}): it still settles, drifts, or "
+            "never repeats, the drive frequency is wrong, or the noise is large; record longer, later"
+        )
+    if sizes[most] > amplitude:
+        n = found.orders[most]
+        return f"the response is larger at the drive's frequency over {n}: use `order={n}`"
+    return None
 
-
-_NOT = "not periodic at order {e.order}: "
-REASONS: Rules[LockinResult] = [
-    (
-        Rule(
-            _others,
-            _NOT
-            + "{case[1]:.3g} nm at the drive's frequency over {case[0]}, beside {e.lockin_amplitude_nm:.3g} nm over "
-            "{e.order} (at most {e.largest_share:.1%} of it); is it `order={case[0]}`?",
-        ),
-        Rule(
-            lambda e: not e.lockin_amplitude_nm > max(_SEEN * e.lockin_amplitude_error_nm, _SILENT_NM),
-            _NOT + "no response at the drive's frequency over it, {e.lockin_amplitude_nm:.3g} nm are noise",
-        ),
-        Rule(
-            lambda e: e.scatter > SHARE,
-            _NOT + f"parts of the trace differ by {{e.scatter:.1%}} (at most {SHARE:.0%}): it still settles, drifts, "
-            "or never repeats, the drive frequency is wrong, or the noise is large; record longer, later",
-        ),
-        Rule(
-            lambda e: [n for n, a in _lines(e, within=True) if a > e.lockin_amplitude_nm],
-            _NOT + "the response is larger at the drive's frequency over {case}: use `order={case}`",
-        ),
-    )
-]
 
 TRACE = Form(
     (
