@@ -157,9 +157,8 @@ def test_order_of_the_points_and_sign_and_turns_of_the_phase_do_not_matter(rever
     assert result.quality_factor.value == pytest.approx(plain.quality_factor.value, rel=1e-9)
     columns = result.tables()["calibration_points.csv"]
     assert np.abs(columns["fitted_phase_deg"] - phase).max() < 10.0
-    for said, in_result, in_plain in (("opposite sign", reverse < 0.0, False), ("were sorted", True, False)):
-        assert any(said in warning for warning in result.warnings) == in_result
-        assert any(said in warning for warning in plain.warnings) == in_plain
+    for found, reversed_phase in ((result, reverse < 0.0), (plain, False)):
+        assert any("opposite sign" in warning for warning in found.warnings) == reversed_phase
 
 
 @pytest.mark.parametrize(

@@ -166,7 +166,7 @@ def test_a_contradictory_row_is_named_and_an_error_of_the_frequency_is_systemati
     table = noisy(2, 0.1)
     peak = np.array(table.peak_amplitude_nm)
     peak[5] *= 1.1
-    found = invert(dataclasses.replace(table, peak_amplitude_nm=peak), frequency_error_khz=0.02)
+    found = invert(dataclasses.replace(table, peak_amplitude_nm=peak, free_frequency_error_khz=0.02))
     assert found.shared_names == ("free_frequency_khz",)
     assert np.all(found.shared[:, 2, 0] != 0.0)
     assert "contradict each other" in found.note[5]

@@ -15,12 +15,11 @@ def inversion(
     table: Path | None,
     noise: float | None,
     quality_factor: tuple[float, float | None] | None,
-    frequency_error_khz: float | None,
     example: bool,
 ) -> Output:
     """Return the inversion of a table, or of the bundled one."""
     (measured,) = tables_with([example_path() if example or table is None else table], noise, quality_factor)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
-        result = invert(measured, frequency_error_khz=frequency_error_khz)
+        result = invert(measured)
     figure = later("fitting.inversion.picture:inversion_figure")
     return Output.of(result, files={"invert.png": lambda path: save(figure(result), path)}, json_file="invert.json")

@@ -98,7 +98,7 @@ def _parse_csv(text: str, faults: Faults) -> dict[str, Any]:
     if unit != DENSITY:
         for key in {"averages", "scale_error"} & set(table.settings):
             faults.add(f"{key} belongs to a thermal spectrum (asd_nm_per_sqrt_hz or psd_nm2_per_hz); remove the line")
-    found = {"amplitude_unit": unit, "settings": table.settings, "lines": table.lines, "remarks": table.remarks}
+    found = {"amplitude_unit": unit, "settings": table.settings, "lines": table.lines}
     return table.columns | found
 
 
@@ -123,7 +123,6 @@ class ResonanceSweep(Result):
             ``temperature_k``, ``length_um``, ``width_um`` and ``scale_error``, as far as they are known.
         source: path of the file as it was given.
         lines: the line of the file that each point stands in, shape (points,).
-        remarks: free comments of the file.
 
     Raises:
         TableError: if a value is impossible, the lengths differ, or there are errors without what they belong to.
@@ -139,7 +138,6 @@ class ResonanceSweep(Result):
     settings: Mapping[str, tuple[float, float | None]] = field(default_factory=dict)
     source: str = "sweep in memory"
     lines: Int[np.ndarray, " points"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    remarks: tuple[str, ...] = ()
 
     def __post_init__(self):
         faults = Faults(self.source, place="line" if len(self.lines) else "row")
@@ -163,12 +161,6 @@ class ResonanceSweep(Result):
     def points(self) -> int:
         """The number of points of the frequency scan."""
         return len(self.frequency_khz)
-
-    @property
-    def reordered(self) -> bool:
-        """Whether the frequencies did not rise, or fall, from point to point, so that the points were sorted."""
-        steps = np.diff(self.lines)
-        return bool((steps > 0).any() and (steps < 0).any())
 
     @property
     def averages(self) -> float | None:

@@ -17,7 +17,7 @@ from afm_jax.columns import printed_table
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
-from afm_jax.words import bullets, interval, value_alone
+from afm_jax.words import bullets, with_error
 from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.prior import Prior, prior_of_fit
 from fitting.fits.result import FitResult
@@ -122,15 +122,7 @@ class Design(Result):
             "measured_so_far": self.expected(0),
             "candidates": int(self.candidates.usable.sum()),
             "left_out": self.candidates.left_out,
-            "prior": {
-                "source": prior.source,
-                "values": dict(zip(prior.problem.names, prior.values.tolist(), strict=True)),
-                "fixed": prior.fixed,
-                "free_frequency_khz": prior.free_frequency_khz,
-                "quality_factor": prior.quality_factor,
-                "mass_ng": prior.mass_ng,
-                "rows_measured": len(prior.measured),
-            },
+            "prior": {"source": prior.source, "rows_measured": len(prior.measured)},
         }
 
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -149,13 +141,10 @@ class Design(Result):
         cells |= {"lag\ndegrees": _reading("phase_lag", "deg")} if self._tapping else {}
         cells |= {"u_in\nnm/us": "expected_approach_speed_nm_per_us:.1f"}
         cells |= {f"+- {name}": f"{name}:.2g" for name in self.interest[:4]}
-        now, then = self.expected(0), self.expected()
-        forecast = [
-            {"name": name, "value": value_alone(entry["value"], entry["standard_error"], unknown=".6g")}
-            | {"now": now[name]["standard_error"], "then": entry["standard_error"], "interval": _interval(entry)}
-            for name, entry in then.items()
+        then = [
+            f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
+            for name, entry in self.expected().items()
         ]
-        names = {"": "name", "prior": "value", "+- now": "now:.2g", "+- then": "then:.2g"}
         title = f"{len(self.chosen)} points to measure next for {', '.join(self.interest)}"
         left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in found.left_out.items()]
         return [
@@ -163,7 +152,7 @@ class Design(Result):
             *bullets("Reasons:", self.reasons),
             printed_table("", cells, [point | point["standard_errors"] for point in self.points()]),
             "+-: standard errors expected once the point and those above are measured",
-            printed_table("", names | {"95 % interval then": "interval"}, forecast),
+            f"After all: {', '.join(then)}",
             *bullets(f"{found.usable.sum()} of {len(found.why_not)} drives can be planned with.", left_out),
             *bullets("Notes:", self.warnings),
         ]
@@ -207,11 +196,6 @@ def _expected(parameter: Parameter, value: float, error: float) -> dict[str, Any
 
 def _finite(number: float) -> float | None:
     return number if np.isfinite(number) else None
-
-
-def _interval(entry: dict[str, Any]) -> str:
-    low, high = entry["interval95"]
-    return "none" if low is None or high is None else f"{interval(low, high)} {entry['unit']}".rstrip()
 
 
 @checked

@@ -18,9 +18,9 @@ from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
 from fitting.fits.result import FitResult
 from fitting.models import Problem, check_constraints
-from fitting.parameters import NUISANCE_NAMES, Parameter, model_parameters, paper_values
+from fitting.parameters import MODELS, NUISANCE_NAMES, Parameter, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
-from fitting.tables.csv_text import TableError, read_fit_json
+from fitting.tables.csv_text import TableError, beyond, read_fit_json
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
@@ -169,12 +169,12 @@ def _checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.n
     """Return values in the problem's order.
 
     Raises:
-        ValueError: if one is outside of what its parameter can be.
+        TableError: if one is outside of what its parameter can be.
     """
     for parameter in problem.parameters:
         value = values[parameter.name]
         if not np.isfinite(value) or not parameter.lowest <= value <= parameter.highest:
-            raise ValueError(
+            raise TableError(
                 f"{parameter.name} must be between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
             )
     return np.array([float(values[name]) for name in problem.names])
@@ -193,9 +193,9 @@ def read_prior(path: str | Path, uncertainty: float = UNCERTAINTY) -> Prior:
     payload = read_fit_json(path)
     try:
         return prior_of_fit(payload, uncertainty)
-    except ValueError as error:
+    except TableError as error:
         raise TableError(f"{printable(str(path))}: {error}") from error
-    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         # an entry of another kind than `afm-jax fit` writes there
         raise TableError(f"{printable(str(path))}: the saved fit is damaged; fit the table again") from error
 
@@ -208,14 +208,11 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         uncertainty: how far values may be off, relative, where the fit does not say.
 
     Raises:
-        ValueError: if the mapping is no fit, or its correlations are impossible.
+        TableError: if a parameter or the correlations are impossible.
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
-    if payload.get("format") != "afm-jax fit":
-        raise ValueError("this is no saved fit; give the JSON of `afm-jax fit TABLE.csv --json`")
-    for key in ("model", "parameters", "correlations", "input", "valid"):
-        if key not in payload:
-            raise ValueError(f"the saved fit lacks {key!r}; write it again with `afm-jax fit TABLE.csv --json`")
+    if payload["model"] not in MODELS:
+        raise TableError(f"the saved fit has the unknown model {payload['model']!r}; fit the table again")
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"
@@ -254,10 +251,12 @@ def _information(found: Mapping[str, Any], correlations: list[list[float | None]
     """Return the Fisher information of a fit: of what it determined, and the constraints on what it did not."""
     matrix = np.array(correlations, dtype=float)
     error = np.array([entry["standard_error"] for entry in found.values()], dtype=float)
+    if matrix.shape != 2 * error.shape or np.any(beyond(error, positive=True)):
+        raise ValueError("not a correlation for each pair of parameters, or an error beyond what can be computed with")
     known = np.isfinite(error) & np.isfinite(np.diag(matrix)) & (error > 0.0)
     inner = matrix[np.ix_(known, known)]
     if not np.all(np.isfinite(inner)) or (known.any() and np.linalg.eigvalsh(inner)[0] < 1e-14):
-        raise ValueError("the saved fit's correlations contradict each other; fit the table again")
+        raise TableError("the saved fit's correlations contradict each other; fit the table again")
     information = np.diag([float(e["constraint"][1]) ** -2.0 if e.get("constraint") else 0.0 for e in found.values()])
     # Errors far apart in size: invert the correlations, which have none.
     information[np.ix_(known, known)] = np.linalg.inv(inner) / np.outer(error[known], error[known])

@@ -162,7 +162,7 @@ class Inversion(Result):
 
 
 @checked
-def invert(table: TableLike, *, frequency_error_khz: float | None = None) -> Inversion:
+def invert(table: TableLike) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and lines through the losses.
 
     A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
@@ -171,22 +171,18 @@ def invert(table: TableLike, *, frequency_error_khz: float | None = None) -> Inv
     over (1, u_in), a viscous loss, and over (1, u_in^2), a restitution.
 
     Args:
-        table: from `read_table`, with phases.
-        frequency_error_khz: standard error of the free frequency; None: the table's, exactly known if it has none.
+        table: from `read_table`, with phases; its free frequency is exactly known if it has no error.
 
     Returns:
         Rows with errors, lines and a verdict; see `Inversion`.
 
     Raises:
         TableError: if the table has no phase, or does not say its quality factor.
-        ValueError: if the frequency's error is not positive.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
     check_quality_factor(table)
     require_float64()
-    if frequency_error_khz is not None and not 0.0 < frequency_error_khz < table.free_frequency_khz:
-        raise ValueError(f"`frequency_error_khz` must be positive, but is {frequency_error_khz!r}")
     if table.tapping:
         raise TableError(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "
@@ -199,9 +195,8 @@ def invert(table: TableLike, *, frequency_error_khz: float | None = None) -> Inv
             f"{table.source}: no row has a phase with an amplitude; add the columns phase_deg and phase_error_deg, or "
             "use `afm-jax fit`"
         )
-    frequency_error_khz = table.free_frequency_error_khz if frequency_error_khz is None else frequency_error_khz
     values = {name: value for name, (value, _) in table.calibration.items()}
-    errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": frequency_error_khz}
+    errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": table.free_frequency_error_khz}
     errors = {name: e for name, e in (errors | {k: e for k, (_, e) in table.calibration.items()}).items() if e}
     at = _EXACT | {"free_frequency_khz": table.free_frequency_khz, "quality_factor": table.quality_factor} | values
     found = _at(table, chosen, at)

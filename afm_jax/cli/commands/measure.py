@@ -287,13 +287,6 @@ INVERT = Command(
         click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path)),
         NOISE,
         QUALITY_FACTOR,
-        click.option(
-            "--frequency-error",
-            "frequency_error_khz",
-            type=Finite(positive=True),
-            metavar="KHZ",
-            help="Standard error of the free frequency; without it, exactly known.",
-        ),
         flag("--example", "Invert the bundled table instead of a file."),
     ),
     check=_check_table,
