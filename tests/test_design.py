@@ -97,12 +97,12 @@ def test_a_fit_is_added_to(drives, of_law):
     exact = other_amplitudes(of_law.drives)
     result = fit(table_of(of_law.drives, exact, NOISE * exact, quality_factor_error=QUALITY_FACTOR[1]), "law")
     stated = result.to_dict()["parameters"]
-    assert [*stated] == [*of_law.expected()]
+    assert [*stated] == [*of_law.expected]
     # without noise the fit ends at the believed law: its own minimum is good to 1e-5 standard errors
-    np.testing.assert_allclose(errors_of(stated), errors_of(of_law.expected()), rtol=1e-4)
+    np.testing.assert_allclose(errors_of(stated), errors_of(of_law.expected), rtol=1e-4)
     again = design(prior_of_fit(result), drives, points=3, noise=NOISE)
     # a covariance through its correlations and back
-    np.testing.assert_allclose(errors_of(again.expected(0)), errors_of(stated), rtol=1e-6)
+    np.testing.assert_allclose(errors_of(again.measured_so_far), errors_of(stated), rtol=1e-6)
     assert again.candidates.left_out["measured"] == 5
     assert not {*again.chosen.tolist()} & {*of_law.chosen.tolist()}
     # as good as both measured at once

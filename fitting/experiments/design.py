@@ -99,9 +99,18 @@ class Design(Result):
             answer.append(point)
         return answer
 
-    def expected(self, after: int = -1) -> dict[str, dict[str, Any]]:
-        """Return value, unit, standard error and 95 % interval of every parameter after some points; -1: after all."""
-        columns = zip(self.prior.problem.parameters, self.prior.values.tolist(), self.errors[after], strict=True)
+    @property
+    def measured_so_far(self) -> dict[str, dict[str, Any]]:
+        """How well every parameter is known now: value, unit, standard error and 95 % interval."""
+        return self._known_after(0)
+
+    @property
+    def expected(self) -> dict[str, dict[str, Any]]:
+        """How well every parameter will be known once the points are measured."""
+        return self._known_after(-1)
+
+    def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
+        columns = zip(self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count], strict=True)
         return {parameter.name: _expected(parameter, value, float(error)) for parameter, value, error in columns}
 
     def to_dict(self) -> dict[str, Any]:
@@ -118,8 +127,8 @@ class Design(Result):
             "interest": list(self.interest),
             "noise": self.noise,
             "points": self.points(),
-            "expected": self.expected(),
-            "measured_so_far": self.expected(0),
+            "expected": self.expected,
+            "measured_so_far": self.measured_so_far,
             "candidates": int(self.candidates.usable.sum()),
             "left_out": self.candidates.left_out,
             "prior": {"source": prior.source, "rows_measured": len(prior.measured)},
@@ -143,7 +152,7 @@ class Design(Result):
         cells |= {f"+- {name}": f"{name}:.2g" for name in self.interest[:4]}
         then = [
             f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
-            for name, entry in self.expected().items()
+            for name, entry in self.expected.items()
         ]
         title = f"{len(self.chosen)} points to measure next for {', '.join(self.interest)}"
         left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in found.left_out.items()]
