@@ -9,7 +9,7 @@ import pytest
 
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
-from fitting.fits.intervals import Convergence
+from fitting.fits.intervals import UNSETTLED, Convergence
 from fitting.fits.verdict import Evidence, correlation_excess, judge_fit
 from tests.fit_tables import example_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
@@ -85,6 +85,20 @@ def test_a_finding_is_a_reason_or_a_warning_or_not_worth_a_word(model, changes, 
 def test_what_is_said_of_a_quality_factor_that_is_fitted_along(value, words, where):
     along = {"quality_factor": made_parameter("quality_factor", value, constraint=(40.0, 0.4))}
     assert_said(evidence(parameters=made_fit("law").parameters | along, correlations=np.eye(3)), words, where)
+
+
+@pytest.mark.parametrize(
+    ("interval", "why", "where"),
+    [
+        ((0.9, None), "upper end: reaches the end of its range, 1", "nowhere"),
+        ((0.9, None), f"upper end: {UNSETTLED}", "reasons"),
+        ((None, 1.0), f"lower end: {UNSETTLED}: chi2 is not finite on this side", "reasons"),
+    ],
+)
+def test_an_interval_whose_search_did_not_settle_makes_a_fit_invalid(interval, why, where):
+    parameter = made_parameter("r", 0.95, interval95=interval, interval_reason=why)
+    given = evidence(parameters=made_fit("law").parameters | {"r": parameter})
+    assert_said(given, f"r is not identified: {why}", where)
 
 
 def test_a_row_without_an_orbit_where_the_model_has_one_is_named():

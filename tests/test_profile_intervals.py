@@ -108,7 +108,7 @@ def test_a_side_where_chi2_is_not_finite_is_open_and_the_others_are_not(number):
     with np.errstate(invalid="ignore"):
         first, second = profile_intervals(objective, CENTRE, np.diag([1e-4, 9.0]), 1.5**2)
     assert first.high is None
-    assert first.reason == "upper end: chi2 is not finite on this side"
+    assert first.reason == "upper end: the search did not settle: chi2 is not finite on this side"
     assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
     assert second.low is not None
     assert second.high is not None

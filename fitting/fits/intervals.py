@@ -22,8 +22,9 @@ _INNER_STEPS = 25
 _SETTLED = 1e-6
 """Estimated distance of chi2 to its minimum over the others at which these have arrived."""
 END_OF_RANGE = "reaches the end of its range"
+UNSETTLED = "the search did not settle"
 UNEXPLAINED = "the model does not explain the data"
-"""Why an interval is open, and why there is none."""
+"""Why an end of an interval is open, why it is not known, and why there is no interval."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
 _LOST = 1e3
@@ -114,7 +115,7 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
         distance = abs(target - values[side.index]) / errors[side.index]
         above = value - chi2
         if not np.isfinite(above):
-            side.reason = "chi2 is not finite on this side"
+            side.reason = f"{UNSETTLED}: chi2 is not finite on this side"
             continue
         if above > _LOST:
             # an orbit that was seen must be there: where it is lost the interval ends
@@ -231,7 +232,7 @@ def _interval(sides: list[_Side], index: int) -> Interval:
         return Interval(None, None, "the data do not determine this parameter")
     low, high = mine
     reasons = [
-        f"{name} end: {side.reason or 'the search did not settle'}"
+        f"{name} end: {side.reason or UNSETTLED}"
         for name, side in (("lower", low), ("upper", high))
         if side.end is None
     ]

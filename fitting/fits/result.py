@@ -64,8 +64,8 @@ class FittedParameter:
         error = self.standard_error
         if error is not None and other.standard_error is not None:
             error = max(error, abs(other.value - self.value) / TWO_SIDED_95 + other.standard_error)
-        reason = self.interval_reason or other.interval_reason
-        return replace(self, standard_error=error, interval95=ends, interval_reason=reason)
+        reasons = dict.fromkeys(reason for reason in (self.interval_reason, other.interval_reason) if reason)
+        return replace(self, standard_error=error, interval95=ends, interval_reason="; ".join(reasons) or None)
 
 
 @dataclass(frozen=True)

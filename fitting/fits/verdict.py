@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN, chi2_tail
 from afm_jax.outcomes import Rule, Rules, judge
-from fitting.fits.intervals import Convergence
+from fitting.fits.intervals import UNSETTLED, Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
 from fitting.fits.result import NO_MASS, FittedParameter, FittedRows
@@ -385,15 +385,19 @@ def _other_minimum(evidence: Evidence) -> list[str]:
 
 
 def _open_ones(evidence: Evidence) -> list[str]:
-    """Return the parameters whose intervals are open to both sides, where nothing worse is known, in words."""
+    """Return the parameters whose intervals are open to both sides, where nothing worse is known, in words.
+
+    An end that its search did not find is no end of what the data allow: there one side is enough.
+    """
     # a tapping curve tells those of the delay only together; the law does not hang on each
     together = (*(DELAY_NAMES if evidence.table.tapping else ()), *evidence.undetermined)
     if misfits(evidence) or _not_identified(evidence):
         return []
+    unsettled = {name for name, known in evidence.parameters.items() if UNSETTLED in (known.interval_reason or "")}
     return [
         f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}"
         for name, parameter in evidence.parameters.items()
-        if name not in together and parameter.interval95 == (None, None)
+        if name in unsettled or (name not in together and parameter.interval95 == (None, None))
     ]
 
 
