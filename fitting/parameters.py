@@ -33,7 +33,6 @@ class Parameter:
             drive and the highest of the fastest, for on them depends what an impact captures.
         mass_power: likewise of the effective mass in ng.
         advice: what to measure so that the amplitudes determine it, if there is more to say than of any.
-        symbol: in the formulas of a report; none: its name.
         example: of a quantity of the instrument, given with its error.
     """
 
@@ -50,7 +49,6 @@ class Parameter:
     drive_power: float = 0.0
     mass_power: float = 0.0
     advice: str = ""
-    symbol: str = ""
     example: str = ""
 
     @property
@@ -82,7 +80,6 @@ LAW = (
         starts=(1e-4, 30.0),
         drive_power=2.0,
         advice=_SLOW,
-        symbol="ε",
     ),
     Parameter(
         name="viscous_loss",
@@ -94,7 +91,6 @@ LAW = (
         starts=(1e-4, 10.0),
         drive_power=1.0,
         advice="measure over a wider range of drives at the same frequency",
-        symbol="c",
     ),
 )
 """What an impact law is made of."""
@@ -111,7 +107,6 @@ DELAY = (
         starts=(0.04, 1.0),
         mass_power=0.4,
         advice="measure at several orders, detuned to both sides of each resonance",
-        symbol="a",
     ),
     Parameter(
         name="delay_lead_nm",
@@ -122,7 +117,6 @@ DELAY = (
         width=5.0,
         starts=(0.0, 10.0),
         advice=_SLOW,
-        symbol="b",
     ),
     Parameter(
         name="delay_offset_nm",
@@ -133,7 +127,6 @@ DELAY = (
         width=1.0,
         starts=(-0.5, 1.5),
         advice="measure at several offsets and drives",
-        symbol="d",
     ),
 )
 """What a collision delay is made of."""
@@ -211,7 +204,6 @@ SHAPES = (
         meaning="square of the speed by which a bridge's pull raises that of the drag",
         lowest=0.0,
         highest=1e6,
-        symbol="q",
     ),
     Parameter(
         name="delay_square_nm2_per_us",
@@ -219,7 +211,6 @@ SHAPES = (
         meaning="second term of the lead of a slow way out",
         lowest=-1e6,
         highest=1e6,
-        symbol="f",
     ),
 )
 """What decides the shape of loss and delay in the model discrepancy, each with a prior; no law is printed with them."""

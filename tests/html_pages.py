@@ -64,19 +64,3 @@ def table_of(root: ET.Element, caption: str) -> list[list[str]]:
     """Return the cells of the one table whose caption starts with some words, its head first."""
     (table,) = (t for t in root.iter("table") if words_of(t[0]).startswith(caption))
     return [[words_of(cell) for cell in row] for row in table.iter("tr")]
-
-
-def formulas(root: ET.Element) -> list[str]:
-    """Return the formulas in Python's signs: u_out, u_in, tau, ** for a power."""
-    found = []
-    for element in root.iter("p"):
-        if element.attrib.get("class") != "formula":
-            continue
-        parts = [element.text or ""]
-        for child in element:
-            power = child.tag == "sup"
-            parts += ["**(" if power else "_", child.text or "", ")" if power else "", child.tail or ""]
-        text = "".join(parts).replace("\N{MINUS SIGN}", "-").replace("τ", "tau")
-        # a space between factors is a product
-        found.append(re.sub(r"(?<=[\d)]) +(?=[(u])", "*", text))
-    return found

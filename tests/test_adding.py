@@ -43,10 +43,10 @@ DELAY = {
     "afm_jax/scenefile/tables.py": ['"offset_nm", { => "late_nm2_per_us", }"corrections")'],
     "afm_jax/scenefile/scenefile.py": ["offset_nm = 0.726\n{ => late_nm2_per_us = 0\n}"],
     "fitting/parameters.py": [
-        """        symbol="d",
+        """        advice="measure at several offsets and drives",
     ),
 { =>     Parameter(name="delay_late_nm2_per_us", unit="nm^2/us", meaning="late",
-        lowest=-1.0, highest=1.0, width=1.0, starts=(-0.5, 0.5), symbol="f"),
+        lowest=-1.0, highest=1.0, width=1.0, starts=(-0.5, 0.5)),
 }""",
         '"delay_offset_nm": 0.726{ => , "delay_late_nm2_per_us": 0.0}',
         "- delay_offset_nm/u_in{ =>  + delay_late_nm2_per_us/u_in^2}",

@@ -15,7 +15,6 @@ from fitting.fits.law_after import (
     closest_member,
     containing,
     law_after,
-    nearest_of,
     root_of,
 )
 from fitting.fits.objective import Objective
@@ -293,17 +292,6 @@ def test_the_parameters_are_those_of_the_closest_formula_and_as_unsure(step):
     with_q = (after.factor[:, :, :8] @ np.linalg.pinv(root_of(step.covariance))) @ step.covariance[:, 5] / error[5]
     turned = (closest(after.law + tiny * with_q) - best) / tiny
     np.testing.assert_allclose(correlations[:5, 5], turned, atol=1e-2)
-
-
-def test_a_law_of_a_family_is_its_own_nearest():
-    u = np.linspace(20.0, 200.0, 50)
-    w = np.sqrt(u**2 - 0.5 * u - 80.0)
-    own = nearest_of(("viscous_loss", "epsilon"), u, w, 1e-3 * w)
-    assert own.off < 1e-9
-    other = nearest_of(("r", "epsilon"), u, w, 1e-3 * w)
-    # no r and epsilon make up for a loss linear in speed: by hand, over the ends and the middle
-    assert 1e-4 < other.off < 1e-1
-    assert 20.0 <= other.at_nm_per_us <= 200.0
 
 
 @pytest.mark.slow

@@ -17,7 +17,6 @@ from fitting.fits.result import FitResult, FittedTable
 from fitting.fits.several import parts_of, pulls_of
 from fitting.fits.step import StepParameters, StepSystem
 from fitting.models import Problem, measurement_of
-from fitting.report.html import fit_page
 from fitting.report.report import row_records, summary
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, read_table
@@ -126,7 +125,6 @@ def test_reports_say_each_tables_pull(tmp_path: Path):
     result = made_joint()
     said = " ".join(summary(result).split())
     assert "a.csv 4/4 3.0/7 1.25 -0.50 -" in said
-    assert fit_page(result, [b""] * 4).count("<caption>What the table says of the instrument") == 2
     assert row_records(result)[5] | {"table": "b.csv", "line": 2} == row_records(result)[5]
     # saved and read again, and as a prior
     save(result, tmp_path / "fit.json")

@@ -27,10 +27,9 @@ class Comparison(Result):
     """Models of one table, the best one first.
 
     Attributes:
-        rows: for each model its name, chi2, degrees_of_freedom and valid, those of its fit in `results`; aic and bic,
-            of the formula alone: without the model discrepancy, which would make up for what it lacks, on the rows that
-            all models use and with the largest of their own errors; delta_aic (to the best), and law_change, the
-            largest relative difference of its rebound speed to the best one's over the measured speeds.
+        rows: for each model its name, chi2, degrees_of_freedom and valid, those of its fit in `results`; aic, of the
+            formula alone: without the model discrepancy, which would make up for what it lacks, on the rows that all
+            models use and with the largest of their own errors; delta_aic (to the best).
         verdict: what the measurement tells, a sentence or two.
         results: the fit of every model, by name.
         failed: of every model that could not be fitted, why.
@@ -65,7 +64,6 @@ def compare(
     table: TableLike | SeveralTables | Sequence[TableLike],
     models: Sequence[str] = ("law+delay", "viscous+delay"),
     *,
-    report: Callable[[str], None] | None = None,
     known: Mapping[str, tuple[Found, FitResult]] | None = None,
     **options: Any,
 ) -> Comparison:
@@ -77,7 +75,6 @@ def compare(
     Args:
         table: the amplitudes, of one table or of several.
         models: names of models.
-        report: called with each model's name before it is fitted.
         known: minimum and summary of models that were fitted to the table with the same options already.
         options: as of `fit`; `free` and `fixed` go to models that have such parameters, `effects` to "contact".
 
@@ -98,8 +95,6 @@ def compare(
     def fitted(model: str) -> tuple[Found, FitResult]:
         if known is not None and model in known:
             return known[model][0], _finite(known[model][1])
-        if report is not None:
-            report(model)
         found = find_fit(whole, model, **_options_of(model, options))
         return found, _finite(summarise(whole, found))
 
@@ -112,7 +107,6 @@ def compare(
     rows = sorted(judged.values(), key=lambda row: row["aic"])
     for row in rows:
         row["delta_aic"] = row["aic"] - rows[0]["aic"]
-        row["law_change"] = _law_change(results[row["model"]], results[rows[0]["model"]])
     return Comparison(rows, _verdict(rows, failed | lost), results, failed | lost)
 
 
@@ -168,59 +162,31 @@ def _row(model: str, found: Found, result: FitResult, common: ModelErrors) -> di
         minimum = settle(objective, minimum)
     values = stated.problem.values(minimum.coordinates)
     chi2 = float(np.sum(objective.residual(values[None]) ** 2))
-    used = int(np.asarray(objective.measurement.rows.measured).sum())
-    data = used + int(np.asarray(objective.measurement.rows.no_orbit).sum()) + len(result.settings["constraints"])
-    count = len(values)
     return {
         "model": model,
         "chi2": result.chi2,
         "degrees_of_freedom": result.degrees_of_freedom,
-        "aic": chi2 + 2.0 * count,
-        "bic": chi2 + count * float(np.log(data)),
+        "aic": chi2 + 2.0 * len(values),
         "valid": result.valid,
     }
 
 
-def _law_change(result: FitResult, reference: FitResult) -> float:
-    """Return the largest relative difference of two laws over the speeds that the reference measured."""
-    law, other = reference.law, result.law
-    points, theirs, reached = (
-        law.approach_speed_nm_per_us,
-        other.approach_speed_nm_per_us,
-        reference.rows.reached_nm_per_us,
-    )
-    low, high = max(theirs[0], reached.min(initial=np.inf)), min(theirs[-1], reached.max(initial=0.0))
-    inside = (points >= low) & (points <= high)
-    speeds = points[inside]
-    if not speeds.size:
-        return float("nan")
-    rebound = np.interp(speeds, theirs, other.rebound_speed_nm_per_us)
-    return float(np.max(np.abs(rebound / law.rebound_speed_nm_per_us[inside] - 1.0)))
-
-
 def _verdict(rows: list[dict[str, Any]], failed: dict[str, str]) -> str:
-    """Return what the differences of AIC say of the two best models, whether the best one is any good, what failed."""
-    said = _said_of(*rows[:2]) if rows[1:] else f"There is nothing to compare {_meaning(rows[0]['model'])} with."
+    """Return what the difference of AIC says of the two best models, and whether the best one is any good."""
+    first, *others = (f"{row['model']}: {_meaning(row['model'])}" for row in rows)
+    said = f"There is nothing to compare {first} with."
+    if others:
+        gap = rows[1]["delta_aic"]
+        said = f"The measurement tells plainly: {first}, not {others[0]} (AIC lower by {gap:.0f})."
+        if gap < _PLAIN:
+            said = f"The measurement favours {first} over {others[0]} (AIC lower by {gap:.1f}), not conclusively."
+        if gap < _EVEN:
+            said = f"The measurement does not tell {first} from {others[0]} (AIC differs by {gap:.1f})."
     if not rows[0]["valid"]:
         said += f" But the fit of {rows[0]['model']} is not valid itself."
     return said + "".join(f" The fit of {model} failed: {reason.rstrip('.')}." for model, reason in failed.items())
 
 
-def _said_of(best: dict[str, Any], second: dict[str, Any]) -> str:
-    """Return what the difference of AIC says of the two best models."""
-    gap = second["delta_aic"]
-    first, other = (_meaning(row["model"]) for row in (best, second))
-    change = 100.0 * second["law_change"]
-    apart = f"their laws differ by at most {change:.2g} % over the measured speeds" if np.isfinite(change) else ""
-    if gap < _EVEN:
-        said = f"The measurement does not tell {first} from {other} (AIC differs by {gap:.1f})"
-    elif gap < _PLAIN:
-        said = f"The measurement favours {first} over {other} (AIC lower by {gap:.1f}), not conclusively"
-    else:
-        said = f"The measurement tells plainly: {first}, not {other} (AIC lower by {gap:.0f})"
-    return f"{said}; {apart}." if apart else f"{said}."
-
-
 def _meaning(model: str) -> str:
     law = LAWS.get(model.removesuffix("+delay"))
-    return f"{model}: {law.meaning if law else 'the resolved contact'}"
+    return law.meaning if law else "the resolved contact"

@@ -216,9 +216,7 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
     def predicted(steps: list[LinearStep]) -> Predicted:
         return _predicted_after(at, steps, discrepancy)
 
-    part = descending_part(system, predicted)
-    if at.problem.lasting:
-        part = settled_step(part, system, predicted)
+    part = settled_step(descending_part(system, predicted), system, predicted)
     return _after_step(estimate, part, discrepancy, system)
 
 
@@ -373,15 +371,6 @@ def _predicted_after(at: AtMinimum, parts: list[LinearStep], discrepancy: ModelD
     """Return what the laws after parts of the step predict, with the instrument after it."""
     measurement, problem = at.objective.measurement, at.problem
     values = np.array([part.values[: len(problem.names)] for part in parts])
-    if not problem.lasting:
-        # instantaneous laws have no discrepancy
-        shape = measurement.rows.measured.shape
-        predictions = []
-        for point in values:
-            plain = Objective(measurement, problem, near=at.objective.near).at_values(point[None])
-            misfit = plain.residual[:, : shape[0] * shape[1]].reshape(1, *shape)
-            predictions.append(Predicted(misfit, plain.prediction))
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *predictions)
     laws = [_tabulated_after(at, part, discrepancy) for part in parts]
     speeds: Any = at.linear.prediction.approach_speed_nm_per_us[0]
     exists = (np.asarray(at.linear.prediction.orbits)[0] > 0) & np.isfinite(speeds)

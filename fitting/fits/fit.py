@@ -37,12 +37,12 @@ from fitting.fits.result import (
     loss_of,
 )
 from fitting.fits.several import Pull
-from fitting.fits.verdict import IMPROBABLE, Evidence, judge_fit, misfits
+from fitting.fits.verdict import Evidence, judge_fit, misfits
 from fitting.forward import programs_of_search
-from fitting.models import Problem, held_of, measurement_of, split_held, task_of
+from fitting.models import held_of, split_held, task_of
 from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable, as_table, in_other_units
+from fitting.tables.table import AmplitudeTable, as_table
 
 
 @checked
@@ -104,7 +104,7 @@ def fit(  # noqa: PLR0913
         effects=effects,
         robust=robust,
     )
-    return summarise_in_units(whole, found)
+    return summarise(whole, found)
 
 
 def tables_of(given: Any) -> AmplitudeTable | SeveralTables:
@@ -421,63 +421,3 @@ def _autocorrelation(residual: Float[np.ndarray, "rows k"]) -> float:
     if both.sum() < 8 or total == 0.0:
         return float("nan")
     return float(np.sum(before[both] * after[both]) / both.sum() / (total / np.isfinite(residual).sum()))
-
-
-_GROSS = 10.0
-"""chi2 over degrees of freedom from which on other units are tried."""
-_GRID = np.array([[r, epsilon] for r in (0.5, 0.7, 0.85, 0.93, 0.97, 0.99) for epsilon in (0.0, 30.0, 300.0, 3000.0)])
-"""Values of r and of epsilon in nm^2/us^2 at which a table's distance from the law of eq. 6 is evaluated."""
-_BETTER = 0.5
-"""Distance from the law in other units, over that in the stated units, below which the other units are tried."""
-_TRIED = 6
-"""Tables of several that are tried in other units: each takes a fit."""
-
-
-def summarise_in_units(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
-    """Return the summary of a minimum; a table far from the model is tried in other units, and one that fits is named.
-
-    Amplitudes in micrometres, peak to peak or rms, frequencies in Hz. The law of eq. 6 on a coarse grid says which of
-    them is nearest; the model is fitted to that. Several tables are tried one by one, the first of them.
-    """
-    result = summarise(table, found)
-    far = found.refused or not result.chi2 < _GROSS * max(result.degrees_of_freedom, 1)
-    if result.valid or not far:
-        return result
-    reasons = []
-    for one, label in zip(table.tables[:_TRIED], table.labels, strict=False):
-        said = _other_units(one, label, found)
-        if said:
-            reasons.append(f"{said} Check the units." if one is table else f"{label}: {said} Check its units.")
-    return replace(result, reasons=[*result.reasons, *reasons])
-
-
-def _other_units(table: AmplitudeTable, label: str, found: Found) -> str:
-    """Return in which other units a table fits the model of a fit by itself; nothing where it fits in none."""
-    nearest, meant = min(
-        ((_distance_from_law(one), (words, one)) for words, one in in_other_units(table)), key=lambda pair: pair[0]
-    )
-    if not nearest < _BETTER * _distance_from_law(table):
-        return ""
-    words, other = meant
-    asked = {name: found.settings[name] for name in ("free", "fixed")}
-    known = {
-        parameter_called(name).name: pair
-        for name, pair in found.settings["constraints"].items()
-        if not is_of_one_table(name) or name == name_of_table(parameter_called(name).name, label)
-    }
-    model, effects = found.settings["model"], found.settings["effects"] or EFFECTS
-    try:
-        again = summarise(other, find_fit(other, model, effects=effects, constraints=known, **asked))
-    except ValueError:
-        return ""
-    if not again.p_value >= IMPROBABLE:
-        return ""
-    return f"With {words} the model explains the table (chi2/dof = {again.chi2:.1f}/{again.degrees_of_freedom})."
-
-
-def _distance_from_law(table: AmplitudeTable) -> float:
-    """Return the soft objective of the law of eq. 6 at the best of a coarse grid of its parameters."""
-    problem = Problem("law", ("r", "epsilon"), drive=table.drive)
-    known = {} if table.quality_factor is None else {"quality_factor": (table.quality_factor, 1.0)}
-    objective = Objective(measurement_of(table, problem, known), problem)
-    return float(np.min(objective.screen(_GRID)))

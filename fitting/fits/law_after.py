@@ -359,25 +359,6 @@ _SLOWEST = 0.1
 """Rebound speed of a formula over that of the law that it is compared with at which it is held: it may capture."""
 
 
-def nearest_of(
-    family: Sequence[str],
-    speeds: Float[np.ndarray, " n"],
-    rebound: Float[np.ndarray, " n"],
-    half_width: Float[np.ndarray, " n"],
-) -> Nearness:
-    """Return how near the laws of a family of losses come to a law, in rebound speeds over the half-width of its band.
-
-    Args:
-        family: of r, viscous_loss and epsilon those that the family has.
-        speeds: approach speeds in nm/us.
-        rebound: of the law.
-        half_width: of its band.
-    """
-    free = (rebound > 0.0) & (half_width > 0.0)
-    u, w = speeds[free], rebound[free]
-    return nearness(u, w, rebound_by_formula(closest_loss(family, u, w, 1.0 / half_width[free], {}), u))
-
-
 class ClosestMember(NamedTuple):
     """The parameters of the law of a model's family that is closest to the law after the step, and their covariance."""
 

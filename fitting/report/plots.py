@@ -10,9 +10,8 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import pixels_of, png_of_pixels, svg_of
 from fitting.fits.comparison import Comparison
-from fitting.fits.law_after import rebound_by_formula
-from fitting.fits.result import EV_PER_AJ, FitResult, Loss
-from fitting.report.words import has_delay, values_of_formula
+from fitting.fits.result import FitResult
+from fitting.report.words import has_delay
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
@@ -30,13 +29,8 @@ _APPROACH = "approach speed (nm/µs)"
 
 
 def fit_pictures(result: FitResult) -> list[bytes]:
-    """Return fit.png, and its parts as SVG: the rows, the law, the residuals over the speed and the energy lost.
-
-    Without speeds there is no energy.
-    """
+    """Return fit.png, and its parts as SVG: the rows, the law, and the residuals over the speed."""
     figures = [rows_figure(result), law_figure(result), speed_figure(result)]
-    if result.loss is not None:
-        figures.append(energy_figure(result, result.loss))
     parts = [pixels_of(figure, DPI) for figure in figures]
     return [png_of_pixels(np.concatenate(parts), DPI), *map(svg_of, figures)]
 
@@ -76,54 +70,6 @@ def speed_figure(result: FitResult) -> Figure:
     """Return the figure of the residuals against the approach speed."""
     figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
     draw_residuals_by_speed(figure.subplots(), result)
-    return figure
-
-
-def energy_figure(result: FitResult, loss: Loss) -> Figure:
-    """Return the figure of the energy that an impact takes over the measured speeds, beside the formula."""
-    figure = Figure(figsize=(_WIDTH_INCHES, 3.4), layout="constrained")
-    axes = figure.subplots()
-    mass = result.table.mass_ng
-    law, half = result.law, 0.5 * (1.0 if mass is None else mass)
-    speed = law.approach_speed_nm_per_us
-    columns = (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us, law.rebound_low_nm_per_us)
-    lost, least, most = (half * (speed**2 - column**2) for column in columns)
-    if np.isfinite(least).any():
-        axes.fill_between(speed, least, most, color=COLOURS[0], alpha=0.3, lw=0, label="95 % band")
-    axes.plot(speed, lost, color=COLOURS[0], label="fitted law" if result.valid else "fit, not a measurement")
-    if loss.formula_off is not None:
-        rebound = rebound_by_formula(values_of_formula(result), speed)
-        label = "formula with the fitted parameters"
-        axes.plot(speed, half * (speed**2 - rebound**2), color=COLOURS[1], ls="--", label=label)
-    known = [
-        (one.approach_speed_nm_per_us, one.energy_aj.value, *one.energy_aj.interval95)
-        for one in loss.energies
-        if one.energy_aj is not None
-    ]
-    for u, energy, low, high in known:
-        reach = None if low is None or high is None else [[energy - low], [high - energy]]
-        axes.errorbar([u], [energy], yerr=reach, fmt="o", color="black", ms=3.5, capsize=3)
-    _mark_speeds(axes, result)
-    log_speed_axis(axes)
-    ends = [end for _, energy, low, high in known for end in (energy, low, high) if end is not None]
-    ends = ends or [float(np.nanmin(lost)), float(np.nanmax(lost))]
-    bottom, top = min(ends), max(ends)
-    if 0.0 < _MUCH * bottom < top:
-        axes.set_yscale("log")
-        axes.set_ylim(0.5 * bottom, 2.0 * top)
-        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    else:
-        axes.set_ylim(0.0, max(1.4 * top, 1e-12))
-    axes.set_xlabel(_APPROACH)
-    axes.set_ylabel(
-        "energy lost in an impact (aJ)" if mass is not None else "energy over mass lost in an impact (aJ/ng)"
-    )
-    if mass is not None:
-        volts = axes.secondary_yaxis(
-            "right", functions=(lambda x: np.multiply(x, EV_PER_AJ), lambda x: np.divide(x, EV_PER_AJ))
-        )
-        volts.set_ylabel("(eV)")
-    axes.legend(fontsize=SMALL, loc="upper left")
     return figure
 
 

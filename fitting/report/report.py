@@ -1,6 +1,7 @@
 """A fit as a person reads it: text for the terminal, files for the drawer (HTML, JSON, CSV, PNG)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,17 @@ from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.words import known
 from fitting.fits.comparison import Comparison
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
-from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, text_of
+from fitting.report.sections import (
+    Bullets,
+    Report,
+    ReportSection,
+    Table,
+    Text,
+    page_of,
+    pairs,
+    pictures_of,
+    text_of,
+)
 from fitting.report.words import (
     PULLS,
     band_in_words,
@@ -52,8 +63,13 @@ ROW_COLUMNS = (
 )
 
 
-def summary(result: FitResult) -> str:
+def summary(result: FitResult, comparison: Comparison | None = None, posterior: Posterior | None = None) -> str:
     """Return the fit as text: verdict first, then the law, then goodness of fit and warnings."""
+    return text_of(fit_report(result, comparison, posterior))
+
+
+def fit_report(result: FitResult, comparison: Comparison | None = None, posterior: Posterior | None = None) -> Report:
+    """Return the sections of a fit, with those of other models of its table and of its posterior, if there are any."""
     head = ["parameter", "value", "std. error", "95 % interval"]
     cells = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
     parting = parting_in_words(result) if result.valid else ""
@@ -64,20 +80,21 @@ def summary(result: FitResult) -> str:
         *([] if result.repeats is None else [f"  {repeats_in_words(result.repeats)}"]),
         *_correlation_lines(result),
     ]
-    report = Report(
+    return Report(
         title=f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
         about=[line for line in (*formulas(result), held_in_words(result)) if line],
         valid=result.valid,
         verdict="VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
         reasons=result.reasons,
         sections=[
-            ReportSection("Parameters", [Table("", head, cells, words=head[-1:])]),
-            ReportSection("Goodness of fit", [Text("\n".join(goodness))]),
+            ReportSection("Parameters", [Table("Fitted parameters", head, cells, words=head[-1:])], "Parameters"),
+            ReportSection("Goodness of fit", [Text("\n".join(goodness), "lines")]),
             *_table_sections(result),
-            ReportSection("Notes", [Bullets(result.warnings, "Notes:")]),
+            ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"),
+            *([] if comparison is None else [_compared(comparison)]),
+            *([] if posterior is None else [_sampled(posterior)]),
         ],
     )
-    return text_of(report)
 
 
 def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
@@ -94,17 +111,45 @@ def _goodness_line(result: FitResult) -> str:
 
 def _table_sections(result: FitResult) -> list[ReportSection]:
     """Return each of several tables' pull, what it has to itself, and what an impact takes."""
-    sections = []
+    parts = []
     if result.tables:
-        sections.append(ReportSection("Tables", [Table("", *tables_in_words(result)), Text(f"  {PULLS}.")]))
-        head, rows = nuisances_in_words(result)
-        if rows:
-            sections.append(ReportSection("Tables", [Table("", head, rows, words=(head[1], head[-1]))]))
+        parts += [Table("Tables", *tables_in_words(result)), Text(f"  {PULLS}.")]
+    sections = [ReportSection("Tables", parts)] if parts else []
+    head, rows = nuisances_in_words(result)
+    if rows:
+        sections.append(ReportSection("Nuisances", [Table("Of each table", head, rows, words=(head[1], head[-1]))]))
     losses = losses_in_words(result) if result.valid else []
     if losses:
         head = ["what an impact takes", "95 % interval"]
-        sections.append(ReportSection("Losses", [Table("", head, losses, words=head)]))
+        sections.append(ReportSection("Losses", [Table("What an impact takes", head, losses, words=head)]))
     return sections
+
+
+def _compared(comparison: Comparison) -> ReportSection:
+    rows = [
+        [
+            row["model"],
+            f"{row['chi2']:.1f}/{row['degrees_of_freedom']}",
+            f"{row['aic']:.1f}",
+            f"{row['delta_aic']:.1f}",
+            "yes" if row["valid"] else "no",
+        ]
+        for row in comparison.rows
+    ]
+    head = ["model", "chi2/dof", "AIC", "above the best", "valid"]
+    said = "Models, best first (AIC: of the formula alone, on the rows that all models use):"
+    return ReportSection("Comparison", [Text(said), Table("Models", head, rows), Text(f"  {comparison.verdict}")])
+
+
+def _sampled(posterior: Posterior) -> ReportSection:
+    rows = [
+        [name, f"{posterior.mean[name]:.6g}", *(f"{end:.6g}" for end in ends)]
+        for name, ends in posterior.interval95.items()
+    ]
+    head = ["parameter", "mean", "from", "to"]
+    said = "95 % credible intervals (posterior, flat priors, of the formula without model error):"
+    wrong = [f"Not converged: {reason}" for reason in posterior.reasons]
+    return ReportSection("Posterior", [Text(said), Table("By parameter", head, rows), Bullets(wrong)])
 
 
 def _correlation_lines(result: FitResult) -> list[str]:
@@ -170,8 +215,8 @@ def write_report(
         result: the fit; `afm_jax.load` of fit.json gives it back.
         folder: an existing folder; files of these names are replaced.
         write_table: called with a file name, records and columns for each CSV file.
-        comparison: other models of the same table, for fit.html.
-        posterior: credible intervals, for fit.html.
+        comparison: other models of the same table, for fit.html and fit.txt.
+        posterior: credible intervals, for fit.html and fit.txt.
 
     Returns:
         The files written here (the tables are `write_table`'s).
@@ -180,14 +225,36 @@ def write_report(
         OSError: if a file cannot be written.
     """
     from fitting.report.files import write_report_files  # noqa: PLC0415
-    from fitting.report.html import fit_page  # noqa: PLC0415
     from fitting.report.plots import fit_pictures  # noqa: PLC0415
 
     picture, *pictures = fit_pictures(result)
-    page = fit_page(result, pictures, comparison=comparison, posterior=posterior)
-    written = write_report_files(folder, "fit", text=summary(result), data=saved(result), picture=picture, page=page)
+    report = fit_report(result, comparison, posterior)
+    page = fit_page(result, report, pictures)
+    written = write_report_files(folder, "fit", text=text_of(report), data=saved(result), picture=picture, page=page)
     records = row_records(result)
     write_table("fit_rows.csv", records, tuple(records[0]))
     law = folder / "law.csv"
     save_law_csv(result.law, law)
     return [*written, law]
+
+
+def fit_page(result: FitResult, report: Report, pictures: Sequence[bytes]) -> str:
+    """Return the page of a fit: its report with pictures, remarks of the tables, and what the fit was told.
+
+    Args:
+        result: the fit.
+        report: its sections.
+        pictures: SVG files of the rows, the law, and the residuals over the speed.
+    """
+    shows = (
+        "Amplitudes of each row, measured and predicted; below, how far apart they are in standard errors.",
+        "The law over the approach speed, with its 95 % band.",
+        "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
+    )
+    seen = ReportSection("Pictures", pictures_of(pictures, shows), "Pictures")
+    inputs = [
+        Bullets([remark for table in result.table.tables for remark in table.remarks]),
+        pairs("Options of the fit", ("option", "value"), result.settings),
+        pairs("Versions of what computed it", ("package", "version"), result.versions),
+    ]
+    return page_of(replace(report, sections=[seen, *report.sections, ReportSection("Inputs", inputs, "Inputs")]))

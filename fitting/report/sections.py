@@ -26,7 +26,7 @@ class Text:
 
     Attributes:
         words: the paragraph; of several lines, for the terminal.
-        look: how the page sets it: "" (plain), "formula", or "lines" (spaces and ends of lines as they are).
+        look: how the page sets it: "" (plain) or "lines" (spaces and ends of lines as they are).
     """
 
     words: str
@@ -57,8 +57,6 @@ class Table:
         head: the columns' names.
         rows: a cell for each column.
         words: names of columns that hold words, not numbers.
-        marked: places of rows that stand out.
-        left_out: where the rows are that are not shown, as a sentence.
         numbered: the first column holds numbers, which a terminal sets to the right.
     """
 
@@ -66,8 +64,6 @@ class Table:
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     words: Collection[str] = ()
-    marked: Collection[int] = ()
-    left_out: str = ""
     numbered: bool = False
     kind: ClassVar[str] = "table"
 
@@ -161,13 +157,12 @@ def lines_of(part: Part) -> list[str]:
             return []
 
 
-def page_of(report: Report, lead: Sequence[Part] = (), words: str = "") -> str:
+def page_of(report: Report, lead: Sequence[Part] = ()) -> str:
     """Return a report as one HTML file; it is well-formed XML too.
 
     Args:
         report: what it shows.
         lead: parts between the verdict and the links to the sections.
-        words: a sentence of the verdict; "": the terminal's, if it says more than VALID.
     """
     verdict = "" if report.verdict in {"VALID", "NOT VALID"} else report.verdict.removeprefix("NOT VALID: ")
     lead = [with_signs(part) for part in (*map(Text, report.about), *lead)]
@@ -182,7 +177,7 @@ def page_of(report: Report, lead: Sequence[Part] = (), words: str = "") -> str:
         lstrip_blocks=True,
     )
     return environment.get_template("page.html.jinja").render(
-        result=shown, title=report.title, lead=lead, words=in_signs(words or verdict)
+        result=shown, title=report.title, lead=lead, words=in_signs(verdict)
     )
 
 

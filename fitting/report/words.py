@@ -3,23 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from afm_jax.words import decimals, interval, known, percent, value_alone
 from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED
-from fitting.fits.law_after import delay_by_formula, nearest_of, rebound_by_formula
+from fitting.fits.law_after import rebound_by_formula
 from fitting.fits.result import FitResult, FittedParameter, WithInterval
-from fitting.fits.verdict import IMPROBABLE, value_at_bound
+from fitting.fits.verdict import value_at_bound
 from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
 from fitting.tables.several import RepeatedReadings
 
-SHARE_OF_BAND = 0.1
-"""How far the rounded formula may be off, in half-widths of the 95 % band."""
-_MOST_EXTRA = 8
-_UNLIKELY = 0.05
 _EXACT = 1e-8
 """Relative distance below which two laws are the same."""
-_ROUND = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
 def repeats_in_words(repeats: RepeatedReadings) -> str:
@@ -115,7 +109,7 @@ def formulas(result: FitResult) -> list[str]:
 
 
 def parting_in_words(result: FitResult) -> str:
-    """Return how far the formula and the law part, and which model would do better if it is beyond the band.
+    """Return how far the formula and the law part, and whether that is beyond the band.
 
     Nothing where they are the same, or where there is no formula.
     """
@@ -140,15 +134,7 @@ def parting_in_words(result: FitResult) -> str:
     formula = rebound_by_formula(values_of_formula(result), speeds[inside])
     if not inside.any() or not np.isfinite(half).all() or np.all(np.abs(formula - rebound) <= half):
         return f"{said}, within the band."
-    own = result.model.removesuffix("+delay")
-    rivals = {
-        name: nearest_of(tuple(one.paper), speeds[inside], rebound, half) for name, one in LAWS.items() if name != own
-    }
-    best = min(rivals, key=lambda name: rivals[name].off)
-    if rivals[best].off >= loss.formula_off:
-        return f"{said}, beyond the band; no other formula comes nearer: take the law itself."
-    ending = result.model[len(own) :]
-    return f"{said}, beyond the band; {best}{ending} comes within {percent(rivals[best].off)}: try that model."
+    return f"{said}, beyond the band: take the law itself, or the model that `--compare` finds best."
 
 
 def held_in_words(result: FitResult) -> str:
@@ -197,16 +183,6 @@ def value_in_words(parameter: FittedParameter) -> str:
     if parameter.at_bound:
         return value_at_bound(parameter.value)
     return value_alone(parameter.value, parameter.standard_error)
-
-
-def remarks_on(parameter: FittedParameter) -> str:
-    """Return what is odd about a parameter."""
-    said = (
-        (parameter.undetermined, "not determined by the data"),
-        (parameter.at_bound, "at its bound"),
-        (parameter.did_not_move, "did not move from its start"),
-    )
-    return "; ".join(words for holds, words in said if holds)
 
 
 @dataclass(frozen=True)
@@ -267,142 +243,3 @@ def band_in_words(result: FitResult) -> str:
         f"{where} the rebound speed is known to {percent(width.worst)} or better "
         f"(95 % band, widest at {width.worst_at_nm_per_us:.3g} nm/us)."
     )
-
-
-def trust_in_words(result: FitResult) -> str:
-    """Return whether to trust the fit, on which grounds, and over which speeds."""
-    if not result.valid:
-        return "Do not take these numbers for a measurement of the law, because:"
-    limited = any(parameter.at_bound or None in parameter.interval95 for parameter in result.parameters.values())
-    determined = "determined or limited" if limited else "determined"
-    explained = "the law explains the amplitudes within their errors"
-    if result.settings.get("error_scale") is not None:
-        explained = "the law explains the amplitudes within errors of a believable size"
-    elif result.settings.get("robust") is not None:
-        explained = "the law explains the amplitudes within their errors but for a few outliers"
-    open_ = [name for name, parameter in result.parameters.items() if parameter.undetermined]
-    which = f"every parameter but {' and '.join(open_)}" if open_ else "every parameter"
-    words = f"You can trust it: the fit converged, {explained}, and {which} is {determined} by the data."
-    width = band_width(result)
-    if width is not None:
-        words += (
-            f" It was measured from {width.slowest_nm_per_us:.3g} to {width.fastest_nm_per_us:.3g} nm/µs; "
-            "beyond, it is an extrapolation."
-        )
-    count = len(result.warnings)
-    return words + (f" Read the {count} note{'s' if count > 1 else ''} below first." if count else "")
-
-
-def goodness_in_words(result: FitResult) -> str:
-    """Return chi2 with what its probability means."""
-    goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}"
-    if result.degrees_of_freedom > 0:
-        goodness += f" = {result.chi2 / result.degrees_of_freedom:.4g}"
-    p = result.p_value
-    if not np.isfinite(p):
-        return f"{goodness}: whether the law fits cannot be judged by it, {_why_not_judged(result)}."
-    if p < IMPROBABLE:
-        chance = f"{p:.1g}" if p > 0.0 else "below 1e-300"
-        return (
-            f"{goodness}: the amplitudes lie much farther from the law than their errors allow (probability {chance})."
-        )
-    if p < _UNLIKELY:
-        return f"{goodness}: rather large, by chance it would be so large in {100.0 * p:.2g} % of experiments."
-    if p > 1.0 - IMPROBABLE:
-        return f"{goodness}: improbably small, the stated errors look too large."
-    return (
-        f"{goodness}: the amplitudes scatter about the law as their errors say (by chance chi2 would be larger in "
-        f"{100.0 * p:.2g} % of experiments)."
-    )
-
-
-def _why_not_judged(result: FitResult) -> str:
-    if result.degrees_of_freedom <= 0:
-        return "there are as many parameters as amplitudes"
-    if result.settings.get("error_scale") is not None:
-        return "the errors were scaled to make it 1"
-    return "outliers count less in it"
-
-
-def rounded_values(result: FitResult) -> dict[str, str]:
-    """Return the parameters in digits; rounding moves the formula by at most a tenth of the band where it was measured.
-
-    Errors of correlated parameters are larger than those of the law: rounded to their own errors, the parameters could
-    give a curve outside the band.
-
-    Args:
-        result: a fit of a law, not of a contact.
-    """
-    texts = {}
-    for extra in range(_MOST_EXTRA):
-        texts = {name: f"{p.value:.{_own_decimals(p) + extra}f}" for name, p in result.parameters.items()}
-        if _close_enough(result, {name: float(text) for name, text in texts.items()}):
-            break
-    return texts | {name: f"{value:.12g}" for name, value in (result.settings.get("fixed") or {}).items()}
-
-
-def _own_decimals(parameter: FittedParameter) -> int:
-    """Return the decimals that a value's error warrants, three significant digits where there is none."""
-    if parameter.at_bound:
-        # a loss at its bound is 0 or 1, not 3e-15
-        return 0
-    error = parameter.standard_error
-    return decimals(0.1 * abs(parameter.value) if error is None else 4.0 * error)
-
-
-def _close_enough(result: FitResult, values: dict[str, float]) -> bool:
-    law = result.law
-    width = band_width(result)
-    if width is None:
-        return True
-    speed = law.approach_speed_nm_per_us
-    measured = (speed >= width.slowest_nm_per_us) & (speed <= width.fastest_nm_per_us)
-    exact_values = values_of_formula(result)
-    exact, rounded = (_formula(known, speed[measured]) for known in (exact_values, exact_values | values))
-    bands = (
-        law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us,
-        law.delay_high_us - law.collision_delay_us,
-    )
-    trios = zip(rounded, exact, bands, strict=True)
-    return not any(np.any(np.abs(one - other) > SHARE_OF_BAND * band[measured]) for one, other, band in trios)
-
-
-def _formula(
-    values: dict[str, float], approach_speed_nm_per_us: Float[np.ndarray, " n"]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return rebound speed in nm/us and delay in us as the formulas of the page say; zero where the tip is captured."""
-    rebound = rebound_by_formula(values, approach_speed_nm_per_us)
-    free = rebound > 0.0
-    delay = delay_by_formula(values, approach_speed_nm_per_us, np.where(free, rebound, 1.0))
-    return rebound, np.where(free, delay, 0.0)
-
-
-def law_points(result: FitResult) -> list[list[str]]:
-    """Return a row for each round speed among the measured ones, a table of the law to read off.
-
-    Each holds approach speed, rebound speed, its band and the energy lost in per cent; where impacts last, also the
-    delay in ns and its band.
-    """
-    width = band_width(result)
-    if width is None:
-        return []
-    speeds = np.array([digit * 10.0**power for power in range(-3, 7) for digit in _ROUND])
-    speeds = speeds[(speeds >= width.slowest_nm_per_us) & (speeds <= width.fastest_nm_per_us)]
-    law = result.law
-    names = ("rebound_speed_nm_per_us", "rebound_low_nm_per_us", "rebound_high_nm_per_us")
-    names += ("collision_delay_us", "delay_low_us", "delay_high_us")
-    columns = [np.interp(speeds, law.approach_speed_nm_per_us, getattr(law, name)) for name in names]
-    rows = []
-    for speed, rebound, low, high, delay, early, late in zip(speeds, *columns, strict=True):
-        lost, most, least = (100.0 * (1.0 - (value / speed) ** 2) for value in (rebound, low, high))
-        row = [f"{speed:g}", *_with_band(rebound, low, high), _with_band(lost, least, most)[0]]
-        rows.append(row + (_with_band(1e3 * delay, 1e3 * early, 1e3 * late) if has_delay(result) else []))
-    return rows
-
-
-def _with_band(value: float, low: float, high: float) -> list[str]:
-    """Return a value and its band with the digits that the band warrants, six at most."""
-    if not (np.isfinite(low) and np.isfinite(high)):
-        return [f"{value:.4g}", "-"]
-    digits = min(decimals(high - low, unknown=6), 6)
-    return [f"{value:.{digits}f}", f"{low:.{digits}f} to {high:.{digits}f}"]

@@ -44,7 +44,9 @@ def posterior(
 ) -> Posterior:
     """Return samples of the posterior of all parameters, nuisances included, with priors flat in their values.
 
-    Constraints of the fit (the quality factor's, calibrations) are Gaussian priors.
+    Constraints of the fit (the quality factor's, calibrations) are Gaussian priors. The model's formula is taken as
+    exact: where impacts last, the fit's values and intervals contain its error, and those of samples may contradict
+    them.
 
     Args:
         result: from `fitting.fit`; it must be valid.

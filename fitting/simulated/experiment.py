@@ -16,7 +16,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
-from afm_jax.checks import check_count, check_parameter, checked, require_float64
+from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
@@ -27,7 +27,7 @@ from afm_jax.motion.observe import observe
 from afm_jax.motion.periodic import close_periods, ends_in_flight
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import settled
-from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
+from afm_jax.motion.simulate import simulate
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.lanes import in_blocks
 from fitting.tables.table import DRIVES, AmplitudeTable
@@ -37,6 +37,8 @@ BATCH = 16
 """Rows simulated side by side: one program serves all tables, and its last row keeps few others waiting."""
 RESPONSES = 100
 """Response periods of one piece; a row that has not settled goes on for another."""
+PIECES = 40
+"""Most pieces that a motion may take to settle."""
 _CONTACTS = 260
 """Room for contacts in a piece: motions with more than two a response period are no single-impact orbits."""
 _NOT_PREDICTED = "the law closest to the contact has no stable single-impact orbit there"
@@ -59,22 +61,13 @@ class Drives(ResultTuple):
     offset_nm: Float[np.ndarray, " rows"]
 
 
-class RowReadings(NamedTuple):
-    """What is read of single-impact orbits, one entry a row."""
-
-    peak_amplitude_nm: Float[np.ndarray, " rows"]
-    lockin_amplitude_nm: Float[np.ndarray, " rows"]
-    lockin_phase_deg: Float[np.ndarray, " rows"]
-    """In [0, 360/N)."""
-
-
 class SteadyRows(NamedTuple):
     """What became of the drives."""
 
     rows: Int[np.ndarray, " steady"]
     """The numbers of those with a steady (1, N) orbit, ascending."""
-    reading: RowReadings | None
-    """Of these; None where there are none."""
+    readings: Float[np.ndarray, "3 steady"]
+    """Of these peak and lock-in amplitude in nm, and the lock-in's phase in [0, 360/N) degrees."""
     reasons: dict[int, str]
     """Why the others have none, by number."""
 
@@ -84,7 +77,7 @@ class _Verdict(NamedTuple):
 
     reason: str
     seen: tuple[float, float, float] | None = None
-    """Peak, lock-in amplitude and phase, as in a `RowReadings`."""
+    """Peak, lock-in amplitude and phase."""
     goes_on: State | None = None
 
 
@@ -98,8 +91,6 @@ def steady_rows(
     cantilever: Cantilever,
     drives: Drives,
     *,
-    accuracy: float,
-    pieces: int,
     report: Report,
 ) -> SteadyRows:
     """Return what is observed of every drive once its motion is the (1, N) orbit asked for.
@@ -112,8 +103,6 @@ def steady_rows(
         interaction: a contact, or a law with or without a collision delay.
         cantilever: the cantilever.
         drives: what is driven.
-        accuracy: of each contact, as for `simulate`.
-        pieces: how often a row that has not settled goes on for another hundred response periods.
         report: told how far it is.
 
     Raises:
@@ -124,15 +113,17 @@ def steady_rows(
     count = len(drives.order)
     nothing = np.zeros(0, dtype=int)
     if law is None:
-        return SteadyRows(nothing, None, dict.fromkeys(range(count), "the contact captures tips of every speed"))
-    follow = _follower(interaction, cantilever, drives, accuracy)
+        return SteadyRows(
+            nothing, np.zeros((3, 0)), dict.fromkeys(range(count), "the contact captures tips of every speed")
+        )
+    follow = _follower(interaction, cantilever, drives)
     starts, predicted = _starts(law, cantilever, drives)
     if not predicted.any():
         starts, predicted = _starts_on_resonance(drives)
     reasons = dict.fromkeys(np.flatnonzero(~predicted).tolist(), _NOT_PREDICTED)
     waiting = np.flatnonzero(predicted)
     if not waiting.size:
-        return SteadyRows(nothing, None, reasons)
+        return SteadyRows(nothing, np.zeros((3, 0)), reasons)
     report(f"{len(waiting)} of {count} drives have a stable orbit of the closest law; closing in on them")
     orbits = close_periods(
         lambda starts, rows: ends_in_flight(follow(starts, rows, _responses(drives, rows, 1))),
@@ -142,7 +133,7 @@ def steady_rows(
     )
     starts[:, waiting] = np.where(orbits.closed & (orbits.contraction < _STABLE), orbits.starts, starts[:, waiting])
     steady: dict[int, tuple[float, float, float]] = {}
-    for piece in range(pieces):
+    for piece in range(PIECES):
         if not waiting.size:
             break
         report(f"following {len(waiting)} motions, {RESPONSES} response periods (piece {piece + 1})")
@@ -159,8 +150,8 @@ def steady_rows(
                 left.append(row)
         waiting = np.array(left, dtype=int)
     rows = np.array(sorted(steady), dtype=int)
-    reading = RowReadings(*(np.array([steady[row] for row in rows.tolist()]).T)) if steady else None
-    return SteadyRows(rows, reading, {row: reason for row, reason in reasons.items() if row not in steady})
+    readings = np.array([steady[row] for row in rows.tolist()]).reshape(-1, 3).T
+    return SteadyRows(rows, readings, {row: reason for row, reason in reasons.items() if row not in steady})
 
 
 def _responses(drives: Drives, rows: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
@@ -206,14 +197,14 @@ def _starts_on_resonance(drives: Drives) -> tuple[Float[np.ndarray, "3 rows"], n
     return starts, (drives.order == 1) & (fraction > 0.0) & (fraction < 1.0)
 
 
-def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives, accuracy: float) -> Follow:
+def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives) -> Follow:
     """Return the function that follows rows of the drives."""
 
     @jax.jit
     def program(interaction, cantilever, platforms, starts, durations):
         def one(platform, start, duration):
             scene = Scene(cantilever, platform, interaction)
-            return simulate(scene, start, duration, max_contacts=_CONTACTS, accuracy=accuracy, max_rounds=_ROUNDS)
+            return simulate(scene, start, duration, max_contacts=_CONTACTS, max_rounds=_ROUNDS)
 
         return jax.vmap(one)(platforms, starts, durations)
 
@@ -237,10 +228,6 @@ def _judged(scene: Scene, found: Simulation, order: int) -> _Verdict:
         return _Verdict(verdict.reason)
     seen = observe(scene, found, verdict=verdict)
     return _Verdict(verdict.reason, seen=(seen.peak_amplitude_nm, seen.lockin_amplitude_nm, seen.lockin_phase_deg))
-
-
-PIECES = 40
-"""Most pieces of a hundred response periods that a motion may take to settle."""
 
 
 @public_result()
@@ -276,8 +263,6 @@ def simulate_experiment(  # noqa: PLR0913
     phase_noise_deg: float | None = None,
     seed: int = 0,
     quality_factor_error: float | None = None,
-    accuracy: float = DEFAULT_ACCURACY,
-    pieces: int = PIECES,
     remarks: tuple[str, ...] = (),
     report: Report = lambda _: None,
 ) -> SimulatedExperiment:
@@ -296,8 +281,6 @@ def simulate_experiment(  # noqa: PLR0913
         phase_noise_deg: standard error of the phase in degrees; None: the table has no phase.
         seed: of the noise.
         quality_factor_error: uncertainty of Q that the table states; None: none.
-        accuracy: of each contact, as for `simulate`.
-        pieces: most pieces of a hundred response periods that a motion may take to settle.
         remarks: comments for the table.
         report: told how far it is.
 
@@ -312,23 +295,21 @@ def simulate_experiment(  # noqa: PLR0913
     require_float64(interaction, cantilever)
     _check(drives, drive, noise, phase_noise_deg)
     check_count("seed", seed, 0)
-    check_count("pieces", pieces)
-    check_parameter("accuracy", accuracy, "positive")
     ratio = drives.frequency_khz / float(cantilever.frequency_khz)
     moved = drives
     if drive == "base":
         height = height_of_free_deflection(drives.amplitude_nm, ratio, cantilever.quality_factor)
         moved = drives._replace(amplitude_nm=np.asarray(height))
-    found = steady_rows(interaction, cantilever, moved, accuracy=accuracy, pieces=pieces, report=report)
+    found = steady_rows(interaction, cantilever, moved, report=report)
     kept = found.rows
     left_out = tuple(
         f"order {drives.order[i]}, {drives.frequency_khz[i]:g} kHz, {drives.amplitude_nm[i]:g} nm, "
         f"offset {drives.offset_nm[i]:g} nm: {reason}"
         for i, reason in sorted(found.reasons.items())
     )
-    if found.reading is None:
+    if not kept.size:
         raise ValueError(f"no drive has a steady single-impact orbit (the first: {left_out[0]})")
-    peak, lockin, degrees = found.reading
+    peak, lockin, degrees = found.readings
     known = cantilever.quality_factor
     names = ("peak_amplitude", "phase", "drive")
     if drive != "sample":

@@ -751,35 +751,6 @@ def write_table(table: TableLike, path: str | Path) -> None:
         raise TableError(f"{printable(str(path))}: {error.strerror}; choose another path") from error
 
 
-_FACTORS = (
-    (1000.0, "times 1000 (micrometres were written for nanometres?)"),
-    (0.5, "halved (peak to peak for the amplitude?)"),
-    (float(np.sqrt(2.0)), "times sqrt 2 (rms for the amplitude?)"),
-)
-
-
-def in_other_units(table: AmplitudeTable) -> list[tuple[str, AmplitudeTable]]:
-    """Return what a table may have been meant as: what must be changed, in words, and the table with it."""
-    tip = [name for column in AMPLITUDES for name in (column.name, str(column.error))]
-    drive = ["free_amplitude_nm" if table.tapping else "drive_amplitude_nm"]
-    kinds = (("the tip's amplitudes", tip), ("the drive's amplitude", drive), ("all amplitudes", [*tip, *drive]))
-    if table.tapping:
-        kinds = (("the lock-in amplitude", tip), ("the free amplitude", drive), ("both amplitudes", [*tip, *drive]))
-    found = []
-    for what, names in kinds:
-        for factor, how in _FACTORS:
-            columns = {name: getattr(table, name) for name in names}
-            columns = {name: factor * column for name, column in columns.items() if column is not None}
-            found.append((f"{what} {how}", replace(table, **columns)))
-    hertz = "over 1000 (Hz were written for kHz?)"
-    found.append(
-        (f"the drive's frequency {hertz}", replace(table, drive_frequency_khz=table.drive_frequency_khz / 1e3))
-    )
-    if table.spring_constant_n_per_m is None:
-        found.append((f"the free frequency {hertz}", replace(table, free_frequency_khz=table.free_frequency_khz / 1e3)))
-    return found
-
-
 def _setting_line(name: str, value: float, error: float | None) -> str:
     return f"# {name} = {float(value)!r}" + ("" if error is None else f" +- {float(error)!r}")
 

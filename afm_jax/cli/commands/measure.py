@@ -249,7 +249,11 @@ FIT = Command(
             "--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have."
         ),
         flag("--compare", "Fit the rival models too and say what the table can tell.", into="comparing"),
-        flag("--posterior", "Credible intervals, too, by the no-U-turn sampler (extra `nuts`)."),
+        flag(
+            "--posterior",
+            "Credible intervals, too, by the no-U-turn sampler (extra `nuts`); where impacts last they lack the model "
+            "error that is in the fit's intervals, and may contradict these.",
+        ),
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the random numbers."),
         click.option(
             "--share",
