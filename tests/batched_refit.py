@@ -16,7 +16,6 @@ from scipy.stats import genhyperbolic
 from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square, softened
 from fitting.fits.result import FitResult
-from fitting.models import Problem
 from fitting.sampling.posterior_result import Posterior
 from fitting.sampling.refit import Refit, objective_of, telling_rows
 
@@ -164,7 +163,7 @@ def posterior_draws(result: FitResult, found: Posterior, *, seed: int = 0) -> Po
     step = max(found.chains.samples.shape[1] // DRAWS, 1)
     values = found.chains.samples[:, ::step]
     statistics = {name: column[:, ::step] for name, column in found.chains.statistics.items()}
-    dense = densities(refit.objective, values.reshape(-1, values.shape[2]), found.log_uniform)
+    dense = densities(refit.objective, values.reshape(-1, values.shape[2]))
     noise = noise_of(refit.objective, len(dense.predicted), np.random.default_rng(seed))
     used = np.asarray(refit.objective.measurement.rows.measured)
 
@@ -202,7 +201,6 @@ class Densities(NamedTuple):
 def densities(
     objective: Objective,
     values: Float[np.ndarray, "sets p"],
-    log_uniform: tuple[str, ...] = (),
     shift: Float[np.ndarray, "... n"] | float = 0.0,
 ) -> Densities:
     """Return what sets of values predict and how likely that makes the readings.
@@ -212,7 +210,6 @@ def densities(
     Args:
         objective: of the rows.
         values: of the parameters, within their ranges.
-        log_uniform: as the posterior's.
         shift: what other readings add to the residuals, of all sets or of each.
     """
     prediction = plain(objective).at_values(values)
@@ -226,19 +223,8 @@ def densities(
     return Densities(
         predicted=predicted,
         log_likelihood=each.sum(axis=2) - half[:, readings : readings + unseen],
-        log_density=-half.sum(axis=1) + log_prior(objective.problem, values, log_uniform),
+        log_density=-half.sum(axis=1),
     )
-
-
-def log_prior(
-    problem: Problem, values: Float[np.ndarray, "sets p"], log_uniform: tuple[str, ...]
-) -> Float[np.ndarray, " sets"]:
-    """Return the logarithm of the prior at sets of values, but for constraints and a constant."""
-    total = np.zeros(len(values))
-    for parameter, column in zip(problem.parameters, values.T, strict=True):
-        if parameter.name in log_uniform:
-            total -= np.log(np.maximum(np.abs(column - parameter.reference), 1e-300))
-    return total
 
 
 def noise_of(objective: Objective, sets: int, random: np.random.Generator) -> Float[np.ndarray, "sets rows k"]:

@@ -111,7 +111,7 @@ def calibrate_ranks(
     predicted = densities(refit.objective, true).predicted
     both, data = _both_tables(refit, predicted + noise_of(refit.objective, sets, random))
     fits, shift = fit_data_sets(both, data), shifts(both.objective, data)
-    here = np.append(true, densities(both.objective, true, (), shift).log_density[:, None], axis=1)
+    here = np.append(true, densities(both.objective, true, shift).log_density[:, None], axis=1)
     exact, gaussian = [], []
     for k in np.flatnonzero(fits.converged & np.isfinite(fits.covariance).all(axis=(1, 2))):
         drawn, weight = _posterior(both.objective, fits.values[k], fits.covariance[k], shift[k], random)
@@ -157,7 +157,7 @@ def _posterior(
     lowest, highest = np.array([(p.lowest, p.highest) for p in objective.problem.parameters]).T
     inside = np.all((drawn >= lowest) & (drawn <= highest), axis=1)
     within = np.clip(drawn, lowest, highest)
-    likelihood = densities(objective, within, (), shift).log_density
+    likelihood = densities(objective, within, shift).log_density
     with_likelihood = np.append(drawn, likelihood[:, None], axis=1)
     raw = likelihood + 0.5 * np.sum(z**2, axis=1)
     raw = np.where(inside & np.isfinite(raw), raw, -np.inf)

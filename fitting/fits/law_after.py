@@ -296,22 +296,6 @@ def delay_by_formula(
     return np.sum([values.get(name, 0.0) * term(speeds, rebound) for name, term in DELAY_TERMS.items()], axis=0)
 
 
-class Nearness(NamedTuple):
-    """How near formulas of a family come to a law: the largest distance, relative to the rebound speed, and where."""
-
-    off: float
-    at_nm_per_us: float
-
-
-def nearness(
-    speeds: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], formula: Float[np.ndarray, " n"]
-) -> Nearness:
-    """Return how far rebound speeds of a formula are from those of a law, 0 where the tip is captured."""
-    off = np.where(rebound > 0.0, np.abs(formula / np.where(rebound > 0.0, rebound, 1.0) - 1.0), 0.0)
-    worst = int(np.argmax(off))
-    return Nearness(float(off[worst]), float(speeds[worst]))
-
-
 _POWERS = {"r": 2, "viscous_loss": 1, "epsilon": 0}
 """Powers of the speed: u_in^2 - u_out^2 = (1 - r^2) u^2 + c u + epsilon, each term a loss."""
 

@@ -21,7 +21,7 @@ from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
-from fitting.fits.law_after import LAW_POINTS, AtSpeeds, nearness, points_of_law, rebound_by_formula
+from fitting.fits.law_after import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_formula
 from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
@@ -514,10 +514,12 @@ def loss_of(
         for known in (parameters.get("r"), parameters.get("epsilon"))
     )
     delta = None if epsilon is None or mass_ng is None else scaled(epsilon, 0.5 * mass_ng)
-    off = None
+    off = off_at = None
     if formula is not None:
         speeds = np.geomspace(*measured, LAW_POINTS)
-        off = nearness(speeds, law(speeds).law[0], rebound_by_formula(formula, speeds))
+        rebound, by_formula = law(speeds).law[0], rebound_by_formula(formula, speeds)
+        apart = np.where(rebound > 0.0, np.abs(by_formula / np.where(rebound > 0.0, rebound, 1.0) - 1.0), 0.0)
+        off, off_at = float(apart.max()), float(speeds[np.argmax(apart)])
     return Loss(
         energies=tuple(dict.fromkeys(energies)),
         energies_reason=NO_MASS if mass_ng is None else None,
@@ -525,7 +527,7 @@ def loss_of(
         epsilon_nm2_per_us2=epsilon,
         delta_aj=delta,
         delta_ev=None if delta is None else scaled(delta, EV_PER_AJ),
-        formula_off=None if off is None else off.off,
-        formula_off_at_nm_per_us=None if off is None else off.at_nm_per_us,
+        formula_off=off,
+        formula_off_at_nm_per_us=off_at,
         capture_speed_nm_per_us=interval_of(points.capture, float(np.linalg.norm(points.capture_factor)), lowest=0.0),
     )

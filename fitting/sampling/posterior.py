@@ -6,7 +6,6 @@ end, such as a loss, is its end plus or minus e log(1 + exp(y)), with e its stan
 errors away, exponential close to it. A posterior that is Gaussian but for the end stays nearly so in y.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -30,15 +29,11 @@ WARM_UP = 300
 _SPREAD = 1.0
 """Chains start this many standard deviations apart: R-hat can then tell whether they came together."""
 
-_NEGLIGIBLE = 5.7
-"""Standard errors beyond which the density is negligible, a ten-millionth of its maximum."""
-
 
 @checked
 def posterior(
     result: FitResult,
     *,
-    log_uniform: Sequence[str] = (),
     samples: int = 1000,
     seed: int = 0,
 ) -> Posterior:
@@ -50,7 +45,6 @@ def posterior(
 
     Args:
         result: from `fitting.fit`; it must be valid.
-        log_uniform: losses whose prior is flat in their logarithm instead.
         samples: draws of each of four chains.
         seed: of the sampler.
 
@@ -60,16 +54,11 @@ def posterior(
     """
     require_valid(result)
     refit = compact(objective_of(result))
-    problem = refit.objective.problem
-    for name in log_uniform:
-        if name not in problem.own or not any(p.name == name and not p.width for p in problem.parameters):
-            raise ValueError(f"`log_uniform` must name losses of the model {result.model!r}, but one is {name!r}")
     if samples < FEWEST_SAMPLES:
         raise ValueError(f"`samples` must be at least {FEWEST_SAMPLES}, but is {samples}")
     blackjax = require_blackjax()
     covariance = standard_covariance(refit)
-    _require_proper(refit, covariance, log_uniform)
-    density = log_density_of(refit, covariance, tuple(log_uniform))
+    density = log_density_of(refit, covariance)
     # blackjax mixes integers of 32 and 64 bits, which strict promotion would refuse
     with jax.numpy_dtype_promotion("standard"):
         drawn, statistics = _chains(density, jax.random.split(jax.random.key(seed), CHAINS), samples)
@@ -80,23 +69,7 @@ def posterior(
         effective = np.atleast_1d(blackjax.diagnostics.effective_sample_size(halves))
     statistics = {name: np.asarray(each) for name, each in statistics.items()}
     chains = PosteriorChains(values, r_hat, effective, int(statistics["diverging"].sum()), seed, statistics)
-    return posterior_of_chains(chains, problem.names, tuple(log_uniform))
-
-
-def _require_proper(refit: Refit, covariance: Float[np.ndarray, "p p"], log_uniform: Sequence[str]) -> None:
-    """Refuse a prior flat in a logarithm where the loss may be zero: its integral does not exist.
-
-    Raises:
-        ValueError: if so.
-    """
-    errors = np.sqrt(np.diag(covariance))
-    for parameter, value, error in zip(refit.objective.problem.parameters, refit.values, errors, strict=True):
-        bound = parameter.bound
-        if parameter.name in log_uniform and bound is not None and abs(value - bound) < _NEGLIGIBLE * error:
-            raise ValueError(
-                f"log_uniform: {parameter.name} may be at its bound, {bound:g}, where such a prior has no end; leave "
-                "it flat in the value"
-            )
+    return posterior_of_chains(chains, refit.objective.problem.names)
 
 
 def require_blackjax() -> Any:
@@ -120,14 +93,12 @@ class Space(eqx.Module):
 
     Attributes:
         problem: the model.
-        log_uniform: parameters whose prior is flat in the logarithm of their loss.
         errors: standard errors e of the values, shape (p,).
         middle: coordinates of the fit, shape (p,).
         axes: its columns are steps of about one standard deviation each, shape (p, p).
     """
 
     problem: Problem = eqx.field(static=True)
-    log_uniform: tuple[str, ...] = eqx.field(static=True)
     errors: Float[Array, " p"]
     middle: Float[Array, " p"]
     axes: Float[Array, "p p"]
@@ -143,9 +114,8 @@ class Space(eqx.Module):
                 continue
             distance = jax.nn.softplus(y)
             values.append(parameter.reference + (parameter.sign or 1) * self.errors[i] * distance)
-            # d value/d y, up to a constant; a prior flat in the logarithm is divided by the distance to the end
+            # d value/d y, up to a constant
             logs = logs + jax.nn.log_sigmoid(y)
-            logs = logs - (jnp.log(distance) if parameter.name in self.log_uniform else 0.0)
         return jnp.stack(values), logs
 
 
@@ -153,7 +123,6 @@ def space_around(
     problem: Problem,
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "p p"],
-    log_uniform: tuple[str, ...],
 ) -> Space:
     """Return the space in which a posterior is about standard normal.
 
@@ -163,7 +132,6 @@ def space_around(
         problem: the model.
         values: of the fit.
         covariance: its, finite.
-        log_uniform: parameters whose prior is flat in the logarithm of their loss.
 
     Raises:
         ValueError: if the data hardly tell parameters apart.
@@ -175,7 +143,7 @@ def space_around(
     if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled / np.trace(scaled))[0] < 1e-15:
         raise ValueError(f"the data hardly tell {', '.join(problem.names)} apart: hold one fixed, or constrain it")
     axes = np.linalg.cholesky(scaled)
-    return Space(problem, log_uniform, jnp.asarray(errors), jnp.asarray(middle), jnp.asarray(axes))
+    return Space(problem, jnp.asarray(errors), jnp.asarray(middle), jnp.asarray(axes))
 
 
 def _coordinate_and_slope(parameter: Parameter, value: float, error: float) -> tuple[float, float]:
@@ -235,19 +203,18 @@ class LogDensity(eqx.Module):
         return -jnp.sum(half), -(slope + weight[-constraint.size :] / measurement.constraint_error)
 
 
-def log_density_of(refit: Refit, covariance: Float[np.ndarray, "p p"], log_uniform: tuple[str, ...] = ()) -> LogDensity:
+def log_density_of(refit: Refit, covariance: Float[np.ndarray, "p p"]) -> LogDensity:
     """Return the log density of a fit's posterior, in the space that is scaled by its covariance.
 
     Args:
         refit: the fit, from `fitting.sampling.refit.objective_of`; its orbits are followed.
         covariance: of its values.
-        log_uniform: parameters whose prior is flat in the logarithm of their loss.
 
     Raises:
         ValueError: if the data hardly tell parameters apart.
     """
     objective = refit.objective
-    space = space_around(objective.problem, refit.values, covariance, log_uniform)
+    space = space_around(objective.problem, refit.values, covariance)
     near = None if objective.near is None else jnp.asarray(objective.near)
     measurement = jax.tree.map(jnp.asarray, objective.measurement)
     return LogDensity(space, measurement, near, robust=objective.robust)

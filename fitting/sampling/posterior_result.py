@@ -43,7 +43,6 @@ class Posterior(Result):
     """The posterior of a fit's parameters.
 
     Attributes:
-        log_uniform: parameters with a prior flat in the logarithm of their loss; the others' are flat in their value.
         mean: by parameter.
         standard_deviation: by parameter.
         interval95: equal-tailed credible interval by parameter.
@@ -52,7 +51,6 @@ class Posterior(Result):
         chains: the samples and their diagnostics.
     """
 
-    log_uniform: tuple[str, ...]
     mean: dict[str, float]
     standard_deviation: dict[str, float]
     interval95: dict[str, tuple[float, float]]
@@ -67,7 +65,6 @@ class Posterior(Result):
             "method": "nuts",
             "converged": self.converged,
             "reasons": self.reasons,
-            "log_uniform": list(self.log_uniform),
             "parameters": {
                 name: {
                     "mean": self.mean[name],
@@ -87,13 +84,12 @@ class Posterior(Result):
         }
 
 
-def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...], log_uniform: tuple[str, ...]) -> Posterior:
+def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...]) -> Posterior:
     """Return means and intervals of samples, and whether the chains agree."""
     flat = chains.samples.reshape(-1, len(names))
     low, high = np.quantile(flat, [0.025, 0.975], axis=0)
     reasons = _complaints(chains, names)
     return Posterior(
-        log_uniform=log_uniform,
         mean=dict(zip(names, flat.mean(axis=0).tolist(), strict=True)),
         standard_deviation=dict(zip(names, flat.std(axis=0, ddof=1).tolist(), strict=True)),
         interval95={name: (float(a), float(b)) for name, a, b in zip(names, low, high, strict=True)},

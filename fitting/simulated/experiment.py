@@ -123,7 +123,7 @@ def steady_rows(
     reasons = dict.fromkeys(np.flatnonzero(~predicted).tolist(), _NOT_PREDICTED)
     waiting = np.flatnonzero(predicted)
     if not waiting.size:
-        return SteadyRows(nothing, np.zeros((3, 0)), reasons)
+        return SteadyRows(*nothing, reasons)
     report(f"{len(waiting)} of {count} drives have a stable orbit of the closest law; closing in on them")
     orbits = close_periods(
         lambda starts, rows: ends_in_flight(follow(starts, rows, _responses(drives, rows, 1))),
