@@ -21,7 +21,7 @@ _WIDTH_INCHES, DPI = 6.4, 190.0
 """Narrow enough that letters can still be read on a screen of 420 pixels."""
 _KINDS = ("peak", "lock-in", "phase")
 _EXCLUDED = "#999999"
-_ROW_AXIS = "drive frequency (kHz), for each order N to scale;\nrows of one frequency beside each other"
+_ROW_AXIS = "rows, by order N, drive frequency (kHz), amplitude and offset"
 _HEIGHT = "height of the sample over the tip's rest position (nm)"
 _MUCH = 5.0
 """How much the loss must change to be drawn on a logarithmic axis."""
@@ -103,7 +103,7 @@ def draw_amplitudes(axes: Axes, result: FitResult) -> None:
         _draw_readings(axes, result, kind, result.rows.measured_nm[:, kind], result.rows.predicted_nm[:, kind])
     _mark_missing(axes, result, ranking, places)
     if not result.table.tapping:
-        _mark_orders(axes, result.table.order[ranking])
+        _mark_orders(axes, result, above=True)
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
@@ -145,7 +145,7 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
         alone = kind == 2 and not result.table.tapping and np.isfinite(residual).any()
         axes.plot(places, residual, "o", ms=3, color=COLOURS[kind], label="phase, residual" if alone else None)
     if not result.table.tapping:
-        _name_frequencies(axes, result)
+        _mark_orders(axes, result, above=False)
     axes.set_ylabel("residual (errors)")
     axes.set_xlabel(_HEIGHT if result.table.tapping else _ROW_AXIS)
 
@@ -179,45 +179,13 @@ def _draw_expected(axes: Axes) -> None:
 
 
 def _row_axis(result: FitResult) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows in order, and where each stands: an order N is as wide as any, its drive frequencies to scale.
-
-    Rows of one frequency, at several drives and offsets, stand a little beside each other; those of a tapping curve at
-    their height.
-    """
+    """Return the rows in order and where each stands: side by side; those of a tapping curve at their height."""
     table = result.table
     if table.tapping:
         ranking = np.argsort(table.offset_nm, kind="stable")
         return ranking, table.offset_nm[ranking]
     ranking = np.lexsort((table.offset_nm, table.excitation_nm, table.drive_frequency_khz, table.order))
-    places = np.empty(len(ranking))
-    order, frequency = table.order[ranking], table.drive_frequency_khz[ranking]
-    for number, one in enumerate(np.unique(order)):
-        here = order == one
-        different, which = np.unique(frequency[here], return_inverse=True)
-        width = max(float(np.ptp(different)), 1e-9)
-        room = float(np.diff(different).min()) / width if len(different) > 1 else 1.0
-        rank = np.arange(here.sum()) - np.searchsorted(which, which)
-        beside = 0.6 * room * (rank / max(np.bincount(which).max() - 1, 1) - 0.5)
-        places[here] = (
-            number + 0.06 + 0.88 * ((frequency[here] - different[0]) / width + 0.5 * room + beside) / (1.0 + room)
-        )
-    return ranking, places
-
-
-def _name_frequencies(axes: Axes, result: FitResult) -> None:
-    """Name the lowest, a middle and the highest drive frequency of each order."""
-    ranking, places = _row_axis(result)
-    order, frequency = result.table.order[ranking], result.table.drive_frequency_khz[ranking]
-    ticks, names = [], []
-    for one in np.unique(order):
-        different = np.unique(frequency[order == one])
-        for chosen in sorted({0, len(different) // 2, len(different) - 1}):
-            here = (order == one) & (frequency == different[chosen])
-            ticks.append(float(places[here].mean()))
-            names.append(f"{different[chosen]:.4g}")
-    axes.set_xticks(ticks, names, rotation=35, ha="right", rotation_mode="anchor")
-    for number in range(1, len(np.unique(order))):
-        axes.axvline(number, color="0.7", lw=0.8)
+    return ranking, np.arange(len(ranking), dtype=float)
 
 
 def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray, places: np.ndarray) -> None:
@@ -233,20 +201,28 @@ def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray, places: np
             axes.axvline(place, color=colour, lw=0.8, ls=":", label=None if count else label)
 
 
-def _mark_orders(axes: Axes, orders: np.ndarray) -> None:
-    """Separate the orders N by lines and name them at the top."""
-    for number, order in enumerate(np.unique(orders)):
-        if number:
-            axes.axvline(number, color="0.7", lw=0.8)
-        axes.annotate(
-            f"N = {order}",
-            (number + 0.5, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, 3),
-            textcoords="offset points",
-            ha="center",
-            fontsize=SMALL,
-        )
+def _mark_orders(axes: Axes, result: FitResult, *, above: bool) -> None:
+    """Separate the orders N by lines; name them above the panel, or their first and last drive frequency below it."""
+    ranking, places = _row_axis(result)
+    order, frequency = result.table.order[ranking], result.table.drive_frequency_khz[ranking]
+    ticks = []
+    for number in np.unique(order):
+        first, last = places[order == number][[0, -1]]
+        ticks += [first, last]
+        axes.axvline(last + 0.5, color="0.7", lw=0.8)
+        if above:
+            axes.annotate(
+                f"N = {number}",
+                (0.5 * (first + last), 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(0, 3),
+                textcoords="offset points",
+                ha="center",
+                fontsize=SMALL,
+            )
+    if not above:
+        names = [f"{frequency[int(place)]:.4g}" for place in ticks]
+        axes.set_xticks(ticks, names, rotation=35, ha="right", rotation_mode="anchor")
 
 
 def draw_law(axes: Axes, result: FitResult) -> None:
@@ -318,7 +294,8 @@ def draw_delay(axes: Axes, result: FitResult) -> None:
     log_speed_axis(axes)
     axes.set_xlabel(_APPROACH)
     axes.set_ylabel("collision delay (ns)")
-    _frame_measured(axes, result)
+    # below the measured speeds the delay may fall steeply
+    _frame(axes, result, [1e3 * column for column in (law.collision_delay_us, law.delay_low_us, law.delay_high_us)])
 
 
 def _mark_speeds(axes: Axes, result: FitResult, label: str | None = None) -> None:
@@ -326,14 +303,6 @@ def _mark_speeds(axes: Axes, result: FitResult, label: str | None = None) -> Non
     reached = result.rows.reached_nm_per_us
     edge = axes.get_xaxis_transform()
     axes.plot(reached, np.full_like(reached, 0.02), "|", color="black", ms=6, mew=0.7, transform=edge, label=label)
-
-
-def _frame_measured(axes: Axes, result: FitResult) -> None:
-    """Let the measured speeds decide the height: below them the delay may fall steeply."""
-    law = result.law
-    _frame(
-        axes, result, tuple(1e3 * column for column in (law.collision_delay_us, law.delay_low_us, law.delay_high_us))
-    )
 
 
 def _frame(axes: Axes, result: FitResult, columns: Sequence[np.ndarray]) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.results import Result, public_result
+from afm_jax.strict_json import plain
 
 HIGHEST_R_HAT = 1.02
 """Samples with a larger ratio between and within chains do not describe one distribution."""
@@ -78,8 +79,8 @@ class Posterior(Result):
                 "draws": draws,
                 "seed": self.chains.seed,
                 "divergences": self.chains.divergences,
-                "r_hat": dict(zip(self.mean, _finite(self.chains.r_hat), strict=True)),
-                "effective_samples": dict(zip(self.mean, _finite(self.chains.effective_samples), strict=True)),
+                "r_hat": dict(zip(self.mean, plain(self.chains.r_hat), strict=True)),
+                "effective_samples": dict(zip(self.mean, plain(self.chains.effective_samples), strict=True)),
             },
         }
 
@@ -113,7 +114,3 @@ def _complaints(chains: PosteriorChains, names: tuple[str, ...]) -> list[str]:
             "as the edge where an orbit is lost"
         )
     return reasons
-
-
-def _finite(column: Float[np.ndarray, " p"]) -> list[float | None]:
-    return [float(x) if np.isfinite(x) else None for x in column]
