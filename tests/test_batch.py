@@ -10,7 +10,6 @@ import pytest
 
 from afm_jax import Scene, iterate_map
 from afm_jax.dynamics.starts import evenly_spread
-from afm_jax.impact.law import formula_of
 from afm_jax.impact.map import iterate_batch
 from afm_jax.scenefile.presets import preset
 from tests.reference_flight import Parameters, high_precision, mp
@@ -46,7 +45,7 @@ def test_blocks_change_nothing(batch: int, block: int):
 @high_precision
 def derivatives_by_r(scene: Scene, time_us: float, velocity: float) -> list[float]:
     """Return d(impact times)/dr in us by a central difference at 50 digits, right to about 30."""
-    law, step = formula_of(scene), mp.mpf("1e-15")
+    law, step = scene.interaction, mp.mpf("1e-15")
     quality = scene.cantilever.quality_factor
     own = Parameters(
         frequency_khz=float(scene.cantilever.frequency_khz),
@@ -69,7 +68,7 @@ def test_forward_and_reverse_derivatives_agree_with_50_digits():
     def times(r: jax.Array) -> jax.Array:
         return iterate_batch(with_r(scene, r), *starts, IMPACTS, block=2).time_us
 
-    r = formula_of(scene).r
+    r = scene.interaction.r
     exact = [derivatives_by_r(scene, float(time), float(speed)) for time, speed in zip(*starts, strict=True)]
     for derivative in (jax.jacfwd, jax.jacrev):
         # three impacts lose at most three digits of sixteen

@@ -16,6 +16,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
+from afm_jax.dynamics.continuation import continue_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of
 from afm_jax.impact.jacobian import map_jacobian
@@ -26,7 +27,7 @@ from afm_jax.motion.observe import observe
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import state_at
-from afm_jax.scenefile.parameter_paths import scene_family
+from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 
 MASS, PER_KHZ = 16.81, 2e-3 * np.pi
 INSTANT = ImpactLaw(0.99, 0.1, 0.01)
@@ -224,6 +225,18 @@ def test_drives_of_several_frequencies_have_no_single_orbit():
     for cantilever, sample, force, said in cases:
         with pytest.raises(ValueError, match=said):
             single_impact_orbits(Scene(cantilever, sample, INSTANT, force=force), 1)
+
+
+def test_one_frequency_of_sample_and_force_is_no_parameter():
+    scene = Scene(Cantilever(90.0, 40.0), Platform(1.5, 92.7, -40.0), INSTANT, force=ForceDrive(1.0, 92.7))
+    said, path, values = "several frequencies, so .* moves one part's alone: give", "force.frequency_khz", [91.0, 92.7]
+    with pytest.raises(ValueError, match=said):
+        bifurcation_diagram(scene, path, np.array(values))
+    plane = scene_family(scene, path, "interaction.r")
+    with pytest.raises(ValueError, match=said):
+        stability_chart(plane, x_values=np.array(values), y_values=np.array([0.8]), last_order=1)
+    with pytest.raises(ValueError, match=said):
+        continue_orbits(scene, 1, ParameterRange(path, *values))
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Numerics without physics: lanes in blocks and again, roots, points of curves, quadrature, derivatives by rules."""
 
 import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +50,26 @@ def test_blocks_of_a_program_that_has_run_begin_side_by_side(monkeypatch: pytest
     two.abort()
     with pytest.raises(threading.BrokenBarrierError):
         in_blocks(at_once, values, block=4, widths=())
+
+
+def test_a_program_whose_first_block_has_failed_has_not_run(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("afm_jax.solve.lanes.available_cores", lambda: 2)
+    running, most = [], []
+
+    def fails(_):
+        raise MemoryError
+
+    def counted(some):
+        running.append(some)
+        time.sleep(0.05)
+        most.append(len(running))
+        running.pop()
+        return some
+
+    with pytest.raises(MemoryError):
+        in_blocks(fails, VALUES[:8], block=4, widths=(), program="a first block")
+    in_blocks(counted, VALUES[:8], block=4, widths=(), program="a first block")
+    assert most == [1, 1]
 
 
 @pytest.mark.parametrize("recompute", [False, True])

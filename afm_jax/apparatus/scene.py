@@ -125,28 +125,6 @@ def _check_frequencies(scene: Scene) -> None:
                 )
 
 
-def require_sample_drive(scene: Scene, *, second_frequency: bool = False) -> None:
-    """Check that nothing drives a scene but its platform, for what knows nothing else.
-
-    Args:
-        scene: the scene.
-        second_frequency: whether the platform may have a second frequency.
-
-    Raises:
-        ValueError: if there is another drive; says which.
-    """
-    if scene.base is not None:
-        drive = "`base`, a motion of the cantilever's base"
-    elif scene.force is not None:
-        drive = "`force`, a force on the tip"
-    elif scene.platform.second is not None and not second_frequency:
-        drive = "`platform.second`, a second frequency of the platform"
-    else:
-        return
-    known = "the platform's motion" if second_frequency else "one cosine of the platform"
-    raise ValueError(f"the scene has {drive}, but only {known} is allowed here: leave it out, or simulate the scene")
-
-
 def require_one_frequency(scene: Scene) -> None:
     """Check that no part of a scene has a second frequency.
 
@@ -164,6 +142,10 @@ def require_one_frequency(scene: Scene) -> None:
 
 _SAME = 1e-12
 """Relative distance below which two frequencies are one."""
+
+
+RANGE_OF_ONE = "a range of a frequency moves one part's alone: give the others that move an amplitude of 0"
+"""Why base and sample of one frequency cannot be taken through it together."""
 
 
 class DrivePeriod(NamedTuple):

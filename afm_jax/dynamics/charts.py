@@ -233,13 +233,6 @@ class StabilityChart(Result):
         frequency, amplitude = np.meshgrid(self.x_values, self.y_values)
         return frequency.ravel(), amplitude.ravel()
 
-    def tongue(self, order: int) -> Bool[np.ndarray, "rows columns"]:
-        """Return where an orbit of this order is stable with a flight shorter than the tip's free period (n > N/2).
-
-        Longer flights, past the platform without a touch, are possible too: islands apart from the tongue.
-        """
-        return self.stable[order - 1] & (self.x_values > 0.5 * order)
-
     def table(self) -> list[dict[str, object]]:
         """Return one row a point: where it is, its lowest stable order and that orbit's peak amplitude."""
         order = self.lowest_stable_order.ravel()
@@ -383,4 +376,5 @@ def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Sce
         check_kind("scene_of(...)", scene, Scene)
         return scene
 
-    return eqx.filter_jit(eqx.filter_vmap(made))(*(jnp.asarray(column, float) for column in columns))
+    # operation by operation, which JAX knows again: a program of a new function would be compiled at every call
+    return eqx.filter_vmap(made)(*(jnp.asarray(column, float) for column in columns))

@@ -30,7 +30,7 @@ from afm_jax.dynamics.impact_orbits import (
 )
 from afm_jax.dynamics.many_tips import next_contact, tips_after_contacts
 from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leaving_tips, sample_driven
-from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_sum, peak_amplitude, single_impact_orbits
+from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_flight, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
@@ -408,10 +408,8 @@ def _peak_of_flight(seen: SampleDriven, begin_us: Array, rebound: Array, arrival
     height, rate = scene.platform.position_and_velocity(begin_us)
     height, velocity, lasts = height + gap_of_departure(scene), rate + rebound, arrival_us - begin_us
     flight = FlightEnds(begin_us, lasts, height, velocity, *scene.cantilever.propagator(lasts)(height, velocity))
-    if seen.frame.response is None:
-        return peak_amplitude(scene.cantilever, flight)
-    still = jnp.zeros_like(begin_us)
-    return highest_of_sum(scene.cantilever, flight, Surface(still, still, (seen.frame.response,)))
+    wave, still = seen.frame.response, jnp.zeros_like(begin_us)
+    return highest_of_flight(scene.cantilever, flight, None if wave is None else Surface(still, still, (wave,)))
 
 
 def _next_departure(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.table import Table
 
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
+from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene, SceneLike, as_scene, drive_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.contact.contact import Contact
@@ -256,8 +256,8 @@ def continue_orbits(
     scene = as_scene(scene)
     require_float64(scene)
     ranges = (given,) if second is None else (given, second)
-    _check(scene, order, impacts, ranges)
     driven = driven_part(scene)
+    _check(scene, order, impacts, ranges)
     if second is not None:
         value = parameter_values(scene)[second.path]
         if not second.low <= value <= second.high:
@@ -301,7 +301,11 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
                 f"{given}: at r = 0 every impact is a capture and no orbit leaves; begin the range above 0"
             )
         for end in (given.low, given.high):
-            driven_part(scene_family(scene, given.path)(end))
+            try:
+                driven_part(scene_family(scene, given.path)(end))
+            except ValueError as problem:
+                hint = f"; {RANGE_OF_ONE}" if "frequency" in given.path else ""
+                raise ValueError(f"{given}: {problem}{hint}") from None
 
 
 def _orbits_in_range(

@@ -26,7 +26,7 @@ from afm_jax.impact.first_impact import Flight
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import speeds_of_lasting_impact
 from afm_jax.impact.law import Law, Speeds, impact_law_of
-from afm_jax.impact.orbits import FlightEnds, ends_at_its_own_impact, highest_of_sum, peak_amplitude
+from afm_jax.impact.orbits import FlightEnds, ends_at_its_own_impact, highest_of_flight
 from afm_jax.solve.derivatives import largest
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
@@ -261,17 +261,11 @@ def highest_point(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) 
     if unknowns.shape[0] == 0:
         zero = jnp.zeros(())
         free = FlightEnds(zero, loop.period_us, zero, zero, zero, zero)
-        return zero if response is None else highest_of_sum(loop.cantilever, free, response, samples)
+        return highest_of_flight(loop.cantilever, free, response, samples)
     impacts = impacts_at(unknowns, loop)
     end, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
     flights = FlightEnds(impacts.leaving_us, impacts.duration_us, impacts.height, impacts.velocity, end, speed)
-
-    def highest(flight):
-        if response is None:
-            return peak_amplitude(loop.cantilever, flight)
-        return highest_of_sum(loop.cantilever, flight, response, samples)
-
-    return largest(jax.vmap(highest)(flights))
+    return largest(jax.vmap(lambda flight: highest_of_flight(loop.cantilever, flight, response, samples))(flights))
 
 
 class LoopReading(eqx.Module):

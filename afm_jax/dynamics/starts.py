@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene
 from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
 from afm_jax.contact.collide import capture_speed
@@ -81,8 +81,8 @@ def sample_driven(scenes: Scene) -> SampleDriven:
     frame = free_frame(scenes)
     if not np.all(np.asarray(frame.periodic)):
         raise ValueError(
-            "the drive has several frequencies, so that no period of the drive repeats; a range of a frequency moves "
-            "one part's alone: give the others that move an amplitude of 0, or `simulate` scenes one by one"
+            f"the drive has several frequencies, so that no period of the drive repeats; {RANGE_OF_ONE}, or `simulate` "
+            "scenes one by one"
         )
     if not np.all(np.asarray(frame.platform.amplitude_nm) > 0.0):
         raise ValueError("`amplitude_nm` of the platform must be positive here: on a resting platform motion dies away")

@@ -76,14 +76,6 @@ class CollisionDelay(eqx.Module):
         u, w = as_argument(approach_speed), as_argument(rebound_speed)
         return self.hertz * u**-0.2 - self.lead_nm * (1.0 / w - 1.0 / u) - self.offset_nm / u
 
-    def slope(
-        self, approach_speed: ArrayLike, rebound_speed: ArrayLike, rebound_slope: ArrayLike
-    ) -> Float[Array, "..."]:
-        """Return d tau/d u in us^2/nm along a law with slope dw/du, all at one approach speed."""
-        u, w = as_argument(approach_speed), as_argument(rebound_speed)
-        hertz = -0.2 * self.hertz * u**-1.2
-        return hertz + self.lead_nm * (rebound_slope / w**2 - 1.0 / u**2) + self.offset_nm / u**2
-
 
 class HertzContact(NamedTuple):
     """What lasts of an impact: a Hertz contact on a surface near gap 0, with straight paths to it and from it.
@@ -325,13 +317,6 @@ class ImpactLaw(Law):
             return Speeds(u, rebound, jnp.zeros_like(u))
         return Speeds(u, rebound, jnp.where(free, self.delay(jnp.where(free, u, 1.0), safe), 0.0))
 
-    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d u_out/d u_in = (2 r^2 u_in - c)/(2 u_out); 0 where the tip is captured."""
-        u = as_argument(approach_speed)
-        rebound = self.rebound_speed(u)
-        free = rebound > 0.0
-        return jnp.where(free, (2.0 * self.r**2 * u - self.viscous_loss) / (2.0 * jnp.where(free, rebound, 1.0)), 0.0)
-
     def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
         """Return the u_in in nm/us that leaves at u_out: the law read backwards; infinite at r = 0."""
         w = as_argument(rebound_speed)
@@ -342,16 +327,6 @@ class ImpactLaw(Law):
         root = jnp.where(positive, jnp.sqrt(jnp.where(positive, discriminant, 1.0)), 0.0)
         leaves = self.r > 0.0
         return jnp.where(leaves, (self.viscous_loss + root) / (2.0 * jnp.where(leaves, self.r, 1.0) ** 2), jnp.inf)
-
-    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d tau/d u_in in us^2/nm (`CollisionDelay.slope`); 0 without a delay or where captured."""
-        u = as_argument(approach_speed)
-        if self.delay is None:
-            return jnp.zeros_like(u)
-        rebound = self.rebound_speed(u)
-        free = rebound > 0.0
-        u, rebound = jnp.where(free, u, 1.0), jnp.where(free, rebound, 1.0)
-        return jnp.where(free, self.delay.slope(u, rebound, self.rebound_slope(u)), 0.0)
 
     def coordinate(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the coordinate Y in nm/us of an impact that comes at a speed in nm/us above capture."""
@@ -1070,24 +1045,3 @@ def extrapolation_of(law: Any, speeds: Any) -> str | None:
         f"Extrapolated: the law is known from {low:.4g} to {high:.4g} nm/us, but {outside.size} of {known.size} "
         f"impacts come at {ends} nm/us."
     )
-
-
-def errors_of(law: Law, approach_speed: ArrayLike) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return the standard errors of a law's rebound speeds in nm/us and delays in us; 0 where none are known of it."""
-    u = as_argument(approach_speed)
-    if not isinstance(law, TabulatedLaw) or law.deviations is None:
-        return np.zeros(u.shape), np.zeros(u.shape)
-    slopes = jax.jit(jax.jacfwd(lambda unknowns: law.moved(unknowns).at_approach(u)))(jnp.zeros(law.unknowns))
-    return np.linalg.norm(slopes.rebound, axis=1), np.linalg.norm(slopes.delay, axis=1)
-
-
-def formula_of(scene: Scene) -> ImpactLaw:
-    """Return the scene's impact law, which must be a formula.
-
-    Raises:
-        TypeError: if the scene's interaction is something else.
-    """
-    law = impact_law_of(scene)
-    if not isinstance(law, ImpactLaw):
-        raise TypeError(f"this needs a law that is a formula, an ImpactLaw, not a {type(law).__name__}")
-    return law

@@ -142,8 +142,8 @@ def next_impact(
     ...     print(round(float(next_impact(scene, 4.0, 6.0).time_us), 6))
     9.646489
     """
-    free = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
-    return _in_lab(_next_impact(free.scene, free.start, free.tolerance_us, max_steps=max_steps), free.response)
+    seen, response, start, tolerance = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
+    return _in_lab(_next_impact(seen, start, tolerance, max_steps=max_steps), response)
 
 
 @checked
@@ -175,26 +175,18 @@ def iterate_map(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if `impacts` is not positive, or an undamped cantilever is driven at its free frequency.
     """
-    free = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
+    seen, response, start, tolerance = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
     if impacts < 1:
         raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
-    rows = follow_impacts(free.scene, free.start, free.tolerance_us, impacts=impacts, max_steps=max_steps)
-    return _in_lab(rows, free.response)
-
-
-class _FreeStart(NamedTuple):
-    """A start as the freely moving tip sees it: without the steady response to base and force."""
-
-    scene: Scene
-    response: Surface | None
-    start: Departure
-    tolerance_us: Float[Array, ""]
+    return _in_lab(follow_impacts(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
 
 
 def _free_start(
     scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike
-) -> _FreeStart:
-    """Return scene and start as the freely moving tip sees them, checked; a start that is no flight is an outcome.
+) -> tuple[Scene, Surface | None, Departure, Float[Array, ""]]:
+    """Return scene, steady response to base and force, start without it, and tolerance in us, checked.
+
+    A start that is no flight is an outcome.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
@@ -213,7 +205,7 @@ def _free_start(
     dtype = scene.platform.frequency_khz.dtype
     time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
     start = Departure(time, None, velocity if response is None else velocity - response.velocity(time))
-    return _FreeStart(seen, response, start, jnp.asarray(tolerance_us, dtype))
+    return seen, response, start, jnp.asarray(tolerance_us, dtype)
 
 
 def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:

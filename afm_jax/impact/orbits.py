@@ -527,6 +527,15 @@ def peak_amplitude(cantilever: Cantilever, flight: FlightEnds) -> Float[Array, "
     return jnp.where(turn < flight.duration_us, jnp.maximum(ends, top), ends)
 
 
+def highest_of_flight(
+    cantilever: Cantilever, flight: FlightEnds, response: Surface | None, samples: int = SAMPLES
+) -> Float[Array, ""]:
+    """Return the largest height in nm in the lab during a flight, given the steady response that is added to it."""
+    if response is None:
+        return peak_amplitude(cantilever, flight)
+    return highest_of_sum(cantilever, flight, response, samples)
+
+
 def highest_of_sum(
     cantilever: Cantilever, flight: FlightEnds, motion: Surface, samples: int = SAMPLES
 ) -> Float[Array, ""]:

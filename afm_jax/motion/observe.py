@@ -14,7 +14,7 @@ the last response period once a motion has settled, else the whole response peri
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Annotated, Any, NamedTuple, get_args
 
 import jax
@@ -25,15 +25,15 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import surface_of
+from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Law
-from afm_jax.impact.orbits import FlightEnds, peak_amplitude
+from afm_jax.impact.orbits import FlightEnds, highest_of_flight
 from afm_jax.motion.record import ContactKind, Contacts, Simulation, State, contacts_left, to_gap
 from afm_jax.motion.settle import Settled, Window, settled, window_of
-from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly
+from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
 from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
@@ -45,9 +45,6 @@ _COVERED = 1e-6
 _REFINEMENTS = 4
 _REFINED = 33
 """Times between two around the best one, of every refinement."""
-_GRID = 257
-_ZOOMS = 3
-"""Times of the grid that looks for the highest point of a driven flight, and how many grids follow one another."""
 TOO_SHORT = "the window is shorter than a response period: follow the motion longer"
 _ONLY_RESOLVED = "only a resolved contact has a force"
 _BASE_RESTS = "the base rests: the deflection is the height"
@@ -84,6 +81,11 @@ class Observable:
         """Return the quantity of a window; None where the scene has none, NaN where the window is too short."""
         value = self.read(motion)
         return value if value is None or self.of_a_part or motion.responses else math.nan
+
+
+def _of_deflection(meaning: str, read: Callable[["Signal"], float], *, of_a_part: bool = False) -> Observable:
+    """Return how a quantity of the deflection against a moving base is read."""
+    return Observable(meaning, lambda m: m.deflection and read(m.deflection), _BASE_RESTS, of_a_part)
 
 
 class Observables(NamedTuple):
@@ -174,48 +176,28 @@ class Observables(NamedTuple):
     virial_aj: Annotated[float, Observable("mean of force times height", lambda m: m.virial_aj)]
     peak_deflection_nm: Annotated[
         float | None,
-        Observable(
-            "largest deflection against a moving base",
-            lambda m: m.deflection and m.deflection.largest,
-            _BASE_RESTS,
-            of_a_part=True,
-        ),
+        _of_deflection("largest deflection against a moving base", lambda s: s.largest, of_a_part=True),
     ]
     mean_deflection_nm: Annotated[
-        float | None,
-        Observable("mean deflection against a moving base", lambda m: m.deflection and m.deflection.mean, _BASE_RESTS),
+        float | None, _of_deflection("mean deflection against a moving base", lambda s: s.mean)
     ]
     deflection_lockin_amplitude_nm: Annotated[
         float | None,
-        Observable(
-            "amplitude of the deflection at the response frequency",
-            lambda m: m.deflection and m.deflection.at_response.amplitude_nm,
-            _BASE_RESTS,
-        ),
+        _of_deflection("amplitude of the deflection at the response frequency", lambda s: s.at_response.amplitude_nm),
     ]
     deflection_lockin_phase_deg: Annotated[
         float | None,
-        Observable(
-            "phase of the deflection at the response frequency, modulo 360/N",
-            lambda m: m.deflection and m.deflection.at_response.phase_deg,
-            _BASE_RESTS,
+        _of_deflection(
+            "phase of the deflection at the response frequency, modulo 360/N", lambda s: s.at_response.phase_deg
         ),
     ]
     deflection_drive_lockin_amplitude_nm: Annotated[
         float | None,
-        Observable(
-            "amplitude of the deflection at the drive's frequency",
-            lambda m: m.deflection and m.deflection.at_drive.amplitude_nm,
-            _BASE_RESTS,
-        ),
+        _of_deflection("amplitude of the deflection at the drive's frequency", lambda s: s.at_drive.amplitude_nm),
     ]
     deflection_drive_lockin_phase_deg: Annotated[
         float | None,
-        Observable(
-            "phase of the deflection at the drive's frequency",
-            lambda m: m.deflection and m.deflection.at_drive.phase_deg,
-            _BASE_RESTS,
-        ),
+        _of_deflection("phase of the deflection at the drive's frequency", lambda s: s.at_drive.phase_deg),
     ]
     phase_lag_deg: Annotated[
         float | None,
@@ -460,10 +442,8 @@ class Signal:
     @property
     def largest(self) -> float:
         """Largest value in nm."""
-        motion, ends = self.motion, (self.motion.from_us, self.motion.to_us)
-        if self.against is None:
-            return largest_height(motion.dense, motion.path, *ends)
-        return largest_along(motion.dense, self.along, motion.nodes[0], ends)
+        motion = self.motion
+        return largest_along(motion.dense, self.along, motion.nodes[0], (motion.from_us, motion.to_us))
 
     @property
     def mean(self) -> float:
@@ -594,24 +574,6 @@ def _integral_of_overlaps(
     return complex(np.sum(half * _WEIGHTS * gaps * np.exp(-1j * angular_frequency * times)))
 
 
-def largest_height(dense: DensePath, path: Trajectory, from_us: float, to_us: float) -> float:
-    """Return the largest height between two times.
-
-    Args:
-        dense: the tip between the two times.
-        path: the tip at times in between that resolve contacts and flights, those of `DensePath.nodes`.
-        from_us: beginning.
-        to_us: end.
-    """
-    scene = dense.scene
-    if scene.base is None and scene.force is None:
-        in_flight = _largest_in_flights(scene, dense.simulation, from_us, to_us)
-        # no contact comes as high in most motions: then it need not be looked at more closely
-        if path.position_nm.size and in_flight >= float(path.position_nm.max()):
-            return in_flight
-    return largest_along(dense, lambda path: path.position_nm, path.time_us, (from_us, to_us))
-
-
 def largest_along(
     dense: DensePath,
     quantity: Callable[[Trajectory], np.ndarray],
@@ -642,24 +604,10 @@ def largest_along(
     return largest
 
 
-def _largest_in_flights(scene: Scene, simulation: Simulation, from_us: float, to_us: float) -> float:
-    """Return the largest height of flights between two times, of a tip that only the sample drives."""
-    flights = flights_of(scene, simulation)
-    begin, end = np.maximum(flights.begin_us, from_us), np.minimum(flights.end_us, to_us)
-    inside = end > begin
-    if not inside.any():
-        return -np.inf
-    position, velocity = fly(scene, flights.where(inside), begin[inside][None, :])
-    return float(peaks_of_flights(scene, begin[inside], position[0], velocity[0], end[inside]).max())
-
-
 def peaks_of_flights(
     scene: Scene, start_us: ArrayLike, position_nm: ArrayLike, velocity_nm_per_us: ArrayLike, end_us: ArrayLike
 ) -> Float[np.ndarray, " flights"]:
-    """Return the largest height of each of some flights.
-
-    With drives of base or force: a grid over the flight, then finer grids about its highest point; a flight shorter
-    than a few dozen periods of the fastest motion is resolved to rounding.
+    """Return the largest height of each of some flights (`highest_of_flight`).
 
     Args:
         scene: the scene.
@@ -669,21 +617,8 @@ def peaks_of_flights(
         end_us: where they end.
     """
     _, response = surface_of(scene)
-    if response is None:
-        start, z, v = (jnp.asarray(column, float) for column in (start_us, position_nm, velocity_nm_per_us))
-        return np.asarray(_peaks(scene.cantilever, start, z, v, jnp.asarray(end_us, float)))
-    start, end = (np.asarray(column, float)[:, None] for column in (start_us, end_us))
-    position, velocity = (jnp.asarray(column)[:, None] for column in (position_nm, velocity_nm_per_us))
-    steady, rate = response.position_and_velocity(start)
-    low, high, heights = start, end, np.zeros(start.shape)
-    for _ in range(_ZOOMS):
-        times = low + (high - low) * np.linspace(0.0, 1.0, _GRID)
-        free, _ = scene.cantilever.propagator(times - start)(position - steady, velocity - rate)
-        heights = np.asarray(free + response.position_and_velocity(times)[0])
-        top, spacing = np.argmax(heights, axis=1)[:, None], (high - low) / (_GRID - 1)
-        peak = np.take_along_axis(times, top, axis=1)
-        low, high = np.maximum(peak - spacing, start), np.minimum(peak + spacing, end)
-    return heights.max(axis=1)
+    columns = (jnp.asarray(column, float) for column in (start_us, position_nm, velocity_nm_per_us, end_us))
+    return np.asarray(_peaks(scene.cantilever, response, *columns))
 
 
 @compiled_quickly()
@@ -694,16 +629,20 @@ def _least_force(solid: ElasticCurve, depths_nm: Float[np.ndarray | Array, " loa
 @compiled_quickly()
 def _peaks(
     cantilever: Cantilever,
+    response: Surface | None,
     start_us: Float[Array, " flights"],
     position_nm: Float[Array, " flights"],
     velocity_nm_per_us: Float[Array, " flights"],
     end_us: Float[Array, " flights"],
 ) -> Float[Array, " flights"]:
-    """Return the largest heights of flights that only the sample drives."""
+    """Return the largest heights in the lab of flights."""
     duration = end_us - start_us
+    if response is not None:
+        steady, rate = response.position_and_velocity(start_us)
+        position_nm, velocity_nm_per_us = position_nm - steady, velocity_nm_per_us - rate
     ends = cantilever.propagator(duration)(position_nm, velocity_nm_per_us)
     flights = FlightEnds(start_us, duration, position_nm, velocity_nm_per_us, *ends)
-    return jax.vmap(partial(peak_amplitude, cantilever))(flights)
+    return jax.vmap(lambda flight: highest_of_flight(cantilever, flight, response))(flights)
 
 
 def peaks_between_contacts(scene: Scene, simulation: Simulation) -> Float[np.ndarray, " flights"]:

@@ -48,14 +48,6 @@ class Orbit(NamedTuple):
     """One response period."""
 
 
-class Followed(NamedTuple):
-    """A scene followed from a start until it settles."""
-
-    orbit: Orbit | None
-    reason: str | None
-    """Why there is no orbit."""
-
-
 def why_impossible(scene: Scene) -> str | None:
     """Return why a scene cannot be simulated at all; None if it can."""
     try:
@@ -67,8 +59,8 @@ def why_impossible(scene: Scene) -> str | None:
     return None
 
 
-def follow_to_orbit(scene: Scene, start: State, most_us: float, run: Run) -> Followed:
-    """Follow a scene until it is near a periodic orbit, and close in on that to rounding.
+def follow_to_orbit(scene: Scene, start: State, most_us: float, run: Run) -> tuple[Orbit | None, str | None]:
+    """Return the periodic orbit that a scene comes to, closed to rounding, or why there is none.
 
     An orbit counts only if it is near the simulated motion, and attracts.
 
@@ -80,16 +72,16 @@ def follow_to_orbit(scene: Scene, start: State, most_us: float, run: Run) -> Fol
     """
     reason = why_impossible(scene)
     if reason is not None:
-        return Followed(None, reason)
+        return None, reason
     piece_us = min(_ORBIT_PIECE * drive_of(scene).period_us, most_us)
     for piece in follow_in_pieces(scene, start, float(start.time_us) + most_us, run, piece_us=piece_us):
         reason = why_over(piece)
         if reason is not None:
-            return Followed(None, reason)
+            return None, reason
         orbit = _orbit_near(scene, piece.motion, run)
         if orbit is not None:
-            return Followed(orbit, None)
-    return Followed(None, f"nothing repeats: no steady orbit within {most_us:.4g} us of the start")
+            return orbit, None
+    return None, f"nothing repeats: no steady orbit within {most_us:.4g} us of the start"
 
 
 def _orbit_near(scene: Scene, motion: Simulation, run: Run) -> Orbit | None:

@@ -29,48 +29,15 @@ ROUNDING = 1e-8
 _LAST_FRACTION = 0.2
 
 
-class Repetition(NamedTuple):
-    """How a sequence of contacts repeats."""
-
-    contacts: int
-    """m, contacts until it repeats."""
-    periods: int
-    """N, drive periods until it repeats."""
-    remaining: float
-    """Estimated distance from the motion it tends to; of the velocity scale, phases in rad."""
-
-
-def find_repetition(
-    times_us: Float[np.ndarray, " contacts"],
-    velocities: Float[np.ndarray, " contacts"],
-    period_us: float,
-    *,
-    tolerance: float,
-) -> Repetition | None:
-    """Return the shortest repetition of a sequence of departures, closer than a tolerance; None if there is none.
-
-    Two departures m contacts apart differ by a velocity and a phase. Their distance e is the largest over a block of
-    six repetitions; from the block before, q = (e/e_before)^(1/6) is the rate per repetition, and e q/(1 - q) what is
-    left of the geometric series. A block takes a maximum because distances oscillate where an approach spirals. What
-    repeats after a part of the m contacts, to within twice what is left, repeats after that part.
-
-    Args:
-        times_us: when each contact ended, in order.
-        velocities: velocity of the tip then, in nm/us.
-        period_us: of the drive.
-        tolerance: largest remaining distance that counts as none.
-    """
-    turns = np.asarray(times_us)[None] / period_us
-    contacts, periods, remaining = find_repetitions(turns, np.asarray(velocities)[None], tolerance=tolerance)
-    return Repetition(int(contacts[0]), int(periods[0]), float(remaining[0])) if contacts[0] else None
-
-
 class Repetitions(NamedTuple):
-    """`Repetition` of many sequences, arrays of one lane a sequence; ``contacts`` 0 where nothing repeats."""
+    """How sequences of contacts repeat, arrays of one lane a sequence; ``contacts`` 0 where nothing repeats."""
 
     contacts: Int[np.ndarray, " lanes"]
+    """m, contacts until it repeats."""
     periods: Int[np.ndarray, " lanes"]
+    """N, drive periods until it repeats."""
     remaining: Float[np.ndarray, " lanes"]
+    """Estimated distance from the motion it tends to; of the velocity scale, phases in rad."""
 
 
 def find_repetitions(
@@ -81,7 +48,12 @@ def find_repetitions(
     repeated: int = _REPETITIONS,
     rounding: float = ROUNDING,
 ) -> Repetitions:
-    """Return the shortest repetition of each of many sequences of departures, by the criterion of `find_repetition`.
+    """Return the shortest repetition of each of many sequences of departures, closer than a tolerance.
+
+    Two departures m contacts apart differ by a velocity and a phase. Their distance e is the largest over a block of
+    some repetitions n; from the block before, q = (e/e_before)^(1/n) is the rate per repetition, and e q/(1 - q) what
+    is left of the geometric series. A block takes a maximum because distances oscillate where an approach spirals. What
+    repeats after a part of the m contacts, to within twice what is left, repeats after that part.
 
     Args:
         turns: times of the departures in drive periods.
@@ -185,13 +157,15 @@ def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_
     rows = simulation.contacts
     departures = (rows.departure_time_us, rows.departure_velocity_nm_per_us)
     times, velocities = (np.asarray(column)[contacts_left(simulation)] for column in departures)
-    repetition = find_repetition(times, velocities, drive.period_us, tolerance=tolerance)
-    if repetition is None:
+    turns = times[None] / drive.period_us
+    contacts, periods, remaining = (
+        column[0].item() for column in find_repetitions(turns, velocities[None], tolerance=tolerance)
+    )
+    if not contacts:
         why = f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {len(times)} contacts)"
         return unsettled._replace(reason=why)
-    contacts, periods = _counted(repetition.contacts, "contact"), _counted(repetition.periods, "drive period")
-    why = f"the motion repeats: {contacts} in {periods}"
-    return Settled(settled=True, stuck=False, reason=why, **repetition._asdict())
+    why = f"the motion repeats: {_counted(contacts, 'contact')} in {_counted(periods, 'drive period')}"
+    return Settled(settled=True, contacts=contacts, periods=periods, stuck=False, remaining=remaining, reason=why)
 
 
 def _counted(count: int, what: str) -> str:

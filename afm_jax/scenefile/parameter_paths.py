@@ -199,7 +199,8 @@ def scene_batch(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
         ValueError: if the scene lacks a parameter.
     """
     columns = [jnp.asarray(column, float) for column in values.values()]
-    return jax.jit(jax.vmap(scene_family(scene, *values)))(*columns)
+    # operation by operation, which JAX knows again: a program of a new function would be compiled at every call
+    return jax.vmap(scene_family(scene, *values))(*columns)
 
 
 def _is_contact(scene: Scene) -> bool:

@@ -84,13 +84,13 @@ def in_blocks(
             return jax.tree.map(np.asarray, work(jax.device_put(jax.tree.map(cut, whole))))
 
     firsts = range(0, count, width)
-    alone = 1
-    if program is not None and len(firsts) > 1:
-        leaves, structure = jax.tree.flatten(whole)
-        compiled = (program, width, structure, *((leaf.dtype, leaf.shape[1:]) for leaf in leaves))
-        alone = 0 if compiled in _COMPILED else 1
-        _COMPILED.add(compiled)
+    leaves, structure = jax.tree.flatten(whole)
+    compiled = (program, width, structure, *((leaf.dtype, leaf.shape[1:]) for leaf in leaves))
+    alone = 0 if compiled in _COMPILED and len(firsts) > 1 else 1
     done = [part(first) for first in firsts[:alone]]
+    if program is not None:
+        # only now: a block that fails compiles nothing, and others that run meanwhile must not count on it
+        _COMPILED.add(compiled)
     if len(firsts) > alone:
         with ThreadPoolExecutor(available_cores()) as pool:
             for result in pool.map(part, firsts[alone:]):
