@@ -87,7 +87,7 @@ def test_a_force_is_added_in_three_files_and_a_parameter_of_the_delay_in_five(tm
         "from afm_jax import Contact, load_scene; from afm_jax.cli.main import main\n"
         "from fitting.parameters import CONTACT_NAMES, model_parameters\n"
         "less = Contact.paper(effects=('capillary', 'structural', 'core', 'viscous', 'jkr'))\n"
-        "print(float(Contact.paper().forces.static(2.0) - less.forces.static(2.0)))\n"
+        "print(float(Contact.paper().forces(2.0) - less.forces(2.0)))\n"
         f"files = [{str(tmp_path)!r} + name for name in ('/old.toml', '/new.toml')]\n"
         "old, new = (load_scene(file).interaction.delay(50.0, 40.0) for file in files)\n"
         "print(float(new - old))\nprint(CONTACT_NAMES, model_parameters('law+delay'))\nmain(['collide', '--help'])"

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
+from afm_jax.contact.contact import Contact, bridge_of
 from afm_jax.contact.forces import Capillary, CoreRepulsion, ForceSum, Jkr, Liquid, Structural, VanDerWaals, Viscous
 from afm_jax.contact.forces import jkr as jkr_formulas
 from tests.reference_contact_forces import ContactParameters, constants, static_force, static_potential
@@ -73,8 +74,8 @@ def test_a_sum_does_not_depend_on_order_or_brackets(forces, gap, rate):
     assert left.terms == right.terms
     parts = [float(force(gap, rate)) for force in forces]
     assert float(left(gap, rate)) == pytest.approx(sum(parts), rel=0, abs=4e-16 * np.abs(parts).sum() * 4)
-    assert len(left.static.terms) == 3
-    assert len(left.dissipative.terms) == 1
+    bridge = bridge_of(Contact(left))
+    assert (len(bridge.potentials), len(bridge.dampings)) == (3, 1)
 
 
 @given(st.floats(jkr_formulas.FOLD + 1e-6, 30.0))

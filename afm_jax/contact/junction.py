@@ -233,7 +233,8 @@ def explain_missing_junction(contact: Contact) -> str:
     if not bool(_meniscus_fits(contact)):
         return "the Kelvin radius exceeds the tip radius; lower `relative_humidity` or take a larger `tip_radius_nm`"
     gaps = jnp.geomspace(SMALLEST_GAP_NM, contact.bridge_forms_nm, 400)
-    stiffness, force = contact.forces.static.stiffness(gaps), contact.forces.static(gaps)
+    bridge = bridge_of(contact)
+    stiffness, force = bridge.stiffness(gaps), bridge.force(gaps)
     tension = 1.5 * contact.solid.load_scale_nn
     if not bool((stiffness[0] > 0) & (force[0] > 0)):
         return "the bridge does not get stiffer than the JKR contact as the gap closes: it needs a core repulsion"
