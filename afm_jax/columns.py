@@ -16,6 +16,12 @@ def columns_of(rows: Sequence[Mapping[str, Any]], names: Iterable[str] | None = 
     return {name: [row.get(name) for row in rows] for name in chosen}
 
 
+def rows_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows that columns, arrays or lists, are made of."""
+    plain = (_plain(column) for column in columns.values())
+    return [dict(zip(columns, row, strict=True)) for row in zip(*plain, strict=True)]
+
+
 def csv_cells(column: Any) -> Iterable[Any]:
     """Return the cells of a column: numbers with all their digits, true and false in words, the unknown empty."""
     if hasattr(column, "tolist"):

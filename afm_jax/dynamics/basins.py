@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
+from afm_jax.columns import rows_of
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
 from afm_jax.dynamics.many_tips import Record, Tips, advance, follow
@@ -88,11 +89,8 @@ class Basins(ResultTuple):
     share_interval95: Float[np.ndarray, "attractors 2"] | None = None
 
     def table(self) -> list[dict[str, object]]:
-        """Return one row a start: where it is, and the number of its attractor."""
-        speed, phase = np.meshgrid(self.rebound_speed_nm_per_us, self.phase_rad, indexing="ij")
-        names = ("phase_rad", "rebound_speed_nm_per_us", "attractor")
-        columns = (np.ravel(column).tolist() for column in (phase, speed, self.attractor))
-        return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+        """Return the rows of basins.csv, one a start: where it is, and the name of its attractor."""
+        return rows_of(self.tables()["basins.csv"])
 
     @property
     def reason(self) -> str | None:
@@ -153,7 +151,7 @@ class Basins(ResultTuple):
         starts = {
             "phase_rad": phase.ravel(),
             "rebound_speed_nm_per_us": speed.ravel(),
-            "attractor": names[self.attractor.ravel()].tolist(),
+            "attractor": names[self.attractor.ravel()],
         }
         # an attractor without an impact has a row, too
         nothing = np.array([np.nan])

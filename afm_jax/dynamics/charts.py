@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
 from afm_jax.checks import check_kind, checked
+from afm_jax.columns import rows_of
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
@@ -169,16 +170,6 @@ def highest_orbits(
     return jax.tree.map(jnp.transpose, lax.map(of_order, orders))
 
 
-TABLE_COLUMNS = (
-    "reduced_frequency",
-    "drive_amplitude_nm",
-    "stable",
-    "lowest_stable_order",
-    "admissible",
-    "peak_amplitude_nm",
-)
-
-
 @public_result(picture="afm_jax.plots.dynamics:chart_figure", rows="table")
 @dataclass(frozen=True)
 class StabilityChart(Result):
@@ -234,12 +225,8 @@ class StabilityChart(Result):
         return frequency.ravel(), amplitude.ravel()
 
     def table(self) -> list[dict[str, object]]:
-        """Return one row a point: where it is, its lowest stable order and that orbit's peak amplitude."""
-        order = self.lowest_stable_order.ravel()
-        peak = np.take_along_axis(self.verdicts.peak_amplitude_nm, np.maximum(order - 1, 0)[None], axis=0)[0]
-        columns = (*self.points(), order > 0, order, self.verdicts.any_admissible(), peak)
-        rows = zip(*(column.tolist() for column in columns), strict=True)
-        return [dict(zip(TABLE_COLUMNS, row, strict=True)) for row in rows]
+        """Return the rows of chart.csv, one a point."""
+        return rows_of(self.tables()["chart.csv"])
 
     @property
     def reason(self) -> str | None:
