@@ -102,21 +102,22 @@ def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetti
     g = driven.acceleration(driven.gap_of_root(form), state.gap_rate, state.time_us, jnp.zeros_like(turn))
     for _ in range(2):
         turn = _turn_under(driven, form, level, g, turn)
-    inward = _iterated(_Half(driven, form, pressing=True), level, state.time_us, (turn, g), setting)
-    turn, at_turn = inward.turn, inward.time_us
+    half = _Half(driven, form, pressing=True)
+    turn, at_turn, _, holds = _iterated(half, level, state.time_us, (turn, g), setting)
     g = driven.acceleration(driven.gap_of_root(turn), jnp.zeros_like(turn), at_turn, jnp.zeros_like(turn))
-    outward = _iterated(_Half(driven, fold, pressing=False), level, at_turn, (turn, g), setting)
+    half = _Half(driven, fold, pressing=False)
+    _, end_us, mean, holds_out = _iterated(half, level, at_turn, (turn, g), setting)
     work, depth = (of(turn) - of(fold) for of in (solid.work, solid.depth))
-    leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.solid.depth_scale_nm * outward.mean * depth)
+    leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.solid.depth_scale_nm * mean * depth)
     return Leg(
         state=ContactState(
             x=driven.junction.breaks_gap_nm + jnp.zeros_like(turn),
             gap_rate=leaving,
-            time_us=outward.time_us,
+            time_us=end_us,
             viscous_loss_aj=state.viscous_loss_aj,
         ),
         deepest_gap_nm=driven.gap_of_root(turn),
-        holds=inward.holds & outward.holds & (leaving > 0.0) & (state.gap_rate < 0.0),
+        holds=holds & holds_out & (leaving > 0.0) & (state.gap_rate < 0.0),
     )
 
 
@@ -183,20 +184,12 @@ class _Half(NamedTuple):
         return _Along(s, y, over_y, slope, twice * reach * slope / over_y)
 
 
-class _IteratedHalf(NamedTuple):
-    """A half of the way through the junction under a drive."""
-
-    turn: Float[Array, "..."]
-    time_us: Float[Array, "..."]
-    mean: Float[Array, "..."]
-    """The mean of g over all of the depth."""
-    holds: Bool[Array, "..."]
-
-
 def _iterated(
     half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array], setting: QuickSetting
-) -> _IteratedHalf:
-    """Return a half under a drive.
+) -> tuple[Array, Array, Array, Bool[Array, "..."]]:
+    """Return s at the turning point, the time at the end, and the mean of g over the depth of a half under a drive.
+
+    The last one says whether nodes and iterations are enough.
 
     Args:
         half: the half.
@@ -233,7 +226,7 @@ def _iterated(
     at = half.along(turn, points, means)
     duration = jnp.tensordot(weights, at.time_slope, axes=1)
     change = jnp.abs((means - before) * twice * mean_depth_slope(turn, at.s)) / at.over_y**2
-    return _IteratedHalf(turn, begin_us + duration, mean, setting.suffices(change, at.time_slope, duration))
+    return turn, begin_us + duration, mean, setting.suffices(change, at.time_slope, duration)
 
 
 def _turn_under(driven: Driven, form: Array, level: Array, mean: Array, turn: Array) -> Array:

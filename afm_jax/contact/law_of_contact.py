@@ -70,15 +70,9 @@ SPEED_ERROR, DELAY_ERROR_US = 1e-7, 1e-6
 """Relative error of the rebound speed, and error of the delay, beyond which a table does not count."""
 
 
-class _Rule(NamedTuple):
-    """Gauss nodes and iterations of a way through the bridge, and Gauss nodes of the junction."""
-
-    nodes: int
-    iterations: int
-    junction: int
-
-
-_USUAL, _FINER = _Rule(13, 6, 16), _Rule(26, 12, 32)
+_Rule = tuple[int, int, int]
+"""Gauss nodes and iterations of a way through the bridge, and Gauss nodes of the junction."""
+_USUAL, _FINER = (13, 6, 16), (26, 12, 32)
 _COMPARED = slice(0, None, 6)
 """The nodes at which the usual rule is compared with the finer one."""
 _BARRIER_GAPS = 24
@@ -660,19 +654,18 @@ def _traced_back(tip: Driven, leaving_aj: Float[Array, ""], rule: _Rule) -> tupl
 
     Retraction, junction and approach are followed against time, so that drag gives back what it took.
     """
+    nodes, iterations, junction_nodes = rule
     tip = tip._replace(bridge=tip.bridge.reversed())
     forms, ends = tip.forms_nm, tip.ends_nm
     on, off = tip.junction.forms_gap_nm, tip.junction.breaks_gap_nm
     margin = margin_of(leaving_aj, tip.bridge.force(ends) * -ends)
     retract = way_through(tip, (ends, off), leaving_aj, margin, inward=True)
-    out = pass_by_collocation(retract, rule.nodes, rule.iterations)
+    out = pass_by_collocation(retract, nodes, iterations)
     formed = out.energy_aj + tip.elastic_aj
-    inside = pass_through_junction(tip, formed, rule.junction)
+    inside = pass_through_junction(tip, formed, junction_nodes)
     arriving = formed + tip.potential(on) - tip.potential(forms)
     margin = margin_of(jnp.maximum(arriving, 0.0), tip.bridge.force(forms) * -forms)
-    approach = pass_by_collocation(
-        way_through(tip, (forms, on), formed, margin, inward=False), rule.nodes, rule.iterations
-    )
+    approach = pass_by_collocation(way_through(tip, (forms, on), formed, margin, inward=False), nodes, iterations)
     speed = jnp.sqrt(2.0 * jnp.maximum(approach.energy_aj, 1e-12) / tip.mass_ng)
     return speed, out.time_us + inside.time_us + approach.time_us
 

@@ -103,14 +103,13 @@ def advance(
     trial = _try_step(driven, tip, until_us, fineness)
     solid = trial.solid
     repeats, next_length = _repetition(trial, until_us)
-    landing = _land(trial, until_us)
-    forms, breaks = ~solid & landing.at_low & ~repeats, solid & landing.at_low & ~repeats
-    leaves = ~solid & landing.at_high & ~repeats
+    end, at_low, at_high = _land(trial, until_us)
+    forms, breaks = ~solid & at_low & ~repeats, solid & at_low & ~repeats
+    leaves = ~solid & at_high & ~repeats
     # the junction breaks into the bridge where that outlives it, else into free flight
     after_junction = jnp.where(driven.junction.breaks_gap_nm < driven.breaks_nm, Phase.BRIDGE, Phase.DRY)
     phase = jnp.where(forms, Phase.JUNCTION, jnp.where(leaves, Phase.DRY, tip.phase))
     phase = jnp.where(breaks, after_junction, phase).astype(tip.phase.dtype)
-    end = landing.state
     x = jnp.where(forms, driven.junction.forms_root, jnp.where(breaks, driven.junction.breaks_gap_nm, end.x))
     in_junction = jnp.where(solid, end.time_us - tip.state.time_us, 0.0)
     deepest = jnp.minimum(tip.deepest_gap_nm, _deepest_gap(driven, trial))
@@ -204,16 +203,11 @@ def _repetition(trial: _Trial, until_us: Float[Array, "..."]) -> tuple[Bool[Arra
     return (too_far | too_late | hidden | ~finite) & resolved, jnp.where(finite, again, 0.25 * length)
 
 
-class _Landing(NamedTuple):
-    """The end of a trial, moved onto the threshold or the time that it has met."""
+def _land(trial: _Trial, until_us: Float[Array, "..."]) -> tuple[ContactState, Bool[Array, "..."], Bool[Array, "..."]]:
+    """Return the end of a trial, moved by a parabola onto what it met, and whether that is the low or the high level.
 
-    state: ContactState
-    at_low: Bool[Array, "..."]
-    at_high: Bool[Array, "..."]
-
-
-def _land(trial: _Trial, until_us: Float[Array, "..."]) -> _Landing:
-    """Return the end of a trial, moved by a parabola onto the threshold, or the end of the simulation, that it met."""
+    It meets a threshold, or the end of the simulation.
+    """
     end, rates, low, high = trial.end, trial.end_rates, trial.low, trial.high
     closing = (end.x - low < trial.near_low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
     opening = (high - end.x < _NEAR * high) & (rates.x > 0.0)
@@ -229,7 +223,7 @@ def _land(trial: _Trial, until_us: Float[Array, "..."]) -> _Landing:
     rest = jnp.where(over, (until_us - end.time_us) / jnp.where(over, rates.time_us, 1.0), rest)
     moved = jax.tree.map(lambda value, rate: value + rate * rest, end, rates)
     x, time = jnp.where(at_threshold, target, moved.x), jnp.where(over, until_us, moved.time_us)
-    return _Landing(moved._replace(x=x, time_us=time), at_low, at_high)
+    return moved._replace(x=x, time_us=time), at_low, at_high
 
 
 def _deepest_gap(driven: Driven, trial: _Trial) -> Float[Array, "..."]:

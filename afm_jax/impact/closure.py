@@ -446,44 +446,22 @@ def _scale(problem: OrbitProblem) -> Float[Array, ""]:
     return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.reach)
 
 
-class _Samples(NamedTuple):
-    """Coordinates, the residuals there, and whether impacts are over soon."""
-
-    grid: Float[Array, " points"]
-    value: Float[Array, " points"]
-    brief: Bool[Array, " points"]
-
-
 def _scanned_roots(problem: OrbitProblem, scan: Scan) -> Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
-    samples = _sampled(grid, problem)
-    crossing = _changes(samples)
-    root, exists = _narrowed(_crossings(crossing, samples, scan), _dips(samples, scan), problem)
-    # the fastest ones if there are too many
+    value, brief = (jax.vmap(of, in_axes=(0, None))(grid, problem) for of in (closing_residual, _brief))
+    # changes of sign between impacts that are over soon
+    below, above = value < 0.0, value >= 0.0  # neither where it is not a number
+    crossing = (below[:-1] & above[1:] | above[:-1] & below[1:]) & brief[:-1] & brief[1:]
+    # the fastest ones if there are too many: close to capture the law itself ends
+    at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0][::-1]
+    real = (jnp.arange(scan.crossings) < jnp.sum(crossing))[::-1]
+    crossings = _Brackets(grid[at], grid[at + 1], value[at], value[at + 1], real)
+    root, exists = _narrowed(crossings, _dips(grid, value, brief, scan), problem)
     fastest = jnp.argsort(jnp.where(exists, -root, jnp.inf))[: scan.slots]
     order = fastest[jnp.argsort(jnp.where(exists[fastest], root[fastest], jnp.inf))]
     complete = (jnp.sum(crossing) <= scan.crossings) & (jnp.sum(exists) <= scan.slots)
     return Coordinates(root[order], exists[order], complete)
-
-
-def _sampled(grid: Float[Array, " points"], problem: OrbitProblem) -> _Samples:
-    """Return the residual at coordinates."""
-    value = jax.vmap(lambda coordinate: closure(coordinate, problem)[1].residual)(grid)
-    return _Samples(grid, value, jax.vmap(_brief, in_axes=(0, None))(grid, problem))
-
-
-def _changes(samples: _Samples) -> Bool[Array, " intervals"]:
-    """Say in which intervals the residual changes its sign, between impacts that are over soon."""
-    _, value, brief = samples
-    below, above = value < 0.0, value >= 0.0  # neither where it is not a number
-    return (below[:-1] & above[1:] | above[:-1] & below[1:]) & brief[:-1] & brief[1:]
-
-
-def _inside(crossing: Bool[Array, " intervals"], scan: Scan) -> tuple[Array, Array]:
-    """Return where the changes of sign are, ascending, the fastest ones if there are too many, and which exist."""
-    at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0]
-    return at[::-1], (jnp.arange(scan.crossings) < jnp.sum(crossing))[::-1]
 
 
 def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
@@ -523,32 +501,20 @@ class _Dips(NamedTuple):
     """The residual there."""
 
 
-def _crossings(crossing: Bool[Array, " intervals"], samples: _Samples, scan: Scan) -> _Brackets:
-    """Return the changes of sign, the fastest ones if there are too many: close to capture the law itself ends."""
-    at, real = _inside(crossing, scan)
-    grid, value, _ = samples
-    return _Brackets(grid[at], grid[at + 1], value[at], value[at + 1], real)
-
-
-def _dips(samples: _Samples, scan: Scan) -> _Dips:
+def _dips(
+    grid: Float[Array, " points"], value: Float[Array, " points"], brief: Bool[Array, " points"], scan: Scan
+) -> _Dips:
     """Return where the scan may have stepped over a pair of roots."""
-    grid, value, brief = samples
     size = jnp.abs(value)
     same = (value[:-2] * value[1:-1] > 0.0) & (value[1:-1] * value[2:] > 0.0)
     dip = same & (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & brief[1:-1]
-    at, real = _lowest_of(jnp.where(dip, size[1:-1], jnp.inf), scan.turns)
-    return _Dips(_Brackets(grid[at], grid[at + 2], value[at], value[at + 2], real), value[at + 1])
-
-
-def _lowest_of(size: Float[Array, " n"], count: int) -> tuple[Array, Array]:
-    """Return where the smallest numbers are, and which of them are finite."""
 
     def take(size, _):
         place = jnp.argmin(size)
         return size.at[place].set(jnp.inf), (place, jnp.isfinite(size[place]))
 
-    _, (at, real) = lax.scan(take, size, None, length=count)
-    return at, real
+    _, (at, real) = lax.scan(take, jnp.where(dip, size[1:-1], jnp.inf), None, length=scan.turns)
+    return _Dips(_Brackets(grid[at], grid[at + 2], value[at], value[at + 2], real), value[at + 1])
 
 
 def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple[Array, Array]:

@@ -187,10 +187,6 @@ class Law(Impact):
     def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
         """Return the u_in in nm/us that leaves at u_out in nm/us: the law read backwards."""
 
-    @abstractmethod
-    def without_delay(self) -> "Law":
-        """Return the law of instantaneous impacts with the same rebound speeds."""
-
     @property
     def delayed(self) -> bool:
         """Whether the next flight begins at another time than the last one ends."""
@@ -289,10 +285,6 @@ class ImpactLaw(Law):
     def slow_restitution(self) -> Float[Array, "..."]:
         """The coefficient of restitution r, which the slowest impacts have."""
         return self.r
-
-    def without_delay(self) -> "ImpactLaw":
-        """Return the law of instantaneous impacts with the same rebound speeds."""
-        return ImpactLaw(self.r, self.epsilon, self.viscous_loss)
 
     @property
     def lowest(self) -> Float[Array, ""]:
@@ -525,10 +517,6 @@ class TabulatedLaw(Law):
         made = _with_numbers(self, {name: getattr(self, name) + change for name, change in changes.items()})
         # a loss so small that it is not sure to be one
         return _replaced(made, capture=jnp.maximum(made.capture, 0.0), deviations=None)
-
-    def without_delay(self) -> "TabulatedLaw":
-        """Return the law of instantaneous impacts with the same rebound speeds; of its errors none are kept."""
-        return _replaced(self, delay=None, deviations=None)
 
     def sample(self, key: Array, n: int) -> "TabulatedLaw":
         """Return laws drawn from the errors of this one: one law whose every number has a first axis of length n.
