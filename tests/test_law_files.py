@@ -109,7 +109,7 @@ def test_a_law_of_another_mass_and_a_batch_of_laws_are_refused(law, tmp_path):
         afm.save_scene(afm.Scene(afm.Cantilever(90.0, 40.0, 1.5), afm.Platform(4.0, 181.8), batch), tmp_path / "b.toml")
 
 
-def test_a_fit_of_instantaneous_impacts_tells_delays_of_0(law, tmp_path):
+def test_a_fit_of_instantaneous_impacts_tells_delays_of_0(tmp_path):
     instant = TabulatedLaw(SPEEDS, WET.rebound_speed(SPEEDS), mass_ng=1.5)
     told = instant.to_dict() | {"collision_delay_us": [0.0] * 12}
     fit = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": told}

@@ -55,10 +55,6 @@ class OrbitVerdicts(NamedTuple):
         """Return where an orbit of any order is stable."""
         return np.asarray(self.stable.any(axis=0))
 
-    def any_admissible(self) -> Bool[np.ndarray, " scenes"]:
-        """Return where an orbit of any order is admissible."""
-        return np.asarray(self.admissible.any(axis=0))
-
 
 def orbit_verdicts(
     scenes: Scene, *, first_order: int = 1, last_order: int, report: Report | None = None
