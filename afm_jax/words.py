@@ -5,7 +5,6 @@ import math
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
-from itertools import zip_longest
 from typing import Any, SupportsFloat
 
 
@@ -118,29 +117,27 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, words: Seq
     >>> text_table(["", "value"], [["r", "0.95"], ["epsilon", "60"]])
     ['           value', '  r         0.95', '  epsilon     60']
     """
-    lines = [list(head), *map(list, rows)]
+    cells = [list(head), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     sides = ["<" if k in words else ">" for k in range(len(head))]
-    room = _room.get()
-    whole = _aligned(lines, sides)
-    if len(lines) == 1 or _widest(whole) <= room:
-        return whole
-    if sides[-1] == "<" or len(head) == 2:
-        # remarks at the end of a line go on below where they begin
-        left = room - _widest(_aligned([line[:-1] for line in lines], sides)) - 2
-        cells = [broken(line[-1], max(int(left), 1)) for line in lines]
-        if left >= _LEAST_REMARK and max(map(_widest, cells)) <= left:
-            lines = [[*line[:-1], "\n".join(cell)] for line, cell in zip(lines, cells, strict=True)]
-            return _aligned(lines, [*sides[:-1], "<"])
-    return whole if len(head) == 2 else _turned(lines, int(room))
+    lines = [
+        "".join(f"  {cell:{side}{width}}" for cell, side, width in zip(line, sides, widths, strict=True)).rstrip()
+        for line in cells
+    ]
+    if len(head) < 3 or max(map(len, lines)) <= _room.get():
+        return lines
+    left = max(map(len, head))
+    blocks = [["", *(f"  {name:{left}}  {cell}" for name, cell in zip(head, row, strict=True))] for row in cells[1:]]
+    return [line for block in blocks for line in block][1:]
 
 
 @contextlib.contextmanager
 def lines_at_most(width: int) -> Iterator[None]:
-    """Within this block a table wider than so many signs is turned: a line a column, as many rows abreast as fit.
+    """Within this block a table of three columns or more that is wider than so many signs has a line a cell.
 
     >>> with lines_at_most(16):
-    ...     text_table(["", "value", "error"], [["r", "0.95", "0.01"], ["epsilon", "60", "2"]])
-    ['            r', '  value  0.95', '  error  0.01', '', '         epsilon', '  value       60', '  error        2']
+    ...     text_table(["law", "value", "error"], [["r", "0.95", "0.01"], ["epsilon", "60", "2"]])
+    ['  law    r', '  value  0.95', '  error  0.01', '', '  law    epsilon', '  value  60', '  error  2']
     """
     before = _room.set(float(width))
     try:
@@ -150,9 +147,6 @@ def lines_at_most(width: int) -> Iterator[None]:
 
 
 _room: ContextVar[float] = ContextVar("_room", default=math.inf)
-
-
-_LEAST_REMARK = 12
 
 
 def broken(text: str, width: int, indent: str = "") -> list[str]:
@@ -169,46 +163,6 @@ def broken(text: str, width: int, indent: str = "") -> list[str]:
     whole = text.replace(" +- ", "\0+-\0")
     lines = textwrap.wrap(whole, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
     return [line.replace("\0", " ") for line in lines] or [""]
-
-
-def _widest(lines: Iterable[str]) -> int:
-    return max(map(len, lines), default=0)
-
-
-def _aligned(lines: Sequence[Sequence[str]], sides: Sequence[str]) -> list[str]:
-    """Return rows as lines of text; a cell may have several lines."""
-    cells = [[cell.split("\n") for cell in line] for line in lines]
-    widths = [max(_widest(cell) for cell in column) for column in zip(*cells, strict=True)]
-    return [
-        "  "
-        + "  ".join(f"{part:{side}{width}}" for part, side, width in zip(parts, sides, widths, strict=False)).rstrip()
-        for line in cells
-        for parts in zip_longest(*line, fillvalue="")
-    ]
-
-
-def _turned(lines: Sequence[Sequence[str]], room: int) -> list[str]:
-    """Return a table with its columns below each other, in blocks of rows that fit in the room."""
-    head, *rows = lines
-    head = ["\n".join(broken(name, room // 2)) if len(name) > room // 2 else name for name in head]
-    left = 2 + max(_widest(name.split("\n")) for name in head)
-    # names and remarks longer than the room go on below
-    most = max(room - left - 2, _LEAST_REMARK)
-    rows = [["\n".join(broken(cell, most)) if len(cell) > most else cell for cell in row] for row in rows]
-    blocks: list[list[Sequence[str]]] = []
-    used = room + 1
-    for row in rows:
-        width = 2 + max(_widest(cell.split("\n")) for cell in row)
-        if used + width > room:
-            blocks.append([])
-            used = left
-        blocks[-1].append(row)
-        used += width
-    turned: list[str] = []
-    for block in blocks:
-        cells = [[name, *values] for name, *values in zip(head, *block, strict=True)]
-        turned += ["", *_aligned(cells, ["<", *("<" if any("\n" in cell for cell in row) else ">" for row in block)])]
-    return turned[1:]
 
 
 def bullets(title: str, items: Sequence[str]) -> list[str]:

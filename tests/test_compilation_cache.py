@@ -142,7 +142,6 @@ def test_doctor_says_whether_the_cache_works(tmp_path: Path):
     told = json.loads(printed)
     assert (told["cache"]["works"], told["float_bits"], said) == (True, 64, "")
     assert told["versions"]["jaxlib"] in told["cache"]["folder"]
-    assert told["microseconds_per_impact"] > 0.0
     (tmp_path / "afm-jax").chmod(0o777)
     printed, said = outputs(doctor, with_cache_in(tmp_path), (3,))
     assert json.loads(printed)["cache"]["works"] is False

@@ -20,8 +20,6 @@ from afm_jax.version import EXCLUDED_JAX
 
 _PACKAGES = ("afm-jax", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optimistix", "flatbuffers")
 _PROBE = "small_program_of_the_doctor"
-_IMPACTS = 20
-_TIPS = 1000
 
 
 def doctor(session: Session) -> Output:
@@ -50,7 +48,6 @@ def doctor(session: Session) -> Output:
             "first_s": None if first is None else first.seconds,
             "again_s": None if again is None else again.seconds,
         },
-        "microseconds_per_impact": time_impacts(),
     }
     complaints = [] if excluded is None else [excluded]
     if cache.refused:
@@ -93,20 +90,6 @@ def try_cache(folder: Path) -> CacheTrial:
     return CacheTrial(*json.loads(done.stdout)) if done.returncode == 0 else CacheTrial(found=False, seconds=math.nan)
 
 
-def time_impacts() -> float:
-    """Return microseconds that an impact of many tips takes, the best of three times."""
-    import jax  # noqa: PLC0415
-
-    from afm_jax.impact.map import iterate_batch  # noqa: PLC0415
-    from afm_jax.scenefile.presets import preset  # noqa: PLC0415
-    from afm_jax.studies.timing import best_seconds  # noqa: PLC0415
-
-    scene = preset("figure2")
-    times, speeds = jax.numpy.linspace(0.0, 5.0, _TIPS), jax.numpy.linspace(50.0, 100.0, _TIPS)
-    seconds = best_seconds(lambda: iterate_batch(scene, times, speeds, _IMPACTS), repetitions=3)
-    return 1e6 * seconds / (_IMPACTS * _TIPS)
-
-
 def _version(name: str) -> str | None:
     try:
         return metadata.version(name)
@@ -125,7 +108,6 @@ def _lines(payload: dict[str, Any]) -> list[str]:
         f"Platform: {payload['platform']}, {payload['processors']} processors; JAX devices: {devices}",
         f"Floats: {payload['float_bits']} bits",
         f"Compilation cache: {cache['folder'] or 'no folder'} ({cache['reason']}); {state}",
-        f"Time of an impact: {payload['microseconds_per_impact']:.2g} us ({_TIPS} tips side by side)",
     ]
 
 

@@ -76,31 +76,6 @@ class Finite(ValueKind):
         return number
 
 
-class PositiveInteger(ValueKind):
-    """An integer from 1 to a million."""
-
-    name = "integer"
-
-    def read(self, text: str) -> int:
-        """Return the integer that a text says."""
-        if not re.fullmatch(r"\s*[0-9]{1,7}\s*", text) or not 1 <= int(text) <= 1_000_000:
-            raise ValueError(f"must be a positive integer up to 1000000, but is {text}")
-        return int(text)
-
-
-class Multiples(ValueKind):
-    """Positive integers in a comma list."""
-
-    name = "list"
-
-    def read(self, text: str) -> tuple[int, ...]:
-        """Return the integers, without repetitions."""
-        parts = text.split(",")
-        if not all(re.fullmatch(r"\s*[0-9]{1,4}\s*", part) and 1 <= int(part) <= 1000 for part in parts):
-            raise ValueError(f"must be integers from 1 to 1000 as in 1,2,3, but is {text}")
-        return tuple(dict.fromkeys(map(int, parts)))
-
-
 class Numbers(ValueKind):
     """A comma list of numbers; each part a number or a range start:stop:step that holds the stop if it fits.
 
@@ -156,6 +131,10 @@ class Orders(ValueKind):
     name = "orders"
     advice = "; write 1,2 or 1-4"
 
+    def __init__(self, what: str = "order"):
+        """Say what one of the numbers is."""
+        self.what = what
+
     def read(self, text: str) -> tuple[int, ...]:
         """Return the orders, without repetitions."""
         orders: list[int] = []
@@ -163,7 +142,7 @@ class Orders(ValueKind):
             ends = re.fullmatch(r"\s*([0-9]{1,3})\s*(?:-\s*([0-9]{1,3})\s*)?", part)
             low, high = (0, 0) if ends is None else (int(ends[1]), int(ends[2] or ends[1]))
             if not 1 <= low <= high:
-                raise ValueError(f"`{part.strip()}` is no order")
+                raise ValueError(f"`{part.strip()}` is no {self.what}")
             orders += range(low, high + 1)
         return tuple(dict.fromkeys(orders))
 

@@ -11,7 +11,7 @@ from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.plots.dynamics import label_of
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, legend_once, new_figure
 from afm_jax.units import TWO_SIDED_95
 
 _MARKS = {
@@ -43,9 +43,8 @@ def continuation_figure(
     """
     figure = new_figure(7.0, 4.6)
     axes = figure.subplots()
-    labels: set[str] = set()
     for number, branch in enumerate(found.branches):
-        _draw_branch(axes, branch, [one for one in found.special if one.branch == number], labels)
+        _draw_branch(axes, branch, [one for one in found.special if one.branch == number])
         if bands is not None:
             _draw_band(axes, branch, bands[number])
     for index, point in enumerate(found.special):
@@ -65,26 +64,17 @@ def continuation_figure(
             markeredgewidth=1.8,
             capsize=3,
             zorder=4,
-            label=_once(point.kind.replace("_", " "), labels),
+            label=point.kind.replace("_", " "),
         )
     label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
-    what = f"({found.impacts}, {found.order}) orbits"
-    axes.set_title(what, fontsize=12, loc="left")
+    axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.margins(x=0.02)
-    if labels:
-        axes.legend(fontsize=10, frameon=False)
+    legend_once(axes)
     return figure
 
 
-def _once(label: str, labels: set[str]) -> str | None:
-    if label in labels:
-        return None
-    labels.add(label)
-    return label
-
-
-def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint], labels: set[str]) -> None:
+def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint]) -> None:
     """Draw a branch, through its special points, where the style of the line changes."""
     stable = is_stable(multipliers_of(np.asarray(branch.reading.trace), np.asarray(branch.reading.determinant)))
     state = np.where(branch.reading.admissible, np.where(stable, 2, 1), 0)
@@ -102,7 +92,7 @@ def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint
         if lines[begin] >= 0:
             line, colour, name = styles[int(lines[begin])]
             piece = slice(begin, end + 1)
-            axes.plot(x[piece], y[piece], line, color=colour, linewidth=1.8, label=_once(name, labels))
+            axes.plot(x[piece], y[piece], line, color=colour, linewidth=1.8, label=name)
         begin = end
 
 
@@ -111,13 +101,8 @@ def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " point
     height = branch.reading.peak_amplitude_nm
     half = TWO_SIDED_95 * error
     shown = np.isfinite(half) & (half < 0.3 * np.abs(height)) & branch.reading.admissible
-    begin = 0
-    for end in [*(np.flatnonzero(np.diff(shown.astype(int))) + 1).tolist(), len(shown)]:
-        if shown[begin] and end - begin > 1:
-            piece = slice(begin, end)
-            low, high = height[piece] - half[piece], height[piece] + half[piece]
-            axes.fill_between(branch.parameter[piece], low, high, color=BLUE, alpha=0.2, linewidth=0.0)
-        begin = end
+    low, high = height - half, height + half
+    axes.fill_between(branch.parameter, low, high, where=shown, color=BLUE, alpha=0.2, linewidth=0.0)
 
 
 def curves_figure(found: Continuation) -> Figure:
@@ -133,7 +118,6 @@ def curves_figure(found: Continuation) -> Figure:
         raise ValueError("there are no curves: no second parameter was followed")
     figure = new_figure(7.0, 4.6)
     axes = figure.subplots()
-    labels: set[str] = set()
     for curve in found.curves:
         _, colour = _MARKS[curve.kind]
         for flown, line in ((True, "-"), (False, ":")):
@@ -144,15 +128,14 @@ def curves_figure(found: Continuation) -> Figure:
             shown = np.where(here, curve.second, np.nan)
             if np.isfinite(shown).any():
                 name = curve.kind.replace("_", " ") + ("" if flown else ", passes through the sample")
-                axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=_once(name, labels))
+                axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=name)
         for one in curve.meetings:
             marker = "*" if one.kind == "cusp" else "X"
             name = "cusp" if one.kind == "cusp" else "codimension two"
-            axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=_once(name, labels))
+            axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=name)
     label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))
-    if labels:
-        axes.legend(fontsize=10, frameon=False)
+    legend_once(axes)
     return figure

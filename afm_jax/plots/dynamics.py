@@ -111,10 +111,9 @@ def _orbits(
             left.plot(np.degrees(phase[one]), velocity[one], ls=":", lw=0.8, **own)
             right.plot(np.max(approach[one], initial=-np.inf), peak[one], ls="", **own)
     left.set(xlim=(0.0, 360.0), xticks=range(0, 361, 90))
-    for axes in (left, right):
-        # one orbit alone would have an axis of its own rounding
-        axes.update_datalim([(0.0, 0.0)], updatex=axes is right)
-        axes.autoscale_view(scalex=axes is right)
+    # one orbit alone would have an axis of its own rounding
+    left.set_ylim(bottom=min(0.0, left.get_ylim()[0]))
+    right.set(xlim=(0.0, None), ylim=(0.0, None))
     label_axes(left, x="drive phase just after the impact (deg)", y=r"velocity after it (nm/$\mu$s)")
     label_axes(right, x=r"approach speed, of the hardest impact (nm/$\mu$s)", y="peak amplitude (nm)")
     for axes in (left, right):
@@ -139,7 +138,7 @@ def exponents_figure(
 ) -> Figure:
     """Return both Lyapunov exponents per impact, of one motion or of many: chaos is what lies above the line at 0.
 
-    Where the tip rests they are minus infinity: such motions have a tick in a strip below the axis.
+    Where the tip rests they are minus infinity: such motions have a tick on the lower edge.
 
     Args:
         found: the exponents.
@@ -164,16 +163,11 @@ def exponents_figure(
     low, high = (float(np.quantile(finite, 0.01)), float(finite.max())) if finite.size else (-1.0, 1.0)
     gone = np.isneginf(exponents[:, 0])
     if gone.any():
-        style = {"transform": axes.get_xaxis_transform(), "color": DARK, "ms": 9.0, "rasterized": True}
+        style = {"color": DARK, "ms": 9.0, "clip_on": False, "rasterized": True}
         label = r"the tip rests: both are $-\infty$"
-        axes.plot(values[gone], np.full(gone.sum(), _STRIP / 2), "|", label=label, **style)
-        axes.axhline(low - 0.3, color=DARK, linewidth=0.8)
-        axes.annotate(r"$-\infty$", (-0.01, _STRIP / 2), xycoords="axes fraction", ha="right", va="center", fontsize=11)
+        axes.plot(values[gone], np.full(gone.sum(), low - 0.3), "|", label=label, **style)
     margin = 0.5 if len(values) == 1 else 0.0
-    strip = _STRIP / (1.0 - _STRIP) * (high + 0.2 - (low - 0.3)) if gone.any() else 0.0
-    axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.3 - strip, high + 0.2))
-    # no ticks in the strip
-    axes.set_yticks([tick for tick in axes.get_yticks() if low - 0.3 <= tick <= high + 0.2])
+    axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.3, high + 0.2))
     axes.grid(color=GRID, alpha=0.25)
     axes.axhline(0.0, color="black", linewidth=1.0)
     label_axes(axes, x=label_of(path) if path else "number of the motion", y="Lyapunov exponent per impact")
@@ -181,10 +175,6 @@ def exponents_figure(
     for handle in legend.get_lines():
         handle.set_markersize(10.0)
     return figure
-
-
-_STRIP = 0.07
-"""Height of the strip for exponents of minus infinity, of the axis."""
 
 
 def bifurcation_figure(ramped: Sweep | Ramps) -> Figure:
@@ -328,22 +318,9 @@ def _mark_orbits(axes: Axes, attractors: Sequence[Attractor], scene: Scene) -> L
     surface, response = surface_of(scene)
     omega = drive_of(scene).angular_frequency
     style = {"color": "white", "markeredgecolor": "black", "ms": 11.0, "clip_on": False, "zorder": 5}
-    for attractor, colour in zip(attractors, KINDS, strict=False):
+    for attractor in attractors:
         state = State(attractor.phase_rad / omega, np.zeros_like(attractor.phase_rad), attractor.velocity_nm_per_us)
         speeds = np.asarray(to_gap(surface, response, state)[1])
         for phase, speed in zip(np.degrees(attractor.phase_rad), speeds, strict=True):
             axes.plot(phase, min(speed, top), "o" if speed <= top else "^", **style)
-            if speed > top:
-                said = f"{attractor.name} at {speed:.3g} nm/µs"
-                place = {
-                    "xytext": (10, -16),
-                    "textcoords": "offset points",
-                    "ha": "left" if phase < _RIGHT else "right",
-                }
-                box = {"facecolor": "white", "edgecolor": colour, "boxstyle": "round,pad=0.2"}
-                axes.annotate(said, (phase, top), fontsize=10, bbox=box, **place)
     return Line2D([], [], ls="", marker="o", label="impacts of the orbits", **{**style, "clip_on": True})
-
-
-_RIGHT = 250.0
-"""Phase in degrees from which on there is no room for words to the right."""

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -37,6 +38,13 @@ def label_axes(axes: Axes, *, x: str, y: str) -> None:
     axes.set_xlabel(x, fontsize=_FONT + 1)
     axes.set_ylabel(y, fontsize=_FONT + 1)
     axes.tick_params(labelsize=_FONT)
+
+
+def legend_once(axes: Axes, **style: Any) -> None:
+    """Add a legend in which every label stands once, however many lines have it; none without labels."""
+    named = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    if named:
+        axes.legend(named.values(), named.keys(), frameon=False, fontsize=10, **style)
 
 
 def with_zero_line(axes: Axes) -> None:

@@ -49,29 +49,14 @@ class SceneEffect(NamedTuple):
     """One effect of a scene."""
 
     name: str
-    sentence: str
     without: Callable[[Scene], Scene]
     """The scene without it; nothing of it is left in the compiled program, unless it is a number of the impact law."""
     required: str | None = None
     """Why the scene cannot do without it; None: it can be left out."""
 
 
-_OF_CONTACTS = {
-    "capillary": "capillary attraction of the liquid bridge",
-    "structural": "structural repulsion of the confined liquid",
-    "core": "core repulsion",
-    "van_der_waals": "van der Waals attraction",
-    "viscous": "viscous force of the liquid bridge",
-    "jkr": "solid junction (JKR)",
-    "dmt": "solid contact (DMT)",
-    "hertz": "solid contact (Hertz)",
-}
-_OF_LAWS = (
-    ("restitution", "loss in proportion to the energy, r below 1", "r", 1.0),
-    ("adhesion", "loss by adhesion", "epsilon", 0.0),
-    ("viscous_loss", "loss in proportion to the speed", "viscous_loss", 0.0),
-)
-"""Name, meaning, number of the law, and its value without the effect."""
+_OF_LAWS = {"restitution": ("r", 1.0), "adhesion": ("epsilon", 0.0), "viscous_loss": ("viscous_loss", 0.0)}
+"""Of each effect the number of the law, and its value without the effect."""
 _AMPLITUDES = {"platform": "amplitude_nm", "base": "amplitude_nm", "force": "amplitude_nn"}
 
 
@@ -82,18 +67,14 @@ def effects_in(scene: Scene) -> list[SceneEffect]:
     if isinstance(interaction, Contact):
         effects += map(_of_contact, interaction.effects)
     elif isinstance(interaction, ImpactLaw):
-        effects += [
-            SceneEffect(name, sentence, _putting(jnp.asarray(neutral), "interaction", number))
-            for name, sentence, number, neutral in _OF_LAWS
-        ]
+        for name, (number, neutral) in _OF_LAWS.items():
+            effects.append(SceneEffect(name, _putting(jnp.asarray(neutral), "interaction", number)))
         if interaction.delay is not None:
-            effects.append(SceneEffect("delay", "collision delay", _putting(None, "interaction", "delay")))
+            effects.append(SceneEffect("delay", _putting(None, "interaction", "delay")))
         if interaction.lasts:
-            lasting = "what moving sample, spring and air change while an impact lasts"
-            effects.append(SceneEffect("delay_corrections", lasting, _without_corrections))
+            effects.append(SceneEffect("delay_corrections", _without_corrections))
     if scene.cantilever.quality_factor is not None:
-        without_air = _putting(None, "cantilever", "quality_factor")
-        effects.append(SceneEffect("air_damping", "air damping of the cantilever", without_air))
+        effects.append(SceneEffect("air_damping", _putting(None, "cantilever", "quality_factor")))
     return effects + list(_of_drives(scene))
 
 
@@ -115,10 +96,11 @@ def _of_contact(name: str) -> SceneEffect:
         kept = tuple(term for term, own in zip(terms, scene.interaction.effects, strict=False) if own != name)
         return eqx.tree_at(lambda one: one.interaction.forces.terms, scene, kept)
 
-    return SceneEffect(name, _OF_CONTACTS.get(name, f"force {name}"), without, WHY_REQUIRED.get(name))
+    return SceneEffect(name, without, WHY_REQUIRED.get(name))
 
 
 def _without_corrections(scene: Scene) -> Scene:
+    """Return a scene with nothing that moving sample, spring and air change while an impact lasts."""
     delay = scene.interaction.delay
     return scene if delay is None else _putting(replace(delay, corrections=False), "interaction", "delay")(scene)
 
@@ -126,18 +108,16 @@ def _without_corrections(scene: Scene) -> Scene:
 def _of_drives(scene: Scene) -> Iterator[SceneEffect]:
     """Yield the ramp, second frequencies, and the drives of base and tip."""
     if scene.platform.offset_rate_nm_per_us != 0.0:
-        without = _putting(jnp.asarray(0.0), "platform", "offset_rate_nm_per_us")
-        yield SceneEffect("ramp", "slow ramp of the offset", without)
+        yield SceneEffect("ramp", _putting(jnp.asarray(0.0), "platform", "offset_rate_nm_per_us"))
     driven = {name: getattr(scene, name) for name in _AMPLITUDES if getattr(scene, name) is not None}
     moving = [name for name, drive in driven.items() if getattr(drive, _AMPLITUDES[name]) != 0.0]
     for name, drive in driven.items():
         if drive.second is not None:
             own = "second_frequency" if name == "platform" else f"{name}_second_frequency"
-            yield SceneEffect(own, f"second frequency of the {name}", _putting(None, name, "second"))
+            yield SceneEffect(own, _putting(None, name, "second"))
         if name != "platform":
-            sentence = "motion of the cantilever's base" if name == "base" else "force on the tip"
             only = "it is the scene's only drive" if moving == [name] else None
-            yield SceneEffect(f"{name}_drive", sentence, _putting(None, name), only)
+            yield SceneEffect(f"{name}_drive", _putting(None, name), only)
 
 
 # --- what is compared -------------------------------------------------------------------------------------------------
@@ -194,11 +174,9 @@ class EffectReport(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
-        name, sentence, _, required = self.effect
         return {
-            "name": name,
-            "description": sentence,
-            "required": required is not None,
+            "name": self.effect.name,
+            "required": self.effect.required is not None,
             "change": self.change._asdict(),
             "reason": self.reason,
             "time_us_per_period": self.cost,

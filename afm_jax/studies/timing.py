@@ -51,16 +51,6 @@ def time_compiled(compiled: Compiled, *arguments: Any, repetitions: int) -> tupl
     return Timing(compiled.seconds, min(seconds), statistics.median(seconds)), result
 
 
-def best_seconds(run: Callable[[], Any], *, repetitions: int) -> float:
-    """Return the seconds of the quickest of some calls, after a first one that compiles."""
-    seconds = []
-    for _ in range(1 + repetitions):
-        began = time.perf_counter()
-        jax.block_until_ready(run())
-        seconds.append(time.perf_counter() - began)
-    return min(seconds[1:])
-
-
 def _seconds(compiled: Compiled, arguments: tuple[Any, ...], calls: int) -> float:
     began = time.perf_counter()
     for _ in range(calls):

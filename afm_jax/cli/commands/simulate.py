@@ -9,7 +9,7 @@ import click
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Course, Ends, Finite, Grid, Multiples, PositiveInteger, Share
+from afm_jax.cli.values import Course, Ends, Finite, Grid, Orders, Share
 
 BASINS = Command(
     name="basins",
@@ -147,7 +147,9 @@ CONTINUE = Command(
     """,
     options=(
         SCENE,
-        click.option("--order", metavar="N", required=True, type=PositiveInteger(), help="Drive periods of the orbit."),
+        click.option(
+            "--order", metavar="N", required=True, type=click.IntRange(1, 1_000_000), help="Drive periods of the orbit."
+        ),
         click.option(
             "--impacts",
             metavar="M",
@@ -233,13 +235,13 @@ ORBITS = Command(
             "--order",
             metavar="N",
             required=True,
-            type=PositiveInteger(),
+            type=click.IntRange(1, 1_000_000),
             help="Drive periods between two impacts, a positive integer.",
         ),
         click.option(
             "--impacts",
             metavar="M",
-            type=PositiveInteger(),
+            type=click.IntRange(1, 1_000_000),
             help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
         ),
         LAW,
@@ -309,7 +311,7 @@ SIMULATE = Command(
         ),
         click.option(
             "--harmonics",
-            type=Multiples(),
+            type=Orders("multiple"),
             default="1",
             metavar="K,...",
             help="Multiples of the response frequency omega/N at which amplitude and phase are read, besides the "
