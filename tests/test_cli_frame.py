@@ -44,7 +44,7 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
         module = ModuleType("trial_command")
         module.__dict__["body"] = body
         monkeypatch.setitem(sys.modules, "trial_command", module)
-        told = {"name": "trial", "group": "check", "summary": "Try.", "help": "", "options": options}
+        told = {"name": "trial", "help": "Try.", "options": options}
         row = Command(**told, runs="trial_command:body", computes=False)
         monkeypatch.setitem(main.COMMANDS, "trial", row)
         return CliRunner().invoke(main.main, ["trial", *arguments])

@@ -194,7 +194,7 @@ from afm_jax.cli.main import COMMANDS, Command, main
 signal.signal(signal.SIGINT, signal.default_int_handler)
 {}
 sys.modules["rough"] = types.SimpleNamespace(command=command)
-COMMANDS["rough"] = Command(name="rough", group="check", summary="", help="", runs="rough:command", computes=False)
+COMMANDS["rough"] = Command(name="rough", help="", runs="rough:command", computes=False)
 sys.argv[1:] = ["rough"]
 main()
 """

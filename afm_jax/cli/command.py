@@ -1,4 +1,4 @@
-"""A command is a row: name, group, the function that it calls, its options and its help. The runner is here, too.
+"""A command is a row: name, the function that it calls, its options and its help. The runner is here, too.
 
 The rows stand in `measure.py`, `simulate.py`, `contact.py` and `check.py` of `afm_jax/cli/commands`, without JAX, so
 that help needs none. The function that a row names stands in a module that imports all that it needs at its top: the
@@ -133,10 +133,8 @@ class Command:
 
     Attributes:
         name: what is typed.
-        group: under which heading `afm-jax --help` lists it: measure, simulate, contact or check.
-        summary: the line of that list.
         runs: the function that is called, "module:function".
-        help: what `afm-jax NAME --help` says above the options.
+        help: what `afm-jax NAME --help` says above the options; its first sentence, a paragraph, lists it.
         options: arguments and options, decorators of click; `SCENE` is loaded, with the law of `LAW` if that is there.
         check: what is refused before JAX starts (it raises `click.UsageError`); it may change the options.
         computes: whether JAX is started, before the function's module is imported.
@@ -145,8 +143,6 @@ class Command:
     """
 
     name: str
-    group: str
-    summary: str
     runs: str
     help: str
     options: tuple[Callable[..., Any], ...] = ()
@@ -154,6 +150,11 @@ class Command:
     computes: bool = True
     programs: Callable[[Options], Sequence[str]] = lambda _: ()
     out_file: str = ""
+
+    @property
+    def summary(self) -> str:
+        """The line of `afm-jax --help`."""
+        return " ".join(self.help.partition("\n\n")[0].split())
 
     def click_command(self) -> click.Command:
         """Return the command for click."""

@@ -88,16 +88,14 @@ def _interrupt(number: int, frame: types.FrameType | None) -> None:
     signal.default_int_handler(number, frame)
 
 
-COMMANDS: dict[str, Command] = {
-    row.name: row for group in (measure, simulate, contact, check) for row in group.COMMANDS
-}
 _GROUPS = {
-    "measure": "Measure: read data, fit and plan",
-    "simulate": "Simulate: motions, orbits, basins of a scene",
-    "contact": "Contact: forces between tip and sample",
-    "check": "Check: equations, accuracy, speed, installation",
+    "Measure: read data, fit and plan": measure,
+    "Simulate: motions, orbits, basins of a scene": simulate,
+    "Contact: forces between tip and sample": contact,
+    "Check: equations, accuracy, speed, installation": check,
 }
-"""Headings of the list of commands."""
+"""The commands by the headings of their list."""
+COMMANDS: dict[str, Command] = {row.name: row for group in _GROUPS.values() for row in group.COMMANDS}
 
 
 class LazyGroup(click.Group):
@@ -111,12 +109,11 @@ class LazyGroup(click.Group):
         """Return a command; None if there is none of this name."""
         return COMMANDS[cmd_name].click_command() if cmd_name in COMMANDS else None
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         """Write the list of commands, a section a group."""
-        for group, heading in _GROUPS.items():
+        for heading, group in _GROUPS.items():
             with formatter.section(heading):
-                names = [name for name in self.list_commands(ctx) if COMMANDS[name].group == group]
-                formatter.write_dl([(name, COMMANDS[name].summary) for name in names])
+                formatter.write_dl(sorted((row.name, row.summary) for row in group.COMMANDS))
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -16,8 +16,7 @@ from afm_jax.words import counted
 def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     """Return rebound speed, delay and losses of collisions over the approach speed; where tips are captured is shaded.
 
-    Rebound speed, delay and losses are unknown where a tip does not leave. From a dozen tips on they are joined by
-    lines: fewer say too little of what lies between.
+    Rebound speed, delay and losses are unknown where a tip does not leave.
 
     Args:
         found: collisions; where the capture speed is known the captured range ends there, else at the fastest
@@ -39,13 +38,7 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     upper, middle, lower = panels
     end = 1.03 * max(np.max(approach, initial=0.0), np.finfo(float).tiny)
     upper.plot([0.0, end], [0.0, end], color=GRID, lw=1.2, ls="--", label=r"no loss, $u_{out} = u_{in}$")
-    joined = bool(np.all(np.diff(approach) > 0.0)) and len(approach) >= _FEWEST_JOINED
-    style = {
-        "lw": 1.6,
-        "ls": "-" if joined else "",
-        "ms": 4,
-        "marker": "o" if len(approach) <= 60 or not joined else "",
-    }
+    style = {"ls": "", "marker": ".", "ms": 5}
     upper.plot(approach, rebound, color=DARK, label="contact", **style)
     middle.plot(approach, delay, color=DARK, **style)
     for name, (label, colour) in _LOSSES.items():
@@ -55,11 +48,8 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
         style = {"color": ACCENT, "ms": 7, "label": "captured", "clip_on": False}
         upper.plot(approach[is_captured], np.zeros(is_captured.sum()), "x", **style)
     held_below = capture_speed_nm_per_us or np.max(approach[is_captured], initial=0.0)
-    if held_below:
-        exact = f" {capture_speed_nm_per_us:.4g} nm/µs" if capture_speed_nm_per_us else ""
-        label = f"captured below{exact}" if exact else "captured"
-        for axes in panels:
-            axes.axvspan(0.0, held_below, color=ACCENT, alpha=0.13, lw=0.0, label=label if axes is upper else None)
+    for axes in panels:
+        axes.axvspan(0.0, held_below, color=ACCENT, alpha=0.13, lw=0.0)
     upper.set(xlim=(0.0, end), ylim=(0.0, end))
     label_axes(upper, x="", y=r"rebound speed  $u_{out}$ (nm/µs)")
     label_axes(middle, x="", y="collision delay (µs)")
@@ -75,7 +65,6 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     return figure
 
 
-_FEWEST_JOINED = 12
 _DRAWN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "captured")
 _LOSSES = {
     "bridge_hysteresis_aj": ("liquid bridge", BLUE),

@@ -8,8 +8,6 @@ from afm_jax.cli.values import SceneName
 
 VERIFY = Command(
     name="verify",
-    group="check",
-    summary="Compare eqs. 5 to 8 with automatic differentiation.",
     runs="afm_jax.cli.verify:verification",
     help="""Compare eqs. 5 to 8 with automatic differentiation, forward and reverse, at random scenes and starts.
 
@@ -26,8 +24,6 @@ VERIFY = Command(
 
 ACCURACY = Command(
     name="accuracy",
-    group="check",
-    summary="Show error against time, beside SciPy and Diffrax.",
     runs="afm_jax.cli.accuracy:accuracy",
     help="""Show errors of a value and of its gradient against the time they take, beside SciPy and Diffrax.
 
@@ -55,8 +51,6 @@ ACCURACY = Command(
 
 DOCTOR = Command(
     name="doctor",
-    group="check",
-    summary="Say what is installed, how JAX computes, and whether its cache works.",
     runs="afm_jax.cli.doctor:doctor",
     help="""Say what is installed, how JAX computes, and whether its compilation cache works.
 

@@ -23,8 +23,6 @@ def _check_law(_: Session, options: Options) -> None:
 
 COLLIDE = Command(
     name="collide",
-    group="contact",
-    summary="Let free tips collide with the sample: rebound, delay, capture, energy.",
     runs="afm_jax.cli.collide:collide",
     help="""Let free tips collide with a sample at rest, through liquid bridge and solid junction.
 

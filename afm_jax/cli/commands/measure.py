@@ -31,8 +31,6 @@ def _number(name: str, unit: str, text: str) -> Any:
 
 CALIBRATE = Command(
     name="calibrate",
-    group="measure",
-    summary="Fit a resonance scan or a thermal spectrum: frequency, Q, stiffness.",
     runs="afm_jax.cli.calibrate:calibration",
     help="""Fit frequency and quality factor to a frequency scan of the free resonance, or to a thermal spectrum.
 
@@ -91,8 +89,6 @@ def _check_lists(_: Session, options: Options) -> None:
 
 DESIGN = Command(
     name="design",
-    group="measure",
-    summary="Choose the drives to measure next, and forecast what they will determine.",
     runs="afm_jax.cli.design:planned",
     help="""Choose the drives to measure next, and forecast how well the law will then be known.
 
@@ -198,8 +194,6 @@ DESIGN = Command(
 
 FIT = Command(
     name="fit",
-    group="measure",
-    summary="Fit the impact law to a table of vibration amplitudes.",
     runs="afm_jax.cli.fit:fit",
     help="""Fit the impact law to a table of vibration amplitudes, or one law to several tables.
 
@@ -277,8 +271,6 @@ def _check_table(_: Session, options: Options) -> None:
 
 INVERT = Command(
     name="invert",
-    group="measure",
-    summary="Read speeds and delay of every impact off amplitude and phase, without a law.",
     runs="afm_jax.cli.invert:inversion",
     help="""Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
 
@@ -298,8 +290,6 @@ INVERT = Command(
 
 LOCKIN = Command(
     name="lockin",
-    group="measure",
-    summary="Read amplitudes and phase off a deflection in time, at the drive's frequency over 1 to 8.",
     runs="afm_jax.cli.lockin:lockin_of_trace",
     help="""Read amplitude and phase of a deflection in time at the drive's frequency over N, and over 1 to 8 besides.
 
@@ -391,8 +381,6 @@ READING_OPTIONS = (
 
 READ = Command(
     name="read",
-    group="measure",
-    summary="Read tapping curves out of an instrument's file, as tables.",
     runs="afm_jax.cli.read:curves_of_a_file",
     help="""Read amplitude and phase against height out of an instrument's file.
 
@@ -421,8 +409,6 @@ def _check_curves(_: Session, options: Options) -> None:
 
 TAPPING = Command(
     name="tapping",
-    group="measure",
-    summary="Read the energy of a tap, and the impact law, off a tapping curve.",
     runs="afm_jax.cli.tapping:energy_of_taps",
     help="""Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
 
@@ -481,8 +467,6 @@ def _check_zarr(_: Session, options: Options) -> None:
 
 TAPPING_MAP = Command(
     name="tapping-map",
-    group="measure",
-    summary="Read the energy of a tap off every pixel of an image.",
     runs="afm_jax.cli.tapping_map:map_of_an_image",
     help="""Read the energy of a tap and the virial off every pixel of an image of amplitude and phase.
 

@@ -1,6 +1,5 @@
 """Commands about the motions of a scene."""
 
-import math
 from importlib import import_module
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from afm_jax.cli.values import Course, Ends, Finite, Grid, Orders, Share
 
 BASINS = Command(
     name="basins",
-    group="simulate",
-    summary="Find which start of a scene ends where.",
     runs="afm_jax.cli.basins:basins",
     help="""Find on which motion each start of a scene ends.
 
@@ -42,8 +39,6 @@ BASINS = Command(
 
 BIFURCATION = Command(
     name="bifurcation",
-    group="simulate",
-    summary="Ramp a parameter and record on which motion the tip settles.",
     runs="afm_jax.cli.bifurcation:bifurcation",
     help="""Ramp a parameter and record on which motion the tip settles at each of its values.
 
@@ -78,8 +73,6 @@ def _check_chart(_: Session, options: Options) -> None:
 
 CHART = Command(
     name="chart",
-    group="simulate",
-    summary="Chart which single-impact orbits are stable over two parameters.",
     runs="afm_jax.cli.chart:chart",
     help="""Chart over two parameters of a scene which single-impact orbits exist, are stable and coexist.
 
@@ -106,8 +99,6 @@ CHART = Command(
 
 LYAPUNOV = Command(
     name="lyapunov",
-    group="simulate",
-    summary="Compute Lyapunov exponents of a motion, or along a parameter.",
     runs="afm_jax.cli.lyapunov:lyapunov",
     help="""Compute Lyapunov exponents by QR of the impact map's exact Jacobians; a contact's come from its simulation.
 
@@ -135,8 +126,6 @@ LYAPUNOV = Command(
 
 CONTINUE = Command(
     name="continue",
-    group="simulate",
-    summary="Follow orbits and their special points through parameters.",
     runs="afm_jax.cli.continue_orbits:follow",
     help="""Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
 
@@ -173,18 +162,14 @@ CONTINUE = Command(
 
 
 def _check_effects(_: Session, options: Options) -> None:
-    """Check the duration, and that the scene can be written."""
-    duration_us, write = options["duration_us"], options["write"]
-    if duration_us is not None and not (duration_us > 0.0 and math.isfinite(duration_us)):
-        raise click.UsageError(f"--duration-us must be a positive number, but is {duration_us:g}")
+    """Check that the scene can be written."""
+    write = options["write"]
     if write is not None and not write.absolute().parent.is_dir():
         raise click.UsageError(f"--write {write}: there is no folder {write.absolute().parent}; choose another place")
 
 
 EFFECTS = Command(
     name="effects",
-    group="simulate",
-    summary="Say what each effect of a scene changes and costs, and which can be left out.",
     runs="afm_jax.cli.effects:effects",
     help="""Say what each effect of a scene changes and costs.
 
@@ -202,7 +187,12 @@ EFFECTS = Command(
             default="1%",
             help="Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
         ),
-        click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow each scene at most, in us."),
+        click.option(
+            "--duration-us",
+            type=Finite(positive=True),
+            metavar="T",
+            help="How long to follow each scene at most, in us.",
+        ),
         click.option("--only", metavar="NAME,...", help="The effects to look at; all if left out."),
         click.option(
             "--write",
@@ -217,8 +207,6 @@ EFFECTS = Command(
 
 ORBITS = Command(
     name="orbits",
-    group="simulate",
-    summary="Find the orbits of a scene, of one impact or more, and whether they are stable.",
     runs="afm_jax.cli.orbits:orbits",
     help="""Find all single-impact orbits of a scene with a law, or with --impacts orbits of several impacts.
 
@@ -254,11 +242,7 @@ DEFAULT_PERIODS = 2000
 
 
 def _check_simulation(session: Session, options: Options) -> None:
-    """Check the duration, and that a trace has a folder."""
-    for option, name in (("--duration-us", "duration_us"), ("--periods", "periods")):
-        value = options[name]
-        if value is not None and not (value > 0.0 and math.isfinite(value)):
-            raise click.UsageError(f"{option} must be a positive number, but is {value:g}")
+    """Check that there is one duration, and that a trace has a folder."""
     if options["duration_us"] is not None and options["periods"] is not None:
         raise click.UsageError("--duration-us and --periods say the same: give one of them")
     if options["samples"] and session.out is None:
@@ -276,8 +260,6 @@ def _check_simulation(session: Session, options: Options) -> None:
 
 SIMULATE = Command(
     name="simulate",
-    group="simulate",
-    summary="Follow a scene in time: contacts, amplitudes, phases, energies.",
     runs="afm_jax.cli.simulate:simulation",
     help="""Follow a scene in time: contacts, amplitudes, phases, forces, energies.
 
@@ -301,8 +283,10 @@ SIMULATE = Command(
             metavar="FROM:TO:COUNT",
             help="Record an approach curve, both ways: heights of the sample in nm, negative below the rest position.",
         ),
-        click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow the scene, in us."),
-        click.option("--periods", type=Finite(), metavar="P", help="How long, in periods of the drive."),
+        click.option(
+            "--duration-us", type=Finite(positive=True), metavar="T", help="How long to follow the scene, in us."
+        ),
+        click.option("--periods", type=Finite(positive=True), metavar="P", help="How long, in periods of the drive."),
         flag(
             "--until-settled",
             f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive "
@@ -366,10 +350,8 @@ def _check_sweep(session: Session, options: Options) -> None:
 
 SWEEP = Command(
     name="sweep",
-    group="simulate",
-    summary="Compute many scenes over a grid of parameters; resumes.",
     runs="afm_jax.cli.sweep:sweep",
-    help="""Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
+    help="""Compute many scenes over the grid of SWEEP.toml, into DIR/sweep.zarr; call it again to go on after a fault.
 
     \b
     scene = "scene.toml"                  # or a preset
