@@ -1,26 +1,20 @@
 """A measurement in the test's own process, where compiled programs are kept from one run of the tests to the next."""
 
 import inspect
-from collections.abc import Callable, Mapping
-from importlib import import_module
+from collections.abc import Callable
 from typing import Any
 
 
-def run_here(task: str, settings: Mapping[str, Any]) -> Any:
+def run_here(task: Callable[..., Any], **settings: Any) -> Any:
     """Stand in for `afm_jax.studies.timing.run_in_own_process`."""
-    return _function(task)(**settings)
+    return task(**settings)
 
 
-def answered_with(results: Mapping[str, Any]) -> Callable[..., Any]:
-    """Return a stand-in that has measured already, by the functions' names; it sees that these take the settings."""
+def answered_with(result: Any) -> Callable[..., Any]:
+    """Return a stand-in that has measured already; it sees that the function takes the settings."""
 
-    def run(task: str, settings: Mapping[str, Any]) -> Any:
-        _ = inspect.signature(_function(task)).bind(**settings)
-        return results[task.partition(":")[2]]
+    def run(task: Callable[..., Any], **settings: Any) -> Any:
+        _ = inspect.signature(task).bind(**settings)
+        return result
 
     return run
-
-
-def _function(task: str) -> Callable[..., Any]:
-    module, _, function = task.partition(":")
-    return getattr(import_module(module), function)

@@ -164,7 +164,7 @@ def test_command_tells_all_of_a_study(tmp_path: Path, monkeypatch: pytest.Monkey
     rows[-1]["reason"] = "gave up"
     study = {"rows": rows, "value_of": "arrival of contact 10 (us)", "reference": "a finer one"}
     study |= {"reference_error": 1e-12, "reference_gradient_error": 0.0}
-    monkeypatch.setattr(own_process, "run_in_own_process", answered_with({"measured": study}))
+    monkeypatch.setattr(own_process, "run_in_own_process", answered_with(study))
     payload = answer(tmp_path, "accuracy", "figure9b")
     assert payload["problem"] == "figure9b"
     assert payload["rows"] == rows

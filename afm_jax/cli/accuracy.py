@@ -8,6 +8,7 @@ from afm_jax.cli.session import Session
 from afm_jax.cli.values import scene_and_start
 from afm_jax.columns import columns_of, printed_table
 from afm_jax.studies import timing
+from afm_jax.studies.accuracy import measured
 
 _COLUMNS = ("of", "method", "setting", "microseconds", "error", "compile_s", "reason")
 _CELLS = {name: name for name in ("of", "method", "setting", "microseconds", "error", "compile_s")}
@@ -19,8 +20,7 @@ def accuracy(session: Session, study: str, *, contacts: int, quick: bool) -> Out
         # what is wrong with a file is said at once, and what it leaves to be assumed
         _ = scene_and_start(study)
     with session.working("measuring"):
-        settings = {"problem": study, "contacts": contacts, "quick": quick}
-        result = timing.run_in_own_process("afm_jax.studies.accuracy:measured", settings)
+        result = timing.run_in_own_process(measured, problem=study, contacts=contacts, quick=quick)
     rows = result["rows"]
     return Output(
         payload={"problem": study, **result},

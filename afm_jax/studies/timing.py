@@ -1,18 +1,17 @@
 """Time of a compiled JAX function: compilation apart, several repetitions, the best and the median of them.
 
-A measurement runs in a Python process of its own, on one core: how many cores JAX uses is settled before it is
-imported, and a process that has run other programs is a poor place to measure time in. Settings go in as JSON on
-standard input, results come back as JSON on standard output.
+A measurement runs in a Python process of its own, on one core: how many cores JAX uses is settled before it computes,
+and a process that has run other programs is a poor place to measure time in.
 """
 
-import json
 import os
+import signal
 import statistics
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from importlib import import_module
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from typing import Any, NamedTuple
 
 import jax
@@ -58,59 +57,36 @@ def _seconds(compiled: Compiled, arguments: tuple[Any, ...], calls: int) -> floa
     return (time.perf_counter() - began) / calls
 
 
-def run_in_own_process(task: str, settings: Mapping[str, Any]) -> Any:
+def run_in_own_process(task: Callable[..., Any], **settings: Any) -> Any:
     """Run a function in a new process and return its result; the process has one core where the system can pin it.
 
     Args:
-        task: "module:function"; the function takes the settings as keywords and returns what JSON can carry.
-        settings: the function's arguments.
+        task: a function at the top of a module.
+        settings: its arguments.
 
     Raises:
-        ValueError: if the function refuses its settings, or the process fails; its message went to standard error.
+        Exception: as the function does.
     """
-    # where nothing pins it, XLA reads that; its flags do not bring its threads down to one
-    threads = {} if hasattr(os, "sched_setaffinity") else {"NPROC": "1"}
-    done = subprocess.run(  # noqa: S603
-        [sys.executable, "-m", "afm_jax.studies.timing", task],
-        input=json.dumps(dict(settings)),
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-        env={**os.environ, **threads, "JAX_PLATFORMS": "cpu"},
-        # an interrupt from the terminal is for the process that waits, and ends this one without a traceback of its own
-        process_group=0 if os.name == "posix" else None,
-    )
-    if done.returncode != 0:
-        raise ValueError(f"the measurement in a process of its own ended with exit code {done.returncode}")
-    answer = json.loads(done.stdout.splitlines()[-1])
-    if "refused" in answer:
-        raise ValueError(answer["refused"])
-    return answer["result"]
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_on_one_core) as pool:
+        return pool.submit(task, **settings).result()
+
+
+def _on_one_core() -> None:
+    """Settle how a process computes."""
+    # the process that waits says that there was an interrupt
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    else:
+        # where nothing pins it, XLA reads that; its flags do not bring its threads down to one
+        os.environ["NPROC"] = "1"
+    jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_enable_x64", True)  # noqa: FBT003
+    # compile times are part of the result, so none may come from an earlier run
+    jax.config.update("jax_enable_compilation_cache", False)  # noqa: FBT003
 
 
 def progress(message: str) -> None:
     """Write a line to standard error."""
     sys.stderr.write(f"{message}\n")
     sys.stderr.flush()
-
-
-def main() -> None:
-    """Run the task named on the command line with settings from standard input."""
-    task = sys.argv[1]
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    import jax  # noqa: PLC0415
-
-    jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    # compile times are part of the result, so none may come from an earlier run
-    jax.config.update("jax_enable_compilation_cache", False)  # noqa: FBT003
-    module, function = task.split(":")
-    try:
-        answer = {"result": getattr(import_module(module), function)(**json.load(sys.stdin))}
-    except ValueError as refusal:
-        answer = {"refused": str(refusal)}
-    sys.stdout.write(json.dumps(answer) + "\n")
-
-
-if __name__ == "__main__":
-    main()
