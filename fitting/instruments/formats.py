@@ -22,6 +22,7 @@ from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import MOST_VALUES
 from fitting.instruments.recording import (
     HEADER_KEYS,
+    NATIVE,
     UNITS,
     Known,
     Recording,
@@ -401,8 +402,7 @@ def parse_separated(data: bytes, name: str) -> Recording:
     pairs = [re.split(r"\s*[=:]\s*", text, maxsplit=1) for text in comments]
     settings = {pair[0]: pair[1] for pair in pairs if len(pair) == 2}
     # this package's own table says in which unit a key is by its name
-    native = {"frequency": "kHz", "stiffness": "N/m", "length": "nm", "sensitivity": "nm/V"}
-    keys = {key: (key, native.get(quantity, "")) for key, quantity in HEADER_KEYS.items() if key != "temperature_k"}
+    keys = {key: (key, NATIVE.get(quantity, "")) for key, quantity in HEADER_KEYS.items() if key != "temperature_k"}
     segments = _by_branch(body, titles, {plain: columns[title] for title, plain, _ in named})
     return Recording("separated text", name, segments, units, known_from(settings, keys), settings=settings)
 

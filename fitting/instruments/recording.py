@@ -139,13 +139,14 @@ HEADER_KEYS = {
     "averages": "",
 }
 """What headers say that matters here, and what it measures."""
-_NATIVE = {
+NATIVE = {
     "frequency": "kHz",
     "stiffness": "N/m",
     "length": "nm",
     "sensitivity": "nm/V",
     "temperature": "K",
 }
+"""This package's unit of a quantity."""
 
 
 def known_from(
@@ -166,7 +167,7 @@ def known_from(
         quantity, factor = UNITS.get(said[1] or unit, ("", 1.0))
         if quantity == HEADER_KEYS[key]:
             # twelve digits: a change of unit must not add others
-            found[key] = Known(float(f"{said[0] * factor:.12g}"), _NATIVE.get(quantity, ""), f"{where}: {name}")
+            found[key] = Known(float(f"{said[0] * factor:.12g}"), NATIVE.get(quantity, ""), f"{where}: {name}")
     return found
 
 

@@ -381,8 +381,6 @@ def _with_energy(
     if not all(len(p) for p in between):
         return found
     if found.approach.offset_nm > found.retract.offset_nm and held_rows(curve)[between[1]].mean() > 0.5:
-        if not curve.height_known:
-            return found
         value = _energy_of_release(curve, found.approach.offset_nm, found.retract.offset_nm)
         return replace(found, energy_between_aj=value, energy_of="approach and retract")
     if not all(np.isfinite(energy[p]).any() for p in between):

@@ -48,7 +48,7 @@ class TappingCurve:
     Attributes:
         source: its name, as it begins messages.
         drive: what shakes the cantilever: a force on the tip, or its base.
-        offset_nm: height of the sample over the tip's rest position, or over any other height (`height_known`).
+        offset_nm: height of the sample over the tip's rest position.
         amplitude_nm: of the height (force) or the deflection (base) at the drive's frequency.
         amplitude_error_nm: its standard error.
         lag_deg: how far it lags behind the drive; NaN throughout where no phase was recorded.
@@ -57,14 +57,12 @@ class TappingCurve:
         free_amplitude_error: its relative standard error.
         drive_frequency_khz: omega/2 pi.
         retract: whether the sample moves away.
-        both_ways: whether the curve says which way the sample moves.
         free_frequency_khz: f0.
         quality_factor: Q.
         spring_constant_n_per_m: k, of the mode (1.03 times the static one of a rectangular cantilever).
         over_spring_constant: whether k is not known: it counts as 1 N/m, and energies in aJ are those over k in nm^2.
         tip_calibration: true length over the length stated, of every amplitude.
         phase_zero_deg: lag that the instrument adds; None: nothing is known of it.
-        height_known: whether heights count from the tip's rest position.
         origin_error_nm: standard error of that position.
         lines: where each row stands in its file.
         time: place of each row in the order of measurement, from -1/2 to 1/2; None: that order is not known.
@@ -83,14 +81,12 @@ class TappingCurve:
     free_amplitude_error: float = 0.0
     drive_frequency_khz: Rows
     retract: Bool[np.ndarray, " rows"]
-    both_ways: bool = False
     free_frequency_khz: Given
     quality_factor: Given
     spring_constant_n_per_m: Given
     over_spring_constant: bool = False
     tip_calibration: Given = EXACTLY_ONE
     phase_zero_deg: Given | None = None
-    height_known: bool = True
     origin_error_nm: float = 0.3
     lines: Int[np.ndarray, " rows"]
     time: Rows | None = None

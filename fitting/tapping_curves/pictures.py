@@ -20,7 +20,7 @@ def curve_figure(result: Tapping) -> Figure:
     figure = new_figure(7.5, 0.5 + 3.0 * panels)
     top, *between, bottom = figure.subplots(panels, 1, sharex=True)
     _points(top, result, curve.amplitude_nm, curve.amplitude_error_nm)
-    if curve.drive == "force" and curve.height_known:
+    if curve.drive == "force":
         reach = np.linspace(curve.offset_nm.min(), min(curve.offset_nm.max(), 0.0), 2)
         reach = np.maximum(reach, -curve.free_amplitude_nm.max())
         top.plot(reach, -reach, ":", color=GRID, label="the tip just reaches the sample")
@@ -41,7 +41,7 @@ def curve_figure(result: Tapping) -> Figure:
         _points(bottom, result, rows.largest_energy_aj, np.zeros(curve.rows))
     label_axes(
         bottom,
-        x="height of the sample over the tip's rest position (nm)" if curve.height_known else "height (nm)",
+        x="height of the sample over the tip's rest position (nm)",
         y=result.in_unit("energy of a tap (aJ)" if curve.has_phase else "at most (aJ)"),
     )
     # a legend in the panel would hide readings
@@ -58,7 +58,7 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
     for back, marker in ((False, "o"), (True, "s")):
         for chosen, colour, label in (
             (free, GRID, "free"),
-            (~free & ~aside, BLUE if not back else ACCENT, way_of(back) if curve.both_ways else "rows"),
+            (~free & ~aside, BLUE if not back else ACCENT, way_of(back)),
             (~free & aside, "none", "excluded"),
         ):
             here = chosen & (curve.retract == back) & np.isfinite(values)

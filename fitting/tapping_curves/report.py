@@ -19,7 +19,7 @@ from fitting.report.sections import (
     text_of,
 )
 from fitting.tapping_curves.branches import Height, Hysteresis
-from fitting.tapping_curves.energy import HEADLINE, Z95, EnergyFunctions, OneEnergy, said_of
+from fitting.tapping_curves.energy import HEADLINE, Z95, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 from fitting.tapping_curves.verdict import ORIGINS
@@ -100,7 +100,7 @@ def _band_in_words(low: float, high: float) -> str:
 
 
 def _along_the_branches(result: Tapping) -> list[ReportSection]:
-    """Return the energy of each branch at some amplitudes, where it turns, and what is known of the instrument."""
+    """Return the energy of each branch at some amplitudes, and what is known of the instrument."""
     functions = result.functions
     if functions is None or not result.branches:
         return []
@@ -141,7 +141,16 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
         f"  rows about smooth energies: chi2 {functions.rows_chi2:.1f} for {functions.rows_freedom:.0f} degrees of "
         f"freedom{scaled}"
     )
-    instrument = _instrument(functions, "instrument, from what is stated and free rows")
+    known = [
+        [
+            one.name.removesuffix("_0"),
+            str(one.given) if np.isfinite(one.given.error) else "not known",
+            with_error(one.value, one.standard_error),
+        ]
+        for one in functions.nuisances
+    ]
+    caption_of_known = "What is known of the instrument beforehand, and with its free rows"
+    instrument = Table(caption_of_known, ["instrument, from what is stated and free rows", "given", "fitted"], known)
     return [
         ReportSection("Energy along the branches", [Table(caption, head, cells), *_lines(lines)], "Energy"),
         ReportSection("Instrument", [instrument, *_lines([chi2])]),
@@ -150,19 +159,6 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
 
 def _lines(lines: Sequence[str]) -> list[Text]:
     return [Text("\n".join(lines), "lines")] if lines else []
-
-
-def _instrument(fit: EnergyFunctions | OneEnergy, first: str) -> Table:
-    """Return what is given of the instrument and what a fit makes of it."""
-    cells = [
-        [
-            one.name.removesuffix("_0"),
-            str(one.given) if np.isfinite(one.given.error) else "not known",
-            with_error(one.value, one.standard_error),
-        ]
-        for one in fit.nuisances
-    ]
-    return Table("What is known of the instrument beforehand, and after the fit", [first, "given", "fitted"], cells)
 
 
 def _one_energy(result: Tapping) -> list[ReportSection]:
@@ -189,18 +185,11 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
         known = interval(*ends) if np.isfinite(ends).all() else "open"
         cells.append([group.name, f"{count}", with_error(value, error), known])
     least = fit.minimum
+    caption, head = "Each tap of a branch is assumed to take the same", ["branch", "rows", "energy (aJ)", "95 %"]
     chi2 = f"  chi2/dof = {least.chi2:.1f}/{least.degrees_of_freedom}, probability {least.p_value:.2g}"
     return [
         ReportSection("One energy for all taps", _lines(lines), "One energy"),
-        ReportSection(
-            "Branches with one energy each",
-            [
-                Table(
-                    "Each tap of a branch is assumed to take the same", ["branch", "rows", "energy (aJ)", "95 %"], cells
-                )
-            ],
-        ),
-        ReportSection("Fitted with one energy: the instrument", [_instrument(fit, "instrument"), *_lines([chi2])]),
+        ReportSection("Branches with one energy each", [Table(caption, head, cells), *_lines([chi2])]),
     ]
 
 

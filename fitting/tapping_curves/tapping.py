@@ -138,7 +138,6 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         free_amplitude_error=float(np.nanmedian(noise)),
         drive_frequency_khz=table.drive_frequency_khz,
         retract=np.zeros(table.rows, bool) if table.retract is None else table.retract == 1.0,
-        both_ways=table.retract is not None,
         **_lever_of(table, quality),
         phase_zero_deg=None if zero is None else Given(*zero),
         origin_error_nm=table.calibration.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1],
