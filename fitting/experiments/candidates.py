@@ -111,7 +111,7 @@ def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.nda
     """Say which drives are among others, given as rows of order, frequency, amplitude and offset."""
     # no instrument sets nine digits
     places = np.stack(drives, axis=1)[:, None]
-    return np.isclose(places, others, rtol=1e-9, atol=1e-12).all(axis=2).any(axis=1)
+    return np.any(np.all(np.isclose(places, others, rtol=1e-9, atol=1e-12), axis=2), axis=1)
 
 
 LEFT_OUT = {
