@@ -80,7 +80,7 @@ _LEAD_SPEEDS = np.geomspace(2.0, 30.0, 8)
 _PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(TERMS) / (TERMS - 1))
 
 
-@public_result(picture="afm_jax.plots.collisions:law_figure")
+@public_result()
 @dataclass(frozen=True)
 class ContactLaw(Result):
     """A law fitted to a contact, and how far it is off.
@@ -338,7 +338,7 @@ def range_above_capture(
     return float(low), float(high)
 
 
-@public_result(picture="afm_jax.plots.collisions:delay_figure")
+@public_result()
 @dataclass(frozen=True)
 class ContactDelay(Result):
     """The delay of a contact against the approach speed, and the law fitted to it; times in us, shapes (n,).

@@ -87,20 +87,6 @@ def contact_law_figure(law: ContactLaws) -> Figure:
     return figure
 
 
-def law_figure(law: ContactLaw) -> Figure:
-    """Return the picture of a law's relative errors, the left half of what `afm-jax collide --make-law` draws."""
-    figure = new_figure(6.0, 5.0)
-    _draw_laws(figure.subplots(), [law])
-    return figure
-
-
-def delay_figure(delay: ContactDelay) -> Figure:
-    """Return the picture of a delay and its law, the right half of what `afm-jax collide --make-law` draws."""
-    figure = new_figure(6.0, 5.0)
-    _draw_delay(figure.subplots(), delay)
-    return figure
-
-
 def _draw_laws(axes: Axes, laws: Sequence[ContactLaw]) -> None:
     for law in laws:
         name, colour = _NAMES.get(law.model, law.model), _COLOURS.get(law.model, DARK)
