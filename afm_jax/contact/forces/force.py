@@ -121,6 +121,24 @@ class ForceSum(Force):
         gap = as_argument(gap_nm)
         return sum((term(gap, gap_rate_nm_per_us) for term in self.terms), start=jnp.zeros_like(gap))
 
+    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
+        """Return the potential of the static forces in aJ at a gap in nm."""
+        gap = as_argument(gap_nm)
+        parts = (term.potential(gap) for term in self.terms if isinstance(term, StaticForce))
+        return sum(parts, start=jnp.zeros_like(gap))
+
+    def stiffness(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
+        """Return -dF/dD of the static forces in nN/nm at a gap in nm."""
+        gap = as_argument(gap_nm)
+        parts = (term.stiffness(gap) for term in self.terms if isinstance(term, StaticForce))
+        return sum(parts, start=jnp.zeros_like(gap))
+
+    def damping(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
+        """Return the damping of the dissipative forces in nN us/nm at a gap in nm."""
+        gap = as_argument(gap_nm)
+        parts = (term.damping(gap) for term in self.terms if isinstance(term, DissipativeForce))
+        return sum(parts, start=jnp.zeros_like(gap))
+
 
 def slope_of(function: Callable[[Array], Array], at: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the derivative of an elementwise function, by automatic differentiation."""
