@@ -26,10 +26,8 @@ from afm_jax.cli.command import Command, Output
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.options import SCENE
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import PRESET_NAMES
 from afm_jax.columns import printed_table
 from afm_jax.results import text_of_parts
-from afm_jax.scenefile.presets import PRESETS
 from afm_jax.words import text_table
 from tests.fresh_python import outputs, python
 
@@ -186,15 +184,6 @@ def test_text_fits_the_terminal_and_numbers_stay_whole(
     # nobody looks at a pipe: the table stays as it is
     monkeypatch.delenv("COLUMNS")
     assert sum(all(cell in line for cell in rows[0]) for line in trial(body).stdout.splitlines()) == 2
-
-
-def test_presets_are_those_of_the_scene_files_and_are_completed():
-    assert tuple(PRESETS) == PRESET_NAMES
-    command = main.main.get_command(click.Context(main.main), "orbits") or main.main
-    scene = next(each for each in command.params if each.name == "scene")
-    offered = scene.type.shell_complete(click.Context(command), scene, "figure1")
-    assert [item.value for item in offered] == ["figure10", "figure11"]
-    assert scene.type.shell_complete(click.Context(command), scene, "my")[0].type == "file"
 
 
 def test_a_result_with_impacts_says_whether_its_law_is_extrapolated(trial: Callable[..., Result]):

@@ -7,7 +7,7 @@ import click
 
 from afm_jax.cli.options import flag
 from afm_jax.cli.session import add_note
-from afm_jax.cli.values import Finite, SceneName, option_of, scene_and_start
+from afm_jax.cli.values import Finite, option_of, scene_and_start
 from afm_jax.contact.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_RANGES,
@@ -43,7 +43,7 @@ def _number(name: str, text: str) -> Callable[..., Any]:
 
 
 CONTACT_OPTIONS = (
-    click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=SceneName()),
+    click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=click.Path()),
     *(_number(each.name, f"{each.meaning}; paper: {each.default:g}.") for each in CONTACT_PARAMETERS),
     *(_number(each.name, f"{each.meaning}; of a dry contact: {each.default:g}.") for each in DRY_PARAMETERS),
     *(_number(name, text) for name, text in _OF_THE_TIP.items()),

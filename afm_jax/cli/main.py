@@ -161,7 +161,7 @@ class LazyGroup(click.Group):
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog="Exit codes: 0 done; 1 the program failed; 2 the call or the data are wrong; 3 ran, but the result is not "
-    'valid. Completion of commands, options and presets: eval "$(_AFM_JAX_COMPLETE=bash_source afm-jax)" in ~/.bashrc; '
+    'valid. Completion of commands, options and files: eval "$(_AFM_JAX_COMPLETE=bash_source afm-jax)" in ~/.bashrc; '
     "zsh_source in ~/.zshrc; fish: _AFM_JAX_COMPLETE=fish_source afm-jax | source.",
 )
 @click.option("--version", is_flag=True, help="Show the version and exit.")

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from afm_jax.cli.values import PictureFormat, SceneName, Share, ValueAndError
+from afm_jax.cli.values import Share, ValueAndError
 
 
 def flag(name: str, text: str, *, into: str | None = None) -> Callable[..., Any]:
@@ -14,7 +14,7 @@ def flag(name: str, text: str, *, into: str | None = None) -> Callable[..., Any]
     return click.option(*((name,) if into is None else (name, into)), is_flag=True, help=text)
 
 
-SCENE = click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
+SCENE = click.argument("scene", metavar="SCENE.toml|PRESET", type=click.Path())
 """The scene that is loaded before the command's function is called, which gets it as a `NamedScene`."""
 LAW = click.option(
     "--law",
@@ -25,7 +25,9 @@ LAW = click.option(
 )
 """With `SCENE` it is loaded, too: the scene has its law then."""
 DRAWS = click.option("--draws", type=click.IntRange(2), default=20, help="Laws drawn from the fit for the bands.")
-PICTURE = click.option("--picture", type=PictureFormat(), default="png", help="png, pdf or svg.")
+PICTURE = click.option(
+    "--picture", type=click.Choice(("png", "pdf", "svg")), default="png", help="Format of the picture."
+)
 NOISE = click.option(
     "--noise",
     type=Share("a relative error"),

@@ -1,4 +1,4 @@
-"""Kinds of values on the command line (numbers, lists, shares, grids, scenes), and what options name in files.
+"""Kinds of values on the command line (numbers, lists, shares, grids), and what options name in files.
 
 A kind makes a value of a text, and says in a sentence what is wrong with the text where it makes none.
 """
@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import click.shell_completion
 
 from afm_jax.cli.session import add_note
 from afm_jax.scenefile.tables import cut_short
@@ -243,44 +242,6 @@ class Course(ValueKind):
         if not (math.isfinite(first) and math.isfinite(last)) or first == last or count < 2:
             raise ValueError(f"must be from:to:count as in -50:-4:24, but is {cut_short(text, 60)}")
         return tuple(first + (last - first) * index / (count - 1) for index in range(count))
-
-
-PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11", "dry")
-"""Names of `afm_jax.scenefile.presets.PRESETS`, stated here too because help and completion must not wait for JAX."""
-
-
-class SceneName(click.ParamType):
-    """A scene file, or one of the paper's scenes by its name."""
-
-    name = "scene"
-
-    def __init__(self, *also: str):
-        """Say which other words may stand in its place."""
-        self.also = also
-
-    def shell_complete(
-        self,
-        ctx: click.Context,  # noqa: ARG002
-        param: click.Parameter,  # noqa: ARG002
-        incomplete: str,
-    ) -> list[click.shell_completion.CompletionItem]:
-        """Return the names that begin so; then the shell offers files."""
-        names = [name for name in (*self.also, *PRESET_NAMES) if name.startswith(incomplete)]
-        items = [click.shell_completion.CompletionItem(name) for name in names]
-        return items or [click.shell_completion.CompletionItem(incomplete, type="file")]
-
-
-class PictureFormat(ValueKind):
-    """The suffix of a picture: png, pdf or svg."""
-
-    name = "format"
-
-    def read(self, text: str) -> str:
-        """Return the suffix without its dot."""
-        suffix = text.lower().removeprefix(".")
-        if suffix not in ("png", "pdf", "svg"):
-            raise ValueError(f"must be png, pdf or svg, but is {text}")
-        return suffix
 
 
 def option_of(parameter: str) -> str:

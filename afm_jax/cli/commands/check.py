@@ -4,7 +4,6 @@ import click
 
 from afm_jax.cli.command import Command
 from afm_jax.cli.options import flag
-from afm_jax.cli.values import SceneName
 
 VERIFY = Command(
     name="verify",
@@ -35,9 +34,7 @@ ACCURACY = Command(
     accuracy.csv, accuracy.json and accuracy.png.
     """,
     options=(
-        click.argument(
-            "study", default="map", metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide")
-        ),
+        click.argument("study", default="map", metavar="[map|collide|SCENE.toml|PRESET]", type=click.Path()),
         click.option(
             "--contacts",
             type=click.IntRange(1, 10_000),
