@@ -5,7 +5,7 @@ joint confidence region of the parameters that matter becomes smallest (D-optima
 exchange helps (Fedorov), then put into the best order.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import printed_table
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
-from afm_jax.words import bullets, with_error
+from afm_jax.words import bullets, known, text_table, with_error
 from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.prior import Prior, prior_of_fit
 from fitting.fits.result import FitResult
@@ -142,14 +141,22 @@ class Design(Result):
 
     def printed(self) -> list[Any]:
         """Return the verdict, the points, what they will determine, and notes."""
-        found = self.candidates
-        cells: dict[str, Any] = {"N": "order:d", "kHz": "drive_frequency_khz:.8g"}
-        cells |= {"free nm" if self._tapping else "drive nm": self.drive_columns[2], "offset nm": "offset_nm:.4g"}
-        cells |= {} if self._tapping else {"peak\nnm": _reading("peak_amplitude", "nm")}
-        cells |= {"lock-in\nnm": _reading("lockin_amplitude", "nm")}
-        cells |= {"lag\ndegrees": _reading("phase_lag", "deg")} if self._tapping else {}
-        cells |= {"u_in\nnm/us": "expected_approach_speed_nm_per_us:.1f"}
-        cells |= {f"+- {name}": f"{name}:.2g" for name in self.interest[:4]}
+        found, tapping, shown = self.candidates, self._tapping, self.interest[:4]
+        read = {"peak nm": "peak_amplitude_{}nm", "lock-in nm": "lockin_amplitude_{}nm", "lag deg": "phase_lag_{}deg"}
+        del read["peak nm" if tapping else "lag deg"]
+        head = ["N", "kHz", "free nm" if tapping else "nm", "offset", *read, "u_in", *(f"+- {name}" for name in shown)]
+        rows = [
+            [
+                f"{point['order']}",
+                f"{point['drive_frequency_khz']:.8g}",
+                f"{point[self.drive_columns[2]]:.5g}",
+                f"{point['offset_nm']:.4g}",
+                *(_reading(point, f"expected_{name}") for name in read.values()),
+                f"{point['expected_approach_speed_nm_per_us']:.1f}",
+                *(known(point["standard_errors"][name], ".2g") for name in shown),
+            ]
+            for point in self.points()
+        ]
         then = [
             f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
             for name, entry in self.expected.items()
@@ -159,8 +166,9 @@ class Design(Result):
         return [
             f"{'VALID' if self.valid else 'NOT VALID'}: {title} ({self.prior.problem.model}, {self.prior.source})",
             *bullets("Reasons:", self.reasons),
-            printed_table("", cells, [point | point["standard_errors"] for point in self.points()]),
-            "+-: standard errors expected once the point and those above are measured",
+            "",
+            *text_table(head, rows, words=()),
+            "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
             f"After all: {', '.join(then)}",
             *bullets(f"{found.usable.sum()} of {len(found.why_not)} drives can be planned with.", left_out),
             *bullets("Notes:", self.warnings),
@@ -185,14 +193,10 @@ class Design(Result):
         return "\n".join([*lines, *(row + "," * len(read) for row in rows)]) + "\n"
 
 
-def _reading(name: str, unit: str) -> Callable[[dict[str, Any]], str | None]:
-    """Return what makes a cell of a reading and its error."""
-
-    def cell(point: dict[str, Any]) -> str | None:
-        value = point.get(f"expected_{name}_{unit}")
-        return None if value is None else f"{value:.2f} +- {point[f'expected_{name}_error_{unit}']:.2f}"
-
-    return cell
+def _reading(point: dict[str, Any], name: str) -> str:
+    """Return a reading with its error; a dash where it is not read."""
+    value, error = point.get(name.format("")), point.get(name.format("error_"))
+    return "-" if value is None else f"{value:.2f} +- {error:.2f}"
 
 
 def _expected(parameter: Parameter, value: float, error: float) -> dict[str, Any]:
