@@ -21,7 +21,7 @@ from afm_jax.motion.start import default_start, state
 from afm_jax.plots.motion import draw_motion, look_at, spectrum_figure, spectrum_of
 from afm_jax.scenefile import presets
 
-ALL = ["time_course.png", "spectrum.png", "poincare.png", "gap.png", "force_gap.png"]
+ALL = ["time_course.png", "spectrum.png", "poincare.png", "force_gap.png"]
 
 
 def drawn(scene: Scene, found: Simulation, folder: Path) -> list[str]:
@@ -78,7 +78,7 @@ def test_batches_and_empty_simulations_are_refused(bouncing, tmp_path: Path):
 def test_a_law_has_no_force_to_draw_and_the_line_at_half_the_drive_is_that_of_the_orbit(tmp_path: Path):
     scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 363.6), ImpactLaw(0.95, 10.0))
     found = simulate(scene, default_start(scene), 1500.0)
-    assert drawn(scene, found, tmp_path) == ALL[:-2]
+    assert drawn(scene, found, tmp_path) == ALL[:-1]
     look = look_at(scene, found)
     spectrum = spectrum_of(look)
     assert look.responses.repeats

@@ -1,6 +1,5 @@
 """Pictures of a simulated motion: its course in time, its contacts, its Poincare section and its spectrum."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +36,7 @@ _LONGEST_HELD = 4.0
 """Drive periods of a held tip that are shown: it is integrated step by step."""
 _MANY = 12
 """Contacts from which on the peaks of all flights are shown besides."""
-_GAP_PANELS = 3
+_CURVES = 3
 _GAP_SHOWN_NM = 6.0
 _STROKES = ((GRID, 5.0), ("#56B4E9", 3.2), ("black", 1.4))
 """Wide below narrow, so that loops that coincide all show."""
@@ -65,8 +64,8 @@ def draw_motion(
 ) -> list[Path]:
     """Draw what there is to see of a motion, as PNG files.
 
-    Always the time course and the spectrum; with contacts the Poincare section, and of resolved contacts the gap and
-    the force against it.
+    Always the time course and the spectrum; with contacts the Poincare section, and of resolved contacts the force
+    against the gap.
 
     Args:
         scene: the scene that was simulated.
@@ -85,7 +84,7 @@ def draw_motion(
     if np.isfinite(look.departure_us).any():
         figures |= {"poincare": section_figure}
     if look.used.any() and isinstance(scene.interaction, Contact):
-        figures |= {"gap": gap_figure, "force_gap": force_gap_figure}
+        figures |= {"force_gap": force_gap_figure}
     files = []
     for name, figure in figures.items():
         files.append(folder / f"{name}.png")
@@ -275,26 +274,6 @@ def _peaks(axes: Axes, look: Look) -> None:
     _with_legend_above(axes, x="time (µs)", y=f"peak after each {what} (nm)")
 
 
-def gap_figure(look: Look) -> Figure:
-    """Return the gap around the last contacts, a panel each, with the gaps at which the phase changes."""
-    rows = np.arange(look.arrival_us.size)[-_GAP_PANELS:]
-    picture = new_figure(4.0 * len(rows) + 1.0, 4.8)
-    panels = picture.subplots(1, len(rows), squeeze=False, sharey=True)[0]
-    contact = look.scene.interaction
-    for axes, row in zip(panels, rows, strict=True):
-        part = look.between(*_around(look, int(row)))
-        since = part._replace(time_us=part.time_us - look.arrival_us[row])
-        axes.plot(since.time_us, since.gap_nm, color="black", linewidth=1.8)
-        shade_phases(axes, since, contact)
-        _mark(axes.axhline, contact)
-        with_zero_line(axes)
-        axes.set_xlim(since.time_us[0], since.time_us[-1])
-        label_axes(axes, x=f"time after {look.arrival_us[row]:.2f} µs (µs)", y="gap (nm)" if row == rows[0] else "")
-        axes.set_title(f"contact {row + 1} of {look.arrival_us.size}", fontsize=11, loc="left")
-    picture.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=10)
-    return picture
-
-
 def _around(look: Look, row: int) -> tuple[float, float]:
     """Return the times between which a contact is shown: from and to a gap of a few nm."""
     arrival, departure = look.arrival_us[row], look.departure_us[row]
@@ -305,19 +284,11 @@ def _around(look: Look, row: int) -> tuple[float, float]:
     return max(first, min(arrival, end) - lead), min(last, max(arrival, end) + lead)
 
 
-def _mark(line: Callable[..., object], contact: Contact) -> None:
-    """Draw a line, of either direction, at each gap at which the phase of a contact changes."""
-    junction = find_junction(contact)
-    gaps = contact.bridge_breaks_nm, contact.bridge_forms_nm, junction.breaks_gap_nm, junction.forms_gap_nm
-    for (name, (colour, dashes)), gap in zip(_MARKS.items(), gaps, strict=True):
-        line(float(gap), color=colour, linewidth=1.0, linestyle=dashes, label=name)
-
-
 def force_gap_figure(look: Look) -> Figure:
     """Return the force against the gap through the last contacts: all of it, and the attractive part."""
     picture = new_figure(12.0, 5.0)
     whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
-    rows = np.arange(look.arrival_us.size)[-_GAP_PANELS:]
+    rows = np.arange(look.arrival_us.size)[-_CURVES:]
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
         path_of_row = look.between(*_around(look, int(row)))
@@ -327,7 +298,10 @@ def force_gap_figure(look: Look) -> Figure:
         least = min(least, float(path_of_row.force_nn.min()))
         for axes in (whole, part):
             axes.plot(path_of_row.gap_nm, path_of_row.force_nn, color=colour, linewidth=width, label=label)
-    _mark(part.axvline, look.scene.interaction)
+    contact, junction = look.scene.interaction, find_junction(look.scene.interaction)
+    gaps = contact.bridge_breaks_nm, contact.bridge_forms_nm, junction.breaks_gap_nm, junction.forms_gap_nm
+    for (name, (colour, dashes)), gap in zip(_MARKS.items(), gaps, strict=True):
+        part.axvline(float(gap), color=colour, linewidth=1.0, linestyle=dashes, label=name)
     for axes in (whole, part):
         with_zero_line(axes)
         label_axes(axes, x="gap (nm)", y="force on the tip (nN)" if axes is whole else "")
