@@ -18,7 +18,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
 from fitting.fits.result import FitResult
 from fitting.models import Problem, check_constraints
-from fitting.parameters import MODELS, NUISANCE_NAMES, Parameter, model_parameters, paper_values
+from fitting.parameters import MODELS, NUISANCE_NAMES, PARAMETERS, Parameter, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
 from fitting.tables.csv_text import TableError, beyond, read_fit_json
 
@@ -213,6 +213,9 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     payload = result.to_dict() if isinstance(result, FitResult) else result
     if payload["model"] not in MODELS:
         raise TableError(f"the saved fit has the unknown model {payload['model']!r}; fit the table again")
+    for name in payload["parameters"]:
+        if name not in PARAMETERS:
+            raise TableError(f"the saved fit has the unknown parameter {name!r}; fit the table again")
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"
