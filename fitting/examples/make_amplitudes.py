@@ -92,6 +92,4 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
     target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
-    table = example_table()
-    write_table(table, target)
-    sys.stderr.write(f"wrote {table.rows} rows to {target}\n")
+    write_table(example_table(), target)

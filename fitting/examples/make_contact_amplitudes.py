@@ -16,7 +16,7 @@ import jax
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.contact import Contact
-from fitting.simulated.experiment import Drives, Report, SimulatedExperiment, drives_of, simulate_experiment
+from fitting.simulated.experiment import Drives, SimulatedExperiment, drives_of, simulate_experiment
 from fitting.tables.table import write_table
 
 FREE_FREQUENCY_KHZ = 90.0
@@ -46,12 +46,8 @@ def example_drives(free_frequency_khz: float = FREE_FREQUENCY_KHZ) -> Drives:
     return drives_of(rows)
 
 
-def example_experiment(report: Report = lambda _: None) -> SimulatedExperiment:
-    """Return the bundled table, made anew, with its noise-free amplitudes.
-
-    Args:
-        report: told how far it is.
-    """
+def example_experiment() -> SimulatedExperiment:
+    """Return the bundled table, made anew, with its noise-free amplitudes."""
     return simulate_experiment(
         Contact.paper(),
         Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR),
@@ -65,7 +61,6 @@ def example_experiment(report: Report = lambda _: None) -> SimulatedExperiment:
             f"truth: Q {QUALITY_FACTOR}; noise 1 % and {PHASE_NOISE_DEG} degrees, seed {SEED}",
             "made by python -m fitting.examples.make_contact_amplitudes",
         ),
-        report=report,
     )
 
 
@@ -73,15 +68,7 @@ def main() -> None:
     """Write the table."""
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
     target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
-    made = example_experiment(_say)
-    for sentence in made.left_out:
-        _say(f"left out: {sentence}")
-    write_table(made.table, target)
-    _say(f"wrote {made.table.rows} rows to {target}")
-
-
-def _say(text: str) -> None:
-    sys.stderr.write(f"{text}\n")
+    write_table(example_experiment().table, target)
 
 
 if __name__ == "__main__":

@@ -148,13 +148,7 @@ def main() -> None:
     """Write the table."""
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
     target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
-    rows = steady_curve()
-    for height, row in zip(HEIGHTS_NM, rows, strict=True):
-        print(
-            f"{height:6.1f} nm: {row.amplitude_nm:.4f} nm, {row.lag_deg:.3f} degrees, {row.energy_aj:.4f} aJ a period"
-        )
-    write_table(table_of(rows), target)
-    print(f"wrote {len(rows)} rows to {target}")
+    write_table(table_of(steady_curve()), target)
 
 
 if __name__ == "__main__":

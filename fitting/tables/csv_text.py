@@ -421,28 +421,16 @@ def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> T
     comments, rows = split_lines(text)
     found, remarks = settings_in(comments, settings, faults)
     check_not_empty(comments, rows, faults)
-    columns, names, lines = columns_of_rows(rows, form, faults)
-    return TextTable(columns, names, lines, found, remarks)
-
-
-def columns_of_rows(
-    rows: NumberedLines, form: Form, faults: Faults
-) -> tuple[Columns, tuple[str, ...], Int[np.ndarray, " rows"]]:
-    """Return columns by what they become, the names of those that were read, and the lines of the rows.
-
-    Raises:
-        TableError: at once where the column names are wrong.
-    """
     form = form if form.separator else replace(form, separator=_separator_of(rows[0][1]))
     head, rows = named_rows(rows, form, faults)
     faults.raise_any()
     columns, _, lines = parse_rows(rows, head.names, form, faults)
-    found = {}
+    numbers = {}
     for column in form.columns:
         if column.name in columns:
             values = columns[column.name]
-            found[column.becomes] = values if column.convert is None else column.convert(values)
-    return found, tuple(columns), lines
+            numbers[column.becomes] = values if column.convert is None else column.convert(values)
+    return TextTable(numbers, tuple(columns), lines, found, remarks)
 
 
 def _separator_of(names: str) -> str:
