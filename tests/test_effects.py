@@ -203,10 +203,10 @@ def test_forces_of_no_or_hardly_any_strength_are_dropped_and_those_of_the_juncti
 def test_the_reduced_file_is_as_accurate_as_wanted_and_the_command_writes_what_it_says(tmp_path):
     full = law_scene(WITHOUT["delay_corrections"])
     save_scene(full, tmp_path / "scene.toml")
-    options = ("--accuracy", "1 %", "--only", "restitution,viscous_loss,adhesion", "--write", tmp_path / "reduced.toml")
+    options = ("--accuracy", "1 %", "--only", "restitution,viscous_loss,adhesion")
     payload = answer(tmp_path / "out", "effects", tmp_path / "scene.toml", *options)
     assert payload["not_needed"] == ["viscous_loss", "restitution"]
-    reduced = read_scene(tmp_path / "reduced.toml")
+    reduced = read_scene(tmp_path / "out" / "reduced.toml")
     assert float(reduced.scene.interaction.r) == 1.0
     assert 0.0 < np.abs(orbit_of(reduced.scene)[:2] / orbit_of(full)[:2] - 1.0).max() < 0.01
     assert reduced.start is not None

@@ -161,13 +161,6 @@ CONTINUE = Command(
 )
 
 
-def _check_effects(_: Session, options: Options) -> None:
-    """Check that the scene can be written."""
-    write = options["write"]
-    if write is not None and not write.absolute().parent.is_dir():
-        raise click.UsageError(f"--write {write}: there is no folder {write.absolute().parent}; choose another place")
-
-
 EFFECTS = Command(
     name="effects",
     runs="afm_jax.cli.effects:effects",
@@ -176,8 +169,8 @@ EFFECTS = Command(
     Each effect is left out, absent from the program, and the steady motion compared with that of the full scene: peak
     and lock-in amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the
     scene's default one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared.
-    Costs are times to compute a drive period, the median of several runs. With --out effects.csv, effects.json and
-    effects.png.
+    Costs are times to compute a drive period, the median of several runs. With --out effects.csv, effects.json,
+    effects.png and reduced.toml, the scene without what the accuracy does not need, and its start.
     """,
     options=(
         SCENE,
@@ -194,14 +187,7 @@ EFFECTS = Command(
             help="How long to follow each scene at most, in us.",
         ),
         click.option("--only", metavar="NAME,...", help="The effects to look at; all if left out."),
-        click.option(
-            "--write",
-            metavar="FILE",
-            type=click.Path(path_type=Path, dir_okay=False),
-            help="Save the scene without what the accuracy does not need, and its start, as a scene file.",
-        ),
     ),
-    check=_check_effects,
 )
 
 
