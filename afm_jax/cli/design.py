@@ -18,20 +18,10 @@ from fitting.parameters import LAW_NAMES, PARAMETERS, PRIOR_NUISANCES
 
 _TAPPING = {"orders": "1", "detuning": "1.02:1.1:0.02", "drive_nm": "40,80", "heights": "0.1:0.9:0.1"}
 _SAMPLE = {"orders": "1-4", "detuning": "0.97:1.05:0.01", "drive_nm": "2,4,7,10", "offsets_nm": "-1,0,1"}
+_OF_DESIGN = ("points", "noise", "amplitudes", "largest_nm", "phase_noise_deg")
 
 
-def planned(  # noqa: PLR0913
-    session: Session,
-    *,
-    frequencies_khz: tuple[float, ...] | None,
-    largest_nm: float | None,
-    points: int,
-    interest: str | None,
-    noise: float,
-    amplitudes: str,
-    phase_noise_deg: float,
-    **options: Any,
-) -> Output:
+def planned(session: Session, *, interest: str | None, **options: Any) -> Output:
     """Return the drives to measure next, of all combinations of the lists, and what they will determine."""
     prior = prior_of_options(options)
     usual = _TAPPING if prior.problem.tapping else _SAMPLE
@@ -41,27 +31,19 @@ def planned(  # noqa: PLR0913
         kind = Orders() if name == "orders" else Numbers(positive=False)
         chosen[name] = chosen[name] if said else kind.convert(text, None, None)
     names = None if interest is None else tuple(name.strip().replace("-", "_") for name in interest.split(","))
+    frequencies = options["frequencies_khz"]
     with session.working("forecasting (the first run compiles for some seconds)"):
         drives = drive_grid(
             orders=chosen["orders"],
             amplitudes_nm=chosen["drive_nm"],
             offsets_nm=chosen["offsets_nm"] or (0.0,),
             heights=chosen["heights"],
-            frequencies_khz=frequencies_khz,
-            detunings=chosen["detuning"] if frequencies_khz is None else None,
+            frequencies_khz=frequencies,
+            detunings=chosen["detuning"] if frequencies is None else None,
             free_frequency_khz=prior.free_frequency_khz,
             drive=prior.problem.drive,
         )
-        result = design(
-            prior,
-            drives,
-            points=points,
-            noise=noise,
-            interest=names,
-            amplitudes=amplitudes,
-            largest_nm=largest_nm,
-            phase_noise_deg=phase_noise_deg,
-        )
+        result = design(prior, drives, interest=names, **{name: options[name] for name in _OF_DESIGN})
     figure = later("fitting.experiments.picture:design_figure")
     files = {
         "design.png": lambda path: save(figure(result), path),

@@ -259,9 +259,7 @@ def _fitted(sweep: ResonanceSweep, noise: float | None) -> Calibration:
         reason = why if variance < _OPEN else "the scan does not determine it"
         if reason is not None:
             return CalibratedValue(value, None, (None, None), reason)
-        share = float(np.sqrt(variance))
-        ends = (value * float(np.exp(side * TWO_SIDED_95 * share)) for side in (-1.0, 1.0))
-        return CalibratedValue(value, value * share, (next(ends), next(ends)))
+        return _known_to(value, float(np.sqrt(variance)))
 
     places = np.eye(fit.jacobian.shape[1])
     area, slopes = 0.0, places[0] - places[1]
@@ -342,7 +340,7 @@ def _springs(found: Calibration, *, static: bool) -> dict[str, CalibratedValue]:
         centre = [value for value, _ in inputs]
         value = sader(*centre)
         moved = [[*centre[:k], one + (error or 0.0), *centre[k + 1 :]] for k, (one, error) in enumerate(inputs)]
-        springs["sader"] = _spring(value, float(np.sqrt(sum((sader(*one) / value - 1.0) ** 2 for one in moved))))
+        springs["sader"] = _known_to(value, float(np.sqrt(sum((sader(*one) / value - 1.0) ** 2 for one in moved))))
     if mean is not None and mean.standard_error is not None:
         value = equipartition(mean.value, warm[0], static=static)
         shares = (
@@ -350,7 +348,7 @@ def _springs(found: Calibration, *, static: bool) -> dict[str, CalibratedValue]:
             (warm[1] or 0.0) / warm[0],
             2.0 * stated.get("scale_error", SCALE_ERROR)[0],
         )
-        one, other = _spring(value, float(np.linalg.norm(shares))), springs.get("sader")
+        one, other = _known_to(value, float(np.linalg.norm(shares))), springs.get("sader")
         said = found.sweep.instrument.get("spring_constant_n_per_m")
         if other is not None:
             doubt = _doubt(one, other.value, other.standard_error or 0.0, "Sader's method")
@@ -360,7 +358,8 @@ def _springs(found: Calibration, *, static: bool) -> dict[str, CalibratedValue]:
     return springs
 
 
-def _spring(value: float, share: float) -> CalibratedValue:
+def _known_to(value: float, share: float) -> CalibratedValue:
+    """Return a value whose logarithm has a standard error."""
     ends = (value * float(np.exp(-TWO_SIDED_95 * share)), value * float(np.exp(TWO_SIDED_95 * share)))
     return CalibratedValue(value, value * share, ends)
 

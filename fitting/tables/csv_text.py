@@ -396,14 +396,12 @@ class TextTable(NamedTuple):
         names: of the columns that were read.
         lines: the line of each row.
         settings: value and error of those that comments make.
-        remarks: the other comments.
     """
 
     columns: Columns
     names: tuple[str, ...]
     lines: Int[np.ndarray, " rows"]
     settings: dict[str, tuple[float, float | None]]
-    remarks: tuple[str, ...]
 
 
 def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> TextTable:
@@ -419,7 +417,7 @@ def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> T
         TableError: at once where there are no rows, or the column names are wrong: the cells cannot be judged then.
     """
     comments, rows = split_lines(text)
-    found, remarks = settings_in(comments, settings, faults)
+    found, _ = settings_in(comments, settings, faults)
     check_not_empty(comments, rows, faults)
     form = form if form.separator else replace(form, separator=_separator_of(rows[0][1]))
     head, rows = named_rows(rows, form, faults)
@@ -430,7 +428,7 @@ def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> T
         if column.name in columns:
             values = columns[column.name]
             numbers[column.becomes] = values if column.convert is None else column.convert(values)
-    return TextTable(numbers, tuple(columns), lines, found, remarks)
+    return TextTable(numbers, tuple(columns), lines, found)
 
 
 def _separator_of(names: str) -> str:
