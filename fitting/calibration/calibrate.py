@@ -13,7 +13,6 @@ from scipy.special import digamma
 from afm_jax.checks import checked
 from afm_jax.columns import printed_table
 from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
-from afm_jax.outcomes import Rule, Rules, judge
 from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
@@ -211,9 +210,8 @@ def calibrate(
     _check_sweep(sweep)
     found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep, noise)
     found = replace(found, spring_constant_n_per_m=_springs(found, static=static))
-    reasons = judge(REASONS, found)
-    warnings = (*found.warnings, *judge(WARNINGS, found))
-    return replace(found, reasons=tuple(reasons), warnings=warnings, valid=not reasons)
+    reasons, warnings = _why_not_valid(found), (*found.warnings, *_warnings(found))
+    return replace(found, reasons=reasons, warnings=warnings, valid=not reasons)
 
 
 def _check_sweep(sweep: ResonanceSweep) -> None:
@@ -376,80 +374,62 @@ def _doubt(thermal: CalibratedValue, wanted: float, error: float, who: str) -> s
     )
 
 
-REASONS: Rules[Calibration] = [
-    Rule(
-        lambda e: e.chi2_without_resonance - e.chi2 < _PEAK * max(e.chi2 / e.degrees_of_freedom, 1e-300),
-        "No resonance stands out of the sweep: a parabola explains it about as well.",
-    ),
-    (
-        Rule(
-            lambda e: not e.left < 1e-3,
-            "Not converged: chi2 lies an estimated {e.left:.2g} above its minimum.",
+def _why_not_valid(e: Calibration) -> tuple[str, ...]:
+    """Return what makes a calibration invalid: of the faults of its fit the first."""
+    at, near = f"The resonance ({e.frequency_khz.value:.6g} kHz) lies", min(e.half_widths)
+    unknown = e.frequency_khz.reason or e.quality_factor.reason
+    springs = e.spring_constant_n_per_m.values()
+    doubts = [] if any(one.standard_error for one in springs) else [one.reason for one in springs]
+    many = f"chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom"
+    of_fit = (
+        (not e.left < 1e-3, f"Not converged: chi2 lies an estimated {e.left:.2g} above its minimum."),
+        (near < 0.0, f"{at} outside the sweep: sweep around it."),
+        (near < 1.0, f"{at} at the edge of the sweep: sweep at least one half-width (f0/2Q) to both sides."),
+        (
+            e.model != "power" and e.inside < _LEAST_POINTS,
+            f"Only {counted(e.inside, 'point')} within the half-width: sweep in finer steps.",
         ),
-        Rule(
-            lambda e: min(e.half_widths) < 0.0,
-            "The resonance ({e.frequency_khz.value:.6g} kHz) lies outside the sweep: sweep around it.",
+        (
+            e.p_value < IMPROBABLE,
+            f"The model does not explain the sweep: {many}. Another background, a drift, or too small errors?",
         ),
-        Rule(
-            lambda e: min(e.half_widths) < 1.0,
-            "The resonance ({e.frequency_khz.value:.6g} kHz) lies at the edge of the sweep: sweep at least one "
-            "half-width (f0/2Q) to both sides.",
+        (unknown, f"Not identified: {unknown}."),
+    )
+    reasons = [said for holds, said in of_fit if holds][:1]
+    if e.chi2_without_resonance - e.chi2 < _PEAK * max(e.chi2 / e.degrees_of_freedom, 1e-300):
+        reasons.insert(0, "No resonance stands out of the sweep: a parabola explains it about as well.")
+    if e.residual_autocorrelation > _SYSTEMATIC:
+        reasons.append(
+            f"Neighbouring residuals are strongly correlated ({e.residual_autocorrelation:+.2f}): the model misses "
+            "something (another background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
+        )
+    how = "`length_um=...` and `width_um=...` give k by Sader's method"
+    return (*reasons, *(f"The spring constant is not calibrated: {doubt}; {how}." for doubt in doubts))
+
+
+def _warnings(e: Calibration) -> tuple[str, ...]:
+    """Return what a reader should know besides."""
+    springs = e.spring_constant_n_per_m.values()
+    doubts = [one.reason for one in springs if one.reason is not None]
+    khz, inside = f"{e.frequency_khz.value:.6g} kHz", counted(e.inside, "point")
+    notes = (
+        (
+            e.frequency_khz.value > _FAST_KHZ,
+            f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.",
         ),
-        Rule(
-            lambda e: e.model != "power" and e.inside < _LEAST_POINTS,
-            lambda e, _: f"Only {counted(e.inside, 'point')} within the half-width: sweep in finer steps.",
+        (e.phase_reversed, "The phase rises through the resonance: it was taken with the opposite sign."),
+        (
+            e.model == "power" and e.inside < _LEAST_POINTS,
+            f"{inside} within the half-width: Q is hardly resolved; the area under the line, and k, hold.",
         ),
-        Rule(
-            lambda e: e.p_value < IMPROBABLE,
-            "The model does not explain the sweep: chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom. "
-            "The background may be another one, the frequency may have drifted, or the errors are too small.",
+        (
+            e.error_origin == "estimated",
+            "The points' errors were estimated from the misfit so that chi2/dof = 1: goodness of fit cannot be judged.",
         ),
-        Rule(
-            lambda e: [v.reason for v in (e.frequency_khz, e.quality_factor) if v.reason is not None][:1],
-            "Not identified: {case}.",
+        (doubts, f"The spring constants contradict each other: {'; '.join(doubts)}."),
+        (
+            springs,
+            "k is that of a rectangular lever: by equipartition with the laser on its end, by Sader in dry air to 5 %.",
         ),
-    ),
-    Rule(
-        lambda e: e.residual_autocorrelation > _SYSTEMATIC,
-        "Neighbouring residuals are strongly correlated ({e.residual_autocorrelation:+.2f}): the model misses "
-        "something (another background, drift, a second resonance, too fast a sweep), and the errors mean nothing.",
-    ),
-    Rule(
-        lambda e: [
-            one.reason
-            for one in e.spring_constant_n_per_m.values()
-            if all(other.standard_error is None for other in e.spring_constant_n_per_m.values())
-        ],
-        "The spring constant is not calibrated: {case}; `length_um=...` and `width_um=...` give k by Sader's method.",
-    ),
-]
-"""What makes a calibration invalid."""
-WARNINGS: Rules[Calibration] = [
-    Rule(
-        lambda e: e.frequency_khz.value > _FAST_KHZ,
-        "A resonance of {e.frequency_khz.value:.6g} kHz is beyond any cantilever's: if the frequencies are in Hz, name "
-        "their column frequency_hz.",
-    ),
-    Rule(lambda e: e.phase_reversed, "The phase rises through the resonance: it was taken with the opposite sign."),
-    Rule(
-        lambda e: e.model == "power" and e.inside < _LEAST_POINTS,
-        lambda e, _: (
-            f"{counted(e.inside, 'point')} within the half-width: Q is hardly resolved, and a window of the spectrum "
-            "widens the line; the area under it, and k, hold."
-        ),
-    ),
-    Rule(
-        lambda e: e.error_origin == "estimated",
-        "The points' errors were estimated from the misfit so that chi2/dof = 1: the goodness of fit cannot be judged.",
-    ),
-    Rule(
-        lambda e: [v.reason for v in e.spring_constant_n_per_m.values() if v.reason is not None],
-        "The spring constants contradict each other: {case}.",
-    ),
-    Rule(
-        lambda e: bool(e.spring_constant_n_per_m),
-        "A spring constant rests on a rectangular lever: by equipartition with the laser on its end, by Sader's method "
-        "in dry air, to some 5 %.",
-    ),
-]
-"""What a reader should know besides."""
+    )
+    return tuple(said for holds, said in notes if holds)
