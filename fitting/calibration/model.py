@@ -18,17 +18,18 @@ measured/fitted density. Each term is the square of a residual, so that least sq
 """
 
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
+from scipy.optimize import least_squares
 
-from afm_jax.least_squares import Box, Searches, descended, distance
 from fitting.calibration.sweep import ResonanceSweep
 
 _LEAST_SQUARE = 1e-12
 """Of a modelled square, in units of the largest: a trial step may leave less, or a negative one, whose root is none."""
-_SEARCHES, _STEPS, _SETTLED = 6, 200, 1e-12
+_SEARCHES = 6
+_STEPS, _SETTLED = 200, 1e-15
 
 
 class ScanFit(NamedTuple):
@@ -182,21 +183,18 @@ def minimum(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> ScanF
     alike = [start for start in starts if start[3] == reverse][:_SEARCHES]
     best = [np.array([np.log(f), np.log(q), *linear]) for (linear, _), f, q, _ in alike]
 
-    def look(places: Float[np.ndarray, "some p"], _: Int[np.ndarray, " some"]) -> Searches:
-        found = [_evaluate(points, place)[:2] for place in places]
-        residual, jacobian = (np.stack(part) for part in zip(*found, strict=True))
-        chi2 = np.sum(residual**2, axis=1)
-        return Searches(places, residual, jacobian, np.where(np.isfinite(chi2), chi2, np.inf))
+    def apart(place: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        return _evaluate(points, place)[0]
 
-    far = np.full(len(best[0]) - 2, np.inf)
-    ends_of = np.log([[max(frequency[0] - span, 0.1 * frequency[0]), frequency[-1] + span], [0.5, 1e9]]).T
-    lowest, highest = (np.concatenate(side) for side in zip(ends_of, (-far, far), strict=True))
-    box = Box(lowest, highest, np.zeros((len(best), len(lowest)), dtype=bool))
-    ends = descended(look, look(np.stack(best), np.arange(len(best))), box, settled=_SETTLED, most=_STEPS)
-    end = int(np.argmin(ends.chi2))
-    place = ends.place[end]
-    left = float(distance(ends, box)[end])
+    def slopes(place: Float[np.ndarray, " p"]) -> Float[np.ndarray, "n p"]:
+        return _evaluate(points, place)[1]
+
+    exact: dict[str, Any] = {"jac": slopes, "xtol": _SETTLED, "ftol": _SETTLED, "gtol": _SETTLED, "max_nfev": _STEPS}
+    ends = [least_squares(apart, place, method="lm", **exact) for place in best]
+    place = min(ends, key=lambda end: end.cost).x
     residual, jacobian, model = _evaluate(points, place)
+    # what one more step would gain
+    left = float(np.sum((jacobian @ np.linalg.lstsq(jacobian, residual, rcond=1e-12)[0]) ** 2))
     natural, quality_factor = np.exp(place[:2]).tolist()
     return ScanFit(natural, quality_factor, place[2:], residual, jacobian, model + 0j, reverse, left)
 
