@@ -6,6 +6,7 @@ the grazing of a resting and of a driven tip.
 
 import csv
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from afm_jax.cli.main import main
 from afm_jax.dynamics import curves
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
+from afm_jax.dynamics.special_points import at_lost_ends
 from afm_jax.impact.closure import OrbitProblem, closing_residual
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.strict_reading import strictly
@@ -392,6 +394,23 @@ def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     ends = {end: one.parameter[place] for one in found.branches for place, end in ((0, one.ends[0]), (-1, one.ends[1]))}
     assert "capture" not in ends
     assert abs(ends["no_speed"]) == pytest.approx(beta, abs=1e-3)
+
+
+@pytest.mark.parametrize(("before", "last", "kind"), [(np.inf, 1e-6, 3), (0.3, 3e-4, 3), (np.inf, np.inf, None)])
+def test_a_curve_that_is_lost_next_to_a_grazing_has_a_special_point_there(before: float, last: float, kind: int | None):
+    """The root of the line through the last two points; a flight without a lowest point is infinitely far off."""
+
+    def at(place: float, near: float) -> curves.CurvePoint:
+        tests = np.array([1.0, 1.0, 1.0, near, 0.4])
+        return curves.CurvePoint(np.array([1.0, 0.5, place]), np.array([0.0, 0.0, 1.0]), tests, 0.0)
+
+    leg = curves.CurveLeg(at(0.2, before), at(0.3, last), np.zeros(3), np.zeros(3))
+    with warnings.catch_warnings(action="error"):
+        roots = at_lost_ends(curves.FollowedCurve(leg.begin, [], [leg], ("range", "lost")))
+    assert [root.test for root in roots] == ([] if kind is None else [kind])
+    for root in roots:
+        place = 0.3 if np.isinf(before) else np.interp(0.0, [-before, -last], [0.2, 0.3]) + 0.1 * last / (before - last)
+        np.testing.assert_allclose(root.point.point, [1.0, 0.5, place], rtol=1e-12)
 
 
 @pytest.fixture

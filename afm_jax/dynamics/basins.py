@@ -142,6 +142,11 @@ class Basins(ResultTuple):
                 f"{line}; {low:.4g} to {high:.4g} % in 95 % of the draws"
                 for line, (low, high) in zip(lines, ends, strict=True)
             ]
+        if any(attractor.kind == MotionKind.IRREGULAR for attractor in self.attractors):
+            lines.append(
+                f"irregular: nothing repeated within {_LONG} impacts; with a high quality factor the motion may still "
+                "be settling (`afm-jax lyapunov --transient` follows one start for longer)"
+            )
         return [starts, *lines]
 
     def tables(self) -> dict[str, dict[str, Any]]:

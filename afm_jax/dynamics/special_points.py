@@ -38,8 +38,8 @@ from afm_jax.scenefile.parameter_paths import ParameterRange
 
 _ASIDE = 1e-5
 """Of a step between points: how far to either side of a grazing or a capture is looked."""
-_AT_AN_END = 1e-4
-"""Test function below which a contact's curve has been lost at its root."""
+_AT_AN_END = 1e-3
+"""Test function below which a curve has been lost at its root."""
 _SAME_POINT = 1e-7
 """Of the range: distance below which special points of one kind that follow each other are one."""
 _LONG_ENOUGH = 1e-5
@@ -105,14 +105,14 @@ class _Root(NamedTuple):
 
 
 def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> list[SpecialPoint]:
-    """Return the special points of a branch in their order along it, and where a contact's curve was lost at one.
+    """Return the special points of a branch in their order along it, and where the curve was lost at one.
 
     Args:
         curve: the branch.
         number: of the branch.
         family: of its loops.
     """
-    roots = [*_roots_on(curve, family), *(_at_lost_ends(curve) if family.flights is not None else ())]
+    roots = [*_roots_on(curve, family), *at_lost_ends(curve)]
     if not roots:
         return []
     roots.sort(key=lambda root: root.position)
@@ -129,7 +129,8 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
             continue
         unknowns, parameter = root.point.point[:-1], low + width * float(root.point.point[-1])
         point = SpecialPoint(kind, parameter, number, root.position, admissible, unknowns, reading, root.test)
-        if special and _is_the_same(special[-1], point, width):
+        near = special and abs(special[-1].parameter - parameter) < _SAME_POINT * width
+        if near and special[-1].kind == kind:
             # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
             special[-1] = special[-1]._replace(admissible=special[-1].admissible or admissible)
         else:
@@ -143,20 +144,18 @@ def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
     for leg, position_of in curve.places():
         for test in range(len(KINDS)):
             root = root_on(leg, tested_by(test, family), family)
-            if root is None or (test == TORUS and not _is_complex(root[1])):
+            if root is None:
                 continue
             fraction, point = root
+            # multipliers that are a complex pair, given D = 1: |T| < 2
+            if test == TORUS and not abs(float(point.tests[DOUBLING] - point.tests[FOLD])) < 4.0:
+                continue
             position = position_of(fraction)
             if test == CAPTURE:
                 # there the branch ends: its last point is beside it
                 position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
             roots.append(_Root(position, test, point, [point.point, *_beside(leg, fraction, test, family)]))
     return roots
-
-
-def _is_the_same(point: SpecialPoint, other: SpecialPoint, width: float) -> bool:
-    """Say whether two special points, roots of two test functions, are one point."""
-    return point.kind == other.kind and abs(point.parameter - other.parameter) < _SAME_POINT * width
 
 
 def _beside(leg: CurveLeg, fraction: float, test: int, family: LoopFamily) -> list[np.ndarray]:
@@ -167,10 +166,10 @@ def _beside(leg: CurveLeg, fraction: float, test: int, family: LoopFamily) -> li
     return [point.point for point in points if point is not None]
 
 
-def _at_lost_ends(curve: FollowedCurve) -> list[_Root]:
-    """Return grazings and captures at which a contact's curve ends: beyond, its map flies otherwise, or not at all.
+def at_lost_ends(curve: FollowedCurve) -> list[_Root]:
+    """Return grazings and captures at which a curve ends: beyond, its map flies otherwise, or not at all.
 
-    The curve has come within a millionth and less; the rest is extrapolated. The orbit that is read is that of the
+    The curve has come within a thousandth and less; the rest is extrapolated. The orbit that is read is that of the
     curve's own last point.
     """
     roots = []
@@ -181,9 +180,10 @@ def _at_lost_ends(curve: FollowedCurve) -> list[_Root]:
         apart = (leg.begin for leg in reversed(legs) if np.linalg.norm(leg.begin.point - last.point) > _LONG_ENOUGH)
         before = next(apart, legs[0].begin)
         for test in (GRAZING, CAPTURE):
-            falls = float(before.tests[test] - last.tests[test])
-            if 0.0 <= last.tests[test] < _AT_AN_END and falls > 0.0:
-                ahead = float(last.tests[test]) / falls * (last.point - before.point)
+            left, earlier = float(last.tests[test]), float(before.tests[test])
+            # infinite where no flight has a lowest point
+            if 0.0 <= left < _AT_AN_END and left < earlier:
+                ahead = left / (earlier - left) * (last.point - before.point)
                 roots.append(_Root(position, test, last._replace(point=last.point + ahead), [last.point]))
     return roots
 
@@ -199,11 +199,6 @@ def captures_nothing(point: Float[np.ndarray, " n"], family: LoopFamily) -> bool
         return False
     _, fractions = split_point(jnp.asarray(point), family)
     return float(loop_at(fractions, family).impact.lowest) == 0.0
-
-
-def _is_complex(point: CurvePoint) -> bool:
-    """Say whether the multipliers are a complex pair, given D = 1: |T| < 2."""
-    return abs(float(point.tests[DOUBLING] - point.tests[FOLD])) < 4.0
 
 
 def special_curves(
