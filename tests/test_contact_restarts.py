@@ -14,7 +14,11 @@ import afm_jax as afm
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import end_of_contact
+from afm_jax.dynamics.basins import basins_of_attraction
+from afm_jax.dynamics.bifurcations import bifurcation_diagram
+from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.contact_orbits import contact_orbits
+from afm_jax.dynamics.continuation import continue_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.many_tips import departure_jacobians, tips_after_contacts
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
@@ -24,6 +28,10 @@ from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import Outcome
+from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
+from afm_jax.studies import accuracy
+from afm_jax.studies.effects import study_effects
+from afm_jax.studies.sweep import sweep
 
 QUALITY, MASS, AMPLITUDE_NM, RATIO = 40.0, 1.0, 4.0, 2.02
 OMEGA = 2e-3 * np.pi * 90.0
@@ -181,6 +189,79 @@ def test_six_hundred_and_fifty_periods_have_a_contact_each(name):
     end, record = tips_after_contacts(batch, tips, skip=640, record=40, accuracy=1e-6)
     assert end.outcome.tolist() == [Outcome.IMPACT]
     np.testing.assert_allclose(np.diff(record.departure_periods + record.departure_us / PERIOD_US), 1.0, atol=1e-6)
+
+
+PEAK_NM = {"dry": 97.3079, "hertz": 93.7513}
+"""Of orbits that close in SciPy."""
+MOVING = ("platform.amplitude_nm", "platform.offset_nm")
+
+
+@pytest.fixture(scope="module", params=["wet", *CONSERVE])
+def settled(request):
+    """A contact's scene, and the peak of the motion that it comes to in 650 periods."""
+    scene = scene_of(request.param)
+    table = {"what": "simulation", "periods": 650.0}
+    # the second one in stretches of other lengths
+    axes = [{"parameter": MOVING[0], "list": [AMPLITUDE_NM, AMPLITUDE_NM + 0.01]}]
+    ends = sweep(scene, axes, table)
+    assert ends["settled"].values.tolist() == [True, True]
+    assert ends["contacts_per_response"].values.tolist() == [1, 1]
+    peak = float(ends["peak_amplitude_nm"][0])
+    assert peak == pytest.approx(PEAK_NM.get(request.param, peak), abs=1e-4)
+    return request.param, scene, peak
+
+
+@pytest.mark.slow
+def test_diagrams_and_basins_come_to_the_motion_that_a_simulation_settles_on(settled):
+    _, scene, _ = settled
+    orbit = contact_orbits(scene, 1, 1)
+    (place,) = np.flatnonzero(orbit.stable)
+    velocity = float(orbit.reading.velocity_after_nm_per_us[place, 0])
+    swept = bifurcation_diagram(scene, MOVING[0], np.array([AMPLITUDE_NM]), impacts=650)
+    assert swept.verdicts.names() == ["(1,1)"]
+    assert swept.velocity_after_nm_per_us[0, -1] == pytest.approx(velocity, rel=1e-4)
+    basins = basins_of_attraction(scene, columns=2, rows=2, speeds_nm_per_us=(20.0, 60.0))
+    assert basins.reason is None
+    (main,) = (attractor for attractor in basins.attractors if attractor.name.startswith("(1,1)"))
+    assert main.velocity_nm_per_us[0] == pytest.approx(velocity, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_charts_branches_and_sweeps_have_the_orbit_that_a_simulation_settles_on(settled):
+    _, scene, peak = settled
+    at, beside = np.array([AMPLITUDE_NM]), np.array([0.0])
+    chart = stability_chart(scene_family(scene, *MOVING), x_values=at, y_values=beside, last_order=1)
+    assert chart.stable_share == 1.0
+    # the accuracy of charts of contacts
+    assert chart.verdicts.peak_amplitude_nm[0, 0] == pytest.approx(peak, rel=1e-5)
+    found = sweep(scene, [{"parameter": MOVING[0], "list": [AMPLITUDE_NM]}], {"what": "orbits", "orders": [1]})
+    assert float(found["peak_amplitude_nm"][0, 0]) == pytest.approx(peak, rel=1e-5)
+    branches = continue_orbits(scene, 1, ParameterRange(MOVING[0], AMPLITUDE_NM, AMPLITUDE_NM + 0.01)).branches
+    ends = [float(branch.reading.peak_amplitude_nm[np.argmin(branch.parameter)]) for branch in branches]
+    assert min(abs(end / peak - 1.0) for end in ends) < 1e-5
+
+
+@pytest.mark.slow
+def test_effects_and_exponents_are_those_of_the_motion_that_a_simulation_settles_on(settled):
+    name, scene, peak = settled
+    study = study_effects(scene, duration_us=650.0 * PERIOD_US, only=["air_damping"])
+    assert study.observed.reading is not None
+    assert study.observed.reading.peak_amplitude == pytest.approx(peak, rel=1e-5)
+    table = {"what": "lyapunov", "impacts": 100, "transient": 600}
+    found = sweep(scene, [{"parameter": MOVING[0], "list": [AMPLITUDE_NM]}], table)
+    lost = float(found["exponents_per_impact"][0].sum())
+    if name in CONSERVE:
+        assert lost == pytest.approx(-OMEGA * PERIOD_US / QUALITY, rel=1e-5)
+    assert lost < 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONSERVE)
+def test_integrators_of_others_arrive_at_dry_contacts_at_the_same_times(name, tmp_path):
+    afm.save_scene(scene_of(name), tmp_path / "scene.toml")
+    for row in accuracy.measured(str(tmp_path / "scene.toml"), contacts=3, quick=True)["rows"]:
+        assert "reason" not in row, row
+        assert row["error"] < (1e-3 if row["of"] == "gradient" else 1e-5), row
 
 
 @pytest.mark.slow
