@@ -196,7 +196,6 @@ class Form:
         blanks: whether cells may be blank (NaN); else every cell is needed.
         example: a row of column names to show, where the row above the numbers is the whole head.
         separator: what stands between cells; empty: commas, tabs, semicolons or spaces, as the row of names has them.
-        separators: what to add where columns are not separated by it.
         fewer: what to do with a row of too few cells.
         more: and with one of too many.
         number: how a number is written.
@@ -211,7 +210,6 @@ class Form:
     blanks: bool = False
     example: str = ""
     separator: str = ","
-    separators: str = ""
     fewer: str = "fill the row up"
     more: str = "a decimal comma must be a point"
     number: str = "write it like 90.25 or 9.025e1, or remove the row"
@@ -602,7 +600,7 @@ def _check_delimiter(names: str, form: Form, *, line: int, faults: Faults) -> No
         return
     for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
         if sign in names.strip():
-            advice = f"separate them by commas, decimals by points{form.separators}"
+            advice = "separate them by commas, decimals by points"
             Faults(faults.source).fail(f"the columns are separated by {word}; {advice}", line=line)
 
 
@@ -792,10 +790,6 @@ def _parse_column(
 ) -> tuple[Float[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
     numbers = np.full(len(texts), np.nan)
     unreadable = np.zeros(len(texts), dtype=bool)
-    if form.blanks and set("".join(texts)) <= set("0123456789+-" if column.kind == "whole" else "0123456789+-.eE"):
-        # Written in these signs, what float() takes is what NUMBER describes, and it takes it much faster.
-        with contextlib.suppress(ValueError):
-            return np.array([float(text or "nan") for text in texts], dtype=np.float64), unreadable
     for row, text in enumerate(texts):
         if NUMBER.fullmatch(text) and not (column.kind == "whole" and set(text) & set(".eE")):
             numbers[row] = float(text)

@@ -208,15 +208,10 @@ def repeats_of(table: AmplitudeTable | SeveralTables) -> RepeatedReadings | None
     )
 
 
-def drive_of_rows(table: AmplitudeTable) -> Int[np.ndarray, " rows"]:
-    """Return the number of the drive that each row is of: the same for rows that repeat each other."""
-    columns = columns_of(table)
-    return drive_numbers(columns, required(columns))
-
-
 def _sums(table: AmplitudeTable) -> tuple[int, int, int, float]:
     """Return repeated drives, their rows, the degrees of freedom of their scatter and its chi2."""
-    drive, columns = drive_of_rows(table), columns_of(table)
+    columns = columns_of(table)
+    drive = drive_numbers(columns, required(columns))
     count = np.bincount(drive)
     freedom, chi2 = 0, 0.0
     for column in MEASURED:
