@@ -1,6 +1,5 @@
 """Options of `afm-jax fit`: their kinds of values (NAME=VALUE, NAME=VALUE+-ERROR, lists), and which go together."""
 
-from pathlib import Path
 from typing import Any
 
 import click
@@ -45,12 +44,7 @@ def _assigned(text: str) -> tuple[str, list[float]]:
     name, _, numbers = text.partition("=")
     if not name.strip():
         raise ValueError("names no parameter")
-    return named_parameter(name), parse_around_plus_minus(numbers)
-
-
-def named_parameter(text: str) -> str:
-    """Return the parameter that a text names, in the words of an option or of the library."""
-    return text.strip().replace("-", "_")
+    return name.strip().replace("-", "_"), parse_around_plus_minus(numbers)
 
 
 class Names(ValueKind):
@@ -75,22 +69,12 @@ def check_fit(_: Session, options: dict[str, Any]) -> None:
     if options["example"] == bool(options["tables"]):
         both = "not both: " if options["example"] else ""
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
-    _check_tables(options["tables"], options)
-    options["settings"] = fit_settings(options["model"], options)
-
-
-def _check_tables(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
-    """Check that options are those of one table, or of several together.
-
-    Raises:
-        click.UsageError: if not.
-    """
-    if options["share"] and len(tables) < 2:
+    several = len(options["tables"]) > 1
+    if options["share"] and not several:
         raise click.UsageError("--share is about several tables that are fitted together; leave it out")
-    alone = {"--example": "example", "--compare": "comparing", "--posterior": "posterior"}
-    for option, name in alone.items():
-        if len(tables) > 1 and options[name] and option != "--compare":
-            raise click.UsageError(f"{option} is about one table: give one, or leave it out")
+    if options["posterior"] and several:
+        raise click.UsageError("--posterior is about one table: give one, or leave it out")
+    options["settings"] = fit_settings(options["model"], options)
 
 
 def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -117,20 +101,11 @@ def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
         settings["effects"] = effects = _effects(options["left_out"] or ())
         _check_of_use(free or (), fixed, effects)
         settings["free"] = free or _usual_parameters(fixed, effects)
-    _ = checked_model(model, settings["free"], fixed)
-    return settings
-
-
-def checked_model(model: str, free: tuple[str, ...] | None, fixed: dict[str, float]) -> tuple[str, ...]:
-    """Return the parameters of a model, of which some are fitted and some held.
-
-    Raises:
-        click.UsageError: if one is none of the model's, or cannot have its value.
-    """
     try:
-        return model_parameters(model, free, fixed)
+        model_parameters(model, settings["free"], fixed)
     except ValueError as error:
         raise click.UsageError(in_callers_words(str(error))) from error
+    return settings
 
 
 def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:
