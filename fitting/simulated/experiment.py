@@ -111,11 +111,9 @@ def steady_rows(
     """
     law = interaction if isinstance(interaction, ImpactLaw) else law_of_contact(interaction, float(cantilever.mass_ng))
     count = len(drives.order)
-    nothing = np.zeros(0, dtype=int)
+    nothing = np.zeros(0, dtype=int), np.zeros((3, 0))
     if law is None:
-        return SteadyRows(
-            nothing, np.zeros((3, 0)), dict.fromkeys(range(count), "the contact captures tips of every speed")
-        )
+        return SteadyRows(*nothing, dict.fromkeys(range(count), "the contact captures tips of every speed"))
     follow = _follower(interaction, cantilever, drives)
     starts, predicted = _starts(law, cantilever, drives)
     if not predicted.any():
