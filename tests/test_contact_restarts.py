@@ -246,7 +246,7 @@ def test_effects_and_exponents_are_those_of_the_motion_that_a_simulation_settles
     name, scene, peak = settled
     study = study_effects(scene, duration_us=650.0 * PERIOD_US, only=["air_damping"])
     assert study.observed.reading is not None
-    assert study.observed.reading.peak_amplitude == pytest.approx(peak, rel=1e-5)
+    assert study.observed.reading.peak_amplitude_nm == pytest.approx(peak, rel=1e-5)
     table = {"what": "lyapunov", "impacts": 100, "transient": 600}
     found = sweep(scene, [{"parameter": MOVING[0], "list": [AMPLITUDE_NM]}], table)
     lost = float(found["exponents_per_impact"][0].sum())

@@ -236,7 +236,7 @@ def test_one_frequency_of_sample_and_force_is_no_parameter():
     with pytest.raises(ValueError, match=said):
         stability_chart(plane, x_values=np.array(values), y_values=np.array([0.8]), last_order=1)
     with pytest.raises(ValueError, match=said):
-        continue_orbits(scene, 1, ParameterRange(path, *values))
+        continue_orbits(scene, 1, ParameterRange(path, 91.0, 92.7))
 
 
 @pytest.mark.slow

@@ -134,7 +134,7 @@ def parting_in_words(result: FitResult) -> str:
     formula = rebound_by_formula(values_of_formula(result), speeds[inside])
     if not inside.any() or not np.isfinite(half).all() or np.all(np.abs(formula - rebound) <= half):
         return f"{said}, within the band."
-    return f"{said}, beyond the band: take the law itself, or the model that `--compare` finds best."
+    return f"{said}, beyond the band: take the law itself, or the best of the models compared."
 
 
 def held_in_words(result: FitResult) -> str:
