@@ -28,6 +28,7 @@ from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import state_at
 from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
+from afm_jax.studies.sweep import sweep
 
 MASS, PER_KHZ = 16.81, 2e-3 * np.pi
 INSTANT = ImpactLaw(0.99, 0.1, 0.01)
@@ -227,16 +228,21 @@ def test_drives_of_several_frequencies_have_no_single_orbit():
             single_impact_orbits(Scene(cantilever, sample, INSTANT, force=force), 1)
 
 
-def test_one_frequency_of_sample_and_force_is_no_parameter():
-    scene = Scene(Cantilever(90.0, 40.0), Platform(1.5, 92.7, -40.0), INSTANT, force=ForceDrive(1.0, 92.7))
-    said, path, values = "several frequencies, so .* moves one part's alone: give", "force.frequency_khz", [91.0, 92.7]
-    with pytest.raises(ValueError, match=said):
-        bifurcation_diagram(scene, path, np.array(values))
+@pytest.mark.parametrize("path", ["base.frequency_khz", "base.reduced_frequency", "platform.frequency_khz"])
+def test_a_frequency_that_two_parts_share_is_no_range_and_is_told_so(path: str):
+    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 182.0), INSTANT, base=BaseDrive(0.5, 182.0))
+    low, high = (1.0, 1.02) if "reduced" in path else (180.0, 184.0)
+    why = "several frequencies, so .* moves one part's alone: give"
+    with pytest.raises(ValueError, match=why):
+        continue_orbits(scene, 1, ParameterRange(path, low, high))
+    with pytest.raises(ValueError, match=why):
+        bifurcation_diagram(scene, path, np.array([low, high]))
     plane = scene_family(scene, path, "interaction.r")
-    with pytest.raises(ValueError, match=said):
-        stability_chart(plane, x_values=np.array(values), y_values=np.array([0.8]), last_order=1)
-    with pytest.raises(ValueError, match=said):
-        continue_orbits(scene, 1, ParameterRange(path, 91.0, 92.7))
+    with pytest.raises(ValueError, match=why):
+        stability_chart(plane, x_values=np.array([low, high]), y_values=np.array([0.8]), last_order=1)
+    for what in ("orbits", "lyapunov"):
+        with pytest.raises(ValueError, match=why):
+            sweep(scene, [{"parameter": path, "list": [low, high]}], {"what": what})
 
 
 @pytest.mark.slow

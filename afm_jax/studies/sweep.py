@@ -44,7 +44,13 @@ from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import unit_of
-from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_batch, scene_family
+from afm_jax.scenefile.parameter_paths import (
+    ParameterRange,
+    check_ranges,
+    parameter_values,
+    scene_batch,
+    scene_family,
+)
 from afm_jax.scenefile.scenefile import Start, scene_of_tables, scene_tables
 from afm_jax.solve.lanes import LANES, filled, in_blocks
 from afm_jax.strict_json import strict_json
@@ -382,6 +388,9 @@ def _orbits(
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
             raise ValueError(f"under a ramp no orbit repeats: {path} cannot be an axis of 'orbits'")
+        if "frequency" in path:
+            # a little aside: says why not, where another part has the same frequency
+            sample_driven(scene_batch(scene, {path: np.array([1.001 * parameter_values(scene)[path]])}))
     extra = {"order": [float(order) for order in orders]}
     if isinstance(scene.interaction, Contact):
         record = partial(_contact_orbits, scene, orders, accuracy)
