@@ -1,8 +1,7 @@
 """The design of an experiment: which drives to measure next, so that the law is known best.
 
-What a set of measurements says of the parameters is its Fisher information. Points are chosen greedily, so that the
-joint confidence region of the parameters that matter becomes smallest (D-optimal), exchanged one by one until no
-exchange helps (Fedorov), then put into the best order.
+What a set of measurements says of the parameters is its Fisher information. Points are chosen one after another, each
+such that the joint confidence region of the parameters that matter becomes smallest (D-optimal).
 """
 
 from collections.abc import Sequence
@@ -29,9 +28,6 @@ AMPLITUDES = ("both", "peak", "lockin")
 _RIDGE = 1e-9
 """Information added to every parameter, relative to that of all candidates together, while points are chosen: with it
 the first points, which alone determine nothing, can be compared."""
-_ROUNDS = 50
-_BETTER = 1e-9
-"""Gain below which an exchange is rounding."""
 
 
 @public_result(picture="fitting.experiments.picture:design_figure", rows="points")
@@ -331,26 +327,9 @@ def choose_points(
         whole = np.linalg.slogdet(information)[1]
         return whole - np.linalg.slogdet(information[:, nuisances[:, None], nuisances])[1] if nuisances.size else whole
 
-    def greedy(among: Sequence[int], count: int) -> list[int]:
-        """Return candidates taken one after another, each the best addition to those before."""
-        left, taken, information = list(among), [], start
-        for _ in range(count):
-            best = left.pop(int(np.argmax(score(information + gains[left]))))
-            taken.append(best)
-            information = information + gains[best]
-        return taken
-
-    chosen = greedy(range(len(each)), min(points, len(each)))
-    for _ in range(_ROUNDS):
-        before = chosen.copy()
-        for place, point in enumerate(before):
-            others = [other for other in chosen if other != point]
-            better = score(start + gains[others].sum(axis=0) + gains)
-            current = better[point]
-            better[others] = -np.inf
-            best = int(np.argmax(better))
-            if better[best] > current + _BETTER * abs(current):
-                chosen[place] = best
-        if chosen == before:
-            break
-    return np.array(greedy(sorted(chosen), len(chosen)), dtype=np.int64)
+    left, chosen = list(range(len(each))), []
+    for _ in range(min(points, len(each))):
+        best = left.pop(int(np.argmax(score(start + gains[left]))))
+        chosen.append(best)
+        start = start + gains[best]
+    return np.array(chosen, dtype=np.int64)
