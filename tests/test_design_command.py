@@ -56,17 +56,6 @@ def test_report_is_written(reported):
     ]
 
 
-def test_the_table_to_fill_in_is_one_once_filled_in(reported, tmp_path):
-    answer, folder = reported
-    empty = (folder / "to_fill_in.csv").read_text(encoding="utf-8")
-    path = tmp_path / "measured.csv"
-    path.write_text(empty.replace(",,,,", ",100.5,1,45.5,0.5"), encoding="utf-8")
-    table = read_table(path)
-    assert (table.free_frequency_khz, table.quality_factor, table.quality_factor_error) == (90.0, 40.0, 0.4)
-    assert table.drive_frequency_khz.tolist() == [point["drive_frequency_khz"] for point in answer["points"]]
-    assert np.all(table.peak_amplitude_nm == 100.5)
-
-
 def test_a_saved_fit_is_added_to(tmp_path):
     result = fit(rows(read_table(EXAMPLE), slice(0, 20)), "law")
     path = tmp_path / "fit.json"

@@ -10,7 +10,7 @@ from afm_jax.cli.command import Output, later
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Numbers, Orders, option_of
 from afm_jax.plots.picture_style import save
-from afm_jax.whole_files import in_callers_words, write_whole
+from afm_jax.whole_files import in_callers_words
 from fitting.experiments.candidates import drive_grid
 from fitting.experiments.design import design
 from fitting.experiments.prior import Prior, prior_of_values, read_prior
@@ -45,11 +45,7 @@ def planned(session: Session, *, interest: str | None, **options: Any) -> Output
         )
         result = design(prior, drives, interest=names, **{name: options[name] for name in _OF_DESIGN})
     figure = later("fitting.experiments.picture:design_figure")
-    files = {
-        "design.png": lambda path: save(figure(result), path),
-        "to_fill_in.csv": lambda path: write_whole(path, result.table_to_fill_in()),
-    }
-    return Output.of(result, files=files, json_file="design.json")
+    return Output.of(result, files={"design.png": lambda path: save(figure(result), path)}, json_file="design.json")
 
 
 def prior_of_options(options: Mapping[str, Any]) -> Prior:

@@ -19,7 +19,7 @@ from afm_jax.words import bullets, known, text_table, with_error
 from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.prior import Prior, prior_of_fit
 from fitting.fits.result import FitResult
-from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES, Parameter
+from fitting.parameters import DELAY_NAMES, Parameter
 from fitting.simulated.experiment import Drives
 
 FORMAT_VERSION = 2
@@ -170,24 +170,6 @@ class Design(Result):
             *bullets("Notes:", self.warnings),
         ]
 
-    def table_to_fill_in(self) -> str:
-        """Return an amplitude table of the points, the measured columns empty."""
-        prior, known_before = self.prior, self.prior.constraints
-        lines = [f"# drive = {prior.problem.drive}"]
-        if "free_frequency_khz" not in known_before:
-            lines.append(f"# free_frequency_khz = {prior.free_frequency_khz!r}")
-        if prior.mass_ng is not None:
-            lines.append(f"# mass_ng = {prior.mass_ng!r}")
-        if "quality_factor" not in known_before:
-            lines.append(f"# quality_factor = {'none' if prior.quality_factor is None else prior.quality_factor}")
-        instrument = [(name, *known_before[name]) for name in NUISANCE_NAMES if name in known_before]
-        lines += [f"# {name} = {value!r} +- {error!r}" for name, value, error in instrument]
-        (columns,) = self.tables().values()
-        read = [name.removeprefix("expected_") for name in columns if name.startswith("expected_")][:-1]
-        lines.append(",".join([*self.drive_columns, *read]))
-        rows = [",".join(repr(point[name]) for name in self.drive_columns) for point in self.points()]
-        return "\n".join([*lines, *(row + "," * len(read) for row in rows)]) + "\n"
-
 
 def _reading(point: dict[str, Any], name: str) -> str:
     """Return a reading with its error; a dash where it is not read."""
@@ -319,7 +301,7 @@ def choose_points(
     """
     strength = np.diag(prior + each.sum(axis=0))
     unit = 1.0 / np.sqrt(np.where(strength > 0.0, strength, 1.0))
-    start, gains = unit[:, None] * prior * unit + _RIDGE * np.eye(len(unit)), unit[:, None] * each * unit
+    so_far, gains = unit[:, None] * prior * unit + _RIDGE * np.eye(len(unit)), unit[:, None] * each * unit
     nuisances = np.flatnonzero(~matters)
 
     def score(information: Float[np.ndarray, "n p p"]) -> Float[np.ndarray, " n"]:
@@ -329,7 +311,7 @@ def choose_points(
 
     left, chosen = list(range(len(each))), []
     for _ in range(min(points, len(each))):
-        best = left.pop(int(np.argmax(score(start + gains[left]))))
+        best = left.pop(int(np.argmax(score(so_far + gains[left]))))
         chosen.append(best)
-        start = start + gains[best]
+        so_far = so_far + gains[best]
     return np.array(chosen, dtype=np.int64)

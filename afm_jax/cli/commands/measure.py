@@ -96,8 +96,8 @@ DESIGN = Command(
     --epsilon, ...), or a fit of what was measured so far (--fit); and what can be driven: every combination of
     orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
     itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
-    or 170:190:1. With --out design.csv, .json, .png and to_fill_in.csv (a table for `afm-jax fit`, readings left
-    blank). Exit code 3 if no drive can be planned with, or the points do not determine the law.
+    or 170:190:1. With --out design.csv, .json and .png. Exit code 3 if no drive can be planned with, or the points do
+    not determine the law.
     """,
     options=(
         click.option(
