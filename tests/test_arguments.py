@@ -74,7 +74,9 @@ def with_platform(platform: afm.Platform) -> afm.Scene:
 
 
 def grid(**changes: Any) -> Any:
-    return fitting.drive_grid(**{"orders": [1], "amplitudes_nm": [4.0], "frequencies_khz": [180.0]} | changes)
+    return fitting.drive_grid(
+        **{"orders": [1], "amplitudes_nm": [4.0], "detunings": [1.0], "free_frequency_khz": 90.0} | changes
+    )
 
 
 # what scene files can hold, too, is refused by tests/malformed.jsonl

@@ -76,7 +76,9 @@ def test_what_was_measured_is_not_planned_again(tmp_path):
     columns = (table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
     frequency, drive, offset = (float(np.asarray(column)[0]) for column in columns)
     heights = f"{offset},{offset + 0.125}"
-    grid = ("--orders", table.order[0], "--frequencies-khz", frequency, "--drive-nm", drive, "--offsets-nm", heights)
+    order = int(table.order[0])
+    detuning = frequency / (2 * order * table.free_frequency_khz)
+    grid = ("--orders", order, "--detuning", detuning, "--drive-nm", drive, "--offsets-nm", heights)
     found = run("--fit", path, *grid, "--points", 1, "--json")
     assert found.exit_code == 0, found.stderr
     answer = strictly(found.stdout)

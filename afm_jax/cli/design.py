@@ -31,15 +31,13 @@ def planned(session: Session, *, interest: str | None, **options: Any) -> Output
         kind = Orders() if name == "orders" else Numbers(positive=False)
         chosen[name] = chosen[name] if said else kind.convert(text, None, None)
     names = None if interest is None else tuple(name.strip().replace("-", "_") for name in interest.split(","))
-    frequencies = options["frequencies_khz"]
     with session.working("forecasting (the first run compiles for some seconds)"):
         drives = drive_grid(
             orders=chosen["orders"],
             amplitudes_nm=chosen["drive_nm"],
             offsets_nm=chosen["offsets_nm"] or (0.0,),
             heights=chosen["heights"],
-            frequencies_khz=frequencies,
-            detunings=chosen["detuning"] if frequencies is None else None,
+            detunings=chosen["detuning"],
             free_frequency_khz=prior.free_frequency_khz,
             drive=prior.problem.drive,
         )

@@ -31,14 +31,13 @@ Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
 
 
 @checked
-def drive_grid(  # noqa: PLR0913
+def drive_grid(
     *,
     orders: Numbers,
     amplitudes_nm: Numbers,
+    detunings: Numbers,
+    free_frequency_khz: float,
     offsets_nm: Numbers = (0.0,),
-    frequencies_khz: Numbers | None = None,
-    detunings: Numbers | None = None,
-    free_frequency_khz: float | None = None,
     drive: str = "sample",
     heights: Numbers | None = None,
 ) -> Drives:
@@ -47,23 +46,21 @@ def drive_grid(  # noqa: PLR0913
     Args:
         orders: N, drive periods per impact; 1 where the cantilever is driven itself.
         amplitudes_nm: of the platform; of the free tip where that is driven.
-        offsets_nm: mean heights of the platform above the tip's rest position.
-        frequencies_khz: of the drive, the same for every order; or
         detunings: drive frequencies as multiples of each order's resonance 2 N f0 (of f0 where the cantilever is driven
-            itself), with
+            itself).
         free_frequency_khz: f0.
+        offsets_nm: mean heights of the platform above the tip's rest position.
         drive: what is driven: "sample", "force" (on the tip) or "base".
         heights: in place of the offsets, distances of the sample from the rest position of a tip that is driven itself,
             as shares of its free amplitude: 0.9 is where it begins to tap.
 
     Raises:
-        ValueError: if a list is empty or a number impossible, not exactly one of both kinds of frequency is given, or
-            there are too many combinations.
+        ValueError: if a list is empty or a number impossible, or there are too many combinations.
     """
     check_drive(drive)
-    check_parameter("free_frequency_khz", free_frequency_khz, "positive", optional=True)
+    check_parameter("free_frequency_khz", free_frequency_khz, "positive")
     lists = {"orders": orders, "amplitudes_nm": amplitudes_nm, "offsets_nm": offsets_nm, "heights": heights}
-    for name, numbers in (lists | {"frequencies_khz": frequencies_khz, "detunings": detunings}).items():
+    for name, numbers in (lists | {"detunings": detunings}).items():
         if numbers is not None:
             _check_list(name, numbers, positive=name not in {"offsets_nm", "heights"})
     sample = drive == "sample"
@@ -72,24 +69,17 @@ def drive_grid(  # noqa: PLR0913
         raise ValueError(f"`orders` must hold {allowed}, but is {list(orders)}")
     if heights is not None and sample:
         raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
-    if detunings is None and frequencies_khz is not None:
-        frequencies, resonance = frequencies_khz, 0.0
-    elif frequencies_khz is None and detunings is not None:
-        if free_frequency_khz is None:
-            raise ValueError("`detunings` need `free_frequency_khz`, the cantilever's resonance")
-        frequencies, resonance = detunings, (2.0 if sample else 1.0) * free_frequency_khz
-    else:
-        raise ValueError("give either `frequencies_khz` or `detunings`, what the drive frequency can be")
+    resonance = (2.0 if sample else 1.0) * free_frequency_khz
     places = offsets_nm if heights is None else heights
     # rounded to what an instrument is told: a thousandth of a hertz, a femtometre
     rows = {
         (
             order,
-            round(resonance * order * frequency, 6) if resonance else float(frequency),
+            round(resonance * order * detuning, 6),
             float(amplitude),
             float(place) if heights is None else round(-place * amplitude, 6),
         )
-        for order, frequency, amplitude, place in product(orders, frequencies, amplitudes_nm, places)
+        for order, detuning, amplitude, place in product(orders, detunings, amplitudes_nm, places)
     }
     if len(rows) > MOST:
         raise ValueError(f"these are {len(rows)} drives, more than the {MOST} a design looks at; take coarser steps")

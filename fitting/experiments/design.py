@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import check_parameter, checked, require_float64
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
@@ -237,7 +237,13 @@ def design(  # noqa: PLR0913
             raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(names)}")
     if not interest or len(set(interest)) < len(interest):
         raise ValueError("`interest` must name at least one parameter, and none twice")
-    _check_options(points, noise, amplitudes, largest_nm, phase_noise_deg)
+    if points < 1:
+        raise ValueError(f"`points` must be at least 1, but is {points}")
+    if amplitudes not in AMPLITUDES:
+        raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
+    check_parameter("noise", noise, "between 0 and 1")
+    check_parameter("largest_nm", largest_nm, "positive", optional=True)
+    check_parameter("phase_noise_deg", phase_noise_deg, "positive")
     largest = np.inf if largest_nm is None else float(largest_nm)
     candidates = candidates_of(
         prior, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
@@ -271,21 +277,6 @@ def design(  # noqa: PLR0913
         reasons=reasons,
         warnings=warnings,
     )
-
-
-def _check_options(
-    points: int, noise: float, amplitudes: str, largest_nm: float | None, phase_noise_deg: float
-) -> None:
-    if points < 1:
-        raise ValueError(f"`points` must be at least 1, but is {points}")
-    if not 0.0 < noise < 1.0:
-        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
-    if amplitudes not in AMPLITUDES:
-        raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
-    if not 0.0 < phase_noise_deg < 90.0:
-        raise ValueError(f"`phase_noise_deg` must be between 0 and 90, but is {phase_noise_deg!r}")
-    if largest_nm is not None and not largest_nm > 0.0:
-        raise ValueError(f"`largest_nm` must be positive, but is {largest_nm!r}")
 
 
 def choose_points(

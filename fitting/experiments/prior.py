@@ -138,8 +138,7 @@ def prior_of_values(  # noqa: PLR0913
     for name in given:
         if name not in own:
             raise ValueError(f"the model {model!r} has no parameter {name!r}; it has {', '.join(own)}")
-    if not 0.0 < uncertainty < 1.0:
-        raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
+    check_parameter("uncertainty", uncertainty, "between 0 and 1")
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), drive=drive)
     assumed = [name for name in own if name not in given and name not in known]
     start = paper_values(model, mass_ng or 1.0) | {name: value for name, (value, _) in known.items()} | given

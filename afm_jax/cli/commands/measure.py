@@ -80,9 +80,7 @@ CALIBRATE = Command(
 
 
 def _check_lists(_: Session, options: Options) -> None:
-    """Check that frequencies and places are said once."""
-    if options["frequencies_khz"] is not None and options["detuning"] is not None:
-        raise click.UsageError("--frequencies-khz and --detuning both say what the drive frequency can be; give one")
+    """Check that places are said once."""
     if options["offsets_nm"] is not None and options["heights"] is not None:
         raise click.UsageError("--offsets-nm and --heights both say where the sample can be; give one")
 
@@ -105,9 +103,6 @@ DESIGN = Command(
             type=Orders(),
             metavar="LIST",
             help="Drive periods an impact; else 1-4, or 1 where the tip is driven.",
-        ),
-        click.option(
-            "--frequencies-khz", type=Numbers(), metavar="LIST", help="Drive frequencies, the same for every order."
         ),
         click.option(
             "--detuning",
