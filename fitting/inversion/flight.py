@@ -6,7 +6,6 @@ least squares.
 """
 
 from functools import partial
-from itertools import product
 from typing import NamedTuple
 
 import jax
@@ -30,8 +29,8 @@ _LONGEST_MOVE = 0.3
 _SETTLED = 1e-24
 _ARRIVED = 1e-6
 """Squared distance to the minimum, in standard errors, at which a search stops, and up to which its end counts."""
-_ANGLES, _SPEEDS = (-0.9, -0.45, 0.0, 0.45, 0.9), (-0.15, 0.0, 0.15)
-"""Starts of the search: angle of the response in rad, and logarithm of the velocity, beside a half sine's."""
+_ANGLES = (-0.45, 0.0, 0.45)
+"""Starts of the search: angle of the response in rad beside a half sine's."""
 
 
 class MeasuredRow(NamedTuple):
@@ -160,7 +159,7 @@ def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
         rows: arrays with a leading axis of rows.
         cantilever: its frequency and Q, exactly known.
     """
-    beside = np.array(list(product(_ANGLES, _SPEEDS)))
+    beside = np.stack([_ANGLES, np.zeros(len(_ANGLES))], axis=1)
     height = np.where(np.isfinite(rows.error[:, 0]), rows.value[:, 0], rows.value[:, 1] / _HALF_SINE)
     # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi
     middle = np.stack([np.full_like(height, np.pi), np.log(np.asarray(cantilever.angular_frequency) * height)], axis=1)

@@ -13,7 +13,6 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import printed_table
-from afm_jax.impact.law import ImpactLaw
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import filled
@@ -104,16 +103,6 @@ class Inversion(Result):
     def preferred(self) -> str | None:
         """The law of the line with the smaller chi2; None without lines."""
         return min(self.lines, key=lambda name: self.lines[name].chi2, default=None)
-
-    @property
-    def law(self) -> ImpactLaw | None:
-        """The law of the preferred line; None without lines."""
-        if self.preferred is None:
-            return None
-        line = self.lines[self.preferred]
-        lost = max(line.slope, 0.0)
-        r, viscous_loss = (1.0, lost) if self.preferred == "viscous" else (max(1.0 - lost, 0.0) ** 0.5, 0.0)
-        return ImpactLaw(r, max(line.epsilon, 0.0), viscous_loss)
 
     @property
     def reason(self) -> str | None:
@@ -231,7 +220,9 @@ def invert(table: TableLike) -> Inversion:
         table=table,
     )
     reason = _why_not_valid(result)
-    return replace(result, valid=reason is None, reasons=(reason,) if reason else (), warnings=_warnings(result))
+    unsure = table.quality_factor is not None and table.quality_factor_error is None
+    warnings = ("Q comes without an error: its uncertainty is not in the errors here",) if unsure else ()
+    return replace(result, valid=reason is None, reasons=(reason,) if reason else (), warnings=warnings)
 
 
 def _why_not_valid(e: Inversion) -> str | None:
@@ -245,18 +236,6 @@ def _why_not_valid(e: Inversion) -> str | None:
     if all(abs(one.epsilon) < 2 * one.epsilon_error and abs(one.slope) < 2 * one.slope_error for one in lines):
         return "the rows determine no coefficient of either line to two standard errors: measure more finely"
     return None
-
-
-def _warnings(e: Inversion) -> tuple[str, ...]:
-    warnings = []
-    if e.table.quality_factor is not None and e.table.quality_factor_error is None:
-        warnings.append("Q comes without an error: its uncertainty is not in the errors here")
-    lost, wrong = (sum(word in note for note in e.note) for word in ("no flight", "contradict"))
-    if 0 < lost < e.table.rows:
-        warnings.append(f"{lost} rows could not be inverted (see their notes)")
-    if wrong:
-        warnings.append(f"{wrong} rows contradict themselves by more than 4 standard errors (see their notes)")
-    return tuple(warnings)
 
 
 def _numbers(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"]]:

@@ -41,13 +41,11 @@ class Trace(ResultTuple):
     Attributes:
         time_us: of the samples, in us, shape (samples,).
         deflection_nm: height of the tip, in nm; the zero does not matter.
-        platform: a signal in phase with the platform's height, in any unit, or None.
         drive_frequency_khz: of the platform, or None where the file does not say it.
     """
 
     time_us: Float[np.ndarray, " samples"]
     deflection_nm: Float[np.ndarray, " samples"]
-    platform: Float[np.ndarray, " samples"] | None
     drive_frequency_khz: float | None
 
 
@@ -69,7 +67,6 @@ class LockinResult(Result):
         amplitudes_nm: at the drive's frequency over each order; NaN where the trace is too short for it.
         amplitude_errors_nm: their standard errors, NaN where there is one block only.
         phases_deg: their phases, modulo 360 over the order.
-        block_amplitudes_nm: at the order asked for, one after another.
         largest_share: what the amplitude at another order may be of that at the order asked for: 2 %, or what few
             samples a period make of the harmonics.
         valid: whether the trace is periodic at the order asked for.
@@ -89,7 +86,6 @@ class LockinResult(Result):
     amplitudes_nm: Float[np.ndarray, " lines"]
     amplitude_errors_nm: Float[np.ndarray, " lines"]
     phases_deg: Float[np.ndarray, " lines"]
-    block_amplitudes_nm: Float[np.ndarray, " blocks"]
     largest_share: float
     valid: bool = True
     reasons: tuple[str, ...] = ()
@@ -132,23 +128,20 @@ def lockin(
     deflection_nm: Float[np.ndarray, " samples"],
     drive_frequency_khz: float,
     order: int,
-    *,
-    platform: Float[np.ndarray, " samples"] | None = None,
 ) -> LockinResult:
     """Read amplitude and phase of a deflection at the drive's frequency over an order, and at the orders beside it.
 
     Args:
-        time_us: of the samples, in us, rising in nearly equal steps; without `platform` 0 when that is highest.
+        time_us: of the samples, in us, rising in nearly equal steps; 0 when the platform is highest.
         deflection_nm: height of the tip, in nm; the zero does not matter.
         drive_frequency_khz: of the platform.
         order: N, drive periods in a period of the response, 1 to 8.
-        platform: a signal in phase with the platform's height, in any unit: what the phase counts from.
 
     Returns:
         Amplitudes, phases, errors and a verdict; see `LockinResult`.
 
     Raises:
-        TableError: if the trace is too short, has gaps, or the platform's signal is no wave of the drive's frequency.
+        TableError: if the trace is too short or has gaps.
         ValueError: if the order or the frequency is impossible.
     """
     if not 1 <= order <= HIGHEST_ORDER:
@@ -158,15 +151,8 @@ def lockin(
     period = 1e3 / drive_frequency_khz
     time, height = (np.asarray(column, dtype=np.float64) for column in (time_us, deflection_nm))
     _check(time, height, period, order)
-    behind, reference_error = 0.0, 0.0
-    if platform is not None:
-        wave = _blocks(time, np.asarray(platform, dtype=np.float64), period, 1, order)
-        _check_wave(wave, drive_frequency_khz)
-        behind, reference_error = float(np.angle(wave.mean())), _errors(wave)[1] / order
     orders = np.array(sorted({*range(1, HIGHEST_ORDER + 1), 2 * order}))
-    # counted from when the platform is highest
-    since = time + behind / (2.0 * np.pi) * period
-    lines = {int(n): _blocks(since, height, period, int(n), order) for n in orders}
+    lines = {int(n): _blocks(time, height, period, int(n), order) for n in orders}
     values = np.array([blocks.mean() if blocks.size else np.nan for blocks in lines.values()])
     size, asked = np.abs(values), int(np.flatnonzero(orders == order)[0])
     errors = np.array([_errors(blocks)[0] if blocks.size else np.nan for blocks in lines.values()])
@@ -179,24 +165,21 @@ def lockin(
         lockin_amplitude_nm=float(size[asked]),
         lockin_amplitude_error_nm=math.hypot(float(errors[asked]), sampling * float(size[asked])),
         phase_deg=phases[asked],
-        phase_error_deg=math.degrees(math.hypot(_errors(lines[order])[1], sampling, reference_error)),
+        phase_error_deg=math.degrees(math.hypot(_errors(lines[order])[1], sampling)),
         scatter=_scatter(lines[order]),
         orders=orders,
         amplitudes_nm=size,
         amplitude_errors_nm=errors,
         phases_deg=np.array(phases),
-        block_amplitudes_nm=np.abs(lines[order]),
         # the first harmonic that sampling turns into a slow line; the k-th of a bounce is 3/(4 k^2)
         largest_share=max(SHARE, 0.75 / (order * (period / float(np.median(np.diff(time))) - 1.0)) ** 2),
     )
     why = _why_not_periodic(found)
     reasons = (f"not periodic at order {order}: {why}",) if why else ()
-    warnings = []
+    warnings = ["The phase takes time 0 as when the platform is highest."]
     unseen = ", ".join(str(n) for n in orders[np.isnan(size)])
     if unseen:
         warnings.append(f"The trace is too short to see the drive's frequency over {unseen}.")
-    if platform is None:
-        warnings.append("The phase takes time 0 as when the platform is highest; a column of the platform says it.")
     if sampling > SHARE / 10.0:
         warnings.append(f"Few phases are sampled (error {sampling:.1%}): sample faster, or not in step with the drive.")
     return replace(found, valid=not reasons, reasons=reasons, warnings=tuple(warnings))
@@ -283,15 +266,6 @@ def _check(
         )
 
 
-def _check_wave(wave: Complex[np.ndarray, " blocks"], drive_frequency_khz: float) -> None:
-    """Refuse a signal of the platform that is no wave of the drive's frequency."""
-    if not abs(wave.mean()) > 0.0 or _scatter(wave) > SHARE:
-        raise TableError(
-            f"column platform_nm: is no steady wave of {drive_frequency_khz:g} kHz (its parts differ by "
-            f"{_scatter(wave):.1%}); correct the drive frequency, or remove the column"
-        )
-
-
 def _why_not_periodic(found: LockinResult) -> str | None:
     """Return why a motion is not periodic at the order asked for; None if it is."""
     order, amplitude, sizes = found.order, found.lockin_amplitude_nm, np.nan_to_num(found.amplitudes_nm)
@@ -326,8 +300,6 @@ TRACE = Form(
         Column("time_s", kind="number", meaning="time_us", needed="time", convert=lambda s: 1e6 * s),
         Column("deflection_nm", "nm", kind="number", needed="deflection"),
         Column("position_nm", kind="number", meaning="deflection_nm", needed="deflection"),
-        Column("platform_nm", kind="number", meaning="platform"),
-        Column("drive", kind="number", meaning="platform"),
     ),
     "sample",
     open=True,
@@ -340,7 +312,7 @@ SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180", uni
 
 @checked
 def read_trace(path: str | Path) -> Trace:
-    """Read a trace from text of two columns, time_us and deflection_nm, or three with platform_nm (or drive).
+    """Read a trace from text of two columns, time_us and deflection_nm; others are passed over.
 
     Cells are separated by commas, tabs, semicolons or spaces; a comment `# drive_frequency_khz = 180` may stand above.
 
@@ -358,4 +330,4 @@ def read_trace(path: str | Path) -> Trace:
     for name, numbers in columns.items():
         TRACE.check_numbers(name, numbers, table.lines, faults)
     faults.raise_any()
-    return Trace(columns["time_us"], columns["deflection_nm"], columns.get("platform"), frequency)
+    return Trace(columns["time_us"], columns["deflection_nm"], frequency)
