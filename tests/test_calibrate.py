@@ -133,7 +133,8 @@ def test_intervals_cover_the_truth(phase, given):
 def test_errors_follow_the_noise_they_are_told():
     sweep = synthetic_sweep(noise=0.01, given=False)
     scaled = calibrate(sweep)
-    told, doubled = (calibrate(sweep, noise=noise) for noise in (0.01, 0.02))
+    errors = (noise * np.full(sweep.points, sweep.amplitude.max()) for noise in (0.01, 0.02))
+    told, doubled = (calibrate(replace(sweep, amplitude_error=error)) for error in errors)
     # 240 residuals: the noise is found to 1/sqrt(480), here 3 of those
     assert scaled.error_origin == "estimated"
     # the noise of 0.01 is that of the largest amplitude measured, which is 5 nm

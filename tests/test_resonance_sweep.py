@@ -68,7 +68,6 @@ def test_faults_of_sweeps_in_memory():
     one, none = np.array([1.0, 2.0]), np.zeros(0)
     cases: Any = (
         ({"frequency_khz": none, "amplitude": none}, r"sweep in memory, column frequency_khz: has the shape \(0,\)"),
-        ({"phase_deg": one, "phase_error_deg": one}, "the phase has errors but the amplitude has none"),
     )
     for columns, said in cases:
         with pytest.raises(TableError, match=said):

@@ -1,6 +1,5 @@
 """`afm-jax calibrate SWEEP`: frequency, quality factor and stiffness of the free cantilever."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,9 @@ from fitting.calibration.calibrate import calibrate
 from fitting.calibration.sweep import read_sweep
 
 
-def calibration(session: Session, *, sweep: Path, amplitude_only: bool, deflection: str, **options: Any) -> Output:
+def calibration(session: Session, *, sweep: Path, deflection: str, **options: Any) -> Output:
     """Return frequency, quality factor and stiffness of a free cantilever."""
     measured = read_sweep(sweep)
-    if amplitude_only:
-        measured = replace(measured, phase_deg=None, phase_error_deg=None)
     with session.working(f"fitting {measured.points} points"):
         result = calibrate(measured, static=deflection == "static", **options)
     figure = later("fitting.calibration.picture:calibration_figure")

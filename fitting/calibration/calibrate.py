@@ -63,7 +63,7 @@ class Calibration(Result):
         spring_constant_n_per_m: by "equipartition" (of a spectrum) and by "sader" (with the size of the lever).
         mean_square_nm2: of a spectrum, <x^2> of the resonance; else None.
         model: "phase", "amplitude" or "power", what was fitted.
-        error_origin: of the points' errors: "file", "noise", "averages", or "estimated" such that chi2/dof = 1.
+        error_origin: of the points' errors: "file", "averages", or "estimated" such that chi2/dof = 1.
         phase_reversed: the phase rises through the resonance and was taken with the opposite sign.
         chi2: sum of squared residuals over their errors.
         degrees_of_freedom: numbers measured less parameters.
@@ -150,18 +150,16 @@ class Calibration(Result):
         return {"calibration_points.csv": columns}
 
     def printed(self) -> list[Any]:
-        """Return verdict, values, what the instrument says, and the lines for an amplitude table."""
+        """Return verdict, values, and the lines for an amplitude table."""
         values = {"frequency_khz (kHz)": self.frequency_khz, "quality_factor": self.quality_factor}
         values |= {f"spring constant, {name} (N/m)": one for name, one in self.spring_constant_n_per_m.items()}
         rows = [{"name": name} | vars(one) for name, one in values.items()]
         cells: dict[str, Any] = {"of the free cantilever": "name", "value +- standard error": _in_words}
         fit = f"chi2/dof {self.chi2:.1f}/{self.degrees_of_freedom}, errors: {self.error_origin}"
-        found = [f"{name} {value:.8g}" for name, value in self.sweep.instrument.items()]
         return [
             f"{'VALID' if self.valid else 'NOT VALID'}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
             printed_table("", cells, rows),
             fit,
-            f"The instrument says: {', '.join(found)}." if found else None,
             *bullets("Reasons:", self.reasons),
             *bullets("Notes:", self.warnings),
             *(["", "For the top of an amplitude table:", *self.table_comments] if self.valid else []),
@@ -177,7 +175,6 @@ def _in_words(row: dict[str, Any]) -> str:
 def calibrate(
     sweep: ResonanceSweep | str | os.PathLike[str],
     *,
-    noise: float | None = None,
     static: bool = True,
     **settings: tuple[float, float | None] | float | None,
 ) -> Calibration:
@@ -186,9 +183,8 @@ def calibrate(
     The frequency is the undamped natural one; the amplitude is largest a little lower, at f0 sqrt(1 - 1/2Q^2).
 
     Args:
-        sweep: from `read_sweep`, or a file; its phase is used where it is there.
-        noise: standard error of every point as a share of the largest amplitude, for a scan without errors of its own.
-            Without either the errors are estimated from the misfit, and goodness of fit cannot be judged.
+        sweep: from `read_sweep`, or a file; its phase is used where it is there. Without errors of the amplitudes these
+            are estimated from the misfit, and goodness of fit cannot be judged.
         static: the deflection was calibrated by the slope of a force curve (static InvOLS), not by the mode itself.
         **settings: what the file's comments say where it is left out, each a number or a pair with its error:
             `averages`, how many spectra a thermal spectrum is the mean of; `temperature_k` of lever and air (else 296
@@ -204,11 +200,9 @@ def calibrate(
     """
     if not isinstance(sweep, ResonanceSweep):
         sweep = read_sweep(Path(os.fspath(sweep)))
-    if noise is not None and not 0.0 < noise < 1.0:
-        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
     sweep = replace(sweep, settings=stated_settings(sweep, settings))
     _check_sweep(sweep)
-    found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep, noise)
+    found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep)
     found = replace(found, spring_constant_n_per_m=_springs(found, static=static))
     reasons, warnings = _why_not_valid(found), (*found.warnings, *_warnings(found))
     return replace(found, reasons=reasons, warnings=warnings, valid=not reasons)
@@ -225,16 +219,16 @@ def _check_sweep(sweep: ResonanceSweep) -> None:
         raise TableError(f"{sweep.source}: the amplitude is {value} at every frequency; sweep across a resonance")
 
 
-def _fitted(sweep: ResonanceSweep, noise: float | None) -> Calibration:
+def _fitted(sweep: ResonanceSweep) -> Calibration:
     """Return the fit of a scan or of a part of a spectrum, not yet judged."""
     largest = float(sweep.amplitude.max())
-    known = sweep.averages if sweep.spectrum else noise if sweep.amplitude_error is None else 1.0
+    known = sweep.averages is not None if sweep.spectrum else sweep.amplitude_error is not None
     if sweep.spectrum:
         error = np.full(sweep.points, 1.0 / np.sqrt(sweep.averages or 1.0))
     elif sweep.amplitude_error is not None:
         error = np.array(sweep.amplitude_error)
     else:
-        error = np.full(sweep.points, (noise or 0.01) * largest)
+        error = np.full(sweep.points, 0.01 * largest)
     fit = minimum(sweep, error)
     freedom = len(fit.residual) - fit.jacobian.shape[1]
     chi2 = float(np.sum(fit.residual**2))
@@ -247,7 +241,7 @@ def _fitted(sweep: ResonanceSweep, noise: float | None) -> Calibration:
     fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(fit.residual)) < together < 1.0 else 1.0
     covariance = covariance_of(fit.jacobian.T @ fit.jacobian) * scale * fewer
     p_value = chi2_tail(chi2 / size, freedom) if known else np.nan
-    origin = "averages" if sweep.spectrum else "noise" if sweep.amplitude_error is None else "file"
+    origin = "averages" if sweep.spectrum else "file"
     why = "the model does not explain the scan" if p_value < IMPROBABLE else None
 
     def stated(value: float, slopes: Float[np.ndarray, " p"]) -> CalibratedValue:
@@ -321,7 +315,7 @@ def _around(sweep: ResonanceSweep, centre_khz: float, half_khz: float, times: fl
     """Return the fit of a spectrum within so many half-widths of a frequency."""
     part = sweep.within(centre_khz - times * half_khz, centre_khz + times * half_khz)
     _check_sweep(part)
-    return _fitted(part, None)
+    return _fitted(part)
 
 
 def _springs(found: Calibration, *, static: bool) -> dict[str, CalibratedValue]:
@@ -409,8 +403,7 @@ def _why_not_valid(e: Calibration) -> tuple[str, ...]:
 
 def _warnings(e: Calibration) -> tuple[str, ...]:
     """Return what a reader should know besides."""
-    springs = e.spring_constant_n_per_m.values()
-    doubts = [one.reason for one in springs if one.reason is not None]
+    doubts = [one.reason for one in e.spring_constant_n_per_m.values() if one.reason is not None]
     khz, inside = f"{e.frequency_khz.value:.6g} kHz", counted(e.inside, "point")
     notes = (
         (
@@ -422,14 +415,6 @@ def _warnings(e: Calibration) -> tuple[str, ...]:
             e.model == "power" and e.inside < _LEAST_POINTS,
             f"{inside} within the half-width: Q is hardly resolved; the area under the line, and k, hold.",
         ),
-        (
-            e.error_origin == "estimated",
-            "The points' errors were estimated from the misfit so that chi2/dof = 1: goodness of fit cannot be judged.",
-        ),
         (doubts, f"The spring constants contradict each other: {'; '.join(doubts)}."),
-        (
-            springs,
-            "k is that of a rectangular lever: by equipartition with the laser on its end, by Sader in dry air to 5 %.",
-        ),
     )
     return tuple(said for holds, said in notes if holds)

@@ -57,14 +57,13 @@ class ScanFit(NamedTuple):
 
 
 class Points(NamedTuple):
-    """A scan as the model takes it; of a spectrum ``along`` is the root of 1/K."""
+    """A scan as the model takes it; of a spectrum ``error`` is the root of 1/K."""
 
     kind: str
     frequency: Float[np.ndarray, " points"]
     position: Float[np.ndarray, " points"]
     measured: Complex[np.ndarray, " points"]
-    along: Float[np.ndarray, " points"]
-    across: Float[np.ndarray, " points"]
+    error: Float[np.ndarray, " points"]
 
 
 def points_of(sweep: ResonanceSweep, error: Float[np.ndarray, " points"], *, reverse: bool) -> Points:
@@ -77,15 +76,11 @@ def points_of(sweep: ResonanceSweep, error: Float[np.ndarray, " points"], *, rev
     """
     largest, frequency = sweep.amplitude.max(), sweep.frequency_khz
     phase = np.zeros(sweep.points) if sweep.phase_deg is None else np.deg2rad(sweep.phase_deg)
-    along = error if sweep.spectrum else error / largest
-    across = along
-    if sweep.phase_error_deg is not None:
-        # far from the resonance the vector may be shorter than its noise
-        across = np.maximum(sweep.amplitude / largest, 1e-6) * np.deg2rad(sweep.phase_error_deg)
+    noise = error if sweep.spectrum else error / largest
     kind = "power" if sweep.spectrum else "amplitude" if sweep.phase_deg is None else "phase"
     measured = sweep.amplitude / largest * np.exp((-1j if reverse else 1j) * phase)
     position = 2.0 * (frequency - frequency[0]) / max(np.ptp(frequency), 1e-300) - 1.0
-    return Points(kind, frequency, position, measured, along, across)
+    return Points(kind, frequency, position, measured, noise)
 
 
 def response(frequency: Float[np.ndarray, " n"], natural: float, quality_factor: float) -> Complex[np.ndarray, "n 3"]:
@@ -129,17 +124,17 @@ def _evaluate(points: Points, place: Float[np.ndarray, " p"]) -> tuple[np.ndarra
         size = np.abs(points.measured)
         turn = np.conj(points.measured) / np.where(size > 0.0, size, 1.0) + (size == 0.0)
         both = [(turn * (value - points.measured)), turn[:, None] * by_place]
-        parts = [(np.real(part).T / points.along, np.imag(part).T / points.across) for part in both]
+        parts = [(np.real(part).T / points.error, np.imag(part).T / points.error) for part in both]
         return np.concatenate(parts[0]), np.concatenate(parts[1], axis=1).T, value
     square = np.maximum(np.real(value), _LEAST_SQUARE)
     by_place = np.where(np.real(value)[:, None] > _LEAST_SQUARE, np.real(by_place), 0.0)
     amplitude, measured = np.sqrt(square), np.real(points.measured)
     if points.kind == "amplitude":
-        return (amplitude - measured) / points.along, by_place / (2.0 * amplitude * points.along)[:, None], amplitude
+        return (amplitude - measured) / points.error, by_place / (2.0 * amplitude * points.error)[:, None], amplitude
     ratio = measured**2 / square
     root = deviance_root(ratio)
     steep = np.where(np.abs(root) > 1e-6, (ratio - 1.0) / np.where(root == 0.0, 1.0, root), 1.0)
-    return -root / points.along, by_place * (steep / square / points.along)[:, None], amplitude
+    return -root / points.error, by_place * (steep / square / points.error)[:, None], amplitude
 
 
 def _linear(points: Points, natural: float, quality_factor: float) -> tuple[Float[np.ndarray, " terms"], float]:
@@ -204,6 +199,6 @@ def chi2_without_resonance(sweep: ResonanceSweep, error: Float[np.ndarray, " poi
     points = points_of(sweep, error, reverse=False)
     columns = np.vander(points.position, 3).astype(complex)
     # the root of a density has half its relative error
-    noise = 0.5 * points.along * np.abs(points.measured) if points.kind == "power" else points.along
+    noise = 0.5 * points.error * np.abs(points.measured) if points.kind == "power" else points.error
     solution = np.linalg.lstsq(columns / noise[:, None], points.measured / noise, rcond=None)[0]
     return float(np.sum(np.abs((columns @ solution - points.measured) / noise) ** 2))

@@ -7,8 +7,8 @@ The plain form is a CSV file in UTF-8 with comment lines and a row of column nam
     89.0,0.512,12.4
 
 The frequency stands in ``frequency_khz`` or ``frequency_hz``, the amplitude in ``amplitude_nm`` or ``amplitude`` (any
-unit); ``phase_deg``, ``amplitude_error_nm`` (or ``amplitude_error``) and ``phase_error_deg`` may join them. The Nanonis
-form is recognised by its line ``[DATA]``.
+unit); ``phase_deg`` and ``amplitude_error_nm`` (or ``amplitude_error``) may join them. The Nanonis form is recognised
+by its line ``[DATA]``.
 
 A thermal spectrum is a sweep whose amplitude is the root of a spectral density: NanoSurf's .nid, or a CSV file with
 ``asd_nm_per_sqrt_hz`` or ``psd_nm2_per_hz`` and a comment ``# averages = 1000``, the number of spectra averaged.
@@ -71,7 +71,6 @@ SWEEP = Form(
         Column("phase_deg", kind="number"),
         Column("amplitude_error_nm", meaning="amplitude_error"),
         Column("amplitude_error"),
-        Column("phase_error_deg"),
     ),
     "point",
     separator="",
@@ -102,7 +101,7 @@ def _parse_csv(text: str, faults: Faults) -> dict[str, Any]:
     return table.columns | found
 
 
-_COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase_error_deg")
+_COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error")
 
 
 @public_result()
@@ -114,8 +113,8 @@ class ResonanceSweep(Result):
         frequency_khz: of the drive, shape (points,); repeated measurements at one frequency are allowed.
         amplitude: of the response, shape (points,), in ``amplitude_unit``.
         phase_deg: of the response, z = amplitude cos(omega t + phase), shape (points,), or None.
-        amplitude_error: standard error of the amplitude, shape (points,), or None: not known.
-        phase_error_deg: standard error of the phase; None takes the noise as equal in all directions.
+        amplitude_error: standard error of the amplitude, shape (points,), or None: not known. With a phase it is that
+            of the response in all directions.
         amplitude_unit: "nm", empty where the file does not say, "nm/sqrt(Hz)" of a thermal spectrum.
         instrument: what the instrument itself found, for comparison: ``frequency_khz``, ``quality_factor``; of a
             thermal spectrum also ``spring_constant_n_per_m``.
@@ -125,14 +124,13 @@ class ResonanceSweep(Result):
         lines: the line of the file that each point stands in, shape (points,).
 
     Raises:
-        TableError: if a value is impossible, the lengths differ, or there are errors without what they belong to.
+        TableError: if a value is impossible, or the lengths differ.
     """
 
     frequency_khz: Float[np.ndarray, " points"]
     amplitude: Float[np.ndarray, " points"]
     phase_deg: Float[np.ndarray, " points"] | None = None
     amplitude_error: Float[np.ndarray, " points"] | None = None
-    phase_error_deg: Float[np.ndarray, " points"] | None = None
     amplitude_unit: str = "nm"
     instrument: dict[str, float] = field(default_factory=dict)
     settings: Mapping[str, tuple[float, float | None]] = field(default_factory=dict)
@@ -145,7 +143,6 @@ class ResonanceSweep(Result):
         points = np.size(self.frequency_khz)
         lines = np.array(self.lines if len(self.lines) else np.arange(1, points + 1), dtype=np.int64)
         arrays = {name: column_of(name, values, len(lines), faults) for name, values in columns.items()}
-        _check_pairs(arrays, faults)
         faults.raise_any()
         for name, values in arrays.items():
             SWEEP.check_numbers(name, values, lines, faults)
@@ -183,13 +180,6 @@ class ResonanceSweep(Result):
             raise TableError(f"{self.source}: there is no point between {low_khz:g} and {high_khz:g} kHz")
         columns = {name: getattr(self, name) for name in (*_COLUMNS, "lines")}
         return replace(self, **{name: None if column is None else column[kept] for name, column in columns.items()})
-
-
-def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -> None:
-    if "phase_error_deg" in columns and "phase_deg" not in columns:
-        faults.add("stands without phase_deg; add that column or remove this one", column="phase_error_deg")
-    if "phase_error_deg" in columns and "amplitude_error" not in columns:
-        faults.add("the phase has errors but the amplitude has none; add amplitude_error or remove phase_error_deg")
 
 
 @checked

@@ -107,9 +107,7 @@ def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.nda
 LEFT_OUT = {
     "measured": "already measured",
     "no orbit": "no steady single-impact orbit",
-    "several orbits": "several steady orbits: which one is seen depends on the start",
-    "fold": "near a fold, where the orbit ends and has no derivative",
-    "unsure": "no single steady orbit for some of the values that the prior, or a law's own misfit, allows",
+    "unsure": "several steady orbits, or none, or one near its end, for some of the values that the prior allows",
     "too large": "amplitudes above what the instrument takes",
     "inaccurate": "impacts too slow, or under too strong a pull, for the model: a fit excludes such rows",
 }
@@ -194,9 +192,7 @@ def candidates_of(
     holds = {
         "measured": same_drives(drives, prior.measured),
         "no orbit": orbits[0] == 0,
-        "several orbits": orbits[0] > 1,
-        "fold": fold[0] | ~np.isfinite(raw).all(axis=(1, 2)),
-        "unsure": np.any((orbits != 1) | fold, axis=0),
+        "unsure": np.any((orbits != 1) | fold, axis=0) | ~np.isfinite(raw).all(axis=(1, 2)),
         "too large": (drives.amplitude_nm if tapping else amplitude[:, 0]) > largest_nm,
         "inaccurate": model_errors.set_aside[:count],
     }

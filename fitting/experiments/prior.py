@@ -207,14 +207,12 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         uncertainty: how far values may be off, relative, where the fit does not say.
 
     Raises:
-        TableError: if a parameter or the correlations are impossible.
+        TableError: if a value or the correlations are impossible.
+        ValueError: if the model or a parameter is none.
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
-    if payload["model"] not in MODELS:
-        raise TableError(f"the saved fit has the unknown model {payload['model']!r}; fit the table again")
-    for name in payload["parameters"]:
-        if name not in PARAMETERS:
-            raise TableError(f"the saved fit has the unknown parameter {name!r}; fit the table again")
+    if payload["model"] not in MODELS or not {*payload["parameters"]} <= {*PARAMETERS}:
+        raise ValueError("a model or a parameter that no fit has")
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"

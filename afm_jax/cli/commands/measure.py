@@ -35,7 +35,7 @@ CALIBRATE = Command(
     help="""Fit frequency and quality factor to a frequency scan of the free resonance, or to a thermal spectrum.
 
     SWEEP is Nanonis text, or columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any unit) and, where
-    known, phase_deg, amplitude_error_nm (or amplitude_error), phase_error_deg. A thermal spectrum (NanoSurf .nid, or
+    known, phase_deg, amplitude_error_nm (or amplitude_error). A thermal spectrum (NanoSurf .nid, or
     asd_nm_per_sqrt_hz or psd_nm2_per_hz) gives the spring constant, too, by equipartition; with the lever's size also
     by Sader's method. Comments `# averages = 1000`, `# temperature_k = 296` and so on stand for options. frequency_khz
     is the undamped natural frequency, not that of the maximum. With --out calibration.json, .png and
@@ -44,13 +44,6 @@ CALIBRATE = Command(
     """,
     options=(
         click.argument("sweep", metavar="SWEEP", type=click.Path(path_type=Path)),
-        flag("--amplitude-only", "Ignore the phase of the scan."),
-        click.option(
-            "--noise",
-            type=Share("a relative error"),
-            metavar="SHARE",
-            help="Error of every point as a share of the largest amplitude; else estimated from the misfit.",
-        ),
         click.option(
             "--averages",
             type=Finite(positive=True),
