@@ -15,7 +15,7 @@ _SWEEP = 'scene = "figure2"\n[record]\nwhat = "orbits"\norders = [1]\n[[axes]]\n
 _SWEEP += 'parameter = "platform.amplitude_nm"\nlinear = [2, 4, 3]\n'
 _CHART = ("figure2", "--x", "platform.reduced_frequency=0.9:1.1:3", "--y", "platform.amplitude_nm=2:4:3")
 CALLS = {
-    "chart --zarr": (*_CHART, "--orders", "1", "--zarr"),
+    "chart": (*_CHART, "--orders", "1"),
     "lockin": ("trace.csv",),
     "orbits": ("figure2", "--order", "1"),
     "read": (_APPROACH, "--free-frequency-khz", "250", "--quality-factor", "400"),

@@ -14,7 +14,6 @@ def basins(
     grid: tuple[int, int],
     speeds_nm_per_us: tuple[float, float] | None,
     draws: int,
-    picture: str,
 ) -> Output:
     """Return what the starts of a scene come to, with the bands of drawn laws if the law is uncertain."""
     columns, rows = grid
@@ -25,4 +24,4 @@ def basins(
         if scene.unknowns is not None:
             band = drawn_shares(scene.scene, result, scene.unknowns, draws=draws)
             result = result._replace(share_interval95=band)
-    return Output.of(result, files={f"basins.{picture}": picture_of("dynamics:basins_figure", result, scene.scene)})
+    return Output.of(result, files={"basins.png": picture_of("dynamics:basins_figure", result, scene.scene)})

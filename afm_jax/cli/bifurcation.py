@@ -10,7 +10,7 @@ from afm_jax.dynamics.bands import verdict_probability
 from afm_jax.dynamics.bifurcations import Ramps, bifurcation_diagram
 
 
-def bifurcation(  # noqa: PLR0913
+def bifurcation(
     session: Session,
     scene: NamedScene,
     *,
@@ -19,7 +19,6 @@ def bifurcation(  # noqa: PLR0913
     down: bool,
     impacts: int,
     draws: int,
-    picture: str,
 ) -> Output:
     """Return what motions of a scene come to along a parameter, ramped up, down or both ways."""
     (swept,) = ranges_of(scene.name, scene.scene, [parameter], counted=True)
@@ -40,4 +39,4 @@ def bifurcation(  # noqa: PLR0913
     if not all(sweep.complete for sweep in sweeps):
         session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     ramps = Ramps(swept.path, sweeps, impacts)
-    return Output.of(ramps, files={f"bifurcation.{picture}": picture_of("dynamics:bifurcation_figure", ramps)})
+    return Output.of(ramps, files={"bifurcation.png": picture_of("dynamics:bifurcation_figure", ramps)})

@@ -5,10 +5,10 @@ that help needs none. The function that a row names stands in a module that impo
 runner starts JAX before it imports the module. The function gets the session (for progress and messages) and the
 options by their names, and returns an `Output`, which the runner writes (None: the function has written all itself):
 
-    def basins(session: Session, scene: NamedScene, *, grid, speeds, draws, picture) -> Output:
+    def basins(session: Session, scene: NamedScene, *, grid, speeds, draws) -> Output:
         with session.working("following starts", "starts") as report:
             result = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
-        return Output.of(result, files={f"basins.{picture}": picture_of("dynamics:basins_figure", result)})
+        return Output.of(result, files={"basins.png": picture_of("dynamics:basins_figure", result)})
 
 A result says itself: `to_dict()` is the JSON object, `printed()` what is written in the terminal, `tables()` are the
 columns of CSV files by the files' names, `reason` is why it is not valid.

@@ -17,7 +17,6 @@ def follow(
     impacts: int,
     parameter: str,
     second: str | None,
-    picture: str,
 ) -> Output:
     """Return the branches of orbits through a parameter, their special points, and these as curves in two."""
     if not isinstance(scene.scene.interaction, Contact):
@@ -34,7 +33,7 @@ def follow(
             special_errors=special_errors(followed, uncertain),
         )
     errors = {"bands": followed.amplitude_errors, "errors": followed.special_errors}
-    files = {f"branches.{picture}": picture_of("branches:continuation_figure", followed, **errors)}
+    files = {"branches.png": picture_of("branches:continuation_figure", followed, **errors)}
     if followed.curves:
-        files[f"curves.{picture}"] = picture_of("branches:curves_figure", followed)
+        files["curves.png"] = picture_of("branches:curves_figure", followed)
     return Output.of(followed, files=files)

@@ -17,7 +17,6 @@ def lyapunov(
     transient: int,
     parameter: str | None,
     draws: int,
-    picture: str,
 ) -> Output:
     """Return the Lyapunov exponents of a scene's motion, or of those along a parameter."""
     ranges = ranges_of(scene.name, scene.scene, [parameter] if parameter else [], counted=True)
@@ -35,5 +34,5 @@ def lyapunov(
     (along,) = ranges
     return Output.of(
         result._replace(along=along, larger_interval95=band),
-        files={f"lyapunov.{picture}": picture_of("dynamics:exponents_figure", result, along.path, along.values, band)},
+        files={"lyapunov.png": picture_of("dynamics:exponents_figure", result, along.path, along.values, band)},
     )

@@ -25,9 +25,6 @@ LAW = click.option(
 )
 """With `SCENE` it is loaded, too: the scene has its law then."""
 DRAWS = click.option("--draws", type=click.IntRange(2), default=20, help="Laws drawn from the fit for the bands.")
-PICTURE = click.option(
-    "--picture", type=click.Choice(("png", "pdf", "svg")), default="png", help="Format of the picture."
-)
 NOISE = click.option(
     "--noise",
     type=Share("a relative error"),

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
+from afm_jax.cli.options import DRAWS, LAW, SCENE, flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Ends, Finite, Grid, Orders, Share
 
@@ -33,7 +33,6 @@ BASINS = Command(
         ),
         LAW,
         DRAWS,
-        PICTURE,
     ),
 )
 
@@ -60,15 +59,8 @@ BIFURCATION = Command(
         click.option("--impacts", type=click.IntRange(200), default=2000, help="At every value."),
         LAW,
         DRAWS,
-        PICTURE,
     ),
 )
-
-
-def _check_chart(_: Session, options: Options) -> None:
-    """Check that a Zarr store can be written, before it is computed."""
-    if options["zarr"]:
-        import_module("zarr")
 
 
 CHART = Command(
@@ -79,8 +71,8 @@ CHART = Command(
     Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
     if there are several) the peak amplitude and the size of the larger multiplier. A contact's orbits are closed by
     simulation from those of the law closest to it: chart a thousand points, not a million; where none closes the point
-    is unresolved. With --law the fraction of the fit's draws in which an orbit is stable is given, too. With --out a
-    table (chart.csv or chart.zarr) and a picture. Exit code 3 if there is no admissible orbit at all.
+    is unresolved. With --law the fraction of the fit's draws in which an orbit is stable is given, too. With --out
+    chart.csv and a picture. Exit code 3 if there is no admissible orbit at all.
     """,
     options=(
         SCENE,
@@ -89,12 +81,9 @@ CHART = Command(
         ),
         click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows."),
         click.option("--orders", type=click.IntRange(1, 100), default=8, help="Highest order N."),
-        flag("--zarr", "Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."),
         LAW,
         DRAWS,
-        PICTURE,
     ),
-    check=_check_chart,
 )
 
 LYAPUNOV = Command(
@@ -119,7 +108,6 @@ LYAPUNOV = Command(
         ),
         LAW,
         DRAWS,
-        PICTURE,
     ),
 )
 
@@ -156,7 +144,6 @@ CONTINUE = Command(
             "--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both."
         ),
         LAW,
-        PICTURE,
     ),
 )
 
