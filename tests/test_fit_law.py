@@ -132,7 +132,7 @@ def test_delay_law_is_the_published_one(delay):
     assert delay.rms_us < np.sqrt(np.mean((published - delay.delay_us) ** 2)) < 1.1 * delay.rms_us
 
 
-def test_command_tells_and_draws_what_the_functions_find(tmp_path):
+def test_command_tells_what_the_functions_find(tmp_path):
     payload = answer(tmp_path, "collide", "--make-law")
     assert [row["model"] for row in payload["models"]] == ["law", "viscous", "full"]
     rows = table(tmp_path / "law_models.csv")
@@ -145,4 +145,3 @@ def test_command_tells_and_draws_what_the_functions_find(tmp_path):
     np.testing.assert_allclose(worst, law.worst_relative_error, rtol=1e-9, atol=0.0)
     delays = table(tmp_path / "law_delay.csv")
     assert float(delays[0]["lag_us"]) == payload["delay"]["lag_us"][0]
-    assert (tmp_path / "law.png").stat().st_size > 10_000

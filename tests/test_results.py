@@ -24,7 +24,6 @@ import afm_jax as afm
 import fitting
 from afm_jax import results, saved
 from afm_jax.contact.collide import Collisions
-from afm_jax.contact.law_of_contact import ContactLaws
 from afm_jax.dynamics.bifurcations import Ramps
 from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
@@ -326,7 +325,7 @@ def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_pat
         np.testing.assert_array_equal(axes.lines[0].get_ydata(), [np.nan, 3.0, 1.0])
 
 
-@pytest.mark.parametrize("told", [Ramps, Collisions, ContactLaws, EffectStudy])
+@pytest.mark.parametrize("told", [Ramps, Collisions, EffectStudy])
 def test_what_a_command_tells_names_a_picture_that_there_is(told: type):
     module, _, name = getattr(told, "_picture").partition(":")  # noqa: B009  # no field of a named tuple
     assert callable(getattr(importlib.import_module(module), name))

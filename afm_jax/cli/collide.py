@@ -15,7 +15,6 @@ def collide(
     *,
     speeds: tuple[float, ...] | None,
     accuracy: float,
-    method: str,
     make_law: bool,
     **options: Any,
 ) -> Output:
@@ -24,8 +23,8 @@ def collide(
         return contact_as_law(session, **options)
     contact, mass, description = chosen_contact(options)
     with session.working("colliding (the first run compiles for some seconds)"):
-        result = collisions(contact, speeds, mass, accuracy=accuracy, method=method)
-    settings = {"accuracy": accuracy, "method": method, "default_speeds": speeds is None}
+        result = collisions(contact, speeds, mass, accuracy=accuracy)
+    settings = {"accuracy": accuracy, "default_speeds": speeds is None}
     title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
     return Output.of(
         result,
@@ -39,22 +38,13 @@ def contact_as_law(
     session: Session,
     *,
     speed_range: tuple[float, float] | None,
-    delay_range: tuple[float, float] | None,
-    residuals: str | None,
     points: int | None,
     **options: Any,
 ) -> Output:
     """Return the law that a contact amounts to: a table, and the formulas that are closest to it."""
     contact, mass, description = chosen_contact(options)
     with session.working("fitting (the first run compiles for some seconds)"):
-        result = contact_laws(
-            contact,
-            speed_range=speed_range,
-            delay_range=delay_range,
-            residuals=residuals or "relative",
-            mass_ng=mass,
-            points=points or 512,
-        )
+        result = contact_laws(contact, speed_range=speed_range, mass_ng=mass, points=points or 512)
     text = result.printed()
     if session.out is not None:
         text.append(f'In a scene file: [interaction] model = "law", file = "{session.out / "law.json"}"; or --law.')
@@ -65,7 +55,6 @@ def contact_as_law(
         files={
             "law.json": lambda path: save_law(result.law, path),
             "law.csv": lambda path: save_law_csv(result.law, path),
-            "law.png": picture_of("collisions:contact_law_figure", result),
         },
         json_file="collide.json",
     )

@@ -41,7 +41,6 @@ def simulation(  # noqa: PLR0913
     until_settled: bool,
     harmonics: tuple[int, ...],
     accuracy: float,
-    method: str,
     samples: str | None,
     heights: tuple[float, ...] | None,
     noise: float | None,
@@ -49,14 +48,14 @@ def simulation(  # noqa: PLR0913
 ) -> Output:
     """Return a scene followed in time, and what an instrument reads of it; with heights an approach curve."""
     if heights is not None:
-        settings = {"longest_periods": periods and math.ceil(periods), "accuracy": accuracy, "method": method}
+        settings = {"longest_periods": periods and math.ceil(periods), "accuracy": accuracy}
         errors = {"noise": noise or NOISE, "phase_noise_deg": phase_noise_deg or PHASE_NOISE_DEG}
         return approach(session, scene, heights, settings, errors)
     until_settled = until_settled or (duration_us is None and periods is None)
     period_us = drive_of(scene.scene).period_us
     longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period_us
     _check_duration(scene.scene, longest)
-    settings = {"accuracy": accuracy, "method": method, "until_settled": until_settled}
+    settings = {"accuracy": accuracy, "until_settled": until_settled}
     run = _follow(session, scene, longest, settings)
     with session.working("reading amplitudes"):
         dense = _dense(scene.scene, run, to_files=session.out is not None)

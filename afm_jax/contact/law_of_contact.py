@@ -423,8 +423,7 @@ class ContactLaws(NamedTuple):
     delay: ContactDelay
     law: TabulatedLaw
 
-    text, plot = Result.text, Result.plot
-    _picture = "afm_jax.plots.collisions:contact_law_figure"
+    text = Result.text
 
     @property
     def reason(self) -> str | None:

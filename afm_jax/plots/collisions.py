@@ -1,13 +1,9 @@
-"""The pictures of collisions: rebound speed and delay against approach speed; the laws fitted to them, their errors."""
-
-from collections.abc import Sequence
+"""The picture of collisions: rebound speed, delay and losses against approach speed."""
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.contact.collide import Collision, Collisions
-from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, ContactLaws
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 from afm_jax.results import known_columns
 from afm_jax.words import counted
@@ -71,50 +67,3 @@ _LOSSES = {
     "junction_hysteresis_aj": ("solid junction", ACCENT),
     "viscous_loss_aj": ("viscous", "#009E73"),
 }
-
-
-# Okabe and Ito's colours, distinguishable with every kind of colour vision.
-_COLOURS = {"law": "#D55E00", "viscous": "#0072B2", "full": "#009E73"}
-_NAMES = {"law": r"$r$, $\epsilon$", "viscous": r"$\epsilon$, $c$", "full": r"$r$, $\epsilon$, $c$"}
-
-
-def contact_law_figure(law: ContactLaws) -> Figure:
-    """Return the relative errors of the laws on the left, delay, lag, lead and delay law on the right."""
-    figure = new_figure(11.0, 5.0)
-    left, right = figure.subplots(1, 2)
-    _draw_laws(left, law.formulas)
-    _draw_delay(right, law.delay)
-    return figure
-
-
-def _draw_laws(axes: Axes, laws: Sequence[ContactLaw]) -> None:
-    for law in laws:
-        name, colour = _NAMES.get(law.model, law.model), _COLOURS.get(law.model, DARK)
-        label = f"{name}: worst {100.0 * law.worst_relative_error:.2g} %"
-        axes.plot(law.approach_speed_nm_per_us, 100.0 * law.relative_error, color=colour, lw=1.8, label=label)
-    axes.axhline(0.0, color=GRID, lw=0.8)
-    label_axes(axes, x=r"approach speed  $u_{in}$ (nm/µs)", y=r"$u_{fit}/u_{out} - 1$  (%)")
-    axes.set_title(
-        rf"$u_{{out}}^2 = r^2 u_{{in}}^2 - c\,u_{{in}} - \epsilon$, {laws[0].residuals} residuals", fontsize=11
-    )
-    axes.grid(color=GRID, alpha=0.25)
-    axes.legend(fontsize=10)
-
-
-def _draw_delay(axes: Axes, delay: ContactDelay) -> None:
-    speed = delay.approach_speed_nm_per_us
-    axes.plot(speed, delay.lag_us, color=_COLOURS["viscous"], lw=1.4, label="lag: in the solid junction")
-    axes.plot(speed, -delay.lead_us, color=_COLOURS["law"], lw=1.4, label="- lead: outside it")
-    axes.plot(speed, delay.delay_us, color=DARK, lw=2.0, label="delay = lag - lead")
-    axes.plot(speed, delay.fitted_us, color=_COLOURS["full"], lw=1.6, ls="--", label="delay law")
-    axes.axhline(0.0, color=GRID, lw=0.8)
-    axes.set_xscale("log")
-    ticks = [tick for tick in (5, 10, 20, 50, 100, 200, 500, 1000) if speed[0] <= tick <= speed[-1]]
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    axes.set_xticks([], minor=True)
-    label_axes(axes, x=r"approach speed  $u_{in}$ (nm/µs)", y="time (µs)")
-    values = ", ".join(f"{float(np.asarray(value)):.3g}" for value in (delay.delay.hertz, delay.delay.lead_nm))
-    values += f", {float(delay.delay.offset_nm):.3g}"
-    axes.set_title(rf"$a\,u^{{-1/5}} - b\,(1/w - 1/u) - d/u$  with  {values}", fontsize=11)
-    axes.grid(color=GRID, alpha=0.25)
-    axes.legend(fontsize=10)

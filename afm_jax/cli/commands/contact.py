@@ -13,7 +13,7 @@ _PROGRAMS = ("afm_jax.contact.collide:_capture_speed", "afm_jax.contact.collide:
 
 def _check_law(_: Session, options: Options) -> None:
     """Check that options of a law go with --make-law, and others without."""
-    of_laws = ("speed_range", "delay_range", "residuals", "points")
+    of_laws = ("speed_range", "points")
     given = [name for name in of_laws if options[name] is not None]
     if given and not options["make_law"]:
         raise click.UsageError(f"--{given[0].replace('_', '-')} is of the formulas of a law: add --make-law")
@@ -46,12 +46,6 @@ COLLIDE = Command(
             default=1e-9,
             help="Wanted relative accuracy of the rebound speed.",
         ),
-        click.option(
-            "--method",
-            type=click.Choice(("diffrax", "collocation")),
-            default="diffrax",
-            help="How the way through the bridge is integrated.",
-        ),
         flag(
             "--make-law",
             "Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
@@ -63,18 +57,6 @@ COLLIDE = Command(
             metavar="LOW:HIGH",
             help="With --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed "
             "to 250.",
-        ),
-        click.option(
-            "--delay-range",
-            type=Ends(),
-            metavar="LOW:HIGH",
-            help="With --make-law: the same for the delay's formula. Left out: 1.37 times the capture speed to 700.",
-        ),
-        click.option(
-            "--residuals",
-            type=click.Choice(("relative", "absolute")),
-            help="With --make-law: what is made small, u_fit/u_out - 1 (this is what happens without) or u_fit - "
-            "u_out.",
         ),
         click.option(
             "--points",

@@ -281,13 +281,6 @@ SIMULATE = Command(
             help="Of every resolved contact: relative of the rebound speed.",
         ),
         click.option(
-            "--method",
-            type=click.Choice(("collocation", "diffrax")),
-            default="collocation",
-            help="The way through a resolved contact: leg by leg, or in time throughout with Diffrax's Dopri8 "
-            "(slower).",
-        ),
-        click.option(
             "--samples",
             type=click.Choice(["uniform"]),
             help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
