@@ -15,7 +15,6 @@ from afm_jax.contact.parameters import (
     DRY_PARAMETERS,
     EFFECTS,
     REMOVABLE_EFFECTS,
-    REQUIRED_EFFECTS,
     idle_without,
 )
 
@@ -31,13 +30,6 @@ class ChosenContact(NamedTuple):
     description: dict[str, Any]
 
 
-_OF_THE_TIP = {
-    "mass_ng": "Effective mass of the tip; the scene's, or 1.",
-    "spring_constant_n_per_m": "Or its spring constant, whose mass is k/Omega^2.",
-    "free_frequency_khz": "Of the cantilever, for --spring-constant-n-per-m; else the scene's.",
-}
-
-
 def _number(name: str, text: str) -> Callable[..., Any]:
     return click.option(option_of(name), type=Finite(), metavar="X", help=text)
 
@@ -46,9 +38,8 @@ CONTACT_OPTIONS = (
     click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=click.Path()),
     *(_number(each.name, f"{each.meaning}; paper: {each.default:g}.") for each in CONTACT_PARAMETERS),
     *(_number(each.name, f"{each.meaning}; of a dry contact: {each.default:g}.") for each in DRY_PARAMETERS),
-    *(_number(name, text) for name, text in _OF_THE_TIP.items()),
+    _number("mass_ng", "Effective mass of the tip; the scene's, or 1."),
     *(flag(f"--no-{name}", f"Leave the {name} force out.") for name in REMOVABLE_EFFECTS),
-    *(flag(f"--no-{name}", "Not possible; says why.") for name in REQUIRED_EFFECTS),
 )
 """A scene, and what is changed of its contact or of the paper's: `chosen_contact` takes what the call says of them."""
 
@@ -67,25 +58,21 @@ def chosen_contact(options: Mapping[str, Any]) -> ChosenContact:
     from afm_jax.scenefile.contact import contact_parameters, make_contact  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import MASS_ASSUMED  # noqa: PLC0415
 
-    for name, reason in REQUIRED_EFFECTS.items():
-        if options[f"no_{name}"]:
-            raise click.UsageError(f"--no-{name} is not possible: {reason}")
     changed = {name: options[name] for name in DEFAULTS if options[name] is not None}
     for name, value in changed.items():
         check_parameter(option_of(name), value, CONTACT_RANGES[name], optional=True)
-    for name in _OF_THE_TIP:
-        check_parameter(option_of(name), options[name], "positive", optional=True)
-    effects, parameters, tip = EFFECTS, {}, {}
-    mass_given = options["mass_ng"] is not None or options["spring_constant_n_per_m"] is not None
+    mass = options["mass_ng"]
+    check_parameter("--mass-ng", mass, "positive", optional=True)
+    effects, parameters, of_scene = EFFECTS, {}, None
     if options["scene"] is not None:
-        effects, parameters, tip = _of_scene(options["scene"], notes=not mass_given)
+        effects, parameters, of_scene = _of_scene(options["scene"], notes=mass is None)
     effects = tuple(name for name in effects if not options.get(f"no_{name}"))
     for name in changed:
         missing = idle_without(name, effects)
         if missing:
             raise click.UsageError(f"{option_of(name)} changes nothing without the effect {' or '.join(missing)}")
     contact = make_contact(effects, {**parameters, **changed})
-    mass = _mass(options, tip) if mass_given else tip.get("mass_ng")
+    mass = of_scene if mass is None else mass
     if mass is None:
         mass = 1.0
         add_note(f"{MASS_ASSUMED} (--mass-ng).")
@@ -93,23 +80,8 @@ def chosen_contact(options: Mapping[str, Any]) -> ChosenContact:
     return ChosenContact(contact, mass, {"effects": list(contact.effects), **numbers})
 
 
-def _mass(options: Mapping[str, Any], tip: Mapping[str, float]) -> float:
-    """Return the mass that --mass-ng and --spring-constant-n-per-m say.
-
-    Raises:
-        click.UsageError: if the spring constant has no frequency.
-        ValueError: if both are given and 2 % apart or more.
-    """
-    from afm_jax.apparatus.cantilever import mass_of  # noqa: PLC0415
-
-    frequency = options["free_frequency_khz"] or tip.get("frequency_khz")
-    if options["spring_constant_n_per_m"] is not None and frequency is None:
-        raise click.UsageError("--spring-constant-n-per-m says the mass with --free-frequency-khz alone; give it, too")
-    return float(mass_of(frequency, options["mass_ng"], options["spring_constant_n_per_m"]))
-
-
-def _of_scene(path: str, *, notes: bool) -> tuple[tuple[str, ...], dict[str, float], dict[str, float]]:
-    """Return effects, parameters, and mass and frequency of a scene file; ``notes``: say what it leaves open."""
+def _of_scene(path: str, *, notes: bool) -> tuple[tuple[str, ...], dict[str, float], float]:
+    """Return effects, parameters and mass of a scene file; ``notes``: say what it leaves open."""
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
 
@@ -118,5 +90,4 @@ def _of_scene(path: str, *, notes: bool) -> tuple[tuple[str, ...], dict[str, flo
         model = "none" if scene.interaction is None else "law"
         raise ValueError(f'{path}: [interaction] model: must be "contact" here, but is "{model}"')  # noqa: TRY004
     numbers = {name: float(value) for name, value in contact_parameters(scene.interaction).items()}
-    tip = {name: float(getattr(scene.cantilever, name)) for name in ("mass_ng", "frequency_khz")}
-    return scene.interaction.effects, numbers, tip
+    return scene.interaction.effects, numbers, float(scene.cantilever.mass_ng)
