@@ -10,10 +10,8 @@ import errno
 import io
 import os
 import secrets
-import select
 import shutil
 import stat
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -25,61 +23,24 @@ MOST_VALUES = LARGEST_BYTES // 8
 """Of what a file says that it holds, in all its columns: as many 64-bit numbers as there are such bytes."""
 MOST_PACKED = 1000
 """Times its own size that a file may unpack to: more than recorded signals can be compressed."""
-_PATIENCE_S = 2.0
-"""For somebody to begin to write into a pipe."""
 
 
 def read_whole(path: str | os.PathLike[str]) -> bytes:
     """Return what a file, a device or a pipe holds.
 
     Raises:
-        OSError: if it cannot be read, holds too much, or is a pipe that nobody writes to.
+        OSError: if it cannot be read, or holds too much.
     """
-    # a pipe that nobody has opened to write would let this wait for ever
-    with open(path, "rb", buffering=0, opener=lambda name, flags: os.open(name, flags | _AT_ONCE)) as file:
-        is_pipe = stat.S_ISFIFO(os.fstat(file.fileno()).st_mode)
-        if _AT_ONCE:
-            os.set_blocking(file.fileno(), not is_pipe)
-        data = _piped(file) if is_pipe and _AT_ONCE else _read(file)
-    if len(data) > LARGEST_BYTES:
-        raise OSError(errno.EFBIG, f"it holds more than {LARGEST_BYTES:,} bytes", os.fspath(path))
-    return data
-
-
-_AT_ONCE = getattr(os, "O_NONBLOCK", 0)
-_PART = 1 << 20
-
-
-def _read(file: io.FileIO) -> bytes:
-    """Return what a file holds, at most a byte more than may be read."""
     whole = bytearray()
-    while len(whole) <= LARGEST_BYTES and (part := file.read(min(_PART, LARGEST_BYTES + 1 - len(whole)))):
-        whole += part
-    return bytes(whole)
-
-
-def _piped(file: io.FileIO) -> bytes:
-    """Return what is written into a pipe until its last writer leaves.
-
-    Raises:
-        OSError: if there is none.
-    """
-    whole, until = bytearray(), time.monotonic() + _PATIENCE_S
-    begun = False
-    while len(whole) <= LARGEST_BYTES:
-        part = file.read(_PART)
-        if part:
+    with io.FileIO(path) as file:
+        while len(whole) <= LARGEST_BYTES and (part := file.read(min(_PART, LARGEST_BYTES + 1 - len(whole)))):
             whole += part
-        elif part == b"" and (begun or time.monotonic() > until):
-            break
-        # nothing yet is None: there is a writer
-        begun = begun or part is None or bool(part)
-        if not part:
-            select.select([file], [], [], 0.1)
-            time.sleep(0.0 if begun else 0.02)
-    if not begun:
-        raise OSError(errno.EPIPE, "it is a pipe that nobody writes to")
+    if len(whole) > LARGEST_BYTES:
+        raise OSError(errno.EFBIG, f"it holds more than {LARGEST_BYTES:,} bytes", os.fspath(path))
     return bytes(whole)
+
+
+_PART = 1 << 20
 
 
 def first_bytes(path: str | os.PathLike[str], count: int) -> bytes:
