@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import label_axes, new_figure
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
 _MOST = 1000
 """Values along an axis that a picture shows."""
 _MOST_ROWS = 4
-_MOST_IN_BETWEEN = 100.0
-"""Ratio of the ends up to which there is room for labels between powers of ten."""
 
 
 def sweep_figure(found: "xarray.Dataset", names: Sequence[str]) -> Figure:
@@ -92,9 +89,4 @@ def _draw(panel: Axes, found: "xarray.Dataset", name: str, swept: Sequence[str],
         low, high = found[each].values.min(), found[each].values.max()
         # all that was swept, also where there is no result
         panel.update_datalim([(low, low), (high, high)], updatex=side == "x", updatey=side == "y")
-        if each in log:
-            axis = panel.xaxis if side == "x" else panel.yaxis
-            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _MOST_IN_BETWEEN * low else (1.0,)))
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter("")
     panel.autoscale_view()

@@ -40,9 +40,6 @@ INNER_TABLES = tuple(name for name in KEYS if "." in name)
 MODELS = ("law", "contact", "none")
 """The models of an interaction; "none": a free cantilever."""
 
-_UNITS = ("_nm_per_us", "_khz", "_n_per_m", "_nm", "_nn", "_ng", "_deg")
-_UNITS += ("_j_per_m2", "_cm3_per_mol", "_pa_s", "_j_m6", "_gpa", "_k")
-
 
 def keys_of(table: str, model: str) -> tuple[str, ...]:
     """Return the keys that a table may have in a scene whose interaction is of one of the `MODELS`."""
@@ -62,7 +59,7 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     >>> advise_key("platform", "frequency_hz")
     'unknown key; use frequency_khz'
     >>> advise_key("cantilever", "frequency")
-    'the unit is missing; use frequency_khz'
+    'unknown key; use frequency_khz'
     >>> advise_key("platform", "quality_factor")
     'unknown key; it belongs in [cantilever]'
     >>> advise_key("force", "amplitude_nm")
@@ -75,27 +72,19 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
         key: what the file has there.
         model: of the scene's interaction, one of `MODELS`.
     """
-    keys = keys_of(table, model)
-    allowed = {name.casefold(): name for name in keys}
-    plain = key.casefold()
-    stems = {_stem(name): name for name in keys}
-    if plain in stems and plain not in allowed:
-        return f"the unit is missing; use {stems[plain]}"
-    meant = allowed.get(plain, stems.get(_stem(plain)))
-    if meant is not None:
-        return f"unknown key; use {meant}"
+    keys, plain = keys_of(table, model), key.casefold()
     others = [other for other in MODELS if other != model and plain in keys_of("interaction", other)]
     if table == "interaction" and others:
         whose = "a free cantilever" if model == "none" else f"a {model}"
         return f'unknown key of {whose}; it belongs to model = "{others[0]}"'
+    without_unit = [name for name in keys if name.startswith(f"{plain}_")]
+    nearest = without_unit or difflib.get_close_matches(plain, keys, cutoff=0.7)
+    if nearest:
+        return f"unknown key; use {nearest[0]}"
     owners = _owners(plain)
     if owners:
         return f"unknown key; it belongs in {' or '.join(owners)}"
-    same_quantity = [stem for stem in stems if plain.startswith(f"{stem}_")]
-    if same_quantity:
-        return f"unknown key; use {stems[max(same_quantity, key=len)]}"
-    nearest = difflib.get_close_matches(plain, allowed, n=1)
-    return f"unknown key; use {nearest[0]}" if nearest else f"unknown key; use one of {', '.join(keys)}"
+    return f"unknown key; use one of {', '.join(keys)}"
 
 
 def advise_table(name: str, *, is_table: bool) -> str:
@@ -123,11 +112,6 @@ def advise_table(name: str, *, is_table: bool) -> str:
 def _owners(key: str) -> list[str]:
     """Return the tables that have a key, in brackets, but for second frequencies, which have the keys of the first."""
     return [f"[{table}]" for table, keys in KEYS.items() if key in keys and not table.endswith(".second")]
-
-
-def _stem(name: str) -> str:
-    """Return a key without its unit."""
-    return next((name.removesuffix(unit) for unit in _UNITS if name.endswith(unit)), name)
 
 
 Built = TypeVar("Built")
