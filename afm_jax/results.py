@@ -6,7 +6,6 @@ can be told too.
 """
 
 import enum
-import html
 import importlib
 import io
 import math
@@ -67,9 +66,6 @@ class Result:
 
     def __repr__(self) -> str:
         return text_of(self)
-
-    def _repr_html_(self) -> str:
-        return html_of(self)
 
     def text(self) -> str:
         """Return what the command that computes this result prints; of a result without one its fields in 20 lines."""
@@ -155,16 +151,6 @@ def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
         elif part is not None:
             console.print(part)
     return text.getvalue().rstrip("\n")
-
-
-def html_of(self: Any) -> str:
-    """Return a result as an HTML table for notebooks: a row a field, arrays by their range, outcomes in words."""
-    cells = "".join(
-        f"<tr><td style='text-align:left'><code>{html.escape(name)}</code></td>"
-        f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
-        for name, text in _lines(self)
-    )
-    return f"<table><caption style='text-align:left'><b>{type(self).__name__}</b></caption>{cells}</table>"
 
 
 def unit_of(name: str) -> str:

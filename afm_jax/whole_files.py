@@ -55,34 +55,21 @@ def first_bytes(path: str | os.PathLike[str], count: int) -> bytes:
         return file.read(count)
 
 
-def check_plain(path: str | os.PathLike[str], *, within: str | os.PathLike[str] | None = None) -> None:
-    """Check that a path is not, and does not lead through, a link, a device or a pipe that lies in a folder.
-
-    Args:
-        path: of a file or a folder, which need not exist.
-        within: the folder below which every part of the path is looked at; None: the last part alone.
+def check_plain(path: str | os.PathLike[str]) -> None:
+    """Check that there is no link, device or pipe at a path; there may be nothing.
 
     Raises:
-        OSError: that names the part and how to mend it.
+        OSError: that names it and how to mend it.
     """
-    place = Path(path)
-    # by its letters, not by what links would make of it
-    parts = place.relative_to(Path(within)).parts if within is not None else place.parts[-1:]
-    if ".." in parts:
-        raise OSError(errno.EINVAL, "leads out of its folder", str(place))
-    for count in reversed(range(len(parts))):
-        part = place.parents[count - 1] if count else place
-        try:
-            mode = part.lstat().st_mode
-        except FileNotFoundError:
-            return
-        if stat.S_ISLNK(mode):
-            raise OSError(
-                errno.ELOOP, "is a link, which is not followed; delete it or choose another folder", str(part)
-            )
-        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
-            what = "is a device or a pipe, not a file; delete it or choose another folder"
-            raise OSError(errno.EINVAL, what, str(part))
+    try:
+        mode = Path(path).lstat().st_mode
+    except FileNotFoundError:
+        return
+    if stat.S_ISLNK(mode):
+        raise OSError(errno.ELOOP, "is a link, which is not followed; delete it or choose another folder", str(path))
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        what = "is a device or a pipe, not a file; delete it or choose another folder"
+        raise OSError(errno.EINVAL, what, str(path))
 
 
 @contextmanager
@@ -129,21 +116,15 @@ def in_callers_words(text: str) -> str:
 _named: ContextVar[Callable[[str], str] | None] = ContextVar("_named", default=None)
 
 
-def write_whole(
-    path: str | os.PathLike[str],
-    content: str | bytes,
-    *,
-    within: str | os.PathLike[str] | None = None,
-    named_by_user: bool = False,
-) -> None:
+def write_whole(path: str | os.PathLike[str], content: str | bytes, *, named_by_user: bool = False) -> None:
     """Write a file whole or not at all: beside its place, and then there in one step; one that was there is replaced.
 
     Args:
         path: of the file.
         content: bytes, or a text, in the caller's words (`in_callers_words`), to be encoded as UTF-8; what no encoding
             has, as in names of files, is escaped.
-        within: folder below which no part of the path may be a link; None: the file itself must be none.
-        named_by_user: whether the user gave this very path: a link there is followed, a device or a pipe written to.
+        named_by_user: whether the user gave this very path: a link there is followed, a device or a pipe written to;
+            else it must be none of these.
 
     Raises:
         OSError: naming the file, if it cannot be written; what was there before is still there.
@@ -155,7 +136,7 @@ def write_whole(
     target = Path(os.path.realpath(place)) if named_by_user else place
     try:
         if not named_by_user:
-            check_plain(place, within=within)
+            check_plain(place)
         elif target.exists() and not target.is_file():
             target.write_bytes(content)
             return

@@ -44,8 +44,8 @@ def unchecked(name: str, folder: Path) -> tuple[int, str, list[str], list[str]]:
     out, looked = folder / f"out of {name}", set()
     check = whole_files.check_plain
 
-    def noted(path: Path, **where: Path) -> None:
-        check(path, **where)
+    def noted(path: Path) -> None:
+        check(path)
         looked.add(Path(path).absolute())
 
     words = [str(folder / word) if (folder / word).is_file() else word for word in CALLS[name]]

@@ -22,7 +22,7 @@ import click
 from afm_jax.columns import columns_of, csv_cells
 from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
-from afm_jax.whole_files import check_plain, in_callers_words, write_whole
+from afm_jax.whole_files import in_callers_words, write_whole
 from afm_jax.words import broken, lines_at_most, shown, text_table
 
 if TYPE_CHECKING:
@@ -36,18 +36,12 @@ FIT_PROGRAMS = tuple(
 """Jitted functions of a fit of the impact law whose traces are kept (see `Session.start_computing`)."""
 
 
-def prepare_folder(folder: Path, *, within: Path | None = None) -> None:
+def prepare_folder(folder: Path) -> None:
     """Make a folder, with those above it, and check that a file can be written there.
-
-    Args:
-        folder: to be made.
-        within: the user's own folder, below which no part may be a link.
 
     Raises:
         OSError: if it cannot be made or written to.
     """
-    if within is not None:
-        check_plain(folder, within=within)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass

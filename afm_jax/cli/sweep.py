@@ -15,11 +15,11 @@ from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import scene_and_start
 from afm_jax.compilation_cache import available_cores
-from afm_jax.scenefile.scenefile import read_toml, scene_of_tables, scene_tables
+from afm_jax.scenefile.scenefile import read_toml, scene_tables
 from afm_jax.studies.sweep import EXTRAPOLATED, MESSAGE, STORE, SweepPlan, plan_of, run_plan
 from afm_jax.words import counted
 
-_KEYS = {"scene": (str, dict), "record": (dict,), "axes": (list,), "accuracy": (float, int), "chunk": (int,)}
+_KEYS = {"scene": (str,), "record": (dict,), "axes": (list,), "accuracy": (float, int), "chunk": (int,)}
 _MOST_DRAWN = 2
 """Axes of a sweep that a picture can show."""
 _MOST_MESSAGES = 3
@@ -97,11 +97,8 @@ def _plan(given: dict[str, Any], folder: Path, law: Path | None) -> SweepPlan:
     if "scene" not in given or "record" not in given:
         missing = 'scene = "scene.toml"' if "scene" not in given else '[record] with what = "orbits"'
         raise ValueError(f"add {missing} (afm-jax sweep --help shows a whole file)")
-    if isinstance(given["scene"], dict):
-        scene, start = scene_of_tables(given["scene"], "scene"), None
-    else:
-        beside = folder / given["scene"]
-        scene, start = scene_and_start(str(beside) if beside.exists() else given["scene"])
+    beside = folder / given["scene"]
+    scene, start = scene_and_start(str(beside) if beside.exists() else given["scene"])
     scene, _ = with_fitted_law(scene, law)
     # a start is of use for simulations alone
     begin = start._asdict() if start is not None and given["record"].get("what") == "simulation" else None

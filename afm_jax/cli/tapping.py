@@ -11,6 +11,7 @@ from afm_jax.cli.command import Output
 from afm_jax.cli.commands.measure import READING_OPTIONS
 from afm_jax.cli.session import FIT_PROGRAMS, Session, add_note, prepare_folder
 from afm_jax.cli.values import option_of
+from afm_jax.whole_files import check_plain
 from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS
 from fitting.tables.table import AmplitudeTable, read_table
 from fitting.tapping_curves.measured import MeasuredFile, is_table, read_measured
@@ -116,7 +117,8 @@ def _write_curves(
     written: list[Path] = []
     for number, result in curves.items():
         below = folder / f"curve_{number}"
-        prepare_folder(below, within=folder)
+        check_plain(below)
+        prepare_folder(below)
         written += write_tapping(result, below, replace(session, out=below).write_table)
     if whole is not None and whole.scatter:
         written += write_together(whole, folder)

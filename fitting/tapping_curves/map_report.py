@@ -98,7 +98,7 @@ def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[
     if "gsf" in formats:
         contents |= {f"map_{name}.gsf": _simple_field(result, name) for name in ARRAYS}
     for name, content in contents.items():
-        write_whole(folder / name, content, within=folder)
+        write_whole(folder / name, content)
     if "zarr" in formats:
         _write_zarr(result, folder / "map.zarr")
     return [folder / name for name in (*contents, *(["map.zarr"] if "zarr" in formats else []))]

@@ -259,12 +259,12 @@ SIMULATE = Command(
         click.option(
             "--duration-us", type=Finite(positive=True), metavar="T", help="How long to follow the scene, in us."
         ),
-        click.option("--periods", type=Finite(positive=True), metavar="P", help="How long, in periods of the drive."),
-        flag(
-            "--until-settled",
-            f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive "
-            f"periods. "
-            "This is what happens without a duration.",
+        click.option(
+            "--periods",
+            type=Finite(positive=True),
+            metavar="P",
+            help="How long, in periods of the drive. Without a duration the end is where the motion has settled, after "
+            f"{DEFAULT_PERIODS} of them at most.",
         ),
         click.option(
             "--harmonics",
