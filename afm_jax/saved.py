@@ -221,12 +221,7 @@ def _built(kind: type[Any], values: dict[str, Any]) -> Any:
         return kind(**values)
     record = object.__new__(kind)
     for field in dataclasses.fields(kind):
-        if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            raise KeyError(f"{kind.__name__} has no {field.name}")
-        default = None if field.default is dataclasses.MISSING else field.default
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
-        object.__setattr__(record, field.name, values.get(field.name, default))
+        object.__setattr__(record, field.name, values[field.name])
     return record
 
 

@@ -119,10 +119,6 @@ def is_inner(error: ValueError) -> bool:
 def _called_wrongly(error: click.ClickException) -> str:
     message = error.format_message().rstrip(".")
     context = error.ctx if isinstance(error, click.UsageError) else None
-    if isinstance(error, click.NoSuchOption):
-        message = f"there is no option `{error.option_name}`"
-        if error.possibilities:
-            return f"{message}; did you mean `{error.possibilities[0]}`?"
     # the group's own messages say enough; those of a command are followed by where its options are explained
     return message if context is None or context.parent is None else f"{message} (see {context.command_path} --help)"
 

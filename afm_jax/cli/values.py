@@ -60,14 +60,12 @@ class Finite(ValueKind):
 
     name = "number"
 
-    def __init__(self, *, positive: bool = False, none: bool = False):
-        """Say whether it must be positive, and whether it may be the word "none", which stands for infinity."""
-        self.positive, self.none = positive, none
+    def __init__(self, *, positive: bool = False):
+        """Say whether it must be positive."""
+        self.positive = positive
 
     def read(self, text: str) -> float:
         """Return the number that a text says."""
-        if self.none and text == "none":
-            return math.inf
         number = _number_or_nan(text)
         if not (number > 0.0 if self.positive else math.isfinite(number)):
             wanted = "positive" if self.positive else "finite"

@@ -105,10 +105,8 @@ _GIVE = "give a fit.json of `afm-jax fit --out`, a law.json of `afm-jax collide 
 def _of_json(text: str) -> tuple[TabulatedLaw, Mapping[str, Any]]:
     try:
         contents = json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"line {getattr(error, 'lineno', 1)} is no JSON; {_GIVE}") from error
-    except RecursionError:
-        raise ValueError(f"has too many brackets within each other; {_GIVE}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"line {getattr(error, 'lineno', 1)} is no JSON; {_GIVE}") from None
     kind = contents.get("format") if isinstance(contents, dict) else None
     if kind not in (FORMAT, FIT_FORMAT):
         raise ValueError(f"holds no law; {_GIVE}")

@@ -61,16 +61,13 @@ def parse_range(text: str, *, counted: bool) -> ParameterRange:
     example = f"platform.reduced_frequency=0.9:1.1{':100' if counted else ''}"
     path, _, rest = text.partition("=")
     parts = [part.strip() for part in rest.split(":")]
-    if not path.strip() or len(parts) != (3 if counted else 2):
-        raise ValueError(f"`{text}` is no range of a parameter; write {shape} as in {example}")
     try:
         low, high = float(parts[0]), float(parts[1])
-    except ValueError:
+    except (IndexError, ValueError):
         low = high = math.nan
-    if not (math.isfinite(low) and math.isfinite(high)):
-        raise ValueError(f"`{text}`: the ends of a range must be numbers; write {shape} as in {example}")
-    if not low < high:
-        raise ValueError(f"`{text}`: the range is empty; its first end must be below its second, as in {example}")
+    rises = low < high and math.isfinite(low) and math.isfinite(high)
+    if not path.strip() or len(parts) != (3 if counted else 2) or not rises:
+        raise ValueError(f"`{text}` is no rising range of a parameter; write {shape} as in {example}")
     if not counted:
         return ParameterRange(path.strip(), low, high)
     if not (parts[2].isascii() and parts[2].isdigit() and 2 <= int(parts[2]) <= _MOST_VALUES):

@@ -101,12 +101,8 @@ def advise_table(name: str, *, is_table: bool) -> str:
     if not is_table:
         tables = _owners(plain) or [f"[{table}]" for table in TABLES]
         return f"stands outside any table; write it below {' or '.join(tables)}"
-    inner = [table.rpartition(".")[2] for table in INNER_TABLES]
-    nearest = difflib.get_close_matches(plain, [*TABLES, *inner], n=1)
-    if nearest:
-        meant = [f"[{table}]" for table in KEYS if table.rpartition(".")[2] == nearest[0]]
-        return f"unknown table; use {' or '.join(meant)}"
-    return f"unknown table; use {', '.join(f'[{table}]' for table in TABLES)}"
+    nearest = difflib.get_close_matches(plain, TABLES, n=1) or KEYS
+    return f"unknown table; use {', '.join(f'[{table}]' for table in nearest)}"
 
 
 def _owners(key: str) -> list[str]:
@@ -239,7 +235,7 @@ def in_words(value: Any) -> str:
         case bool():
             return "true" if value else "false"
         case str():
-            return f"the text {value!r}; leave out the quotes" if _looks_like_a_number(value) else "a text"
+            return "a text"
         case list():
             return "a list"
         case dict():
@@ -266,11 +262,3 @@ def cut_short(text: str, length: int) -> str:
     """Return a text without its middle where it is longer than a number of letters."""
     half = (length - 5) // 2
     return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"
-
-
-def _looks_like_a_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return len(text) < 40
