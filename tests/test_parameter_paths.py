@@ -29,8 +29,8 @@ def law_scene(**parts) -> Scene:
 def test_what_is_no_range_is_said():
     """What else a range cannot be, and what a scene cannot have, are lines of the corpus (`tests.malformed`)."""
     for text, counted, words in (
-        ("platform.amplitude_nm=1:2", True, "no range of a parameter"),
-        ("=1:2:3", True, "no range of a parameter"),
+        ("platform.amplitude_nm=1:2", True, "no rising range of a parameter"),
+        ("=1:2:3", True, "no rising range of a parameter"),
         ("platform.amplitude_nm=1:2:1", True, "the number of values"),
         ("interaction.r=0.5:0.9:3", False, "PARAMETER=low:high as in"),
     ):

@@ -247,18 +247,6 @@ def option_of(parameter: str) -> str:
     return f"--{parameter.replace('_', '-')}"
 
 
-def parse_number(text: str) -> float:
-    """Return the number that a text says.
-
-    Raises:
-        ValueError: if it is no finite number.
-    """
-    number = _number_or_nan(text)
-    if not math.isfinite(number):
-        raise ValueError(f"`{text.strip()}` is not a number")
-    return number
-
-
 def parse_around_plus_minus(text: str) -> list[float]:
     """Return the numbers that a text has around +-, +/- or ±.
 
@@ -268,7 +256,8 @@ def parse_around_plus_minus(text: str) -> list[float]:
     Raises:
         ValueError: if one of them is no finite number.
     """
-    return [parse_number(part) for part in text.replace("±", "+-").replace("+/-", "+-").split("+-")]
+    parts = text.replace("±", "+-").replace("+/-", "+-").split("+-")
+    return [_number(part, "value", positive=False) for part in parts]
 
 
 def _number_or_nan(text: str) -> float:
