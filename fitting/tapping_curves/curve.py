@@ -104,18 +104,10 @@ class TappingCurve:
         return bool(np.isfinite(self.lag_deg).any())
 
     @property
-    def relative_errors(self) -> dict[str, float]:
-        """Relative standard errors of every energy and virial, which go with k and the square of lengths, by name."""
-        calibration, spring = self.tip_calibration, self.spring_constant_n_per_m
-        return {
-            "tip_calibration": 2.0 * calibration.error / calibration.value,
-            "spring_constant_n_per_m": spring.error / spring.value,
-        }
-
-    @property
     def relative_error(self) -> float:
-        """Relative standard error that all energies and virials have in common."""
-        return float(np.linalg.norm(list(self.relative_errors.values())))
+        """Relative standard error of all energies and virials, which go with k and the square of lengths."""
+        calibration, spring = self.tip_calibration, self.spring_constant_n_per_m
+        return float(np.hypot(2.0 * calibration.error / calibration.value, spring.error / spring.value))
 
 
 def part_of(rows: R, chosen: Bool[np.ndarray, " rows"]) -> R:

@@ -1064,7 +1064,6 @@ class OneEnergy:
         energy_aj: of each group.
         error_aj: its standard error but for spring constant and calibration.
         relative_error: what these add.
-        budget: of each group what its variance comes from, in aJ^2.
         nuisances: of the instrument.
         instrument: at the minimum.
         used: rows that were fitted.
@@ -1077,7 +1076,6 @@ class OneEnergy:
     energy_aj: Float[np.ndarray, " groups"]
     error_aj: Float[np.ndarray, " groups"]
     relative_error: float
-    budget: tuple[dict[str, float], ...]
     nuisances: tuple[Nuisance, ...]
     instrument: Instrument
     used: Bool[np.ndarray, " rows"]
@@ -1155,7 +1153,6 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
         energy_aj=minimum.at[count:],
         error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
         relative_error=curve.relative_error,
-        budget=tuple(_budget(lever, minimum, count + i) for i in range(len(groups))),
         nuisances=lever.nuisances(0, minimum),
         instrument=lever.instrument(0, minimum.at),
         used=used,
@@ -1164,14 +1161,3 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
         minimum=minimum,
         scale=scale,
     )
-
-
-def _budget(lever: Lever, minimum: Solution, place: int) -> dict[str, float]:
-    """Return what the variance of one energy comes from, in aJ^2: each thing stated, and noise."""
-    parts: dict[str, float] = {}
-    for unknown, moved in zip(lever.unknowns, minimum.covariance[place].tolist(), strict=False):
-        if unknown.kind != "free_lag_deg":
-            parts[unknown.kind] = parts.get(unknown.kind, 0.0) + moved**2
-    noise = float(minimum.covariance[place, place]) - sum(parts.values())
-    relative = {name: (share * minimum.at[place]) ** 2 for name, share in lever.curves[0].relative_errors.items()}
-    return {"noise": max(noise, 0.0)} | parts | relative

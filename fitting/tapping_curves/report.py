@@ -22,7 +22,6 @@ from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.energy import HEADLINE, Z95, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
-from fitting.tapping_curves.verdict import ORIGINS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -175,9 +174,6 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
         value = with_error(epsilon["value"], epsilon["standard_error"])
         of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
         lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2" + of_mass)
-    shares = sorted(energy.get("share_of_variance", {}).items(), key=lambda pair: -pair[1])
-    words = [f"{ORIGINS[name]} {percent(share)}" for name, share in shares if share > 0.005]
-    lines += [f"  its variance comes from {', '.join(words)}"] if words else []
     cells = []
     for i, group in enumerate(result.groups):
         value, error, ends = result.constant(i)

@@ -246,8 +246,6 @@ class Tapping(Result):
                 "kind": "none",
                 "reason": "the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong",
             }
-        budget = self.fit.budget[chosen[0]]
-        total = sum(budget.values()) or 1.0
         return {
             "value": value,
             "standard_error": error,
@@ -257,7 +255,6 @@ class Tapping(Result):
             "assumption": "each tap of the branch takes the same energy",
             "p_value": self.fit.minimum.p_value,
             "free_frequency_pull": self.fit.nuisances[0].pull,
-            "share_of_variance": {name: part / total for name, part in budget.items() if part > 0.0},
         }
 
     @property

@@ -420,7 +420,7 @@ def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows
         return None
     largest = largest_energies(curve, given)[touching]
     quality = curve.quality_factor
-    share = np.linalg.norm([*curve.relative_errors.values(), quality.error / quality.value])
+    share = np.hypot(curve.relative_error, quality.error / quality.value)
     return float(np.max(largest) * np.exp(1.645 * share))
 
 

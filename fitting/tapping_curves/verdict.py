@@ -34,7 +34,6 @@ _FOLLOWING = 3.0
 """Errors of a drift along the rows, of one energy for all taps, from which it is one."""
 _SAY_SO = "if they stand as they were measured, say so by '# rows = in order of time', and the drift is fitted along"
 ORIGINS = {
-    "noise": "noise",
     "free_frequency_khz": "free frequency",
     "quality_factor": "Q",
     "spring_constant_n_per_m": "spring constant",
