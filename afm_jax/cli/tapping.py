@@ -49,7 +49,7 @@ def _read(path: Path, options: dict[str, Any]) -> MeasuredFile:
     """Return the curves of a file, a table or an instrument's, with what the call says of the instrument."""
     if is_table(path):
         _refuse_reading(path, options)
-        return MeasuredFile({1: _given(read_table(path, noise=options["noise"]), options)}, {}, {})
+        return MeasuredFile({1: _given(read_table(path, noise=options["noise"]), options)}, {})
     file = read_measured(path, curve=options["curve"], **{name: options[name] for name in READING_OPTIONS})
     for note in file.notes:
         add_note(note)
@@ -70,27 +70,18 @@ def _analysed(session: Session, table: AmplitudeTable, model: str, *, no_law: bo
 def _together(
     session: Session, paths: tuple[Path, ...], files: list[MeasuredFile], model: str, how: dict[str, bool]
 ) -> Output:
-    """Return what is known of several curves of one lever, together and one by one, with the hysteresis of all."""
-    only_file = files[0] if len(files) == 1 else None
+    """Return what is known of several curves of one lever, together and one by one."""
     tables = [(number, table) for file in files for number, table in file.tables.items()]
     whole = together([_analysed(session, table, model, **how) for _, table in tables]) if tables else None
-    numbers = [number for number, _ in tables] if only_file is not None else range(1, len(tables) + 1)
+    numbers = [number for number, _ in tables] if len(files) == 1 else range(1, len(tables) + 1)
     curves = {} if whole is None else dict(zip(numbers, whole.curves, strict=True))
     refused = [
-        {"curve": number, "reason": reason} | ({} if only_file is not None else {"file": str(path)})
+        {"file": str(path), "curve": number, "reason": reason}
         for path, file in zip(paths, files, strict=True)
         for number, reason in file.refused.items()
     ]
-    width = None if only_file is None else only_file.half_width_nm
-    widths = {} if only_file is None else only_file.half_widths_nm
     text = [lambda result=result: tapping_summary(result) + "\n" for result in curves.values()]
     text += [f"Curve {each['curve']} refused: {each['reason']}" for each in refused]
-    if width is not None:
-        text.append(
-            f"Hysteresis at half of the free amplitude: {width[0]:.2f} nm, scatter {width[1]:.2f} nm over "
-            f"{len(widths)} curves ({', '.join(f'{each:.2f}' for each in widths.values())}); it needs no calibration "
-            "of the amplitude"
-        )
     if whole is not None and len(curves) > 1:
         text.append(together_summary(whole))
     valid = whole is not None and whole.valid and not refused
@@ -99,8 +90,6 @@ def _together(
         "curves": [{"curve": number, **result.to_dict()} for number, result in curves.items()],
         "together": None if whole is None else whole.to_dict(),
         "refused": refused,
-        "half_width_nm": None if width is None else {"mean": width[0], "scatter": width[1]},
-        "half_widths_nm": [{"curve": number, "width_nm": each} for number, each in widths.items()],
     }
     return Output(
         payload=payload,

@@ -298,22 +298,16 @@ def _height(
 
 def _half(curve: TappingCurve, part: np.ndarray) -> Height | None:
     """Return where the amplitude crosses half of the free one for good, by the straight line between two rows."""
-    last = last_above(curve.amplitude_nm[part], 0.5 * curve.free_amplitude_nm[part])
-    if last is None:
+    above = np.flatnonzero(curve.amplitude_nm[part] >= 0.5 * curve.free_amplitude_nm[part])
+    if not above.size or above[-1] + 1 == len(part):
         return None
-    rows = part[last : last + 2]
+    rows = part[above[-1] : above[-1] + 2]
     (far, near), (before, after) = curve.offset_nm[rows].tolist(), curve.amplitude_nm[rows].tolist()
     level, slope = curve.free_amplitude_nm[rows[0]], (after - before) / (near - far)
     if before - after > _STEEP * level:
         return _between(far, near)
     at = far + (0.5 * level - before) / slope
     return Height(float(at), float(curve.amplitude_error_nm[rows].max() / abs(slope)))
-
-
-def last_above(values: np.ndarray, level: np.ndarray | float) -> int | None:
-    """Return the place of the last value that is not below a level; None where none is, or all to the end are."""
-    above = np.flatnonzero(values >= level)
-    return int(above[-1]) if above.size and above[-1] + 1 < len(values) else None
 
 
 def _between(low: float, high: float) -> Height:
