@@ -53,7 +53,7 @@ def _read(path: Path, options: dict[str, Any]) -> MeasuredFile:
     file = read_measured(path, curve=options["curve"], **{name: options[name] for name in READING_OPTIONS})
     for note in file.notes:
         add_note(note)
-    return replace(file, tables={number: _calibrated(table, options) for number, table in file.tables.items()})
+    return file
 
 
 def _analysed(session: Session, table: AmplitudeTable, model: str, *, no_law: bool, scale_errors: bool) -> Tapping:
@@ -171,11 +171,4 @@ def _given(table: AmplitudeTable, options: dict[str, Any]) -> AmplitudeTable:
     if stated and stated.get("spring_constant_n_per_m", table.spring_constant_n_per_m) is not None:
         # what spring constant and frequency make it
         stated["mass_ng"] = None
-    return _calibrated(replace(table, **stated) if stated else table, options)
-
-
-def _calibrated(table: AmplitudeTable, options: dict[str, Any]) -> AmplitudeTable:
-    if options["tip_calibration"] is None:
-        return table
-    value, error = options["tip_calibration"]
-    return replace(table, calibration=table.calibration | {"tip_calibration": (value, error or 0.0)})
+    return replace(table, **stated)

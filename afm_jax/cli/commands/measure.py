@@ -299,11 +299,18 @@ LOCKIN = Command(
     computes=False,
 )
 
-_READING_NUMBERS = (
+_LEVER = (
     ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
     ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
     ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
-    ("spring-constant-n-per-m", "N_PER_M", "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'."),
+    (
+        "spring-constant-n-per-m",
+        "N_PER_M",
+        "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are over it, in nm^2.",
+    ),
+)
+_READING_NUMBERS = (
+    *_LEVER,
     ("free-amplitude-nm", "NM", "Amplitude of the free tip; else the median of the rows far from the sample."),
     ("offset-origin-nm", "NM", "Height (growing towards the tip) at which the sample is at the tip's rest position."),
     ("amplitude-error-nm", "NM", "Standard error of every amplitude; else the scatter of the free rows."),
@@ -319,6 +326,12 @@ class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
         return text if text == "slope" else super().read(text)
 
 
+_PHASE_SENSE = click.option(
+    "--phase-sense",
+    type=click.Choice(["lag", "lead"]),
+    help="Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the readings "
+    "decide where they can.",
+)
 READING = (
     click.option(
         "--columns",
@@ -335,12 +348,7 @@ READING = (
         help="What drives the tip: a piezo at its base (assumed without this option), or a force (photothermal, "
         "magnetic).",
     ),
-    click.option(
-        "--phase-sense",
-        type=click.Choice(["lag", "lead"]),
-        help="Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the curve "
-        "decides where it can.",
-    ),
+    _PHASE_SENSE,
     click.option(
         "--nm-per-volt",
         type=NmPerVolt(),
@@ -413,9 +421,6 @@ TAPPING = Command(
         click.argument("curve_files", metavar="[CURVE]...", nargs=-1, type=click.Path(path_type=Path)),
         NOISE,
         *READING,
-        click.option(
-            "--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'."
-        ),
         click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file."),
         click.option("--model", default="viscous+delay", help="Of the law, as for `afm-jax fit`."),
         flag("--example", "Analyse the bundled raw file, simulated with the defects of real ones."),
@@ -431,20 +436,12 @@ TAPPING = Command(
 
 
 _IMAGE_NUMBERS = (
-    ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
-    ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
-    (
-        "spring-constant-n-per-m",
-        "N_PER_M",
-        "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are over it, in nm^2.",
-    ),
+    *_LEVER,
     ("free-amplitude-nm", "NM", "Amplitude of the free tip, as the instrument reads it, '13.4 +- 0.1'."),
     ("free-phase-deg", "DEGREES", "Phase of the free tip, as the instrument reads it, '90 +- 0.05' [its error: 0.2]."),
-    ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
     ("nm-per-volt", "NM", "Sensitivity of an amplitude in volts."),
     ("tip-calibration", "C", "True over stated amplitude; '1 +- 0.02'."),
 )
-_IMAGE_SETTINGS = tuple(_number(*row) for row in _IMAGE_NUMBERS)
 
 
 def _check_zarr(_: Session, options: Options) -> None:
@@ -478,13 +475,8 @@ TAPPING_MAP = Command(
             help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.",
         ),
         click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What is driven."),
-        click.option(
-            "--phase-sense",
-            type=click.Choice(["lag", "lead"]),
-            help="Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the image "
-            "decides where it can.",
-        ),
-        *_IMAGE_SETTINGS,
+        _PHASE_SENSE,
+        *(_number(*row) for row in _IMAGE_NUMBERS),
         click.option(
             "--amplitude-error-nm", type=Finite(positive=True), metavar="NM", help="Standard error of a pixel's."
         ),
