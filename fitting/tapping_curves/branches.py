@@ -2,10 +2,10 @@
 
 On approach the bridge forms where the tip's lowest point comes near enough; on retract it may hold longer. And
 attractive and repulsive branch coexist over a stretch of heights, so that the jump between them comes at another height
-on the way back. Each such pair of heights, and the energy between the two branches, is a `Hysteresis`.
+on the way back. Each such pair of heights is a `Hysteresis`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,9 +50,6 @@ class Hysteresis:
         free_amplitude_nm: of the rows.
         approach: where it comes as the sample comes nearer; None where it does not show.
         retract: where it goes as the sample goes.
-        energy_between_aj: retract less approach over the heights between, and its standard error: of a tap, or for
-            a tip that is held of approach and retract together, (k/2)(retract^2 - approach^2).
-        energy_of: "a tap" or "approach and retract"; empty where there is none.
     """
 
     change: str
@@ -60,8 +57,6 @@ class Hysteresis:
     free_amplitude_nm: float
     approach: Height | None
     retract: Height | None
-    energy_between_aj: tuple[float, float] | None = None
-    energy_of: str = ""
 
     @property
     def width_nm(self) -> tuple[float, float] | None:
@@ -242,12 +237,7 @@ def held_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
 
 
 def changes(
-    curve: TappingCurve,
-    *,
-    free: Bool[np.ndarray, " rows"],
-    repulsive: Bool[np.ndarray, " rows"],
-    energy: Rows,
-    noise: Rows,
+    curve: TappingCurve, *, free: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
 ) -> list[Hysteresis]:
     """Return the changes of each drive, as far as they show on approach or retract.
 
@@ -255,8 +245,6 @@ def changes(
         curve: the curve.
         free: from `free_rows`.
         repulsive: which of the others are on the repulsive branch.
-        energy: of a tap in aJ, NaN where not known.
-        noise: its standard error.
     """
     parts: dict[tuple[float, float], dict[bool, np.ndarray]] = {}
     for part in ways(curve):
@@ -269,10 +257,8 @@ def changes(
             ends = [
                 None if p is None else _height(change, curve, p, free=free, repulsive=repulsive) for p in (into, back)
             ]
-            if ends[0] is None and ends[1] is None:
-                continue
-            one = Hysteresis(change, *drive, approach=ends[0], retract=ends[1])
-            found.append(_with_energy(one, curve, into, back, energy, noise))
+            if ends != [None, None]:
+                found.append(Hysteresis(change, *drive, approach=ends[0], retract=ends[1]))
     return found
 
 
@@ -357,47 +343,6 @@ def _hinge(height: np.ndarray, amplitude: np.ndarray, error: np.ndarray, level: 
         return None
     inside = grid[hinges < hinges[best] + max(1.0, hinges[best] / len(height))]
     return Height(float(grid[best]), float(max(0.5 * (inside[-1] - inside[0]), grid[1] - grid[0])))
-
-
-def _with_energy(
-    found: Hysteresis,
-    curve: TappingCurve,
-    into: np.ndarray | None,
-    back: np.ndarray | None,
-    energy: Rows,
-    noise: Rows,
-) -> Hysteresis:
-    """Return a change with the energy between its branches, if that is known."""
-    if found.approach is None or found.retract is None or into is None or back is None:
-        return found
-    low, high = sorted((found.approach.offset_nm, found.retract.offset_nm))
-    between = [p[(curve.offset_nm[p] > low) & (curve.offset_nm[p] < high)] for p in (into, back)]
-    if not all(len(p) for p in between):
-        return found
-    if found.approach.offset_nm > found.retract.offset_nm and held_rows(curve)[between[1]].mean() > 0.5:
-        value = _energy_of_release(curve, found.approach.offset_nm, found.retract.offset_nm)
-        return replace(found, energy_between_aj=value, energy_of="approach and retract")
-    if not all(np.isfinite(energy[p]).any() for p in between):
-        return found
-    (before, before_error), (after, after_error) = (_mean(energy[p], noise[p]) for p in between)
-    value = after - before, float(np.hypot(before_error, after_error))
-    return replace(found, energy_between_aj=value, energy_of="a tap")
-
-
-def _mean(values: Rows, errors: Rows) -> tuple[float, float]:
-    known = np.isfinite(values) & np.isfinite(errors) & (errors > 0.0)
-    weights = errors[known] ** -2.0
-    return float(np.average(values[known], weights=weights)), float(weights.sum()) ** -0.5
-
-
-def _energy_of_release(curve: TappingCurve, approach: float, retract: float) -> tuple[float, float]:
-    """Return what approach and retract take of a tip that was held, with its error: the lever lets go of (k/2) h^2.
-
-    Heights are known far better to each other than to the tip's rest position.
-    """
-    k = curve.spring_constant_n_per_m
-    value = 0.5 * k.value * (retract**2 - approach**2)
-    return value, float(np.hypot(k.value * (retract - approach) * curve.origin_error_nm, value * k.error / k.value))
 
 
 _DEGREE = 2

@@ -18,7 +18,7 @@ from fitting.report.sections import (
     pictures_of,
     text_of,
 )
-from fitting.tapping_curves.branches import Height, Hysteresis
+from fitting.tapping_curves.branches import Height
 from fitting.tapping_curves.energy import HEADLINE, Z95, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
@@ -201,28 +201,16 @@ def _thresholds(result: Tapping) -> list[ReportSection]:
             _height(one.approach),
             _height(one.retract),
             "-" if one.width_nm is None else with_error(*one.width_nm),
-            _between(one),
         ]
         for one in result.hysteresis
     ]
-    head = ["threshold (height in nm)", "approach", "retract", "approach - retract", "energy between"]
-    table = Table("Heights of the sample over the tip's rest position", head, cells, words=("energy between",))
+    head = ["threshold (height in nm)", "approach", "retract", "approach - retract"]
+    table = Table("Heights of the sample over the tip's rest position", head, cells)
     return [ReportSection("Thresholds", [table], "Thresholds")]
 
 
 def _height(found: Height | None) -> str:
     return "-" if found is None else with_error(*found)
-
-
-def _between(found: Hysteresis) -> str:
-    if found.energy_between_aj is None:
-        return "-"
-    energy = with_error(*found.energy_between_aj)
-    return (
-        f"{energy} aJ {found.energy_of}"
-        if found.energy_of == "a tap"
-        else f"{energy} aJ for one approach and retract of the held tip"
-    )
 
 
 def _speeds(result: Tapping) -> list[ReportSection]:

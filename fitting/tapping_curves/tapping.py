@@ -319,7 +319,6 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         used=nothing if fitted is None else fitted.used,
         note=_notes(curve, kind, far=nothing if believed is None else believed.outliers, alone=alone),
     )
-    energy = np.where(free, 0.0, found.energy_aj)
     result = Tapping(
         table=table,
         curve=curve,
@@ -330,9 +329,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         scale_errors=scale_errors,
         followed=followed,
         bound_aj=None if curve.has_phase else _bound(curve, given, free),
-        hysteresis=tuple(
-            changes(curve, free=free, repulsive=kind.repulsive, energy=energy, noise=rows.energy_noise_aj)
-        ),
+        hysteresis=tuple(changes(curve, free=free, repulsive=kind.repulsive)),
         speeds=None,
         versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
     )
