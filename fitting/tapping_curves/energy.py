@@ -345,17 +345,16 @@ class Lever:
         energy, virial = _slopes(of, x, len(self.unknowns))
         return energy, virial
 
-    def errors_of_rows(self, number: int) -> tuple[Rows, Rows]:
-        """Return the standard error of each energy and each virial from what all rows share.
+    def errors_of_rows(self, number: int) -> Rows:
+        """Return the standard error of each energy from what all rows share.
 
         With the instrument as given: frequency, Q and harmonics by what is stated of them, the rest by free rows.
         """
         given, errors = self.stated, np.sqrt(np.diag(self.minimum.covariance))
         errors[: len(COMMON)] = 1.0
         curve, found = self.curves[number], energies(self.curves[number], self.instrument(number, given))
-        energy, virial = (np.linalg.norm(by * errors, axis=1) for by in self.slopes(curve, number, given))
-        share = curve.relative_error
-        return np.hypot(energy, share * found.energy_aj), np.hypot(virial, share * found.virial_aj)
+        by, _ = self.slopes(curve, number, given)
+        return np.hypot(np.linalg.norm(by * errors, axis=1), curve.relative_error * found.energy_aj)
 
     def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
         """Return what is stated of the instrument of a curve and where a least squares ends."""

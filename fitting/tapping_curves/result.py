@@ -69,9 +69,6 @@ class TapRows:
         energy_of_fit_aj: with the instrument as fitted.
         virial_aj: mean of force times height, of the first harmonic, with the instrument as given; positive where
             attraction prevails, negative where repulsion does.
-        virial_noise_aj: its standard error from the row's own noise.
-        virial_systematic_aj: its standard error from what all rows share.
-        virial_of_fit_aj: with the instrument as fitted.
         largest_energy_aj: the most that a tap can take at this amplitude, whatever the phase.
         used: whether it is in the fit of one energy.
         note: why not; or what it is for.
@@ -84,9 +81,6 @@ class TapRows:
     energy_systematic_aj: Rows
     energy_of_fit_aj: Rows
     virial_aj: Rows
-    virial_noise_aj: Rows
-    virial_systematic_aj: Rows
-    virial_of_fit_aj: Rows
     largest_energy_aj: Rows
     used: Bool[np.ndarray, " rows"]
     note: tuple[str, ...]
@@ -415,31 +409,20 @@ class Tapping(Result):
 
     def records(self) -> list[dict[str, Any]]:
         """Return a mapping per row; what is not known is None."""
-        curve, rows = self.curve, self.rows
+        curve = self.curve
         columns: dict[str, Any] = {
             "line": curve.lines,
             "drive_frequency_khz": curve.drive_frequency_khz,
             "free_amplitude_nm": curve.free_amplitude_nm,
             "branch": [way_of(back) for back in curve.retract],
-            "state": rows.state,
             "offset_nm": curve.offset_nm,
             "lockin_amplitude_nm": curve.amplitude_nm,
             "phase_lag_deg": curve.lag_deg,
-            "lag_departure_deg": rows.lag_departure_deg,
-            "energy_aj": rows.energy_aj,
-            "energy_noise_aj": rows.energy_noise_aj,
-            "energy_systematic_aj": rows.energy_systematic_aj,
-            "virial_aj": rows.virial_aj,
-            "virial_noise_aj": rows.virial_noise_aj,
-            "virial_systematic_aj": rows.virial_systematic_aj,
-            "energy_of_fit_aj": rows.energy_of_fit_aj,
-            "virial_of_fit_aj": rows.virial_of_fit_aj,
+            **vars(self.rows),
             "residual": np.full(curve.rows, np.nan) if self.fit is None else self.fit.residual,
-            "largest_energy_aj": rows.largest_energy_aj,
         }
         if self.speeds is not None:
             columns |= {name: part for name, part in vars(self.speeds).items() if isinstance(part, np.ndarray)}
-        columns |= {"used": rows.used, "note": rows.note}
         flat = {name: plain(column) for name, column in columns.items()}
         return [{name: column[i] for name, column in flat.items()} for i in range(curve.rows)]
 

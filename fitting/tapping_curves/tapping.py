@@ -303,18 +303,14 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     nothing = np.zeros(curve.rows, bool)
     states = [kind.free, kind.held, np.isnan(kind.lag_departure_deg), kind.repulsive]
     state = np.select(states, ["free", "held", "touching", "repulsive"], "attractive")
-    (energy_noise, virial_noise), (energy_error, virial_error) = noise_of(curve, plain), lever.errors_of_rows(0)
     rows = TapRows(
         state=tuple(state.tolist()),
         lag_departure_deg=kind.lag_departure_deg,
         energy_aj=plain.energy_aj,
-        energy_noise_aj=energy_noise,
-        energy_systematic_aj=energy_error,
+        energy_noise_aj=noise_of(curve, plain)[0],
+        energy_systematic_aj=lever.errors_of_rows(0),
         energy_of_fit_aj=found.energy_aj,
         virial_aj=plain.virial_aj,
-        virial_noise_aj=virial_noise,
-        virial_systematic_aj=virial_error,
-        virial_of_fit_aj=found.virial_aj,
         largest_energy_aj=largest_energies(curve, given),
         used=nothing if fitted is None else fitted.used,
         note=_notes(curve, kind, far=nothing if believed is None else believed.outliers, alone=alone),

@@ -153,8 +153,7 @@ def together(curves: Sequence[Tapping]) -> TappingTogether:
         for curve, state, side in zip(lever.curves, states, repulsive, strict=True)
     ]
     for i, functions in zip(chosen, energies_along(lever, stretches, repulsive), strict=True):
-        found = functions.energies
-        rows = replace(curves[i].rows, energy_of_fit_aj=found.energy_aj, virial_of_fit_aj=found.virial_aj)
+        rows = replace(curves[i].rows, energy_of_fit_aj=functions.energies.energy_aj)
         moved[i] = replace(curves[i], functions=functions, rows=rows)
     return TappingTogether(curves=tuple(moved), lever=lever, scatter=_scatters(moved))
 
