@@ -414,8 +414,6 @@ def _ends(curve: MeasuredCurve) -> dict[str, tuple[float, float]]:
     return {name: (float(one[0]), float(one[-1])) for name, one in heights.items()}
 
 
-_MIXED = 5.0
-"""Scatter of readings in contact over that of the free tip from which they may be of two branches."""
 _JUMPS = 0.05
 """Median step of the heights, of their range, from which they are no ramp."""
 
@@ -437,19 +435,8 @@ def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
     why = f"{repeated} rows repeat a height and {back} step back" if repeated or back else "asked for"
     how = f"of {width:.3g} nm" if width else "of equal height"
     error = ", with their scatter for an error" if width else ""
-    notes = [f"Bins: {why}; the table has the means of bins {how}{error} (`bin_nm=...`)."]
-    binned_curve = replace(curve, bin_nm=width)
-    if width and curve.amplitude is not None and curve.amplitude_unit == "nm" and curve.free.any():
-        rows = _rows(binned_curve)
-        single = rows.errors["amplitude"] * np.sqrt(rows.rows)
-        far = rows.readings["amplitude"] > np.median(curve.amplitude[curve.free]) - 3.0 * np.median(single)
-        times = np.percentile(single[~far], 90.0) / np.median(single[far]) if far.any() and not far.all() else 0.0
-        if times > _MIXED:
-            notes.append(
-                f"Scatter: in contact readings at one height scatter {times:.0f} times as much as far away, as where "
-                "approach and retract are mixed; give them as a column branch, or as OUT/BACK in `columns=...`."
-            )
-    return replace(binned_curve, notes=(*curve.notes, *notes))
+    note = f"Bins: {why}; the table has the means of bins {how}{error} (`bin_nm=...`)."
+    return replace(curve, bin_nm=width, notes=(*curve.notes, note))
 
 
 _ASSUMED_ORIGIN_NM = 1.0
