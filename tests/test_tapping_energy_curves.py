@@ -58,7 +58,6 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     assert answer["energy_per_tap_aj"] is None
     assert "one energy a branch does not describe the rows" in answer["energy_per_tap_reason"]
     # the instrument is that of statements and free rows, not the one that a constant would need
-    assert answer["nuisances"] == answer["functions"]["nuisances"]
     assert answer["nuisances_of_one_energy"] == {}
     assert [(one["repulsive"], one["constant"]) for one in answer["branches"]] == [(False, False), (True, False)]
     for branch in answer["branches"]:

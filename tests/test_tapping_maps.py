@@ -125,7 +125,7 @@ def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip_and_without_a_stif
     assert found.unit == "nm^2"
     np.testing.assert_allclose(found.energy, energy / SPRING_CONSTANT, rtol=2e-4)
     assert "spring_constant_n_per_m" not in found.common
-    assert any("over it, in nm^2" in note for note in found.notes)
+    assert "over it, in nm^2" in found.known["spring_constant_n_per_m"].origin
 
 
 def energy_of(drive: str, amplitude: float, behind: float, ratio: float, quality: float) -> float:

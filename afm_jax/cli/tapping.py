@@ -17,7 +17,7 @@ from fitting.tables.table import AmplitudeTable, read_table
 from fitting.tapping_curves.measured import MeasuredFile, is_table, read_measured
 from fitting.tapping_curves.report import tapping_summary, together_summary, write_tapping, write_together
 from fitting.tapping_curves.result import Tapping
-from fitting.tapping_curves.tapping import tapping
+from fitting.tapping_curves.tapping import tapping, with_law
 from fitting.tapping_curves.together import TappingTogether, together
 
 
@@ -61,8 +61,6 @@ def _analysed(session: Session, table: AmplitudeTable, model: str, *, no_law: bo
     if no_law or not result.law_allowed:
         return result
     session.start_computing(*FIT_PROGRAMS)
-    from fitting.tapping_curves.tapping import with_law  # noqa: PLC0415
-
     with session.working("fitting the impact law (the first run compiles for half a minute)"):
         return with_law(result, model)
 

@@ -260,8 +260,9 @@ def _joined(
         is_one = f"; if one of the channels {others} is"
         told = f'{is_one}: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`' if others else ""
         notes.append(f"{_NO_AMPLITUDE}{told}.")
-    elif sources["phase_lag_deg"] is None and others:
-        notes.append(f'Phase: none known; if one of the channels {others} is: `columns="phase_lag_deg=CHANNEL:UNIT"`.')
+    elif sources["phase_lag_deg"] is None:
+        told = f'; if one of the channels {others} is one: `columns="phase_lag_deg=CHANNEL:UNIT"`' if others else ""
+        notes.append(f"There is no phase, so that the energy of a tap has an upper bound only{told}.")
     parts: dict[str, list[Any]] = {role: [] for role in ROLES}
     branches: list[str] = []
     for segment in segments:
@@ -696,11 +697,7 @@ def _scale_notes(curve: MeasuredCurve) -> list[str]:
 
 def _phase_notes(curve: MeasuredCurve, stated: str) -> list[str]:
     """Say what of the phase is not known."""
-    if curve.phase_lag_deg is None or curve.amplitude is None:
-        return (
-            ["There is no phase: the energy of a tap has an upper bound only."] if curve.amplitude is not None else []
-        )
-    if "phase_zero_deg" in curve.known:
+    if curve.phase_lag_deg is None or "phase_zero_deg" in curve.known:
         return []
     sign = [] if stated else [f"Sign: a larger phase is taken as a larger lag; {SENSE_OPTION} says which it is."]
     zero = "Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it."

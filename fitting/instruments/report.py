@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.strict_json import plain
 from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, text_table
 from fitting.instruments.curve import FORMAT_VERSION, MeasuredCurve, table_text
@@ -15,7 +14,7 @@ def curves_payload(curves: list[MeasuredCurve]) -> dict[str, Any]:
     """Return everything that was read as plain lists, numbers and strings."""
     own = {"source": curves[0].source, "instrument_format": curves[0].format}
     listed = [curve.to_dict() for curve in curves]
-    return {"format": "afm-jax read", "format_version": FORMAT_VERSION} | plain(own | {"curves": listed})
+    return {"format": "afm-jax read", "format_version": FORMAT_VERSION, **own, "curves": listed}
 
 
 def curves_summary(curves: list[MeasuredCurve]) -> str:

@@ -1062,7 +1062,6 @@ class OneEnergy:
     Attributes:
         energy_aj: of each group.
         error_aj: its standard error but for spring constant and calibration.
-        relative_error: what these add.
         nuisances: of the instrument.
         instrument: at the minimum.
         used: rows that were fitted.
@@ -1074,7 +1073,6 @@ class OneEnergy:
 
     energy_aj: Float[np.ndarray, " groups"]
     error_aj: Float[np.ndarray, " groups"]
-    relative_error: float
     nuisances: tuple[Nuisance, ...]
     instrument: Instrument
     used: Bool[np.ndarray, " rows"]
@@ -1151,7 +1149,6 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
     return OneEnergy(
         energy_aj=minimum.at[count:],
         error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
-        relative_error=curve.relative_error,
         nuisances=lever.nuisances(0, minimum),
         instrument=lever.instrument(0, minimum.at),
         used=used,

@@ -153,7 +153,7 @@ def tapping_map(
     if not isinstance(images, AmplitudeAndPhase):
         images = read_images(images, columns=columns)
     notes = [images.note]
-    known = _known(images, given, notes)
+    known = _known(images, given)
     value = {key: float(one.value) for key, one in known.items()} | {"harmonics_factor": HARMONICS_FACTOR.value}
     amplitude = images.amplitude * (value["nm_per_volt"] if images.in_volts else 1.0)
     measured = np.isfinite(amplitude) & (amplitude > 0.0) & np.isfinite(images.phase_deg)
@@ -218,7 +218,7 @@ def tapping_map(
     )
 
 
-def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -> dict[str, Known]:
+def _known(images: AmplitudeAndPhase, given: dict[str, Any]) -> dict[str, Known]:
     """Return what is known of the instrument: as given, else as the file says it.
 
     Raises:
@@ -234,10 +234,8 @@ def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -
         raise TableError(f"{images.source}: the file does not say all that an energy needs; give {missing}{record}")
     if "drive_frequency_khz" not in known:
         known["drive_frequency_khz"] = Known(known["free_frequency_khz"].value, "kHz", ASSUMED_RESONANCE)
-        notes.append(f"Drive frequency: {ASSUMED_RESONANCE}.")
     if "spring_constant_n_per_m" not in known:
         known["spring_constant_n_per_m"] = Known(1.0, "N/m", "not known: energies are over it, in nm^2")
-        notes.append("The spring constant is not known: energies and virials are over it, in nm^2 (1 aJ over 1 N/m).")
     known.setdefault("tip_calibration", Known(1.0, "", "assumed"))
     return known
 

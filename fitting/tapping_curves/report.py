@@ -222,11 +222,9 @@ def _speeds(result: Tapping) -> list[ReportSection]:
     here = np.isfinite(u)
     if not here.any():
         return [ReportSection("Speeds of the impacts", [Text("Impact speeds: known to 25 % or better in no row.")])]
-    many = found.in_capture_speeds[here & np.isfinite(found.in_capture_speeds)]
-    in_capture = f" ({many.min():.2g} to {many.max():.2g} capture speeds)" if len(many) else ""
     known = percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))
     speeds = f"{u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows"
-    words = f"Impact speeds: {speeds}{in_capture}, known to {known} in the median"
+    words = f"Impact speeds: {speeds}, known to {known} in the median"
     return [ReportSection("Speeds of the impacts", [Text(words)], "Speeds")]
 
 

@@ -175,11 +175,8 @@ class Tapping(Result):
     def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
         """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
         assert self.fit is not None  # noqa: S101
-        value, alone, share = (
-            float(self.fit.energy_aj[number]),
-            float(self.fit.error_aj[number]),
-            self.fit.relative_error,
-        )
+        value, alone = float(self.fit.energy_aj[number]), float(self.fit.error_aj[number])
+        share = self.curve.relative_error
         return value, float(np.hypot(alone, share * value)), _interval(value, alone, share)
 
     @property
@@ -396,7 +393,6 @@ class Tapping(Result):
             "functions": smooth,
             **dict.fromkeys(("chi2", "degrees_of_freedom", "p_value", "scale")),
             **statistics,
-            "nuisances": {} if functions is None else nuisances_as_dict(functions.nuisances),
             "nuisances_of_one_energy": {} if fit is None or not self.described else nuisances_as_dict(fit.nuisances),
         }
 

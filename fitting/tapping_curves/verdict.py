@@ -241,10 +241,6 @@ WARNINGS: Rules[Any] = [
         ),
     ),
     Rule(
-        lambda e: _given(e) and not e.rows.free.any() and e.curve.phase_zero_deg is None,
-        "no row of the free tip fixes the zero of the phase: it is not known, and the energy depends on it",
-    ),
-    Rule(
         lambda e: [len(e.set_aside)] if e.set_aside else [],
         "{case} of {e.curve.rows} rows are excluded; the column `note` of the table of rows says why",
     ),

@@ -1,6 +1,5 @@
 """Commands that read data of instruments, fit them, and plan what to measure next."""
 
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -444,12 +443,6 @@ _IMAGE_NUMBERS = (
 )
 
 
-def _check_zarr(_: Session, options: Options) -> None:
-    """Check that Zarr is there before anything is computed."""
-    if "zarr" in options["formats"]:
-        import_module("zarr")
-
-
 TAPPING_MAP = Command(
     name="tapping-map",
     runs="afm_jax.cli.tapping_map:map_of_an_image",
@@ -492,7 +485,6 @@ TAPPING_MAP = Command(
             help="Of the arrays written into --out (gsf: for Gwyddion); may be given several times.",
         ),
     ),
-    check=_check_zarr,
     computes=False,
 )
 
