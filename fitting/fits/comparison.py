@@ -1,8 +1,8 @@
 """Models compared on the same table: information criteria, and in plain words what the measurement can tell."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +14,13 @@ from fitting.fits.minimum import ModelErrors, settle, with_inflated_errors
 from fitting.fits.result import FitResult
 from fitting.parameters import CONTACT_NAMES, LAWS, MODELS, model_parameters
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import TableLike
+from fitting.tables.table import AmplitudeTable, TableLike
 
-_T = TypeVar("_T")
 _EVEN, _PLAIN = 2.0, 10.0
 """Differences of AIC up to which models are even, and beyond which one is clearly favoured."""
 
 
-@public_result(picture="fitting.report.plots:models_figure", rows="rows")
+@public_result(rows="rows")
 @dataclass(frozen=True)
 class Comparison(Result):
     """Models of one table, the best one first.
@@ -92,51 +91,44 @@ def compare(
 
     whole = tables_of(table)
 
-    def fitted(model: str) -> tuple[Found, FitResult]:
-        if known is not None and model in known:
-            return known[model][0], _finite(known[model][1])
-        found = find_fit(whole, model, **_options_of(model, options))
-        return found, _finite(summarise(whole, found))
-
-    fits, failed = _attempted(fitted, dict.fromkeys(models))
+    fits: dict[str, tuple[Found, FitResult]] = {}
+    failures: dict[str, Exception] = {}
+    for model in dict.fromkeys(models):
+        try:
+            fits[model] = _fitted(whole, model, known or {}, options)
+        except (ValueError, ArithmeticError, RuntimeError) as error:
+            failures[model] = error
+    if not fits:
+        raise next(iter(failures.values()))
+    failed = {model: str(error) or type(error).__name__ for model, error in failures.items()}
     errors = np.max([one.model_errors.model_error for one, _ in fits.values()], axis=0)
     # the strings' maximum: any reason rather than none
     reasons = np.max([one.model_errors.reasons for one, _ in fits.values()], axis=0)
-    judged, lost = _attempted(lambda model: _row(model, *fits[model], ModelErrors(errors, errors, reasons)), fits)
-    results = {model: fits[model][1] for model in judged}
-    rows = sorted(judged.values(), key=lambda row: row["aic"])
+    common = ModelErrors(errors, errors, reasons)
+    rows = sorted((_row(model, *fit, common) for model, fit in fits.items()), key=lambda row: row["aic"])
     for row in rows:
         row["delta_aic"] = row["aic"] - rows[0]["aic"]
-    return Comparison(rows, _verdict(rows, failed | lost), results, failed | lost)
+    return Comparison(rows, _verdict(rows, failed), {model: result for model, (_, result) in fits.items()}, failed)
 
 
-def _attempted(attempt: Callable[[str], _T], models: Iterable[str]) -> tuple[dict[str, _T], dict[str, str]]:
-    """Return what is made of every model, and why it is not of others.
-
-    Raises:
-        Exception: of the first one, if there is none that anything is made of.
-    """
-    made: dict[str, _T] = {}
-    failures: dict[str, Exception] = {}
-    for model in models:
-        try:
-            made[model] = attempt(model)
-        except (ValueError, ArithmeticError, RuntimeError) as error:
-            failures[model] = error
-    if not made:
-        raise next(iter(failures.values()))
-    return made, {model: str(error) or type(error).__name__ for model, error in failures.items()}
-
-
-def _finite(result: FitResult) -> FitResult:
-    """Return a fit that can be compared.
+def _fitted(
+    table: AmplitudeTable | SeveralTables,
+    model: str,
+    known: Mapping[str, tuple[Found, FitResult]],
+    options: dict[str, Any],
+) -> tuple[Found, FitResult]:
+    """Return minimum and summary of a model.
 
     Raises:
         FloatingPointError: if its chi2 is not a finite number.
     """
+    if model in known:
+        return known[model]
+    found = find_fit(table, model, **_options_of(model, options))
+    result = summarise(table, found)
     if not np.isfinite(result.chi2):
         raise FloatingPointError("chi2 is not finite")
-    return result
+    return found, result
 
 
 def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:

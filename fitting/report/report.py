@@ -32,7 +32,6 @@ from fitting.report.words import (
     losses_in_words,
     nuisances_in_words,
     parting_in_words,
-    repeats_in_words,
     rows_in_words,
     tables_in_words,
     value_in_words,
@@ -40,9 +39,8 @@ from fitting.report.words import (
 from fitting.sampling.posterior_result import Posterior
 from fitting.tables.several import SeveralTables
 
-_MANY_PARAMETERS = 3
 _WORTH_SAYING = 0.9
-"""With more parameters than that, the text names only correlations beyond this magnitude."""
+"""Magnitude from which the text names a correlation."""
 ROW_COLUMNS = (
     "line",
     "order",
@@ -77,7 +75,6 @@ def fit_report(result: FitResult, comparison: Comparison | None = None, posterio
         f"  {band_in_words(result)}",
         *([f"  {parting}"] if parting else []),
         _goodness_line(result),
-        *([] if result.repeats is None else [f"  {repeats_in_words(result.repeats)}"]),
         *_correlation_lines(result),
     ]
     return Report(
@@ -154,15 +151,13 @@ def _sampled(posterior: Posterior) -> ReportSection:
 
 def _correlation_lines(result: FitResult) -> list[str]:
     names = list(result.parameters)
-    least = _WORTH_SAYING if len(names) > _MANY_PARAMETERS else 0.0
     pairs = [
         f"{names[i]}, {names[j]}: {result.correlations[i, j]:+.3f}"
         for i in range(len(names))
         for j in range(i + 1, len(names))
-        if abs(result.correlations[i, j]) >= least
+        if abs(result.correlations[i, j]) >= _WORTH_SAYING
     ]
-    title = f"correlations beyond {_WORTH_SAYING:g}" if least else "correlations"
-    return [f"  {title}: {'; '.join(pairs)}"] if pairs else []
+    return [f"  correlations beyond {_WORTH_SAYING:g}: {'; '.join(pairs)}"] if pairs else []
 
 
 def row_records(result: FitResult) -> list[dict[str, Any]]:

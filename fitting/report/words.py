@@ -6,23 +6,12 @@ import numpy as np
 
 from afm_jax.words import decimals, interval, known, percent, value_alone
 from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED
-from fitting.fits.law_after import rebound_by_formula
 from fitting.fits.result import FitResult, FittedParameter, WithInterval
 from fitting.fits.verdict import value_at_bound
 from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
-from fitting.tables.several import RepeatedReadings
 
 _EXACT = 1e-8
 """Relative distance below which two laws are the same."""
-
-
-def repeats_in_words(repeats: RepeatedReadings) -> str:
-    """Return what repeated readings say of the stated errors."""
-    return (
-        f"{repeats.rows} rows repeat {repeats.drives} drive{'s' if repeats.drives > 1 else ''}: they scatter "
-        f"{repeats.error_ratio:.2g} times as much as their errors say (chi2/dof = {repeats.chi2:.1f}/"
-        f"{repeats.degrees_of_freedom}, probability {repeats.p_value:.2g})"
-    )
 
 
 def rows_in_words(count: int) -> str:
@@ -109,32 +98,14 @@ def formulas(result: FitResult) -> list[str]:
 
 
 def parting_in_words(result: FitResult) -> str:
-    """Return how far the formula and the law part, and whether that is beyond the band.
-
-    Nothing where they are the same, or where there is no formula.
-    """
-    loss, law = result.loss, result.law
+    """Return how far the formula and the law part; nothing where they are the same, or where there is no formula."""
+    loss = result.loss
     if loss is None or loss.formula_off is None or loss.formula_off_at_nm_per_us is None or loss.formula_off <= _EXACT:
         return ""
-    said = (
+    return (
         "The law has besides what its formula leaves out: the formula with these parameters is off by at most "
-        f"{percent(loss.formula_off)} of u_out, at {loss.formula_off_at_nm_per_us:.3g} nm/us"
+        f"{percent(loss.formula_off)} of u_out, at {loss.formula_off_at_nm_per_us:.3g} nm/us."
     )
-    width = band_width(result)
-    if width is None:
-        return f"{said}."
-    speeds = law.approach_speed_nm_per_us
-    inside = (
-        (speeds >= width.slowest_nm_per_us) & (speeds <= width.fastest_nm_per_us) & (law.rebound_speed_nm_per_us > 0)
-    )
-    rebound, half = (
-        column[inside]
-        for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us)
-    )
-    formula = rebound_by_formula(values_of_formula(result), speeds[inside])
-    if not inside.any() or not np.isfinite(half).all() or np.all(np.abs(formula - rebound) <= half):
-        return f"{said}, within the band."
-    return f"{said}, beyond the band: take the law itself, or the best of the models compared."
 
 
 def held_in_words(result: FitResult) -> str:
@@ -142,11 +113,6 @@ def held_in_words(result: FitResult) -> str:
     fixed = result.settings.get("fixed") or {}
     held = ", ".join(f"{name} = {value:g} {PARAMETERS[name].unit}".rstrip() for name, value in fixed.items())
     return f"Held fixed: {held}" if held else ""
-
-
-def values_of_formula(result: FitResult) -> dict[str, float]:
-    """Return the numbers of a fit's formula, those that were held included."""
-    return (result.settings.get("fixed") or {}) | {name: one.value for name, one in result.parameters.items()}
 
 
 def has_delay(result: FitResult) -> bool:
