@@ -50,7 +50,6 @@ def made_fit(model: str, *, width: float = 1e-3, table: AmplitudeTable | None = 
         warnings=[],
         law=made_law(names, width=width, lasting="+" in model or model == "contact"),
         rows=made_rows(table),
-        residual_autocorrelation=0.1,
         convergence=Convergence(True, 1e-6, [1.0] * size, 1e-12, True),  # noqa: FBT003
         table=table,
         settings={"model": model, "error_scale": None, "constraints": {"quality_factor": (40.0, 0.4)}},
@@ -72,7 +71,6 @@ def made_parameter(name: str, value: float, **changes: Any) -> FittedParameter:
         interval_reason="lower end: reaches the end of its range, 0" if bound else None,
         undetermined=False,
         at_bound=bound,
-        did_not_move=False,
         constraint=None,
     )
     return dataclasses.replace(parameter, **changes)

@@ -247,10 +247,8 @@ def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
         chi2=estimate.chi2,
         freedom=at.freedom,
         p_value=chi2_tail(estimate.chi2, at.freedom) if judged else float("nan"),
-        autocorrelation=_autocorrelation(estimate.independent_residual),
         other_minimum=None if other is None else (dict(zip(problem.names, other.values, strict=True)), other.chi2),
         error_scale=scale,
-        lasting=problem.lasting,
         robust=robust,
         correlations=_correlations(estimate.covariance),
         untabulated=tuple(np.flatnonzero(untabulated(at.objective, at.values, at.speeds)).tolist()),
@@ -295,8 +293,6 @@ def _parameters(
 ) -> dict[str, FittedParameter]:
     """Return the parameters with errors and intervals."""
     at, problem = estimate.at, estimate.at.problem
-    resolution = _errors(at.covariance)
-    moved = ~at.free | ~np.isfinite(resolution) | (np.abs(at.values - at.found.minimum.start) > 1e-3 * resolution)
     parameters = {}
     for i, (name, interval) in enumerate(zip(problem.names, intervals, strict=True)):
         parameters[name] = FittedParameter(
@@ -307,7 +303,6 @@ def _parameters(
             interval_reason=interval.reason,
             undetermined=not np.isfinite(estimate.covariance[i, i]),
             at_bound=not bool(at.free[i]),
-            did_not_move=not (moved[i] or name in at.constraints),
             constraint=at.constraints.get(name),
         )
     return parameters
@@ -359,7 +354,6 @@ def result_of(estimate: FitEstimate, other: FitEstimate | None, evidence: Eviden
         ),
         loss=loss,
         rows=estimate.rows,
-        residual_autocorrelation=evidence.autocorrelation,
         convergence=at.convergence,
         table=at.table,
         settings=at.settings,
@@ -411,13 +405,3 @@ def _correlations(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p 
     safe = np.where(known, error, 1.0)
     matrix = np.where(np.isfinite(covariance), covariance, 0.0) / np.outer(safe, safe)
     return np.where(np.outer(known, known), matrix, np.nan)
-
-
-def _autocorrelation(residual: Float[np.ndarray, "rows k"]) -> float:
-    """Return the lag-1 correlation of residuals of neighbouring rows, all readings together; NaN for few rows."""
-    before, after = residual[:-1], residual[1:]
-    both = np.isfinite(before) & np.isfinite(after)
-    total = np.nansum(residual**2)
-    if both.sum() < 8 or total == 0.0:
-        return float("nan")
-    return float(np.sum(before[both] * after[both]) / both.sum() / (total / np.isfinite(residual).sum()))

@@ -37,13 +37,11 @@ class Minimum:
 
     Attributes:
         coordinates: of the best one, shape (p,).
-        start: the grid point it came from, parameter values, shape (p,).
         ends: where every start ended, parameter values, shape (starts, p).
         chi2: there, shape (starts,).
     """
 
     coordinates: Float[np.ndarray, " p"]
-    start: Float[np.ndarray, " p"]
     ends: Float[np.ndarray, "starts p"]
     chi2: Float[np.ndarray, " starts"]
 
@@ -125,8 +123,8 @@ def minimise(objective: Objective) -> Minimum:
     best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
     first = objective.problem.coordinates(points[best])
     if not objective.problem.lasting:
-        return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates, points[best])
-    found = settle(objective, _whole(objective, _scouted(scout, first), points[best]))
+        return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates)
+    found = settle(objective, _whole(objective, _scouted(scout, first)))
     lost = lost_rows(objective, objective.problem.values(found.coordinates))
     back = recovered(objective, found.coordinates, lost) if lost.any() else None
     if back is None:
@@ -137,15 +135,15 @@ def minimise(objective: Objective) -> Minimum:
 
 def _with_own_nuisances(objective: Objective, found: Minimum) -> Minimum:
     """Return the minimum with the nuisances that tables have to themselves, from one where these were held."""
-    known = np.asarray(objective.measurement.constraint_value)[len(found.start) :]
+    known = np.asarray(objective.measurement.constraint_value)[len(found.coordinates) :]
 
     def whole(values: Float[np.ndarray, "... q"]) -> Float[np.ndarray, "... p"]:
         return np.concatenate([values, np.broadcast_to(known, (*values.shape[:-1], known.size))], axis=-1)
 
     ends = whole(found.ends)
     best = objective.problem.coordinates(ends[lowest(found.chi2)])
-    begun = replace(found, coordinates=best, start=whole(found.start), ends=ends)
-    return settle(objective, begun) if objective.problem.lasting else _polished(objective, best[None], begun.start)
+    begun = replace(found, coordinates=best, ends=ends)
+    return settle(objective, begun) if objective.problem.lasting else _polished(objective, best[None])
 
 
 _ROUNDS = 4
@@ -165,9 +163,7 @@ def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Fl
     return coordinates
 
 
-def _whole(
-    objective: Objective, found: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "starts p"]
-) -> Minimum:
+def _whole(objective: Objective, found: Float[np.ndarray, "starts p"]) -> Minimum:
     """Return the best of the scouts' ends by all rows, polished with orbits followed from there."""
     values = objective.problem.values(found)
     chi2 = objective.screen(values)
@@ -176,7 +172,7 @@ def _whole(
     softly = polish(follower, found[winner][None], SOFT, settled=ROUGH)
     end = _plainly(follower, softly.coordinates)
     best = objective.problem.values(end.coordinates)[0]
-    return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
+    return Minimum(end.coordinates[0], np.vstack([best, values]), np.append(end.objective, chi2))
 
 
 def settle(objective: Objective, minimum: Minimum) -> Minimum:
@@ -210,14 +206,11 @@ def _plainly(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Pol
     return found if np.any(end.chi2 < polished.objective - FINE) else polished
 
 
-def _polished(
-    objective: Objective, starts: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "..."]
-) -> Minimum:
-    """Polish plainly and keep the best; `origins` are the starts' grid points, or the one that is already known."""
+def _polished(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Minimum:
+    """Polish plainly and keep the best."""
     final = polish(objective, starts, PLAIN, settled=FINE)
     winner = lowest(final.objective)
-    start = origins if origins.ndim == 1 else origins[winner]
-    return Minimum(final.coordinates[winner], start, objective.problem.values(final.coordinates), final.objective)
+    return Minimum(final.coordinates[winner], objective.problem.values(final.coordinates), final.objective)
 
 
 def _thinned(objective: Objective, most: int) -> Objective:
@@ -261,7 +254,7 @@ def rescale_errors(objective: Objective, minimum: Minimum, parameters: int) -> t
         if objective.problem.lasting:
             minimum = settle(objective, minimum)
         else:
-            minimum = _polished(objective, objective.problem.coordinates(minimum.ends), minimum.start)
+            minimum = _polished(objective, objective.problem.coordinates(minimum.ends))
     return objective, minimum, total
 
 

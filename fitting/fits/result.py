@@ -1,6 +1,6 @@
 """What a fit gives: parameters, the law with its band, what impacts take of it, rows, and everything that went in.
 
-Energies, r and delta with their intervals (`Loss`) are the quantities that people ask for.
+Energies and delta with their intervals (`Loss`), beside the parameters, are the quantities that people ask for.
 """
 
 import dataclasses
@@ -40,7 +40,6 @@ class FittedParameter:
         interval_reason: why an end is open; None if none is.
         undetermined: the data do not determine it, not even to first order.
         at_bound: the loss vanishes within the resolution of the data.
-        did_not_move: the optimiser left the parameter where it started.
         constraint: (value, standard error) that the table gives for it, or None.
     """
 
@@ -51,7 +50,6 @@ class FittedParameter:
     interval_reason: str | None
     undetermined: bool
     at_bound: bool
-    did_not_move: bool
     constraint: tuple[float, float] | None
 
     def containing(self, other: "FittedParameter") -> "FittedParameter":
@@ -154,8 +152,6 @@ class Loss:
     Attributes:
         energies: at three speeds, of the law.
         energies_reason: why they are not known; None where they are.
-        r: the fit's parameter; None of a model without.
-        epsilon_nm2_per_us2: likewise.
         delta_aj: energy lost to adhesion, m epsilon/2.
         delta_ev: in electron volts.
         formula_off: largest distance of the formula with the printed parameters from the law, over the measured speeds,
@@ -166,8 +162,6 @@ class Loss:
 
     energies: tuple[EnergyLost, ...]
     energies_reason: str | None
-    r: WithInterval | None
-    epsilon_nm2_per_us2: WithInterval | None
     delta_aj: WithInterval | None
     delta_ev: WithInterval | None
     formula_off: float | None
@@ -263,7 +257,6 @@ class FitResult(Result):
         loss: what an impact takes: energies, delta, how far formula and law part, the capture speed; None if no speed
             was reached.
         rows: measured and predicted amplitudes.
-        residual_autocorrelation: lag-1 correlation of neighbouring rows' residuals.
         convergence: what the checks of the minimum found.
         table: the table that was fitted, or all of several.
         tables: of several: each one's rows, chi2, pull on the law, and what it has to itself; `parameters` are then
@@ -285,7 +278,6 @@ class FitResult(Result):
     warnings: list[str]
     law: FittedLaw
     rows: FittedRows
-    residual_autocorrelation: float
     convergence: Convergence
     table: AmplitudeTable | SeveralTables
     settings: dict[str, Any] = field(default_factory=dict)
@@ -314,7 +306,6 @@ class FitResult(Result):
             "p_value": plain(self.p_value),
             "aic": plain(self.aic),
             "bic": plain(self.bic),
-            "residual_autocorrelation": plain(self.residual_autocorrelation),
             "law": self.law.to_dict(),
             "loss": None if self.loss is None else plain(asdict(self.loss)),
             "rows": {name: plain(column) for name, column in vars(self.rows).items()},
@@ -509,11 +500,10 @@ def loss_of(
         energy_lost(float(u), float(w), float(e), mass_ng)
         for u, w, e in zip(three, points.law[0, :3], error[:3], strict=True)
     ]
-    r, epsilon = (
-        WithInterval(known.value, known.interval95) if known is not None else None
-        for known in (parameters.get("r"), parameters.get("epsilon"))
-    )
-    delta = None if epsilon is None or mass_ng is None else scaled(epsilon, 0.5 * mass_ng)
+    delta = None
+    if "epsilon" in parameters and mass_ng is not None:
+        epsilon = parameters["epsilon"]
+        delta = scaled(WithInterval(epsilon.value, epsilon.interval95), 0.5 * mass_ng)
     off = off_at = None
     if formula is not None:
         speeds = np.geomspace(*measured, LAW_POINTS)
@@ -523,8 +513,6 @@ def loss_of(
     return Loss(
         energies=tuple(dict.fromkeys(energies)),
         energies_reason=NO_MASS if mass_ng is None else None,
-        r=r,
-        epsilon_nm2_per_us2=epsilon,
         delta_aj=delta,
         delta_ev=None if delta is None else scaled(delta, EV_PER_AJ),
         formula_off=off,

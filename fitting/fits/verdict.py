@@ -62,10 +62,8 @@ class Evidence:
     chi2: float
     freedom: int
     p_value: float
-    autocorrelation: float
     other_minimum: tuple[dict[str, float], float] | None
     error_scale: float | None
-    lasting: bool
     robust: bool
     correlations: Float[np.ndarray, "p p"]
     untabulated: tuple[int, ...] = ()
@@ -237,8 +235,7 @@ def _not_explained(evidence: Evidence) -> list[str]:
 def _why_not_explained(evidence: Evidence) -> str:
     worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
     far = np.argsort(-worst)[: max(1, len(worst) // 20)]
-    names = evidence.parameters
-    tail = f"farthest off: {_unexplained_tables(evidence)}{_lines(evidence, np.sort(far))}"
+    tail = f"farthest off: {_lines(evidence, np.sort(far))}"
     # counting outliers less helps where the others are well explained: not if most are off, or off together
     scaled = (evidence.error_scale or 1.0) * np.abs(np.nan_to_num(evidence.rows.residual))
     few = 2 * np.any(scaled > OUTLIER, axis=1).sum() <= evidence.rows.used.sum()
@@ -249,34 +246,11 @@ def _why_not_explained(evidence: Evidence) -> str:
             f"Impacts last up to {100.0 * evidence.contact_share:.0f} % of a drive period: too long to be impacts of a "
             f"platform that hardly moves meanwhile; measure at lower frequencies, or at lower orders; {tail}."
         )
-    if evidence.lasting:
-        other = (
-            "The loss may depend on the speed otherwise (try viscous+delay), the"
-            if names.keys() & {"r", "viscous_loss"} == {"r"}
-            else "The"
-        )
-        return (
-            f"{other} errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows "
-            f"not single-impact orbits; {tail}."
-        )
     return (
-        "The impacts may last too long for an instantaneous law (a collision delay decides amplitudes near resonance: "
-        f"try the model with +delay), the errors may be too small, or the calibration off; {tail}."
+        "Another law may (near resonance a collision delay decides: models with +delay; `--compare` tries several), "
+        "the errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows not "
+        f"single-impact orbits; {tail}."
     )
-
-
-def _unexplained_tables(evidence: Evidence) -> str:
-    """Return which of several tables are not explained by themselves: 'B.csv (chi2 141/60); '; nothing of one table."""
-    if not isinstance(evidence.table, SeveralTables):
-        return ""
-    named = []
-    for t, label in enumerate(evidence.table.labels):
-        residual = evidence.rows.residual[evidence.table.number == t]
-        residual = residual[np.isfinite(residual)]
-        chi2 = float(residual @ residual)
-        if len(evidence.table.labels) * chi2_tail(chi2, residual.size) < IMPROBABLE:
-            named.append((chi2 / residual.size, f"{label} (chi2 {chi2:.0f}/{residual.size}); "))
-    return "".join(words for _, words in sorted(named, reverse=True))
 
 
 def _disagreeing(evidence: Evidence) -> list[str]:
@@ -470,12 +444,6 @@ def _unseen(evidence: Evidence) -> Bool[np.ndarray, " rows"]:
     return (unseen > 0) & (evidence.rows.orbits > 0)
 
 
-def _neighbours_alike(evidence: Evidence) -> bool:
-    """Say whether neighbouring residuals are correlated, though not so much that the fit is not valid."""
-    pairs = max(int(np.isfinite(evidence.rows.residual).sum()) - 2, 1)
-    return bool(abs(evidence.autocorrelation) > 3.0 / np.sqrt(pairs) and not _correlations(evidence))
-
-
 def _robust_loss(evidence: Evidence) -> list[str]:
     """Return the goodness of a robust fit without its outliers, and which these are, in words."""
     if not evidence.robust:
@@ -608,10 +576,6 @@ WARNINGS: Rules[Evidence] = (
     ),
     Rule(_limits, "{case}."),
     Rule(
-        lambda e: [name for name, known in e.parameters.items() if known.did_not_move],
-        "{case} did not move from the grid point it started at.",
-    ),
-    Rule(
         _other_minimum,
         "Another minimum explains the data about as well ({case}; the band of the law and the intervals hold both.",
     ),
@@ -638,10 +602,6 @@ WARNINGS: Rules[Evidence] = (
         "Several stable orbits coexist for {case}: the one closest to the measurement was taken.",
     ),
     Rule(lambda e: _named(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
-    Rule(
-        _neighbours_alike,
-        "Neighbouring residuals are correlated ({e.autocorrelation:+.2f}): something systematic is left.",
-    ),
     Rule(_robust_loss, "Robust loss: chi2 counts outliers linearly; without them chi2/dof = {case}."),
     Rule(
         lambda e: e.error_scale is not None,

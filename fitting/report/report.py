@@ -39,8 +39,6 @@ from fitting.report.words import (
 from fitting.sampling.posterior_result import Posterior
 from fitting.tables.several import SeveralTables
 
-_WORTH_SAYING = 0.9
-"""Magnitude from which the text names a correlation."""
 ROW_COLUMNS = (
     "line",
     "order",
@@ -75,7 +73,6 @@ def fit_report(result: FitResult, comparison: Comparison | None = None, posterio
         f"  {band_in_words(result)}",
         *([f"  {parting}"] if parting else []),
         _goodness_line(result),
-        *_correlation_lines(result),
     ]
     return Report(
         title=f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
@@ -147,17 +144,6 @@ def _sampled(posterior: Posterior) -> ReportSection:
     said = "95 % credible intervals (posterior, flat priors, of the formula without model error):"
     wrong = [f"Not converged: {reason}" for reason in posterior.reasons]
     return ReportSection("Posterior", [Text(said), Table("By parameter", head, rows), Bullets(wrong)])
-
-
-def _correlation_lines(result: FitResult) -> list[str]:
-    names = list(result.parameters)
-    pairs = [
-        f"{names[i]}, {names[j]}: {result.correlations[i, j]:+.3f}"
-        for i in range(len(names))
-        for j in range(i + 1, len(names))
-        if abs(result.correlations[i, j]) >= _WORTH_SAYING
-    ]
-    return [f"  correlations beyond {_WORTH_SAYING:g}: {'; '.join(pairs)}"] if pairs else []
 
 
 def row_records(result: FitResult) -> list[dict[str, Any]]:
