@@ -133,8 +133,7 @@ class PosteriorDraws:
         measured: what was read there: peak, lock-in amplitude and, if the table has one, the phase; NaN: not used.
         error: of the readings, with the model's.
         values: of the parameters.
-        statistics: what is known of the sampler's steps, by ArviZ's names, each of shape (chains, draws); `lp` is the
-            logarithm of the posterior's density but for a constant.
+        log_density: logarithm of the posterior's density but for a constant, of shape (chains, draws).
         predicted: readings without noise.
         replicated: readings with noise, as another experiment would give them.
         log_likelihood: of each row's readings together.
@@ -145,7 +144,7 @@ class PosteriorDraws:
     measured: Float[np.ndarray, "rows k"]
     error: Float[np.ndarray, "rows k"]
     values: Float[np.ndarray, "chains draws p"]
-    statistics: dict[str, np.ndarray]
+    log_density: Float[np.ndarray, "chains draws"]
     predicted: Float[np.ndarray, "chains draws rows k"]
     replicated: Float[np.ndarray, "chains draws rows k"]
     log_likelihood: Float[np.ndarray, "chains draws rows"]
@@ -162,7 +161,6 @@ def posterior_draws(result: FitResult, found: Posterior, *, seed: int = 0) -> Po
     refit, rows = refit_of_rows(result)
     step = max(found.chains.samples.shape[1] // DRAWS, 1)
     values = found.chains.samples[:, ::step]
-    statistics = {name: column[:, ::step] for name, column in found.chains.statistics.items()}
     dense = densities(refit.objective, values.reshape(-1, values.shape[2]))
     noise = noise_of(refit.objective, len(dense.predicted), np.random.default_rng(seed))
     used = np.asarray(refit.objective.measurement.rows.measured)
@@ -176,7 +174,7 @@ def posterior_draws(result: FitResult, found: Posterior, *, seed: int = 0) -> Po
         measured=np.where(used, np.asarray(refit.objective.measurement.rows.amplitude_nm), np.nan),
         error=np.where(used, np.asarray(refit.objective.measurement.rows.error_nm), np.nan),
         values=values,
-        statistics=statistics | {"lp": in_chains(dense.log_density)},
+        log_density=in_chains(dense.log_density),
         predicted=in_chains(dense.predicted),
         replicated=in_chains(dense.predicted + noise),
         log_likelihood=in_chains(dense.log_likelihood),

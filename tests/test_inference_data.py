@@ -33,7 +33,7 @@ def test_likelihoods_are_those_of_another_programs_amplitudes(believed):
     assert drawn.predicted[2, 7] == pytest.approx(predicted, rel=1e-9)
     assert drawn.log_likelihood[2, 7] == pytest.approx(expected, abs=1e-7)
     known = norm.logpdf(drawn.values[2, :, 2], table.quality_factor, table.quality_factor_error)
-    here = drawn.log_likelihood.sum(axis=2)[2] + known - drawn.statistics["lp"][2]
+    here = drawn.log_likelihood.sum(axis=2)[2] + known - drawn.log_density[2]
     # up to a constant it is the posterior's
     assert np.ptp(here) < 1e-8
     z = (drawn.replicated - drawn.predicted) / drawn.error

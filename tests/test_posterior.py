@@ -87,8 +87,7 @@ def test_a_loss_that_vanishes_has_a_one_sided_density(exact_q):
 
 def test_the_sampler_agrees_with_importance_sampling(law, sampled):
     assert sampled.converged, sampled.reasons
-    assert sampled.chains.statistics["diverging"].sum() == sampled.chains.divergences
-    assert sampled.chains.statistics["energy"].shape == (4, 1000)
+    assert sampled.chains.samples.shape[:2] == (4, 1000)
     # 20,000 draws: half as uncertain as two thousand samples at most
     mean, deviation = importance_sampling(objective_of(law), 20_000)
     for k, name in enumerate(law.parameters):

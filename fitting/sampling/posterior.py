@@ -61,14 +61,13 @@ def posterior(
     density = log_density_of(refit, covariance)
     # blackjax mixes integers of 32 and 64 bits, which strict promotion would refuse
     with jax.numpy_dtype_promotion("standard"):
-        drawn, statistics = _chains(density, jax.random.split(jax.random.key(seed), CHAINS), samples)
+        drawn, diverging = _chains(density, jax.random.split(jax.random.key(seed), CHAINS), samples)
         values = np.asarray(_values_of(density.space, drawn))
         halves = jnp.asarray(values[:, : samples // 2 * 2].reshape(2 * CHAINS, samples // 2, -1))
         # of one parameter they have no axis
         r_hat = np.atleast_1d(blackjax.diagnostics.potential_scale_reduction(halves))
         effective = np.atleast_1d(blackjax.diagnostics.effective_sample_size(halves))
-    statistics = {name: np.asarray(each) for name, each in statistics.items()}
-    chains = PosteriorChains(values, r_hat, effective, int(statistics["diverging"].sum()), seed, statistics)
+    chains = PosteriorChains(values, r_hat, effective, int(diverging.sum()), seed)
     return posterior_of_chains(chains, refit.objective.problem.names)
 
 
@@ -222,7 +221,7 @@ def log_density_of(refit: Refit, covariance: Float[np.ndarray, "p p"]) -> LogDen
 
 @eqx.filter_jit
 def _chains(density: LogDensity, keys, samples: int):
-    """Return draws (chains, draws, p), and of shape (chains, draws) what ArviZ knows of the steps, by its names."""
+    """Return draws (chains, draws, p), and of shape (chains, draws) which steps diverged."""
     blackjax = require_blackjax()
 
     def chain(key):
@@ -234,13 +233,7 @@ def _chains(density: LogDensity, keys, samples: int):
 
         def step(state, key):
             state, info = kernel.step(key, state)
-            told = {
-                "diverging": info.is_divergent,
-                "energy": info.energy,
-                "acceptance_rate": info.acceptance_rate,
-                "n_steps": info.num_integration_steps,
-            }
-            return state, (state.position, told)
+            return state, (state.position, info.is_divergent)
 
         return jax.lax.scan(step, state, jax.random.split(draw, samples))[1]
 

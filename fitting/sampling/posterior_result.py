@@ -1,6 +1,6 @@
 """The posterior of a fit's parameters: samples, their means and intervals, and whether they are enough."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,6 @@ class PosteriorChains:
         effective_samples: number of independent samples worth as much.
         divergences: transitions that lost the energy.
         seed: of the sampler.
-        statistics: of every step, by ArviZ's names, each of shape (chains, draws).
     """
 
     samples: Float[np.ndarray, "chains draws p"]
@@ -35,7 +34,6 @@ class PosteriorChains:
     effective_samples: Float[np.ndarray, " p"]
     divergences: int
     seed: int
-    statistics: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @public_result()
