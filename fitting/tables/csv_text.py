@@ -196,9 +196,6 @@ class Form:
         blanks: whether cells may be blank (NaN); else every cell is needed.
         example: a row of column names to show, where the row above the numbers is the whole head.
         separator: what stands between cells; empty: commas, tabs, semicolons or spaces, as the row of names has them.
-        fewer: what to do with a row of too few cells.
-        more: and with one of too many.
-        number: how a number is written.
         mend: what to do with a number that is impossible.
         largest: size of any number.
         strange: columns that other files have, and what to do about them.
@@ -210,9 +207,6 @@ class Form:
     blanks: bool = False
     example: str = ""
     separator: str = ","
-    fewer: str = "fill the row up"
-    more: str = "a decimal comma must be a point"
-    number: str = "write it like 90.25 or 9.025e1, or remove the row"
     mend: str = "correct it or remove the row"
     largest: float = FARTHEST
     strange: Mapping[str, str] = field(default_factory=dict)
@@ -253,7 +247,7 @@ class Form:
             case "flag":
                 bad |= ~np.isnan(values) & (values != 0.0) & (values != 1.0)
         must = f"must be 1 ({column.says}) or 0" if column.kind == "flag" else _MUST[column.kind]
-        blank = " or leave it blank if it was not measured" if column.error is not None else ""
+        blank = ", or leave it blank if it was not measured" if column.error is not None else ""
         for row in np.flatnonzero(bad):
             number = repr(float(values[row])).removesuffix(".0")
             wanted = said_beyond(values[row], self.largest) if far[row] else must
@@ -531,10 +525,9 @@ def _fault_in_cells(setting: FileSetting, cells: list[str]) -> str | None:
             return f"is {quoted(cell)}; write the decimal comma as a point"
         if not NUMBER.fullmatch(cell):
             return f"has {quoted(cell)} where a number must stand; write '{setting.line}', without the unit"
-    if len(cells) > 2 or (len(cells) == 2 and setting.error == "never"):
-        return f"takes no such error; write '{setting.line}'"
-    if len(cells) == 1 and setting.error == "always":
-        return f"needs its standard error; write '{setting.line}', or correct the columns and remove this line"
+    least, most = {"never": (1, 1), "maybe": (1, 2), "always": (2, 2)}[setting.error]
+    if not least <= len(cells) <= most:
+        return f"{'needs its standard error' if len(cells) < least else 'takes no such error'}; write '{setting.line}'"
     return fault_in_number(setting, *map(float, cells))
 
 
@@ -575,7 +568,9 @@ def named_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Head, N
         TableError: at once where the columns are not separated by commas: every other message would mislead.
     """
     line, text = rows[0]
-    _check_delimiter(text, form, line=line, faults=faults)
+    if form.separator == "," and _separator_of(text) != ",":
+        message = "the columns are not separated by commas; separate them by commas, decimals by points"
+        Faults(faults.source).fail(message, line=line)
     names, found = _cells(text, form.separator), faults.count
     present = check_names(names, form, line=line, faults=faults)
     if not rows[1:] and faults.count == found:
@@ -593,15 +588,6 @@ def check_not_empty(comments: NumberedLines, rows: NumberedLines, faults: Faults
     if not rows:
         what = "only comments" if comments else "nothing"
         faults.fail(f"the file holds {what}; add a row of column names and rows of numbers")
-
-
-def _check_delimiter(names: str, form: Form, *, line: int, faults: Faults) -> None:
-    if form.separator != "," or "," in names:
-        return
-    for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
-        if sign in names.strip():
-            advice = "separate them by commas, decimals by points"
-            Faults(faults.source).fail(f"the columns are separated by {word}; {advice}", line=line)
 
 
 def check_names(names: list[str], form: Form, *, line: int = 0, faults: Faults) -> set[str]:
@@ -628,7 +614,7 @@ def check_names(names: list[str], form: Form, *, line: int = 0, faults: Faults) 
         first.setdefault(name, position)
     # A name that was only misspelt is reported; that its column is then missing is not a second fault.
     meant = _check_unknown(unknown, form, present, line=line, faults=faults)
-    _check_missing(names, form, present | meant, line=line, faults=faults)
+    _check_missing(form, present | meant, line=line, faults=faults)
     return present | meant
 
 
@@ -659,20 +645,16 @@ def _unknown_column(name: str, suggestion: Column | None, form: Form, *, complet
         # where a column is missing this may be it
         advice = "remove it, " if complete else ""
         return f"unknown column {quoted(name)}; {advice}the columns are {', '.join(form.names)}"
-    plain, known = plain_name(name), suggestion.name
-    if suggestion.unit and plain != known and _has_unit(known) and without_unit(plain) == without_unit(known) != plain:
-        return f"unknown unit in column {quoted(name)}; convert it and name it {known}{_in_unit(suggestion)}"
-    return f"unknown column {quoted(name)}; did you mean {known}{_in_unit(suggestion)}?"
+    return f"unknown column {quoted(name)}; did you mean {suggestion.name}{_in_unit(suggestion)}?"
 
 
-def _check_missing(names: list[str], form: Form, present: set[str], *, line: int, faults: Faults) -> None:
+def _check_missing(form: Form, present: set[str], *, line: int, faults: Faults) -> None:
     for what, columns in _missing(form, present).items():
         if len(columns) > 1:
             message = f"there is no {what} column; add {' or '.join(column.name for column in columns)}"
         else:
-            there = f" (there are {', '.join(quoted(name) for name in names[:6])})" if form.open and any(names) else ""
             other = " or rename the one that holds it" if form.open else ""
-            message = f'the column "{columns[0].name}"{_in_unit(columns[0])} is missing{there}; add it{other}'
+            message = f'the column "{columns[0].name}"{_in_unit(columns[0])} is missing; add it{other}'
         faults.add(message, line=line)
 
 
@@ -704,10 +686,6 @@ def without_unit(name: str) -> str:
     return stem if stem and len(unit) <= 5 else name
 
 
-def _has_unit(name: str) -> bool:
-    return name.rpartition("_")[2] in {"khz", "nm", "deg", "ng"}
-
-
 _SIMILAR = 0.75
 """Similarity (0 to 1, as difflib counts it) that a misspelling must reach."""
 
@@ -723,9 +701,6 @@ def nearest_name(text: str, known: Iterable[str]) -> str | None:
     name = plain_name(text)
     for candidate in known:
         if name in {candidate, without_unit(candidate)}:
-            return candidate
-    for candidate in known:
-        if _has_unit(candidate) and without_unit(name) == without_unit(candidate):
             return candidate
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=_SIMILAR)), None)
 
@@ -760,7 +735,7 @@ def parse_rows(
             lines.append(line)
             table.append(cells)
         else:
-            hint = form.fewer if len(cells) < len(names) else form.more
+            hint = "fill the row up" if len(cells) < len(names) else "a decimal comma must be a point"
             faults.add(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
     columns, unreadable = {}, {}
     for name, column in wanted.items():
@@ -806,10 +781,8 @@ def _unreadable(text: str, column: Column, form: Form) -> str:
         return f"{quoted(text)} has a decimal comma; write a point"
     if column.kind == "whole":
         return f"{quoted(text)} is not a positive whole number; write 1, 2, 3, ..."
-    absent = text.lower().lstrip("+-") in {"nan", "inf", "infinity", "na", "n/a", "none", "null", ""}
-    if form.blanks and not column.required and absent:
-        return f"{quoted(text)} is not a number; leave the cell of a value that was not measured blank"
-    return f"{quoted(text)} is not a number; {form.number}"
+    other = "leave the cell blank" if form.blanks and not column.required else "remove the row"
+    return f"{quoted(text)} is not a number; write it like 90.25 or 9.025e1, or {other}"
 
 
 def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, faults: Faults) -> Float[np.ndarray, "..."]:

@@ -178,10 +178,6 @@ def _form(columns: tuple[Column, ...], strange: str) -> Form:
         columns,
         "drive",
         blanks=True,
-        fewer="fill in the others",
-        more="remove the others; a decimal comma must be a point",
-        number="write it like 174.6 or 1.746e2, without a unit",
-        mend="correct it",
         largest=LARGEST,
         strange={column.name: strange for column in (*_SAMPLE, *_TAPPING) if column.name not in names},
     )
@@ -618,11 +614,10 @@ def _check_header(table: AmplitudeTable, faults: Faults) -> None:
         fault = fault_in_number(SETTINGS[name], value, error)
         if fault is not None:
             faults.add(f"{name} {fault}")
-    damped = table.quality_factor is not None and not np.isnan(table.quality_factor)
-    if not damped and table.quality_factor_error is not None:
-        faults.add("quality_factor_error stands without quality_factor; give both or none")
-    if table.spring_constant_n_per_m is None and table.spring_constant_error_n_per_m is not None:
-        faults.add("spring_constant_error_n_per_m stands without spring_constant_n_per_m; give both or none")
+    for name, error in ERROR_OF.items():
+        value = getattr(table, name)
+        if (value is None or np.isnan(value)) and getattr(table, error) is not None:
+            faults.add(f"{error} stands without {name}; give both or none")
     if table.spring_constant_n_per_m is not None and table.mass_ng is not None and faults.count == 0:
         wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
         if wrong is not None:
@@ -711,19 +706,11 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     check_error_columns(head, faults)
     if faults.count > found:
         # With a wrong name the cells below it cannot be judged.
-        if noise is None:
-            check_errors(head, head.present, faults)
-        faults.raise_any()
-    if any(column.name in head.present and column.error not in head.present for column in MEASURED):
-        # whether noise or repeated readings give them is known from the rows, whose own faults come later
-        columns, unreadable, _ = parse_rows(rows, head.names, form, Faults(source))
-        fill_errors(columns, unreadable, noise)
-        fill_errors_of_repeats(columns, required(columns), MEASURED)
-        check_errors(head, columns, faults)
         faults.raise_any()
     columns, unreadable, lines = parse_rows(rows, head.names, form, faults)
     fill_errors(columns, unreadable, noise)
     repeats = fill_errors_of_repeats(columns, required(columns), MEASURED)
+    check_errors(head, columns, faults)
     check_rows(columns, lines, faults, unreadable)
     faults.raise_any()
     header["remarks"] = (*header["remarks"], *repeats)
