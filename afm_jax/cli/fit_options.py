@@ -94,9 +94,6 @@ def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
         "free": free,
         "fixed": fixed,
     }
-    for name in free or ():
-        if name in fixed:
-            raise click.UsageError(f"{name} is both fitted (--free) and held fixed (--fix); remove it from one")
     if model == "contact":
         settings["effects"] = effects = _effects(options["left_out"] or ())
         _check_of_use(free or (), fixed, effects)
@@ -118,10 +115,7 @@ def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:
 
 def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tuple[str, ...]:
     """Return which parameters are fitted if the call names none: the usual ones that are neither fixed nor idle."""
-    chosen = [name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects)]
-    if not chosen:
-        raise click.UsageError("--fix holds every parameter that is usually fitted; name others to fit with --free")
-    return tuple(chosen)
+    return tuple(name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects))
 
 
 def _check_of_use(free: tuple[str, ...], fixed: dict[str, float], effects: tuple[str, ...]) -> None:

@@ -22,8 +22,6 @@ _KINDS = ("peak", "lock-in", "phase")
 _EXCLUDED = "#999999"
 _ROW_AXIS = "rows, by order N, drive frequency (kHz), amplitude and offset"
 _HEIGHT = "height of the sample over the tip's rest position (nm)"
-_MUCH = 5.0
-"""How much the loss must change to be drawn on a logarithmic axis."""
 _APPROACH = "approach speed (nm/µs)"
 
 
@@ -55,11 +53,9 @@ def rows_figure(result: FitResult) -> Figure:
 def law_figure(result: FitResult) -> Figure:
     """Return the figure of the law: rebound speed, its band, energy lost, and the delay where impacts last."""
     figure = Figure(figsize=(_WIDTH_INCHES, 5.6), layout="constrained")
-    panels = {"law": draw_law, "band": draw_band, "losses": draw_losses}
+    panels = {"law": draw_law, "losses": draw_losses}
     panels |= {"delay": draw_delay} if has_delay(result) else {}
-    # without a delay the law has all of the upper row
-    rows = "law losses; band delay" if has_delay(result) else "law law; band losses"
-    mosaic: list[Any] = [row.split() for row in rows.split("; ")]
+    mosaic: list[Any] = [["law", "law"], ["losses", "delay" if has_delay(result) else "losses"]]
     for name, axes in figure.subplot_mosaic(mosaic).items():
         panels[name](axes, result)
     return figure
@@ -219,23 +215,6 @@ def draw_law(axes: Axes, result: FitResult) -> None:
     axes.legend(fontsize=SMALL, loc="upper left")
 
 
-def draw_band(axes: Axes, result: FitResult) -> None:
-    """Draw the 95 % band of the rebound speed as deviation from the fit in per cent: beside the law it is too thin."""
-    law = result.law
-    speed, fitted = law.approach_speed_nm_per_us, law.rebound_speed_nm_per_us
-    with np.errstate(invalid="ignore", divide="ignore"):
-        low, high = (100.0 * (end / fitted - 1.0) for end in (law.rebound_low_nm_per_us, law.rebound_high_nm_per_us))
-    axes.axhline(0.0, color=COLOURS[0])
-    if np.isfinite(high).any():
-        axes.fill_between(speed, low, high, color=COLOURS[0], alpha=0.3, lw=0, label="95 % band")
-        axes.legend(fontsize=SMALL, loc="upper right")
-    _mark_speeds(axes, result)
-    log_speed_axis(axes)
-    _frame(axes, result, (low, high))
-    axes.set_xlabel(_APPROACH)
-    axes.set_ylabel("rebound speed: deviation (%)")
-
-
 def draw_losses(axes: Axes, result: FitResult) -> None:
     """Draw the share of its energy that the tip loses, where the laws differ visibly."""
     law = result.law
@@ -250,11 +229,6 @@ def draw_losses(axes: Axes, result: FitResult) -> None:
     log_speed_axis(axes)
     axes.set_xlabel(_APPROACH)
     axes.set_ylabel("energy lost (%)")
-    if lost.min() > 0.0 and lost.max() > _MUCH * lost.min():
-        axes.set_yscale("log")
-        axes.set_ylim(0.4 * lost.min(), 2.0 * lost.max())
-        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        return
     top = float(np.max(np.where(np.isfinite(most), most, lost)))
     axes.set_ylim(0, min(1.15 * top, 105.0) if top > 0.0 else 1.0)
 

@@ -200,8 +200,6 @@ def band_in_words(result: FitResult) -> str:
         return "No row reached a steady orbit: the law was measured at no speed."
     slowest, fastest = f"{width.slowest_nm_per_us:.3g}", f"{width.fastest_nm_per_us:.3g}"
     where = f"Over the measured approach speeds, {slowest} to {fastest} nm/us,"
-    if slowest == fastest:
-        where = f"At the one measured approach speed, {slowest} nm/us,"
     if not np.isfinite(width.worst):
         cause = "the parameters' errors are not known" if result.valid else "the fit is not valid"
         return f"{where} no band can be given: {cause}."

@@ -73,16 +73,12 @@ class SeveralTables:
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """What each table is called: its file's name, with as much of its path as tells it from the others."""
-        paths = [Path(table.source).parts[::-1] for table in self.tables]
-        depth = 1
-        while True:
-            names = ["/".join(reversed(parts[:depth])) for parts in paths]
+        """What each table is called: its file's name; its path, or this and a number, where that is another's too."""
+        paths = [table.source for table in self.tables]
+        for names in (tuple(Path(path).name for path in paths), tuple(paths)):
             if len(set(names)) == len(names):
-                return tuple(names)
-            if depth >= max(map(len, paths)):
-                return tuple(f"{name} ({number})" for number, name in enumerate(names, 1))
-            depth += 1
+                return names
+        return tuple(f"{path} ({number})" for number, path in enumerate(paths, 1))
 
     @property
     def source(self) -> str:

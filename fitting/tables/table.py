@@ -216,20 +216,6 @@ def _check_order(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faul
         faults.add(f"{message}; remove the row", line=int(lines[row]), column="order")
 
 
-def check_error_columns(head: Head, faults: Faults) -> None:
-    """Note errors without what they belong to.
-
-    Args:
-        head: the column names.
-        faults: where the faults are noted.
-    """
-    for column in MEASURED:
-        error = str(column.error)
-        if error in head.present and column.name not in head.present:
-            message = f"stands without {column.name}; add that column or remove this one"
-            faults.add(message, line=head.line, column=error)
-
-
 def check_errors(head: Head, present: Collection[str], faults: Faults) -> None:
     """Note measured columns without their errors.
 
@@ -703,7 +689,6 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
         faults.raise_any()
         raise AssertionError
     head, rows = named_rows(rows, form, faults)
-    check_error_columns(head, faults)
     if faults.count > found:
         # With a wrong name the cells below it cannot be judged.
         faults.raise_any()
