@@ -44,7 +44,6 @@ def made_fit(model: str, *, width: float = 1e-3, table: AmplitudeTable | None = 
         degrees_of_freedom=6,
         p_value=0.54,
         aic=9.0,
-        bic=9.5,
         valid=True,
         reasons=[],
         warnings=[],

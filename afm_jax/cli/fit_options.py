@@ -69,10 +69,7 @@ def check_fit(_: Session, options: dict[str, Any]) -> None:
     if options["example"] == bool(options["tables"]):
         both = "not both: " if options["example"] else ""
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
-    several = len(options["tables"]) > 1
-    if options["share"] and not several:
-        raise click.UsageError("--share is about several tables that are fitted together; leave it out")
-    if options["posterior"] and several:
+    if options["posterior"] and len(options["tables"]) > 1:
         raise click.UsageError("--posterior is about one table: give one, or leave it out")
     options["settings"] = fit_settings(options["model"], options)
 

@@ -149,7 +149,6 @@ class FitEstimate(NamedTuple):
         independent_residual: residuals in errors without the most likely part that rows share: remainders of the
             corrections, and deviations of the tables' laws.
         after: the step, as much of it as lowers chi2, and the discrepancy that it leads to; None: there is none.
-        system: the rows as the step sees them, without deviations of several tables' laws.
         stuck: chi2 that no part of the step lowers, and what the whole step takes it to to first order; None elsewhere.
         runs: what was found of residuals that run together over the speed.
         contact_share: largest share of a drive's period that the tip is in contact.
@@ -163,7 +162,6 @@ class FitEstimate(NamedTuple):
     rows: FittedRows
     independent_residual: Float[np.ndarray, "rows k"]
     after: tuple[LinearStep, ModelDiscrepancy] | None = None
-    system: StepSystem | None = None
     stuck: tuple[float, float] | None = None
     runs: "Runs | None" = None
     contact_share: float = 0.0
@@ -209,7 +207,7 @@ def estimate_of(table: AmplitudeTable | SeveralTables, found: Found) -> FitEstim
     used = np.isfinite(at.speeds)
     # Hertz time in us times the drive's frequency in kHz; 1e-3 makes it a share of the period
     contact_share = float(np.max(1e-3 * rows.hertz_time[: used.size][used] * table.drive_frequency_khz[used]))
-    estimate = estimate._replace(system=system, runs=runs, tables=tables, contact_share=contact_share)
+    estimate = estimate._replace(runs=runs, tables=tables, contact_share=contact_share)
     if not at.problem.lasting:
         return estimate
 
@@ -424,24 +422,6 @@ def _tabulated_after(at: AtMinimum, step: LinearStep, discrepancy: ModelDiscrepa
         values = step.values[: len(at.values)] if member is None else member.values
         delay = at.problem.law(jnp.asarray(values), at.objective.measurement.fixed).delay
     return table_of_law(speeds, *points.law, capture_speed_nm_per_us=points.capture, delay=delay)
-
-
-_MUCH = 0.25
-"""Share of a parameter's variance that comes of a held one from which it is said to hang on that."""
-
-
-def hanging_on_held(estimate: FitEstimate) -> dict[str, tuple[str, ...]]:
-    """Return, by the name of a fitted parameter, the held parameters whose error gives over 25 % of its variance."""
-    hanging: dict[str, tuple[str, ...]] = {}
-    if estimate.after is None or estimate.system is None:
-        return hanging
-    system, held, whole = estimate.system, estimate.after[1].held, np.diag(estimate.covariance)
-    for place, effect in enumerate(held, start=system.of_law - len(held)):
-        without = np.diag(system.without(place).covariance)
-        for i, name in enumerate(estimate.at.problem.own):
-            if np.isfinite(whole[i]) and whole[i] - without[i] > _MUCH * whole[i]:
-                hanging[name] = (*hanging.get(name, ()), effect.held.name)
-    return hanging
 
 
 _KINDS = (("peak amplitude", ""), ("lock-in amplitude", ""), ("phase", "degrees"))

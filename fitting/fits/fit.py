@@ -21,13 +21,12 @@ from fitting.fits.estimate import (
     Found,
     courses_along_rows,
     estimate_of,
-    hanging_on_held,
     programs_of_laws,
 )
 from fitting.fits.intervals import UNEXPLAINED, Interval, profile_intervals, within_range
 from fitting.fits.law_after import holding, speed_range
 from fitting.fits.minimum import minimum_with_model_errors, rescale_errors, settle, starts, untabulated
-from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest, warm_up_steps
+from fitting.fits.objective import ROBUST, Objective, lowest, warm_up_steps
 from fitting.fits.result import (
     FitResult,
     FittedParameter,
@@ -163,8 +162,6 @@ def find_fit(  # noqa: PLR0913
     settings = {
         "model": model,
         "error_scale": scale,
-        "starts": BATCH,
-        "soft": SOFT,
         "robust": ROBUST if robust else None,
         "constraints": known,
         "free": list(problem.own),
@@ -259,7 +256,6 @@ def evidence_of(estimate: FitEstimate, other: FitEstimate | None) -> Evidence:
         run=(0.0, 0.0) if estimate.runs is None else (estimate.runs.before, estimate.runs.beside),
         short=0.0 if discrepancy is None else discrepancy.short,
         held=() if discrepancy is None else tuple(effect.held for effect in discrepancy.held),
-        hanging=hanging_on_held(estimate),
         unwidened=unwidened,
         independent_residual=estimate.independent_residual,
         stuck=estimate.stuck,
@@ -340,7 +336,6 @@ def result_of(estimate: FitEstimate, other: FitEstimate | None, evidence: Eviden
         degrees_of_freedom=at.freedom,
         p_value=evidence.p_value,
         aic=at.chi2 + 2.0 * len(at.values),
-        bic=at.chi2 + len(at.values) * float(np.log(at.data)),
         valid=not reasons,
         reasons=reasons,
         warnings=warnings,

@@ -249,7 +249,6 @@ class FitResult(Result):
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
         aic: chi2 + 2 k, chi2 here of the formula alone: the model discrepancy would make up for what it lacks.
-        bic: chi2 + k log(n), likewise.
         valid: converged, explained and determined; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
@@ -272,7 +271,6 @@ class FitResult(Result):
     degrees_of_freedom: int
     p_value: float
     aic: float
-    bic: float
     valid: bool
     reasons: list[str]
     warnings: list[str]
@@ -305,7 +303,6 @@ class FitResult(Result):
             "degrees_of_freedom": self.degrees_of_freedom,
             "p_value": plain(self.p_value),
             "aic": plain(self.aic),
-            "bic": plain(self.bic),
             "law": self.law.to_dict(),
             "loss": None if self.loss is None else plain(asdict(self.loss)),
             "rows": {name: plain(column) for name, column in vars(self.rows).items()},

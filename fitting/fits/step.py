@@ -13,7 +13,7 @@ row, are no part of that law: they are in the covariance of the rows.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -177,10 +177,6 @@ class StepSystem:
     noise: Float[np.ndarray, "readings readings"]
     parameters: StepParameters
     of_law: int = 0
-
-    def without(self, place: int) -> "StepSystem":
-        """Return the system without one of the unknowns of the law."""
-        return replace(self, unknown=np.delete(self.unknown, place, axis=1), of_law=self.of_law - 1)
 
     @cached_property
     def whitening(self) -> Float[np.ndarray, "readings readings"]:

@@ -82,8 +82,6 @@ class Evidence:
     """Residuals of the rows without the discrepancy that was added for runs: that goes after outliers."""
     held: tuple[Held, ...] = ()
     """What a fit of the contact holds, with its errors."""
-    hanging: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Which of them decide how well a fitted one is known."""
     short: float = 0.0
     """Share of the loss by which the model discrepancy of short range was added for that."""
     independent_residual: Float[np.ndarray, "rows k"] | None = None
@@ -399,15 +397,6 @@ def _assumed(evidence: Evidence) -> list[str]:
     return [f"{said}: say what is known better, like {better}"]
 
 
-def _hanging(evidence: Evidence) -> list[str]:
-    """Return each fitted parameter whose error is mostly that of what is held, in words."""
-    values = {held.name: _held_in_words(held) for held in evidence.held}
-    return [
-        f"{name} depends on what is held: {', '.join(values[other] for other in others)}"
-        for name, others in evidence.hanging.items()
-    ]
-
-
 def _tied_pairs(evidence: Evidence) -> list[str]:
     """Return the pairs of parameters that are determined only together, with their correlation, in words."""
     names, matrix = list(evidence.parameters), evidence.correlations
@@ -589,7 +578,6 @@ WARNINGS: Rules[Evidence] = (
         "shape; a model discrepancy of {case:.0f} % of the loss at any speed is in law, band and intervals.",
     ),
     Rule(_assumed, "Held, with errors that are assumed: {case}."),
-    Rule(_hanging, "{case}."),
     Rule(_excluded, "Excluded, because these impacts are {case}."),
     Rule(_model_error, "A model error of up to {case}."),
     Rule(

@@ -100,7 +100,7 @@ def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
 def _goodness_line(result: FitResult) -> str:
     probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
     goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
-    return f"  {goodness}, AIC {result.aic:.1f}, BIC {result.bic:.1f}"
+    return f"  {goodness}, AIC {result.aic:.1f}"
 
 
 def _table_sections(result: FitResult) -> list[ReportSection]:

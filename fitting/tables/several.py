@@ -82,11 +82,8 @@ class SeveralTables:
 
     @property
     def source(self) -> str:
-        """The tables' names, the first few of them."""
-        names = self.labels
-        return (
-            ", ".join(names) if len(names) <= _NAMED else f"{', '.join(names[:_NAMED])} and {len(names) - _NAMED} more"
-        )
+        """The first table's name, and how many more there are."""
+        return f"{self.labels[0]} and {len(self.labels) - 1} more"
 
     @cached_property
     def number(self) -> Int[np.ndarray, " rows"]:
@@ -161,8 +158,6 @@ def _readings(table: AmplitudeTable) -> tuple[bytes, ...]:
 
 _SAME_MASS = 0.01
 """Relative difference of masses that is none: they come of spring constants."""
-_NAMED = 3
-"""Tables that a title names."""
 
 
 @dataclass(frozen=True)
