@@ -115,7 +115,7 @@ def test_what_does_not_explain_the_data_says_what_to_try_and_which_rows_are_far(
     residual = np.full((4, 2), 0.5)
     residual[1, 0] = -40.0
     (reason,) = reasons_of("law", residual=residual, p_value=0.0, chi2=9e4)
-    assert "a collision delay decides: models with +delay; `--compare` tries several), the errors may be" in reason
+    assert "a collision delay decides: models with +delay; `compare` tries several), the errors may be" in reason
     assert "farthest off: line 2 (if only a few are wrong: `robust=True`)." in reason
 
 

@@ -245,7 +245,7 @@ def _why_not_explained(evidence: Evidence) -> str:
             f"platform that hardly moves meanwhile; measure at lower frequencies, or at lower orders; {tail}."
         )
     return (
-        "Another law may (near resonance a collision delay decides: models with +delay; `--compare` tries several), "
+        "Another law may (near resonance a collision delay decides: models with +delay; `compare` tries several), "
         "the errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows not "
         f"single-impact orbits; {tail}."
     )
