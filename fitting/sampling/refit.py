@@ -36,7 +36,7 @@ def objective_of(result: FitResult) -> Refit:
     require_float64()
     if isinstance(result.table, SeveralTables):
         raise ValueError(  # noqa: TRY004 (a fit of several tables is no wrong type)
-            "bootstrap and posterior are about one table; the intervals of a joint fit are its own"
+            "a posterior is about one table; the intervals of a joint fit are its own"
         )
     settings = result.settings
     effects = EFFECTS if settings["effects"] is None else tuple(settings["effects"])
