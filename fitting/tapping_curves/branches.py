@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.optimize import least_squares
 
+from fitting.instruments.lag import turned
 from fitting.tapping_curves.curve import Rows, TappingCurve, TipMotion
 
 _FREE = 4.0
@@ -153,7 +154,17 @@ def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
             if all(_departs(curve, other, part[:place][free[part[:place]]]) for other in following):
                 break
             free[row] = not _departs(curve, row, part[:place][free[part[:place]]])
+        other = np.flatnonzero(free & (curve.drive_frequency_khz == curve.drive_frequency_khz[part[0]]))
+        other, own = np.setdiff1d(other, part), part[free[part]]
+        off = np.subtract.outer(curve.lag_deg[own], curve.lag_deg[other])
+        # a tip that still taps at its farthest row has by chance the free one's amplitude, not its lag
+        if np.isfinite(off).any() and abs(np.nanmedian(turned(off))) > _OTHER_MOTION_DEG:
+            free[part] = False
     return free
+
+
+_OTHER_MOTION_DEG = 30.0
+"""How far the lag of a way's free rows is from that of the other's if these rows are not free."""
 
 
 def _departs(curve: TappingCurve, row: int, before: np.ndarray) -> bool:

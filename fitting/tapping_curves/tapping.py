@@ -35,6 +35,7 @@ from fitting.tapping_curves.curve import (
     part_of,
 )
 from fitting.tapping_curves.energy import (
+    FEWEST_FREE_ROWS,
     FEWEST_ROWS,
     Lever,
     OneEnergy,
@@ -254,7 +255,7 @@ def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> Ta
     given, and says so: taken for knowledge besides, it would count both twice.
     """
     stated, free = curve.phase_zero_deg, free_rows(curve) & np.isfinite(curve.lag_deg)
-    if stated is None or not free.any():
+    if stated is None or free.sum() < FEWEST_FREE_ROWS:
         return curve
     frequency, quality = curve.free_frequency_khz, curve.quality_factor
     start = lag_of_free_tip(curve, Instrument(frequency.value, quality.value))[free]
