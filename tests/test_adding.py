@@ -38,7 +38,6 @@ DELAY = {
     "afm_jax/impact/law.py": [
         'True)\n{ =>     late_nm2_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)\n}',
         "(1.0 / w - 1.0 / u) - self.offset_nm / u{ =>  + self.late_nm2_per_us / u**2}",
-        "+ self.offset_nm / u**2{ =>  - 2.0 * self.late_nm2_per_us / u**3}",
     ],
     "afm_jax/scenefile/tables.py": ['"offset_nm", { => "late_nm2_per_us", }"corrections")'],
     "afm_jax/scenefile/scenefile.py": ["offset_nm = 0.726\n{ => late_nm2_per_us = 0\n}"],
