@@ -1,5 +1,6 @@
 """README and pages: what they tell to type works, and README shows what comes of it."""
 
+import math
 import re
 import shlex
 from pathlib import Path
@@ -93,12 +94,11 @@ STAND_FOR = {
     "my_amplitudes.csv": str(EXAMPLES / "amplitudes_law.csv"),
     "SWEEP": "resonance.csv",
     **dict.fromkeys(("first.csv", "second.csv", "third.csv"), str(EXAMPLES / "tapping_resonance.csv")),
-    "trace1.csv": "trace/trace.csv",
+    "TRACE": "half.csv",
 }
 FEWER = (
     (r"(:\d+(?:\.\d+)?):\d+$", r"\1:3"),
     (r"^\d+x\d+$", "4x4"),
-    (r"^trace2\.h5$", ""),
     (r"^viscous\+delay$", "law"),
 )
 """What pages name, as what is there; grids of a few points, and models that compile quickly."""
@@ -130,6 +130,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     points = zip(sweep.frequency_khz.tolist(), sweep.amplitude.tolist(), strict=True)
     lines = [f"{khz!r},{amplitude!r}\n" for khz, amplitude in points]
     (folder / "resonance.csv").write_text("".join(["frequency_khz,amplitude_nm\n", *lines]))
+    halves = [f"{0.25 * n!r},{5.0 * math.cos(2e-3 * math.pi * 181.8 * 0.25 * n)!r}\n" for n in range(2000)]
+    (folder / "half.csv").write_text("".join(["time_us,deflection_nm\n", *halves]))
     (folder / "scene.toml").write_text(blocks(text_of("first_steps"), "toml")[0])
     (folder / "sweep.toml").write_text(blocks(text_of("sweeps"), "toml")[0].replace("201", "3"))
     for name, scene in zip(("base", "force", "two_tones"), blocks(text_of("drives"), "toml"), strict=True):
