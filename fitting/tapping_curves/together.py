@@ -58,7 +58,7 @@ class CurveScatter(CurveBranch):
         return within(ratio, self.amplitude_ratio, *columns)
 
 
-@public_result(picture="fitting.tapping_curves.pictures:together_figure")
+@public_result(picture="fitting.tapping_curves.pictures:together_figure", rows="rows")
 @dataclass(frozen=True, kw_only=True)
 class TappingTogether(Result):
     """Energies of a tap from several curves of one lever: what `tapping_together` returns.
@@ -84,6 +84,11 @@ class TappingTogether(Result):
         if self.lever is None or not self.lever.minimum.degrees_of_freedom:
             return None
         return self.lever.minimum.p_value
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A row a curve: its table, and whether its energy is measured."""
+        return [{"curve": one.table.source, "valid": one.valid} for one in self.curves]
 
     @property
     def reasons(self) -> list[str]:
