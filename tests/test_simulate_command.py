@@ -47,8 +47,8 @@ def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path,
     worked_out, own = [], "afm_jax.motion.trajectory.pieces_between"
     monkeypatch.setattr(own, lambda *where: worked_out.append(where) or pieces_between(*where))
     answer = answers.answer(tmp_path / "out", "simulate", law_file, "--harmonics", "1,3")
-    # observables and files look at one path, the picture at its own
-    assert len(worked_out) == 2
+    # observables, files and pictures look at one path
+    assert len(worked_out) == 1
     assert answer.keys() >= KEYS
     assert nulls(answer) == answer["null_reasons"].keys()
     orbits = single_impact_orbits(LAW, 1)

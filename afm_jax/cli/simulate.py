@@ -21,6 +21,7 @@ from afm_jax.motion.trajectory import DensePath, dense_path
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 draw_motion = later("afm_jax.plots.motion:draw_motion")
+stretch_drawn = later("afm_jax.plots.motion:stretch_drawn")
 
 MOST_OSCILLATIONS = 1e7
 """Oscillations of the free tip or the drive that are followed at most: some minutes of computing."""
@@ -62,7 +63,7 @@ def simulation(  # noqa: PLR0913
     def report(folder: Path, _: Any) -> Any:
         if samples:
             _write_trace(session, scene.scene, run, seen.window)
-        return draw_motion(scene.scene, run.simulation, folder, verdict=run.verdict)
+        return draw_motion(scene.scene, run.simulation, folder, verdict=run.verdict, dense=dense)
 
     return Output(
         payload=told.to_dict(),
@@ -108,10 +109,14 @@ def _follow(session: Session, scene: NamedScene, longest_us: float, settings: di
 
 
 def _dense(scene: Scene, run: LongRun, *, to_files: bool) -> DensePath:
-    """Return the tip over all that is read and written of it: its contacts are integrated once more."""
+    """Return the tip over all that is read, written and drawn of it: its contacts are integrated once more, once."""
     window = window_of(scene, run.simulation, run.verdict)
-    begin, end = stretch_written(run.simulation, window) if to_files else (window.from_us, window.to_us)
-    return dense_path(scene, run.simulation, min(begin, window.from_us), max(end, window.to_us))
+    stretches = [(window.from_us, window.to_us)]
+    if to_files:
+        stretches.append(stretch_written(run.simulation, window))
+        stretches.append(stretch_drawn(scene, run.simulation, run.verdict))
+    begin, end = zip(*stretches, strict=True)
+    return dense_path(scene, run.simulation, min(begin), max(end))
 
 
 def _write_trace(session: Session, scene: Scene, run: LongRun, window: Window) -> None:

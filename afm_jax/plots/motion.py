@@ -61,6 +61,7 @@ def draw_motion(
     folder: Path,
     *,
     verdict: Settled | None = None,
+    dense: DensePath | None = None,
 ) -> list[Path]:
     """Draw what there is to see of a motion, as PNG files.
 
@@ -72,6 +73,7 @@ def draw_motion(
         simulation: of one scene, not of a batch.
         folder: exists and can be written to.
         verdict: what `settled` said, if it is known already.
+        dense: the tip over all that is drawn (`stretch_drawn`), if it is known already.
 
     Returns:
         The files, in the order above.
@@ -79,7 +81,7 @@ def draw_motion(
     Raises:
         ValueError: if the simulation is a batch, or did not get beyond its start.
     """
-    look = look_at(scene, simulation, verdict=verdict)
+    look = look_at(scene, simulation, verdict=verdict, dense=dense)
     figures = {"time_course": course_figure, "spectrum": spectrum_figure}
     if np.isfinite(look.departure_us).any():
         figures |= {"poincare": section_figure}
@@ -158,13 +160,16 @@ class Look(NamedTuple):
         return np.asarray(self.contacts.departure_time_us)[self.used]
 
 
-def look_at(scene: Scene, simulation: Simulation, *, verdict: Settled | None = None) -> Look:
+def look_at(
+    scene: Scene, simulation: Simulation, *, verdict: Settled | None = None, dense: DensePath | None = None
+) -> Look:
     """Return the last contacts of a motion, or its last periods, ready to be drawn.
 
     Args:
         scene: the scene that was simulated.
         simulation: of one scene.
         verdict: what `settled` said, if it is known already.
+        dense: the tip over all that is drawn (`stretch_drawn`), if it is known already.
 
     Raises:
         ValueError: if the simulation is a batch, or did not get beyond its start.
@@ -172,7 +177,8 @@ def look_at(scene: Scene, simulation: Simulation, *, verdict: Settled | None = N
     begin, end = _course_shown(scene, simulation)
     verdict = settled(scene, simulation) if verdict is None else verdict
     responses = _responses_shown(scene, simulation, verdict, end)
-    dense = dense_path(scene, simulation, min(begin, responses.from_us), max(end, responses.to_us))
+    if dense is None:
+        dense = dense_path(scene, simulation, *_both((begin, end), responses))
     rows = simulation.contacts
     used = np.asarray(rows.kind) != ContactKind.NONE
     times = np.linspace(begin, end, _POINTS)
@@ -182,6 +188,25 @@ def look_at(scene: Scene, simulation: Simulation, *, verdict: Settled | None = N
         edges = edges[(edges > begin + _BESIDE_US) & (edges < end - _BESIDE_US)]
         times = np.union1d(times, np.concatenate([edges - _BESIDE_US, edges, edges + _BESIDE_US]))
     return Look(scene, simulation, drive_of(scene), responses, begin, end, dense, dense.at(times), used)
+
+
+def stretch_drawn(scene: Scene, simulation: Simulation, verdict: Settled) -> tuple[float, float]:
+    """Return beginning and end, in us, of all that is drawn of a motion: what has to be known of its contacts.
+
+    Args:
+        scene: the scene that was simulated.
+        simulation: of one scene.
+        verdict: what `settled` said.
+
+    Raises:
+        ValueError: if the simulation is a batch, or did not get beyond its start.
+    """
+    course = _course_shown(scene, simulation)
+    return _both(course, _responses_shown(scene, simulation, verdict, course[1]))
+
+
+def _both(course: tuple[float, float], responses: Responses) -> tuple[float, float]:
+    return min(course[0], responses.from_us), max(course[1], responses.to_us)
 
 
 def _course_shown(scene: Scene, simulation: Simulation) -> tuple[float, float]:
