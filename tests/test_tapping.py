@@ -234,6 +234,32 @@ def test_thresholds_are_found_to_a_tenth_of_a_nanometre(width: float):
             assert end.offset_nm == pytest.approx(wanted, abs=0.1)
 
 
+def test_a_way_that_taps_to_its_farthest_row_has_no_free_rows():
+    offset = np.tile([-44.0, -42.0, -38.0, -34.0], 2)
+    retract = np.repeat([False, True], 4)
+    # the retracting tip passes the free one's amplitude at its second row, on the repulsive branch
+    read = {"amplitude_nm": np.array([40.1, 39.9, 36.0, 33.0, 42.5, 40.05, 37.0, 33.0])}
+    read |= {"lag_deg": np.array([177.0, 176.9, 3.1, 3.0, 3.4, 3.4, 3.2, 3.0]), "drive_frequency_khz": 94.5}
+    assert free_rows(curve_of_rows(8, offset_nm=offset, retract=retract, **read)).tolist() == [True] * 2 + [False] * 6
+    # of one motion, both ways have theirs
+    read["lag_deg"] = np.where(np.arange(8) == 5, 177.1, read["lag_deg"])
+    free = free_rows(curve_of_rows(8, offset_nm=offset, retract=retract, **read))
+    assert free.tolist() == [True] * 2 + [False] * 3 + [True] + [False] * 2
+
+
+def test_a_stated_zero_counts_where_fewer_than_three_rows_are_free():
+    truth = curve_of_energy(TIP, np.linspace(0.9, 0.15, 16), np.full(16, 3.0), np.ones(16, bool))
+    # free rows would know it better, by frequency and Q
+    errors = {"free_frequency_error_khz": 0.01, "calibration": {"phase_zero_deg": (0.0, 10.0)}}
+    for count, wanted in ((2, 10.0), (5, np.inf)):
+        stated = Stated(1e-12, 1e-12, 1e-12, 0.003, 0.2)
+        table = table_of(TIP, truth, stated, np.random.default_rng(1), free_rows=count, **errors)
+        functions = tapping(table, law=False).functions
+        assert functions is not None
+        (zero,) = (one for one in functions.nuisances if one.kind == "phase_zero_deg")
+        assert zero.given.error == wanted
+
+
 def test_a_zero_that_free_rows_were_set_to_is_no_knowledge_besides_frequency_and_q():
     table = parse_table(table_text(read_curve(make_raw_curve.EXAMPLE, **make_raw_curve.OPTIONS)), "example")
     assert "phase_zero_deg" in table.calibration
