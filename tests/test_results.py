@@ -29,6 +29,7 @@ from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from afm_jax.studies.effects import EffectStudy
+from fitting.fits.comparison import Comparison
 from tests.fit_tables import EXAMPLE, example_fit
 from tests.fresh_python import python
 from tests.lockin_traces import noisy_bounce
@@ -38,12 +39,10 @@ PARAMETERS = {"BaseDrive", "Cantilever", "CollisionDelay", "Contact", "ForceDriv
 PARAMETERS |= {"ParameterRange", "TabulatedLaw", "Tone"}
 """What a simulation is made of, and scene files hold; and what a parameter goes through."""
 ROOT = Path(__file__).parent.parent
-DRAWN_BELOW = {"Continuation", "Design", "FitResult", "Inversion", "LockinResult"}
+DRAWN_BELOW = {"Comparison", "Continuation", "Design", "FitResult", "Inversion", "LockinResult"}
 DRAWN_BELOW |= {"StabilityChart"}
 DRAWN_ELSEWHERE = {"Basins", "ContactDelay", "Sweep", "Tapping", "TappingMap"}
 """What is drawn in its own way, from parts that belong together: these are made by computations."""
-NOT_DRAWN = {"Comparison"}
-"""What is a table and a sentence."""
 SIZES = {"rows": 7, "points": 5, "p": 2, "columns": 3, "orders": 2, "scenes": 21}
 
 
@@ -241,7 +240,7 @@ def test_a_table_of_pandas_is_an_amplitude_table_and_back():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numbers at random, some of them NaN
 def test_every_result_of_numbers_is_a_table_and_a_picture_that_says_what_is_drawn(tmp_path: Path):
-    for name in sorted(RESULTS.keys() - DRAWN_BELOW - DRAWN_ELSEWHERE - NOT_DRAWN):
+    for name in sorted(RESULTS.keys() - DRAWN_BELOW - DRAWN_ELSEWHERE):
         record = made(RESULTS[name], np.random.default_rng(6))
         assert record.to_pandas().size, name
         figure = record.plot(tmp_path / "picture.svg")
@@ -286,6 +285,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         fitted,
         fitting.invert(fitting.read_table(EXAMPLE)),
         fitting.design(prior, fitting.drive_grid(**size, free_frequency_khz=90.0), points=2),
+        Comparison([{"model": "law"}], "one only", {"law": fitted}),
         fitting.lockin(*noisy_bounce(1)[:2], 181.8, 1),
     ]
     assert {type(record).__name__ for record in computed} >= DRAWN_BELOW

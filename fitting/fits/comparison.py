@@ -20,7 +20,7 @@ _EVEN, _PLAIN = 2.0, 10.0
 """Differences of AIC up to which models are even, and beyond which one is clearly favoured."""
 
 
-@public_result(rows="rows")
+@public_result(picture="fitting.report.plots:models_figure", rows="rows")
 @dataclass(frozen=True)
 class Comparison(Result):
     """Models of one table, the best one first.
@@ -123,9 +123,10 @@ def _fitted(
         FloatingPointError: if its chi2 is not a finite number.
     """
     if model in known:
-        return known[model]
-    found = find_fit(table, model, **_options_of(model, options))
-    result = summarise(table, found)
+        found, result = known[model]
+    else:
+        found = find_fit(table, model, **_options_of(model, options))
+        result = summarise(table, found)
     if not np.isfinite(result.chi2):
         raise FloatingPointError("chi2 is not finite")
     return found, result
