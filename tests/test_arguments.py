@@ -157,7 +157,7 @@ def test_a_family_without_scenes_and_a_sweep_into_a_file_are_named(tmp_path: Pat
 def test_arguments_of_another_kind_are_named():
     *otherwise, count = python(PROGRAM).splitlines()
     assert otherwise == []
-    assert int(count) > 900
+    assert int(count) > 960
 
 
 def test_paths_and_presets_work_where_scenes_and_tables_do(tmp_path: Path):

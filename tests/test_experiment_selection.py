@@ -21,7 +21,7 @@ def plain_score(information: np.ndarray, matters: np.ndarray) -> float:
 
 @pytest.mark.parametrize("matters", [(0, 1, 2), (0, 2), (1,)])
 @pytest.mark.parametrize("seed", range(4))
-def test_no_choice_of_four_of_eleven_is_better(matters, seed):
+def test_four_of_eleven_taken_one_after_another_are_nearly_the_best_choice(matters, seed):
     random = np.random.default_rng(seed)
     each = informations(random.normal(size=(11, 3)) * [1.0, 0.1, 5.0])
     prior = np.diag([0.0, 3.0, 0.0])
