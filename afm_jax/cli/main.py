@@ -109,11 +109,12 @@ class LazyGroup(click.Group):
         """Return a command; None if there is none of this name."""
         return COMMANDS[cmd_name].click_command() if cmd_name in COMMANDS else None
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands, a section a group."""
+        rows = [COMMANDS[name] for name in self.list_commands(ctx)]
         for heading, group in _GROUPS.items():
             with formatter.section(heading):
-                formatter.write_dl(sorted((row.name, row.summary) for row in group.COMMANDS))
+                formatter.write_dl([(row.name, row.summary) for row in rows if row in group.COMMANDS])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
