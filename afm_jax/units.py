@@ -23,6 +23,9 @@ TWO_SIDED_95 = 1.959963984540054
 RAD_PER_US_PER_KHZ = 2.0 * math.pi * 1e-3
 """Angular frequency in rad/us of a frequency of 1 kHz."""
 
+EV_PER_AJ = 1.0 / 0.1602176634
+"""Electron volts in an attojoule (exact in SI)."""
+
 GAS_CONSTANT_J_PER_MOL_K = 8.31446261815324
 """Molar gas constant in J/(mol K), exact in the SI."""
 

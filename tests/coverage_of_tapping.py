@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from afm_jax.units import TWO_SIDED_95
 from fitting.tables.table import AmplitudeTable
-from fitting.tapping_curves.energy import Z95
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
 from tests.tapping_truth_of_contacts import RATIOS, VISCOSITIES, curve_of_contact
@@ -143,7 +143,7 @@ def judge_shapes(curves: int) -> bool:
             chosen = [one for key, some in found.items() if {*key} >= {shape, lever} - {"all"} for one in some]
             off = np.abs(np.concatenate([one.points.energy for one in chosen]))
             drawn = np.concatenate([np.full(len(one.points.true), one.drawn) for one in chosen])
-            covered, largest = float(np.mean(off < Z95)), off.max(where=drawn < FARTHEST, initial=0.0)
+            covered, largest = float(np.mean(off < TWO_SIDED_95)), off.max(where=drawn < FARTHEST, initial=0.0)
             cells.append(f"{covered:10.3f} {largest:5.1f}")
             # those of one shape and lever are too few to be judged by their share: errors of a curve go together
             reached &= bool(largest <= LARGEST_Z) and (covered >= LOWEST or "all" not in {shape, lever})
@@ -271,7 +271,7 @@ def judge(name: str, found: list[Simulated], largest_share: float = np.inf) -> b
         chosen = [one for one in found if kind in {"", one.kind}]
         points = Points(*(np.concatenate(column) for column in zip(*(one.points for one in chosen), strict=True)))
         off, virial = np.abs(points.energy), np.abs(points.virial)
-        covered, median = float(np.mean(off < Z95)), float(np.median(off)) / _MEDIAN
+        covered, median = float(np.mean(off < TWO_SIDED_95)), float(np.median(off)) / _MEDIAN
         of_implied = float(np.median(np.abs(points.off) / points.implied)) / _MEDIAN
         share = float(np.median(np.abs(points.off / points.true)))
         hysteresis = max((float(np.abs(one.hysteresis).max(initial=0.0)) for one in chosen), default=0.0)
@@ -279,7 +279,7 @@ def judge(name: str, found: list[Simulated], largest_share: float = np.inf) -> b
             f"{f'    {kind}' if kind else name}: {len(chosen)} curves, {sum(one.valid for one in chosen)} valid; "
             f"energy in its band at {covered:.3f} of {len(off)} points, largest deviation {off.max():.1f} errors, "
             f"median error {median:.2f} of those stated, {of_implied:.2f} of those that noise and instrument imply, "
-            f"{share:.1%} of the energy; virial {np.mean(virial < Z95):.3f}, {virial.max():.1f}"
+            f"{share:.1%} of the energy; virial {np.mean(virial < TWO_SIDED_95):.3f}, {virial.max():.1f}"
             + (f"; changes of branch within {hysteresis:.1f} errors\n" if hysteresis else "\n")
         )
         if not kind:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime, least_squares
 
+from afm_jax.units import EV_PER_AJ
 from fitting import fit
 from fitting.fits.discrepancy import ModelDiscrepancy, with_runs
 from fitting.fits.law_after import (
@@ -18,7 +19,7 @@ from fitting.fits.law_after import (
     root_of,
 )
 from fitting.fits.objective import Objective
-from fitting.fits.result import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, scaled
+from fitting.fits.result import Loss, WithInterval, energy_lost, interval_of, scaled
 from fitting.fits.step import LinearStep, StepRows, StepSystem, descending_part, longest_run, settled_step, system_of
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of

@@ -19,7 +19,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
 from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.strict_json import plain
-from afm_jax.units import TWO_SIDED_95
+from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from fitting.fits.intervals import Convergence
 from fitting.fits.law_after import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_formula
 from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
@@ -402,10 +402,6 @@ def fewest_unknowns(
 
 _LEAST_PART = 3e-3
 """Share of an error below which unknowns are left out."""
-
-
-EV_PER_AJ = 1.0 / 0.1602176634
-"""Electron volts in an attojoule (exact in SI)."""
 
 
 def interval_of(value: float, error: float, lowest: float = -np.inf) -> WithInterval:

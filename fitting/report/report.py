@@ -12,6 +12,7 @@ from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.words import known
 from fitting.fits.comparison import Comparison
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
+from fitting.report.files import write_report_files
 from fitting.report.sections import (
     Bullets,
     Report,
@@ -205,7 +206,6 @@ def write_report(
     Raises:
         OSError: if a file cannot be written.
     """
-    from fitting.report.files import write_report_files  # noqa: PLC0415
     from fitting.report.plots import fit_pictures  # noqa: PLC0415
 
     picture, *pictures = fit_pictures(result)

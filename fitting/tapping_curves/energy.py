@@ -34,6 +34,7 @@ from scipy.optimize import isotonic_regression
 from scipy.special import ndtr
 
 from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, covariance_of, descended, distance
+from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.lag import free_lag_deg, turned
 from fitting.parameters import USUAL_DRIFTS
 from fitting.tapping_curves.branches import CurveBranch, free_ends, ways
@@ -49,7 +50,6 @@ from fitting.tapping_curves.curve import (
 
 _HARMONICS = 40
 """The sum of those of a brief impact converges like 1/n; beyond them a contact lasts too long to excite them."""
-Z95 = 1.959964
 (_inverse_triangle,) = get_lapack_funcs(("trtri",), dtype=float)
 
 
@@ -645,7 +645,7 @@ class EnergyCurve:
     @property
     def energy_error_aj(self) -> Float[np.ndarray, " points"]:
         """The standard error that a band of this width has."""
-        return 0.5 * (self.energy_high_aj - self.energy_low_aj) / Z95
+        return 0.5 * (self.energy_high_aj - self.energy_low_aj) / TWO_SIDED_95
 
     def at(self, ratio: float) -> tuple[float, ...] | None:
         """Return the band at an amplitude, of the free one; None beyond the branch."""
@@ -661,8 +661,8 @@ class EnergyCurve:
             "energy_high_aj": self.energy_high_aj,
             "said": [said_of(*ends) for ends in zip(self.energy_low_aj, self.energy_high_aj, strict=True)],
             "virial_aj": self.virial_aj,
-            "virial_low_aj": self.virial_aj - Z95 * self.virial_error_aj,
-            "virial_high_aj": self.virial_aj + Z95 * self.virial_error_aj,
+            "virial_low_aj": self.virial_aj - TWO_SIDED_95 * self.virial_error_aj,
+            "virial_high_aj": self.virial_aj + TWO_SIDED_95 * self.virial_error_aj,
         }
 
 
@@ -744,7 +744,7 @@ def energies_along(
     by_instrument = np.concatenate([c.by_instrument for c in curves]) @ root
     low, high, possible = positive_bands(estimate, noise, certain, by_instrument)
     share = lever.curves[0].relative_error
-    middle, common = 0.5 * (low + high), Z95 * share * 0.5 * (low + high)
+    middle, common = 0.5 * (low + high), TWO_SIDED_95 * share * 0.5 * (low + high)
     low, high = np.maximum(middle - np.hypot(middle - low, common), 0.0), middle + np.hypot(high - middle, common)
     ends = np.cumsum([len(c.noise_aj) for c in curves])[:-1]
     bands = zip(np.split(low, ends), np.split(high, ends), strict=True)
@@ -928,7 +928,7 @@ def positive_bands(
             possible = possible and bool(least <= most)
             least, most = 0.0, np.inf
         low, high = _densest(middle, float(np.sqrt(variance[n])), least, most)
-        ends.append((low, max(high, low + Z95 * noise[n])))
+        ends.append((low, max(high, low + TWO_SIDED_95 * noise[n])))
     low, high = np.array(ends).T
     return low, high, possible
 
@@ -1008,11 +1008,12 @@ def what_narrows(functions: EnergyFunctions) -> str:
     more = {zero: (of_zero, 0.2), free: (of_frequency, 1e-5)}
     today = float(by @ covariance @ by)
     half = {
-        words: Z95 * np.sqrt(max(today - (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g), 0.0) + noise**2)
+        words: TWO_SIDED_95
+        * np.sqrt(max(today - (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g), 0.0) + noise**2)
         for words, (g, e) in more.items()
     }
     words = min(half, key=lambda name: half[name])
-    now = Z95 * np.sqrt(today + noise**2)
+    now = TWO_SIDED_95 * np.sqrt(today + noise**2)
     if half[words] > _NARROWS * now:
         return "zero of the phase and free frequency would not narrow that; less noise or more rows would"
     return f"state {words}, which would leave +- {half[words]:.2g} aJ"

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from afm_jax.checks import checked
 from afm_jax.results import Result, public_result, words_of
 from afm_jax.strict_json import plain
+from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import PhaseReadings, free_lag_deg, sense_of_phase, turned
 from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
@@ -25,8 +26,6 @@ from fitting.tapping_curves.energy import energies, noise_of
 
 _BEYOND = 3.0
 """Standard errors beyond which a pixel is out of range."""
-_BAND = 1.96
-"""Standard errors of half a band of 95 %."""
 _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 """Relative standard errors of what is given without one."""
 _USUAL_ZERO_DEG = 0.2
@@ -348,12 +347,12 @@ def _reasons(
     if used < above + below:
         why = f"{above} with an amplitude above the free one, {below} with an energy below zero"
         reasons.append(f"only {used} of {used + above + below} pixels are in range ({why}): {doubt}")
-    if energy + _BAND * common < 0.0:
+    if energy + TWO_SIDED_95 * common < 0.0:
         reasons.append(
             f"the median energy is below zero beyond its errors ({energy:.3g} +- {common:.2g} {unit}): {doubt}"
         )
-    elif _BAND * total > 0.5 * energy:
-        low, high = max(energy - _BAND * total, 0.0), energy + _BAND * total
+    elif TWO_SIDED_95 * total > 0.5 * energy:
+        low, high = max(energy - TWO_SIDED_95 * total, 0.0), energy + TWO_SIDED_95 * total
         reasons.append(
             f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} {unit} in the median pixel "
             f"({energy:.3g} +- {total:.2g}); most of its error comes from {max(parts, key=lambda name: parts[name])}"

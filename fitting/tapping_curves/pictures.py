@@ -5,8 +5,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
+from afm_jax.units import TWO_SIDED_95
 from fitting.tapping_curves.branches import side_of, way_of
-from fitting.tapping_curves.energy import Z95
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
@@ -116,7 +116,10 @@ def together_figure(result: TappingTogether) -> Figure:
                 ratio, mean = scatter.amplitude_ratio, scatter.energy_aj
                 colour = ACCENT if scatter.retract else BLUE
                 axes.plot(ratio, mean, color=colour, lw=2.0, label=f"{scatter.way}, mean of {scatter.curves}")
-                for width, shade in ((Z95 * scatter.energy_common_error_aj, 0.12), (scatter.energy_scatter_aj, 0.25)):
+                for width, shade in (
+                    (TWO_SIDED_95 * scatter.energy_common_error_aj, 0.12),
+                    (scatter.energy_scatter_aj, 0.25),
+                ):
                     axes.fill_between(ratio, mean - width, mean + width, color=colour, alpha=shade, lw=0)
         axes.set_title(side_of(state), fontsize=_SMALL + 1)
         label_axes(axes, x="amplitude over the free one", y=result.curves[0].in_unit("energy of a tap (aJ)"))

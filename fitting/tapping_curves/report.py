@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from afm_jax.words import broken, interval, percent, with_error
+from fitting.report.files import write_report_files
 from fitting.report.sections import (
     Bullets,
     Report,
@@ -19,14 +21,13 @@ from fitting.report.sections import (
     text_of,
 )
 from fitting.tapping_curves.branches import Height
-from fitting.tapping_curves.energy import HEADLINE, Z95, said_of
+from fitting.tapping_curves.energy import HEADLINE, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_EV_PER_AJ = 6.241509
 _WIDTH = 150
 _CHANGES = {
     "contact": "contact: the amplitude leaves the free one",
@@ -81,12 +82,12 @@ def energy_in_words(result: Tapping) -> str:
     """Return the energy of a tap in aJ and eV, where it is largest."""
     top, over_k = result.largest, result.curve.over_spring_constant
     if result.bound_aj is not None:
-        return f"at most {result.bound_aj:.3g} aJ" + ("" if over_k else f", {_EV_PER_AJ * result.bound_aj:.3g} eV")
+        return f"at most {result.bound_aj:.3g} aJ" + ("" if over_k else f", {EV_PER_AJ * result.bound_aj:.3g} eV")
     if top is None or not (result.valid or "only bracketed" in result.why_not_functions):
         return "not known"
     low, high = top["interval95"]
     where = f"at {top['amplitude_ratio']:.2f} of the free amplitude, where it is largest"
-    electronvolts = "" if over_k else f", {interval(_EV_PER_AJ * low, _EV_PER_AJ * high)} eV"
+    electronvolts = "" if over_k else f", {interval(EV_PER_AJ * low, EV_PER_AJ * high)} eV"
     return f"{_band_in_words(low, high)} aJ {where} (95 %: {interval(low, high)} aJ{electronvolts})"
 
 
@@ -94,7 +95,7 @@ def _band_in_words(low: float, high: float) -> str:
     """Return a band of 95 % as what it is: a value with its standard error, a bracket, or an upper bound."""
     said = said_of(low, high)
     if said == "measured":
-        return with_error(0.5 * (low + high), 0.5 * (high - low) / Z95)
+        return with_error(0.5 * (low + high), 0.5 * (high - low) / TWO_SIDED_95)
     return interval(low, high) if said == "bracket" else f"< {high:.3g}"
 
 
@@ -269,7 +270,6 @@ def _write(
     """Write page, text, JSON and picture of a report; texts in the unit that energies have."""
     # a call without --out needs neither matplotlib nor JAX
     from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
-    from fitting.report.files import write_report_files  # noqa: PLC0415
 
     # SVG files have the layout of the PNG drawn before
     picture = png_of(figure)

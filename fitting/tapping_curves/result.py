@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int
 from afm_jax.outcomes import judge
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
-from afm_jax.units import effective_mass_ng
+from afm_jax.units import TWO_SIDED_95, effective_mass_ng
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
@@ -18,7 +18,6 @@ from fitting.tapping_curves.curve import Rows, TappingCurve
 from fitting.tapping_curves.energy import (
     HEADLINE,
     MEASURED,
-    Z95,
     EnergyFunctions,
     Nuisance,
     OneEnergy,
@@ -293,7 +292,7 @@ class Tapping(Result):
                 "branch": i,
                 "amplitude_ratio": ratio,
                 "energy_aj": 0.5 * sum(band),
-                "standard_error_aj": 0.5 * (band[1] - band[0]) / Z95,
+                "standard_error_aj": 0.5 * (band[1] - band[0]) / TWO_SIDED_95,
                 "interval95_aj": band,
                 "said": said_of(*band),
             }
@@ -477,10 +476,10 @@ def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
     Within its errors an energy is linear in what is fitted, so that no chi2 needs to be profiled as for laws
     (`fitting.fits.intervals`).
     """
-    low, high = energy - Z95 * error, energy + Z95 * error
+    low, high = energy - TWO_SIDED_95 * error, energy + TWO_SIDED_95 * error
     if share == 0.0 or energy <= 0.0:
         return low, high
-    above = float(np.hypot(np.log(high / energy), Z95 * share))
+    above = float(np.hypot(np.log(high / energy), TWO_SIDED_95 * share))
     if low <= 0.0:
         return low, float(energy * np.exp(above))
-    return float(energy * np.exp(-np.hypot(np.log(energy / low), Z95 * share))), float(energy * np.exp(above))
+    return float(energy * np.exp(-np.hypot(np.log(energy / low), TWO_SIDED_95 * share))), float(energy * np.exp(above))
