@@ -297,6 +297,7 @@ def _parameters(
             standard_error=float(errors[i]) if at.free[i] and np.isfinite(errors[i]) else None,
             interval95=(interval.low, interval.high),
             interval_reason=interval.reason,
+            interval_kind=None,
             undetermined=not np.isfinite(estimate.covariance[i, i]),
             at_bound=not bool(at.free[i]),
             constraint=at.constraints.get(name),

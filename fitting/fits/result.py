@@ -38,6 +38,7 @@ class FittedParameter:
         interval95: profile-likelihood interval, moved and widened by what the model leaves out; an end is None where it
             is open.
         interval_reason: why an end is open; None if none is.
+        interval_kind: "profile", "linear", or where an end is open "limit"; None without an interval.
         undetermined: the data do not determine it, not even to first order.
         at_bound: the loss vanishes within the resolution of the data.
         constraint: (value, standard error) that the table gives for it, or None.
@@ -48,6 +49,7 @@ class FittedParameter:
     standard_error: float | None
     interval95: tuple[float | None, float | None]
     interval_reason: str | None
+    interval_kind: str | None
     undetermined: bool
     at_bound: bool
     constraint: tuple[float, float] | None

@@ -221,7 +221,7 @@ def _not_converged(evidence: Evidence) -> list[str]:
     distance = f"chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
     if not np.isfinite(convergence.estimated_distance):
         distance = "chi2 bends downwards where the search ended, which is no minimum"
-    return [distance + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")]
+    return [distance]
 
 
 def _not_explained(evidence: Evidence) -> list[str]:

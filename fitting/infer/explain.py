@@ -1,0 +1,184 @@
+"""A law with everything free: formula, smooth functions beside it, remainders of corrections, instrument.
+
+`fit_lasting` reads as the fit runs: the formula's minimum is searched for; smooth functions beside the formula, what the
+corrections of impacts leave out and the instrument are freed with it, rows are weighed and their orbits searched for
+anew until chi2 stays; outliers are left out where that is asked for; residuals that run together over the speed widen
+the smooth functions. The covariance of everything, (J^T J)^-1, is where the law's band, intervals and correlations come
+from.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from afm_jax.least_squares import covariance_of
+from fitting.fits.law_after import LawAfter, root_of
+from fitting.infer.rows import Weights, remainders_of, weights_of
+from fitting.infer.search import CENSORED, Descent, Found, begun, descend, orbits_at
+from fitting.infer.unknowns import Model
+from fitting.predict.law import SMOOTH, FormulaLaw, Process, of_short_range
+
+_ROUNDS, _SETTLED = 8, 0.02
+"""Rounds of orbits, weights and descent at most, and the change of chi2 at which they have settled."""
+_SOFT, OUTLIER, MOST_OUTLIERS = 2.0, 4.0, 0.1
+"""Residual of a row from which a robust fit counts it linearly, that of an outlier, and their share at most."""
+_RUN_BY_CHANCE, _SHARE_PER_RUN, _LARGEST_SHARE = 2.2, 0.25, 1.0
+"""Standard deviations of a run of residuals that mean nothing, the share of the loss for each beyond, and the largest."""
+_BUMP, _BUMP_STEP, _LEAST_LEFT = 0.2, 0.1, 1e-3
+"""Width of the bumps in ln u that runs are looked for with, their distance, and what must be left beside the unknowns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A law with everything free, and the rows as it explains them.
+
+    Attributes:
+        model: what was fitted.
+        end: unknowns, orbits, chi2 and Jacobian at the minimum.
+        weights: of the rows.
+        found: the orbits, searched for at the minimum.
+        run: standard deviations by which residuals run together over the speed.
+        settled: whether rounds stopped changing chi2.
+    """
+
+    model: Model
+    end: Descent
+    weights: Weights
+    found: Found
+    run: float
+    settled: bool
+
+    @property
+    def residual(self) -> Float[np.ndarray, "rows 3"]:
+        """Predicted less read, in the errors as used; NaN where nothing counts."""
+        off = self.end.orbits.readings - self.model.data.read
+        white = np.einsum("nij,nj->ni", self.weights.whitening, np.where(self.weights.used, off, 0.0))
+        return np.where(self.weights.used, white, np.nan)
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "k k"]:
+        """Of all unknowns, infinite where the readings and priors determine nothing."""
+        return covariance_of(self.end.jacobian.T @ self.end.jacobian)
+
+    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAfter:
+        """Return rebound speeds and delays at approach speeds in nm/us, with their change by independent unknowns."""
+        law, count = self.model.law, len(self.model.law.names)
+        theta = self.model.of_law(self.end.theta)
+        found, (coefficients, by_unknown) = law.at(theta, speeds), law.coefficients(theta)
+        _, lead, _, twice = coefficients
+        leaves = found.square > 0.0
+        w = np.sqrt(np.where(leaves, found.square, 1.0))
+        late = found.time - lead * (1.0 / w - 1.0 / speeds) + twice * (1.0 / w**2 - 1.0 / speeds**2)
+        by_rebound = found.square_slope / (2.0 * w[:, None])
+        by_delay = found.time_slope + (lead / w**2 - 2.0 * twice / w**3)[:, None] * by_rebound
+        by_delay += np.outer(1.0 / speeds - 1.0 / w, by_unknown[1]) + np.outer(1.0 / w**2 - 1.0 / speeds**2, by_unknown[3])
+        root = root_of(self.covariance)[:count]
+        capture = law.capture(theta)
+        ends = capture * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])
+        edge = law.at(theta, ends)
+        rise = (edge.square[2] - edge.square[0]) / (ends[2] - ends[0])
+        factor = np.stack([by_rebound, by_delay]) @ root
+        return LawAfter(
+            np.where(leaves, np.stack([w, late]), 0.0),
+            np.where(leaves[:, None], factor, 0.0),
+            capture,
+            -edge.square_slope[1] @ root / rise,
+        )
+
+
+def fit_lasting(model: Model, *, robust: bool = False) -> tuple[Explained, Explained]:
+    """Return what explains the rows best, and before what was added for runs of residuals.
+
+    Args:
+        model: a formula, without smooth functions, and the rows.
+        robust: find outliers, and leave them out.
+    """
+    out = np.zeros(model.data.time.size, bool)
+    formula = begun(model)
+    whole = freed(model, formula, out, (SMOOTH,), soft=_SOFT if robust else np.inf)
+    if robust:
+        far = np.nan_to_num(np.abs(whole.residual)).max(axis=1) > OUTLIER
+        if far.sum() <= max(1.0, MOST_OUTLIERS * whole.weights.used.any(axis=1).sum()):
+            out = far
+        whole = freed(model, whole.end, out, (SMOOTH,), before=whole.model)
+    share = min(_SHARE_PER_RUN * (whole.run - _RUN_BY_CHANCE), _LARGEST_SHARE)
+    if share <= 0.0:
+        return whole, whole
+    return freed(model, whole.end, out, (SMOOTH, of_short_range(share)), before=whole.model), whole
+
+
+def freed(
+    model: Model,
+    begin: Descent,
+    out: Bool[np.ndarray, " rows"],
+    processes: tuple[Process, ...],
+    *,
+    before: Model | None = None,
+    soft: float = np.inf,
+) -> Explained:
+    """Return the minimum with everything free, from one that had some of it.
+
+    Args:
+        model: the formula and the rows.
+        begin: where to begin.
+        out: rows that are left out.
+        processes: smooth functions beside the formula.
+        before: what `begin` are unknowns of; None: the model.
+        soft: see `descend`.
+    """
+    law = model.law
+    if isinstance(law, FormulaLaw):
+        approach = begin.orbits.approach[np.isfinite(begin.orbits.approach) & ~model.data.row.free]
+        law = law.beside((float(approach.min()), float(approach.max())), *processes)
+    whole = replace(model, law=law, remainders=np.zeros((2, len(out), 7)))
+    theta = whole.prior[0].copy()
+    for name, value in zip((before or model).names, begin.theta, strict=True):
+        if name in whole.names and not name.startswith(("loss_", "path_")):
+            theta[whole.names.index(name)] = value
+    last, settled, end, weights = np.inf, False, None, None
+    for _ in range(_ROUNDS):
+        found = orbits_at(whole, theta)
+        whole = replace(whole, remainders=remainders_of(whole, theta, found.orbits))
+        weights = weights_of(whole, theta, found.orbits, out)
+        end = descend(whole, theta, found.orbits, weights, soft=soft)
+        theta = end.theta
+        if abs(end.chi2 - last) < _SETTLED:
+            settled = True
+            break
+        last = end.chi2
+    assert end is not None  # noqa: S101
+    assert weights is not None  # noqa: S101
+    explained = Explained(whole, end, weights, orbits_at(whole, theta), 0.0, settled)
+    unseen = whole.data.no_orbit & explained.found.exists
+    end = end._replace(chi2=end.chi2 + CENSORED**2 * float(unseen.sum()))
+    return replace(explained, end=end, run=run_of_residuals(explained))
+
+
+def run_of_residuals(explained: Explained) -> float:
+    """Return by how many standard deviations residuals run together over the approach speed, at the worst place.
+
+    A bump of the loss, or of the path that the delay stands for, is fitted at every speed beside everything else: what
+    counts is its size over its standard error (the score statistic).
+    """
+    orbits, end, weights = explained.end.orbits, explained.end, explained.weights
+    seen = weights.used.any(axis=1) & np.isfinite(orbits.approach) & ~explained.model.data.row.free
+    if not seen.any():
+        return 0.0
+    u = np.where(seen, orbits.approach, 1.0)
+    place = np.log(u)
+    middles = np.arange(place[seen].min(), place[seen].max() + _BUMP_STEP, _BUMP_STEP)
+    bumps = np.exp(-0.5 * ((place[:, None] - middles) / _BUMP) ** 2) * seen[:, None]
+    slopes = np.einsum("nij,njk->nik", weights.whitening, np.nan_to_num(orbits.slopes[:, :, :2]))
+    lost = np.where(seen, u**2 - orbits.rebound**2, 0.0)
+    tried = np.concatenate(
+        [slopes[:, :, 0, None] * (bumps * lost[:, None])[:, None], slopes[:, :, 1, None] * (bumps / u[:, None])[:, None]],
+        axis=2,
+    ).reshape(3 * len(u), -1)
+    tried = np.concatenate([tried, np.zeros((end.residual.size - len(tried), tried.shape[1]))])
+    basis, _ = np.linalg.qr(end.jacobian)
+    apart = tried - basis @ (basis.T @ tried)
+    residual = end.residual - basis @ (basis.T @ end.residual)
+    whole, left = np.linalg.norm(tried, axis=0), np.linalg.norm(apart, axis=0)
+    told = left > _LEAST_LEFT * np.maximum(whole, 1e-300)
+    return float(np.max(np.abs(apart.T @ residual)[told] / left[told], initial=0.0))

@@ -1,0 +1,171 @@
+"""The fit of an impact law to amplitude tables: the public function, and what it does, from top to bottom.
+
+What is unknown is one vector with priors (`fitting.infer.unknowns`): the law's, the instrument's, and where impacts last
+smooth functions and remainders that stand for what a formula leaves out. One least squares finds it: instantaneous laws
+by Optax on chi2 (`fitting.infer.instantaneous`), lasting ones by a search that keeps every row's orbit, then with
+everything free (`fitting.infer.explain`). The covariance of that vector, (J^T J)^-1, is where the law's band, intervals
+and correlations come from (`fitting.infer.summary`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from afm_jax.checks import checked, require_float64
+from afm_jax.contact.parameters import EFFECTS
+from fitting.fits.result import FitResult
+from fitting.infer.explain import Explained, fit_lasting
+from fitting.infer.instantaneous import fit_instantaneous, profile_instantaneous, with_scaled_errors
+from fitting.infer.optimiser import OPTIMISER
+from fitting.infer.summary import Fitted, convergence_of, profile_lasting, summary_of
+from fitting.infer.unknowns import Model, data_of, quantities_of
+from fitting.models import Task, held_of, readings_of, split_held, task_of
+from fitting.parameters import is_nuisance, model_parameters
+from fitting.predict.law import FormulaLaw
+from fitting.tables.several import SeveralTables
+from fitting.tables.table import AmplitudeTable, as_table
+
+ROBUST = 2.0
+"""Residual in errors from which a robust fit counts rows linearly while it looks for outliers."""
+
+
+@checked
+def fit(  # noqa: PLR0913
+    table: AmplitudeTable | Sequence[AmplitudeTable] | Any,
+    model: str = "law",
+    *,
+    share: Sequence[str] = (),
+    scale_errors: bool = False,
+    free: Sequence[str] | None = None,
+    fixed: dict[str, float] | None = None,
+    constraints: dict[str, tuple[float, float]] | None = None,
+    effects: Sequence[str] = EFFECTS,
+    robust: bool = False,
+) -> FitResult:
+    """Fit an impact law to measured amplitudes of single-impact orbits.
+
+    Args:
+        table: from `read_table`, the path of a file, or a data frame as `AmplitudeTable.from_dataframe` takes it; what
+            it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to
+            be known to 5 % where impacts last, and exactly by the instantaneous laws. Several of them: one law for all,
+            each with nuisances of its own.
+        model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
+            each instantaneous or with "+delay", the collision delay; or "contact", physical parameters of the resolved
+            contact. On resonance, where a tapping curve determines no impact law, "contact" still can be fitted.
+        share: nuisances that several tables have in common, by name; "all": every one.
+        scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
+            freedom (the error of Q stays); the result is valid only if the scale is believable and what is left of the
+            amplitudes random (see `verdict`).
+        free: the parameters that are fitted; None: all of a law and its delay, of "contact" (keywords of
+            `Contact.paper`) relative humidity, adhesion energy, viscosity and modulus, without those fixed.
+        fixed: values at which other parameters of the model are held; of "contact" what is not named is the paper's.
+        constraints: value and standard error of what else is known, by parameter: a nuisance (`quality_factor`,
+            `tip_calibration`, `drive_calibration`, `offset_origin_nm`), which then is fitted along, or one of the
+            model's parameters. With several tables a nuisance's constraint holds for each of them. In a fit of
+            "contact" a constrained parameter that is not free is held at its value, and its error adds to the errors
+            of the fitted ones; a held parameter without constraint gets an assumed error, which the report names.
+        effects: for "contact": the effects there are.
+        robust: leave outliers out; the result is valid only if they are few and the other amplitudes are explained.
+
+    Returns:
+        Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.
+
+    Raises:
+        ValueError: if there is no such model or parameter, a constraint is impossible or degenerate with the model,
+            there are fewer measured amplitudes than parameters, or tables have no law in common.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    require_float64()
+    whole = tables_of(table)
+    errors: dict[str, float] = {}
+    if model == "contact":
+        own = model_parameters(model, None if free is None else tuple(free), fixed)
+        fixed, constraints, errors = split_held(own, fixed, constraints)
+    if isinstance(whole, AmplitudeTable) and share:
+        raise ValueError("`share` is about several tables: leave it out, or give more than one")
+    options = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
+    task = task_of(whole, model, share=share, **options)
+    data = data_of(whole, task)
+    amplitudes = int(data.measured.sum())
+    if amplitudes < len(task.problem.own):
+        raise ValueError(
+            f"{whole.source}: {amplitudes} measured amplitude{'s' if amplitudes != 1 else ''} cannot determine the "
+            f"{len(task.problem.own)} parameters of the model {model!r}; measure at other drives, orders or offsets too"
+        )
+    settings = {
+        "model": model,
+        "error_scale": None,
+        "robust": ROBUST if robust else None,
+        "constraints": task.known,
+        "free": list(task.problem.own),
+        "fixed": dict(fixed or {}),
+        "effects": list(effects) if model == "contact" else None,
+        "held": held_of(task.problem.own, tuple(effects), fixed or {}, errors) if model == "contact" else (),
+    }
+    if isinstance(whole, SeveralTables):
+        settings["share"] = list(share)
+    begin = model_of(whole, task, settings)
+    return summary_of(whole, task, _fitted(begin, task, settings, scale_errors, robust), readings_of(whole)[0])
+
+
+def tables_of(given: Any) -> AmplitudeTable | SeveralTables:
+    """Return what was given as a table, or as several."""
+
+    def table_of(given: Any) -> AmplitudeTable:
+        return AmplitudeTable.from_dataframe(given) if hasattr(given, "columns") else as_table(given)
+
+    if isinstance(given, SeveralTables):
+        return given
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        return table_of(given)
+    if not given:
+        raise ValueError("there is no table: give one, or the path of one")
+    tables = tuple(map(table_of, given))
+    return tables[0] if len(tables) == 1 else SeveralTables(tables)
+
+
+def model_of(table: AmplitudeTable | SeveralTables, task: Task, settings: dict[str, Any]) -> Model:
+    """Return everything that is unknown, and the rows. Where impacts last drag always is: without it r would make up for it."""
+    data, problem = data_of(table, task), task.problem
+    fixed = settings["fixed"]
+    own = problem.own
+    if problem.lasting and "viscous_loss" not in (*own, *fixed):
+        own = (*own[: own.index("delay_hertz")], "viscous_loss", *own[own.index("delay_hertz") :])
+    law = FormulaLaw(own, fixed, data.mass_ng, lasting=problem.lasting)
+    known = {name: pair for name, pair in task.known.items() if not is_nuisance(name)}
+    return Model(data, law, quantities_of(data, task, table.labels), known)
+
+
+_SCALINGS = 3
+
+
+def _fitted(model: Model, task: Task, settings: dict[str, Any], scale_errors: bool, robust: bool) -> Fitted:
+    """Return the minimum, with errors scaled until chi2 equals its degrees of freedom where that is asked for."""
+    lasting, total = task.problem.lasting, None
+    explained, before, other, steps, optimiser, gradient = _minimum(model, lasting, robust)
+    for _ in range(_SCALINGS if scale_errors else 0):
+        residual = explained.residual[np.isfinite(explained.residual)]
+        freedom = residual.size - len(task.problem.own)
+        if freedom < 1:
+            raise ValueError("scaling the errors needs more amplitudes than parameters; give their errors instead")
+        factor = float(np.sqrt(np.sum(residual**2) / freedom))
+        if factor == 0.0:
+            break
+        total = (total or 1.0) * factor
+        model = with_scaled_errors(model, factor)
+        explained, before, other, steps, optimiser, gradient = _minimum(model, lasting, robust)
+    profile = profile_lasting(explained) if lasting else profile_instantaneous(explained)
+    return Fitted(
+        explained, before, other, profile, convergence_of(explained, optimiser, steps),
+        settings | {"error_scale": total}, total, robust,
+    )  # fmt: skip
+
+
+def _minimum(model: Model, lasting: bool, robust: bool):
+    if lasting:
+        explained, before = fit_lasting(model, robust=robust)
+        return explained, before, None, 0, "Levenberg-Marquardt", 0.0
+    explained, best, other = fit_instantaneous(model, robust=robust)
+    return explained, explained, other, best.steps, OPTIMISER, best.gradient_norm

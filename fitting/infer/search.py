@@ -1,0 +1,346 @@
+"""Where the fit begins: starts are screened and polished; rows that a law has no orbit for are asked for again.
+
+Leaving out a measured row without an orbit lets a minimiser run into a false minimum, so that rows come before residuals:
+`orbits_at` searches for every row's orbits and takes the steady one that explains it best, `recovered` looks around a
+law for laws that have the missing ones.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from afm_jax.least_squares import Box, Searches, descended
+from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.infer.rows import Weights, plain_weights, weights_of
+from fitting.infer.unknowns import Data, Model
+from fitting.parameters import PARAMETERS
+from fitting.predict.orbit import Orbits
+
+STARTS, POLISHED, ROWS = 16, 2, 32
+"""Starts that are screened, how many are polished, and the rows that both look at, at most."""
+_WIDTH = 0.1
+"""Relative misfit of an amplitude, or one of the phase in rad, that counts as much as all larger ones hardly do."""
+_LARGEST = 3.0
+_LOST_COST = 50.0
+"""What a measured row without an orbit adds to chi2 where laws are compared."""
+CENSORED = 3.0
+"""Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
+_SOFT = 2.0
+"""Residual of a row from which it counts linearly in a search."""
+_DRAWN, _ERRORS = 24, (1.0, 3.0, 5.0)
+"""Laws that are drawn around one that lacks orbits, and how many of its errors away."""
+_LIKELY = 0.2
+"""Relative misfit of an amplitude up to which an orbit may be the one that was measured."""
+
+
+class Found(NamedTuple):
+    """The orbits of all rows at unknowns: NaN where there is none; and how many steady ones each row has."""
+
+    orbits: Orbits
+    count: Int[np.ndarray, " rows"]
+
+    @property
+    def exists(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows have one."""
+        return np.isfinite(self.orbits.x[:, 0])
+
+
+def orbits_at(
+    model: Model, theta: Float[np.ndarray, " k"], rows: np.ndarray | None = None, *, roughly: bool = False
+) -> Found:
+    """Return the steady orbit of each row that explains it best.
+
+    Args:
+        model: what is fitted.
+        theta: its unknowns.
+        rows: which of them; None: all.
+        roughly: after three steps of Newton's method, steady or not: to screen starts.
+    """
+    data = model.data
+    whole = model.follow(theta, np.full((data.time.size, 3), 20.0), most=1)
+    free = data.row.free
+    for column in (whole.x, whole.approach, whole.rebound):
+        column[~free] = np.nan
+    whole.x[free] = 20.0
+    count = free.astype(int)
+    rows = np.flatnonzero(~free) if rows is None else rows[~free[rows]]
+    which, orbits = model.candidates(theta, rows, most=4 if roughly else 14, judge=not roughly)
+    fine = np.isfinite(orbits.readings).all(axis=1) if roughly else orbits.steady
+    error = np.maximum(data.error[which], 0.02 * np.abs(data.read[which]))
+    with np.errstate(invalid="ignore"):
+        misfit = np.where(fine, np.nansum(((orbits.readings - data.read[which]) / error) ** 2, axis=1), np.inf)
+    misfit = np.where(np.isfinite(misfit), misfit, np.inf)
+    for row in np.unique(which):
+        mine = np.flatnonzero(which == row)
+        best = mine[np.argmin(misfit[mine])]
+        if np.isfinite(misfit[best]):
+            for column, candidate in zip(whole, orbits, strict=True):
+                column[row] = candidate[best]
+            count[row] = np.unique(np.round(np.log(orbits.approach[mine[fine[mine]]]), 5)).size
+    return Found(whole, count)
+
+
+def soft_cost(data: Data, found: Found, rows: np.ndarray, width: float = _WIDTH) -> float:
+    """Return how badly orbits explain rows, outliers and missing orbits counting little more than bad ones."""
+    read, predicted = data.read[rows], found.orbits.readings[rows]
+    exists = found.exists[rows] & np.isfinite(predicted).all(axis=1)
+    with np.errstate(all="ignore"):
+        ratio = np.log(np.maximum(predicted[:, :2], 1e-3) / read[:, :2])
+        turned = np.deg2rad(predicted[:, 2] - read[:, 2])
+    off = np.concatenate([np.clip(ratio, -_LARGEST, _LARGEST), turned[:, None]], axis=1)
+    off = np.where(exists[:, None], off, [_LARGEST, _LARGEST, 0.0])
+    return float(np.sum(np.log1p((np.where(np.isfinite(read), off, 0.0) / width) ** 2)))
+
+
+class Descent(NamedTuple):
+    """Where a descent has ended: unknowns, orbits, chi2 and the whitened Jacobian with the priors below it."""
+
+    theta: Float[np.ndarray, " k"]
+    orbits: Orbits
+    chi2: float
+    residual: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n k"]
+
+
+def descend(
+    model: Model,
+    theta: Float[np.ndarray, " k"],
+    begin: Orbits,
+    weights: Weights,
+    *,
+    soft: float = np.inf,
+    most: int = 40,
+    settled: float = 1e-3,
+    fixed: Bool[np.ndarray, " k"] | None = None,
+) -> Descent:
+    """Minimise chi2 by Levenberg-Marquardt steps with every row's orbit followed; a step that loses one is refused.
+
+    Args:
+        model: what is fitted.
+        theta: unknowns to begin with.
+        begin: orbits there; rows without one do not count.
+        weights: of the rows.
+        soft: whitened residual of a row from which it counts linearly.
+        most: steps at most.
+        settled: estimated distance of chi2 to its minimum at which a descent has arrived.
+        fixed: unknowns that stay; None: none.
+    """
+    mean, strength = model.prior
+    counts = np.isfinite(begin.x[:, 0]) & weights.used.any(axis=1)
+    here = {"x": begin.x.copy()}
+    looked: dict[bytes, Orbits] = {}
+
+    def evaluated(place: Float[np.ndarray, " k"]):
+        orbits = model.follow(place, here["x"], most=12)
+        read = np.where(weights.used & counts[:, None], orbits.readings - model.data.read, 0.0)
+        white = np.einsum("nij,nj->ni", weights.whitening, read)
+        slope = np.where(counts[:, None, None], np.nan_to_num(model.slopes(place, orbits)), 0.0)
+        white_slope = np.einsum("nij,njk->nik", weights.whitening, slope)
+        size = np.sum(white**2, axis=1)
+        share = np.ones(len(white)) if not np.isfinite(soft) else (1.0 + size / soft**2) ** -0.25
+        residual = np.concatenate([(share[:, None] * white).ravel(), strength * (place - mean)])
+        jacobian = np.concatenate([(share[:, None, None] * white_slope).reshape(-1, place.size), np.diag(strength)])
+        rest = float(np.sum((strength * (place - mean)) ** 2))
+        chi2 = rest + float(np.sum(size if not np.isfinite(soft) else 2 * soft**2 * (np.sqrt(1 + size / soft**2) - 1)))
+        sound = orbits.closes[counts].all() and np.isfinite(jacobian).all()
+        looked.clear()
+        looked[place.tobytes()] = orbits
+        return residual, jacobian, chi2 if sound else np.inf
+
+    def evaluate(places: Float[np.ndarray, "1 k"], _: object) -> Searches:
+        with np.errstate(all="ignore"):
+            residual, jacobian, chi2 = evaluated(places[0])
+        if np.isfinite(chi2):
+            here["last"] = looked[places[0].tobytes()].x
+        return Searches(places, np.nan_to_num(residual)[None], np.nan_to_num(jacobian)[None], np.array([chi2]))
+
+    first = model.follow(theta, begin.x, most=14)
+    counts &= first.closes
+    here["x"] = first.x.copy()
+    start = evaluate(theta[None], None)
+    longest = np.array([1.0 if name in ("epsilon", "delay_hertz") else np.inf for name in model.names])
+    held = np.zeros((1, theta.size), bool) if fixed is None else fixed[None]
+    box = Box(np.full(theta.size, -np.inf), np.full(theta.size, np.inf), held, longest)
+    end = descended(evaluate, start, box, settled=settled, most=most)
+    orbits = model.follow(end.place[0], here["x"], most=14)
+    lost = ~(orbits.closes & counts) & ~model.data.row.free
+    for column in (orbits.x, orbits.approach, orbits.rebound):
+        column[lost & ~(np.isfinite(begin.x[:, 0]) & orbits.closes)] = np.nan
+    return Descent(end.place[0], orbits, float(end.chi2[0]), end.residual[0], end.jacobian[0])
+
+
+def starts(model: Model, count: int = STARTS) -> Float[np.ndarray, "starts k"]:
+    """Return unknowns to start from: a low-discrepancy sequence over what the formula's parameters may be."""
+    law: Any = model.law
+    data, own = model.data, law.own
+    ratio = 2.0
+    for _ in range(60):
+        # x^(d+1) = x + 1: the generalised golden ratio (Roberts)
+        ratio = (1.0 + ratio) ** (1.0 / (len(own) + 1))
+    places = np.mod(0.5 + np.outer(np.arange(1, count + 1), ratio ** -np.arange(1.0, len(own) + 1)), 1.0)
+    drive = RAD_PER_US_PER_KHZ * data.row.drive_amplitude_nm * data.row.drive_frequency_khz
+    lost = _lost_squared(model)
+    theta = np.tile(model.prior[0], (count, 1))
+    for name, place in zip(own, places.T, strict=True):
+        parameter = PARAMETERS[name]
+        scale = np.array([drive.min(), drive.max()]) ** parameter.drive_power * data.mass_ng**parameter.mass_power
+        low, high = np.array(parameter.starts) * scale
+        if name == "r":
+            low, high = 2e-4, 0.5
+        if lost is not None and name in ("epsilon", "viscous_loss", "r"):
+            power = {"epsilon": 0, "viscous_loss": 1, "r": 2}[name]
+            low, high = np.array([0.03, 2.0]) * lost[0] / lost[1] ** power
+        if parameter.width:
+            theta[:, model.names.index(name)] = low + (high - low) * place
+            continue
+        value = low * (high / low) ** place
+        theta[:, model.names.index(name)] = value if name == "r" else law.unknown_of(name, value)
+    return theta
+
+
+_USUAL_SPEED = 0.2
+"""Approach speed of a tip that taps above resonance, about, over the speed of the free tip."""
+
+
+def _lost_squared(model: Model) -> tuple[float, float] | None:
+    """Return the loss u^2 - w^2 that amplitude and phase of driven tips amount to, and a usual speed; None without."""
+    data = model.data
+    some = data.tapping & data.measured[:, 1] & data.measured[:, 2] & ~data.row.free
+    if not some.any():
+        return None
+    ratio = data.row.drive_frequency_khz / data.free_frequency_khz
+    free, amplitude, lag = data.row.drive_amplitude_nm, data.read[:, 1], np.deg2rad(data.read[:, 2])
+    size = np.hypot(1.0 - ratio**2, ratio / data.quality_factor)
+    frequency = RAD_PER_US_PER_KHZ * data.free_frequency_khz
+    lost = 2.0 * np.pi * frequency**2 * amplitude * (free * size * np.sin(lag) - ratio * amplitude / data.quality_factor)
+    lost = lost[some & (np.nan_to_num(lost) > 0.0)]
+    if not lost.size:
+        return None
+    top = RAD_PER_US_PER_KHZ * data.row.drive_amplitude_nm * data.row.drive_frequency_khz
+    return float(np.median(lost)), _USUAL_SPEED * float(np.median(top))
+
+
+def _thinned(data: Data) -> np.ndarray:
+    """Return so many rows at most, spread over orders, frequencies and drives."""
+    seen = np.flatnonzero(data.measured.any(axis=1) & ~data.row.free)
+    row = data.row
+    ranked = seen[np.lexsort((row.drive_amplitude_nm[seen], row.drive_frequency_khz[seen], row.order[seen]))]
+    return np.sort(ranked[np.unique(np.linspace(0, ranked.size - 1, min(ranked.size, ROWS)).round().astype(int))])
+
+
+def _narrowed(model: Model, rows: np.ndarray) -> Model:
+    """Return a model of some of the rows."""
+    data = model.data
+    small = replace(
+        data, row=data.row.take(rows), read=data.read[rows], error=data.error[rows], no_orbit=data.no_orbit[rows],
+        time=data.time[rows], number=data.number[rows], free_frequency_khz=data.free_frequency_khz[rows],
+        quality_factor=data.quality_factor[rows],
+    )  # fmt: skip
+    instrument = tuple(quantity._replace(rows=quantity.rows[rows]) for quantity in model.instrument)
+    return replace(model, data=small, instrument=instrument)
+
+
+def screened(model: Model) -> Float[np.ndarray, " k"]:
+    """Return the unknowns of the best start, polished on some of the rows."""
+    rows = _thinned(model.data)
+    small = model if len(set(model.data.drives)) > 1 else _narrowed(model, rows)
+    every = np.arange(small.data.time.size) if small is not model else rows
+    points = starts(model)
+    cost = [soft_cost(small.data, orbits_at(small, point, every, roughly=True), every) for point in points]
+    nothing = np.zeros(small.data.time.size, bool)
+    best, least = points[int(np.argmin(cost))], np.inf
+    for theta in points[np.argsort(cost, kind="stable")[:POLISHED]]:
+        end = theta
+        for extra in (0.1, 0.03):
+            found = orbits_at(small, end, every)
+            if found.exists[every].sum() < min(6, every.size):
+                break
+            end = descend(
+                small, end, found.orbits, plain_weights(small.data, extra, nothing), soft=_SOFT, most=12, settled=0.1
+            ).theta
+        cost_of = soft_cost(small.data, orbits_at(small, end, every), every, 0.03)
+        if cost_of < least:
+            best, least = end, cost_of
+    return best
+
+
+def lost_rows(data: Data, found: Found) -> Bool[np.ndarray, " rows"]:
+    """Say on which rows something was measured that the law has no orbit for."""
+    return data.measured.any(axis=1) & ~found.exists
+
+
+def recovered(
+    model: Model, theta: Float[np.ndarray, " k"], jacobian: Float[np.ndarray, "n k"], lost: Bool[np.ndarray, " rows"]
+) -> Float[np.ndarray, " k"] | None:
+    """Return, of laws drawn around one, the one that has most of the orbits that it lacks; None if none has any.
+
+    Args:
+        model: what is fitted.
+        theta: its unknowns.
+        jacobian: whitened, which says how far around.
+        lost: rows without an orbit.
+    """
+    rows = np.flatnonzero(lost)
+    normal = jacobian.T @ jacobian
+    unit = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    curvature, axes = np.linalg.eigh(normal / np.outer(unit, unit))
+    root = axes / np.sqrt(np.maximum(curvature, 1e-9)) / unit[:, None]
+    draws, best, most = np.random.default_rng(1), None, 0
+    for number in range(_DRAWN):
+        point = theta + _ERRORS[number % len(_ERRORS)] * root @ draws.normal(size=theta.size)
+        with np.errstate(all="ignore"):
+            found = orbits_at(model, point, rows)
+            off = np.abs(np.log(np.maximum(found.orbits.readings[rows, :2], 1e-3) / model.data.read[rows, :2]))
+        likely = found.exists[rows] & (np.nanmax(np.where(np.isfinite(off), off, -1.0), axis=1) < _LIKELY)
+        if likely.sum() > most:
+            best, most = point, int(likely.sum())
+    return best
+
+
+def total(model: Model, theta: Float[np.ndarray, " k"], chi2: float) -> float:
+    """Return chi2 with what rows without an orbit add to it."""
+    found = orbits_at(model, theta)
+    unseen = model.data.no_orbit & found.exists
+    return chi2 + _LOST_COST * float(lost_rows(model.data, found).sum()) + CENSORED**2 * float(unseen.sum())
+
+
+def begun(model: Model) -> Descent:
+    """Return the formula's minimum: screened, polished on all rows, with as few lost rows as can be found."""
+    return improved(model, _polished(model, screened(model), (0.03, 0.01)))
+
+
+def improved(model: Model, end: Descent) -> Descent:
+    """Return a minimum that has the rows that one lacks, where laws around it have them."""
+    least = total(model, end.theta, end.chi2)
+    for _ in range(3):
+        lost = lost_rows(model.data, orbits_at(model, end.theta))
+        if not lost.any():
+            break
+        other = recovered(model, end.theta, end.jacobian, lost)
+        if other is None:
+            break
+        back = _polished(model, other, (0.03,))
+        here = total(model, back.theta, back.chi2)
+        if here >= least:
+            break
+        end, least = back, here
+    return end
+
+
+def _polished(model: Model, theta: Float[np.ndarray, " k"], extras: tuple[float, ...]) -> Descent:
+    """Return the minimum by all rows, with larger errors first and with the stated ones at the end."""
+    nothing = np.zeros(model.data.time.size, bool)
+    end = None
+    for extra in (*extras, None):
+        found = orbits_at(model, theta)
+        weights = (
+            weights_of(model, theta, found.orbits, nothing)
+            if extra is None
+            else plain_weights(model.data, extra, nothing)
+        )
+        end = descend(model, theta, found.orbits, weights, soft=_SOFT, most=25, settled=0.01)
+        theta = end.theta
+    assert end is not None  # noqa: S101
+    return end
