@@ -8,19 +8,34 @@ from.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import covariance_of
 from fitting.fits.law_after import LawAfter, root_of
-from fitting.infer.rows import Weights, remainders_of, weights_of
-from fitting.infer.search import CENSORED, Descent, Found, begun, descend, orbits_at
+from fitting.infer.rows import Weights, few_left, remainders_of, weights_of
+from fitting.infer.search import (
+    CENSORED,
+    LOST_COST,
+    Descent,
+    Found,
+    begun,
+    descend,
+    lost_rows,
+    orbits_at,
+    recovered,
+)
 from fitting.infer.unknowns import Model
 from fitting.predict.law import SMOOTH, FormulaLaw, Process, of_short_range
 
 _ROUNDS, _SETTLED = 8, 0.02
 """Rounds of orbits, weights and descent at most, and the change of chi2 at which they have settled."""
+_RECOVERIES = 2
+"""How often laws around one that lacks measured orbits are looked at."""
+_DECIDED = 3
+"""Round after which rows are no longer excluded or taken in."""
 _SOFT, OUTLIER, MOST_OUTLIERS = 2.0, 4.0, 0.1
 """Residual of a row from which a robust fit counts it linearly, that of an outlier, and their share at most."""
 _RUN_BY_CHANCE, _SHARE_PER_RUN, _LARGEST_SHARE = 2.2, 0.25, 1.0
@@ -48,6 +63,8 @@ class Explained:
     found: Found
     run: float
     settled: bool
+    refused: bool = False
+    """Hardly a row of a driven tip is left that a law of impacts can be read off."""
 
     @property
     def residual(self) -> Float[np.ndarray, "rows 3"]:
@@ -78,12 +95,16 @@ class Explained:
         ends = capture * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])
         edge = law.at(theta, ends)
         rise = (edge.square[2] - edge.square[0]) / (ends[2] - ends[0])
+        known: Any = law
+        of_capture = -edge.square_slope[1] / rise
+        if not isinstance(law, FormulaLaw):
+            of_capture = known.capture_slope(theta)
         factor = np.stack([by_rebound, by_delay]) @ root
         return LawAfter(
             np.where(leaves, np.stack([w, late]), 0.0),
             np.where(leaves[:, None], factor, 0.0),
             capture,
-            -edge.square_slope[1] @ root / rise,
+            of_capture @ root,
         )
 
 
@@ -97,6 +118,8 @@ def fit_lasting(model: Model, *, robust: bool = False) -> tuple[Explained, Expla
     out = np.zeros(model.data.time.size, bool)
     formula = begun(model)
     whole = freed(model, formula, out, (SMOOTH,), soft=_SOFT if robust else np.inf)
+    if whole.refused:
+        return whole, whole
     if robust:
         far = np.nan_to_num(np.abs(whole.residual)).max(axis=1) > OUTLIER
         if far.sum() <= max(1.0, MOST_OUTLIERS * whole.weights.used.any(axis=1).sum()):
@@ -128,6 +151,9 @@ def freed(
         soft: see `descend`.
     """
     law = model.law
+    if few_left(model.data, weights_of(model, begin.theta, begin.orbits, out)):
+        weights = weights_of(model, begin.theta, begin.orbits, out)
+        return Explained(model, begin, weights, orbits_at(model, begin.theta), 0.0, settled=True, refused=True)
     if isinstance(law, FormulaLaw):
         approach = begin.orbits.approach[np.isfinite(begin.orbits.approach) & ~model.data.row.free]
         law = law.beside((float(approach.min()), float(approach.max())), *processes)
@@ -136,23 +162,47 @@ def freed(
     for name, value in zip((before or model).names, begin.theta, strict=True):
         if name in whole.names and not name.startswith(("loss_", "path_")):
             theta[whole.names.index(name)] = value
-    last, settled, end, weights = np.inf, False, None, None
-    for _ in range(_ROUNDS):
-        found = orbits_at(whole, theta)
-        whole = replace(whole, remainders=remainders_of(whole, theta, found.orbits))
-        weights = weights_of(whole, theta, found.orbits, out)
-        end = descend(whole, theta, found.orbits, weights, soft=soft)
-        theta = end.theta
-        if abs(end.chi2 - last) < _SETTLED:
-            settled = True
+    best = _settled(whole, theta, out, soft)
+    for _ in range(_RECOVERIES):
+        lost = lost_rows(whole.data, best.found) & (best.weights.reasons == "")
+        other = recovered(best.model, best.end.theta, best.end.jacobian, lost) if lost.any() else None
+        if other is None:
             break
+        again = _settled(whole, other, out, soft)
+        if not _cost(again) < _cost(best):
+            break
+        best = again
+    unseen = whole.data.no_orbit & best.found.exists
+    end = best.end._replace(chi2=best.end.chi2 + CENSORED**2 * float(unseen.sum()))
+    return replace(best, end=end, run=run_of_residuals(best))
+
+
+def _cost(explained: Explained) -> float:
+    """Return chi2 with what rows without an orbit add to it."""
+    lost = lost_rows(explained.model.data, explained.found) & (explained.weights.reasons == "")
+    return explained.end.chi2 + LOST_COST * float(lost.sum())
+
+
+def _settled(model: Model, theta: Float[np.ndarray, " k"], out: Bool[np.ndarray, " rows"], soft: float) -> Explained:
+    """Return the minimum after rounds of orbits, remainders, weights and descent."""
+    last, settled, kept, rounds = np.inf, False, None, []
+    for number in range(_ROUNDS):
+        found = orbits_at(model, theta)
+        model = replace(model, remainders=remainders_of(model, theta, found.orbits))
+        weights = weights_of(model, theta, found.orbits, out, kept)
+        end = descend(model, theta, found.orbits, weights, soft=soft)
+        explained = Explained(model, end, weights, orbits_at(model, end.theta), 0.0, settled)
+        theta, settled = end.theta, abs(end.chi2 - last) < _SETTLED
+        if settled or number == _ROUNDS - 1:
+            return replace(explained, settled=settled)
         last = end.chi2
-    assert end is not None  # noqa: S101
-    assert weights is not None  # noqa: S101
-    explained = Explained(whole, end, weights, orbits_at(whole, theta), 0.0, settled)
-    unseen = whole.data.no_orbit & explained.found.exists
-    end = end._replace(chi2=end.chi2 + CENSORED**2 * float(unseen.sum()))
-    return replace(explained, end=end, run=run_of_residuals(explained))
+        if kept is None:
+            lost = int((lost_rows(model.data, explained.found) & (weights.reasons == "")).sum())
+            rounds.append((lost, -int(weights.used.sum()), number, weights.reasons, theta))
+        if number == _DECIDED:
+            # which rows are excluded hangs on the law, and the law on them: as where the fewest were lost
+            *_, kept, theta = min(rounds[1:], key=lambda one: one[:3])
+    raise AssertionError
 
 
 def run_of_residuals(explained: Explained) -> float:

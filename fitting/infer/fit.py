@@ -130,12 +130,18 @@ def model_of(table: AmplitudeTable | SeveralTables, task: Task, settings: dict[s
     """Return everything that is unknown, and the rows. Where impacts last drag always is: without it r would make up for it."""
     data, problem = data_of(table, task), task.problem
     fixed = settings["fixed"]
+    known = {name: pair for name, pair in task.known.items() if not is_nuisance(name)}
+    instrument = quantities_of(data, task, table.labels)
+    if problem.model == "contact":
+        from fitting.predict.contact import ContactLaw  # noqa: PLC0415  # for contacts alone
+
+        held = tuple(one for one in settings["held"] if one.error > 0.0)
+        return Model(data, ContactLaw(problem.own, fixed, held, problem.effects, data.mass_ng), instrument, known)
     own = problem.own
     if problem.lasting and "viscous_loss" not in (*own, *fixed):
         own = (*own[: own.index("delay_hertz")], "viscous_loss", *own[own.index("delay_hertz") :])
     law = FormulaLaw(own, fixed, data.mass_ng, lasting=problem.lasting)
-    known = {name: pair for name, pair in task.known.items() if not is_nuisance(name)}
-    return Model(data, law, quantities_of(data, task, table.labels), known)
+    return Model(data, law, instrument, known)
 
 
 _SCALINGS = 3

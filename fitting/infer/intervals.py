@@ -83,7 +83,7 @@ def _end(
         else:
             outside = trial, root
         if outside is None:
-            trial = min(trial * (wanted / root if root > 0.65 else 3.0), most, _FARTHEST * error)
+            trial = min(trial * max(wanted / max(root, 0.65), 1.5), most, _FARTHEST * error)
             continue
         (low, below), (high, above) = inside, outside
         share = (wanted - below) / (above - below) if np.isfinite(above) else 0.5

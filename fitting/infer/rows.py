@@ -67,7 +67,13 @@ def plain_weights(data: Data, extra: float, out: Bool[np.ndarray, " rows"]) -> W
     return Weights(whitening, used, np.zeros(len(used)), np.full(len(used), "", dtype=object))
 
 
-def weights_of(model: Model, theta: Float[np.ndarray, " k"], orbits: Orbits, out: Bool[np.ndarray, " rows"]) -> Weights:
+def weights_of(
+    model: Model,
+    theta: Float[np.ndarray, " k"],
+    orbits: Orbits,
+    out: Bool[np.ndarray, " rows"],
+    kept: Shaped[np.ndarray, " rows"] | None = None,
+) -> Weights:
     """Return the rows' weights at a law: measured errors and what slow impacts lack, without excluded rows.
 
     Args:
@@ -75,6 +81,7 @@ def weights_of(model: Model, theta: Float[np.ndarray, " k"], orbits: Orbits, out
         theta: its unknowns.
         orbits: of the rows there, NaN where there is none.
         out: rows that are left out as outliers.
+        kept: why rows are excluded, decided before; None: decided here.
     """
     data, law = model.data, model.of_law(theta)
     capture = model.law.capture(law)
@@ -92,6 +99,7 @@ def weights_of(model: Model, theta: Float[np.ndarray, " k"], orbits: Orbits, out
     reasons[_irregular(data, exists)] = IRREGULAR
     reasons[data.row.free] = ""
     reasons[out] = OUTLIER_LEFT_OUT
+    reasons = reasons if kept is None else kept
     near = np.minimum(1.5 * capture / approach, 1.5 / NEAREST)
     frame = IN_FRAME * (1.0 + data.row.drive_amplitude_nm / np.abs(np.where(data.measured[:, 1], data.read[:, 1], np.inf)))
     error = np.where(data.tapping, frame, BASE) + SLOW * near**6
@@ -99,6 +107,17 @@ def weights_of(model: Model, theta: Float[np.ndarray, " k"], orbits: Orbits, out
     error = np.where(data.row.free, 0.0, np.where(exists, error, BASE))
     used = data.measured & (reasons == "")[:, None] & exists[:, None]
     return Weights(_whitening(data, used, error), used, error, reasons)
+
+
+_FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
+"""Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
+
+
+def few_left(data: Data, weights: Weights) -> bool:
+    """Say whether the law has an orbit on fewer than four accurate rows of a driven tip, or on fewer than a fifth."""
+    hits = data.tapping & data.measured.any(axis=1) & ~data.row.free
+    left = int((hits & weights.used.any(axis=1)).sum())
+    return bool(hits.any() and left < max(_FEWEST_LEFT, _LEAST_LEFT * hits.sum()))
 
 
 def _whitening(

@@ -11,19 +11,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.least_squares import Box, Searches, descended
+from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.infer.optimiser import minimised
 from fitting.infer.rows import Weights, plain_weights, weights_of
 from fitting.infer.unknowns import Data, Model
 from fitting.parameters import PARAMETERS
 from fitting.predict.orbit import Orbits
 
-STARTS, POLISHED, ROWS = 16, 2, 32
-"""Starts that are screened, how many are polished, and the rows that both look at, at most."""
+STARTS, POLISHED, ROWS = 32, 6, 32
+"""Starts that are screened, how many of them are polished at most, and the rows that both look at, at most."""
+_GOOD = 0.3
+"""Cost of a reading above what its noise makes up to which a polished start is good enough."""
 _WIDTH = 0.1
 """Relative misfit of an amplitude, or one of the phase in rad, that counts as much as all larger ones hardly do."""
+_FINER = 0.03
+"""The same at the end of a polish."""
 _LARGEST = 3.0
-_LOST_COST = 50.0
+LOST_COST = 50.0
 """What a measured row without an orbit adds to chi2 where laws are compared."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
@@ -102,6 +107,7 @@ class Descent(NamedTuple):
     chi2: float
     residual: Float[np.ndarray, " n"]
     jacobian: Float[np.ndarray, "n k"]
+    steps: int = 0
 
 
 def descend(
@@ -127,48 +133,62 @@ def descend(
         settled: estimated distance of chi2 to its minimum at which a descent has arrived.
         fixed: unknowns that stay; None: none.
     """
-    mean, strength = model.prior
-    counts = np.isfinite(begin.x[:, 0]) & weights.used.any(axis=1)
-    here = {"x": begin.x.copy()}
-    looked: dict[bytes, Orbits] = {}
-
-    def evaluated(place: Float[np.ndarray, " k"]):
-        orbits = model.follow(place, here["x"], most=12)
-        read = np.where(weights.used & counts[:, None], orbits.readings - model.data.read, 0.0)
-        white = np.einsum("nij,nj->ni", weights.whitening, read)
-        slope = np.where(counts[:, None, None], np.nan_to_num(model.slopes(place, orbits)), 0.0)
-        white_slope = np.einsum("nij,njk->nik", weights.whitening, slope)
-        size = np.sum(white**2, axis=1)
-        share = np.ones(len(white)) if not np.isfinite(soft) else (1.0 + size / soft**2) ** -0.25
-        residual = np.concatenate([(share[:, None] * white).ravel(), strength * (place - mean)])
-        jacobian = np.concatenate([(share[:, None, None] * white_slope).reshape(-1, place.size), np.diag(strength)])
-        rest = float(np.sum((strength * (place - mean)) ** 2))
-        chi2 = rest + float(np.sum(size if not np.isfinite(soft) else 2 * soft**2 * (np.sqrt(1 + size / soft**2) - 1)))
-        sound = orbits.closes[counts].all() and np.isfinite(jacobian).all()
-        looked.clear()
-        looked[place.tobytes()] = orbits
-        return residual, jacobian, chi2 if sound else np.inf
-
-    def evaluate(places: Float[np.ndarray, "1 k"], _: object) -> Searches:
-        with np.errstate(all="ignore"):
-            residual, jacobian, chi2 = evaluated(places[0])
-        if np.isfinite(chi2):
-            here["last"] = looked[places[0].tobytes()].x
-        return Searches(places, np.nan_to_num(residual)[None], np.nan_to_num(jacobian)[None], np.array([chi2]))
-
-    first = model.follow(theta, begin.x, most=14)
-    counts &= first.closes
-    here["x"] = first.x.copy()
-    start = evaluate(theta[None], None)
+    rows = _Followed(model, theta, begin, weights, soft)
     longest = np.array([1.0 if name in ("epsilon", "delay_hertz") else np.inf for name in model.names])
-    held = np.zeros((1, theta.size), bool) if fixed is None else fixed[None]
-    box = Box(np.full(theta.size, -np.inf), np.full(theta.size, np.inf), held, longest)
-    end = descended(evaluate, start, box, settled=settled, most=most)
-    orbits = model.follow(end.place[0], here["x"], most=14)
-    lost = ~(orbits.closes & counts) & ~model.data.row.free
-    for column in (orbits.x, orbits.approach, orbits.rebound):
-        column[lost & ~(np.isfinite(begin.x[:, 0]) & orbits.closes)] = np.nan
-    return Descent(end.place[0], orbits, float(end.chi2[0]), end.residual[0], end.jacobian[0])
+    end = levenberg_marquardt(rows.sum, theta, settled=settled, most=most, longest=longest, fixed=fixed)
+    return rows.descent(end.place, end.sum, end.steps)
+
+
+class _Followed:
+    """The rows' chi2 over the unknowns, with orbits followed from where they were at the best unknowns so far."""
+
+    def __init__(self, model: Model, theta: Float[np.ndarray, " k"], begin: Orbits, weights: Weights, soft: float):
+        """Follow the orbits of the rows that count to the unknowns; arguments as of `descend`."""
+        self.model, self.weights, self.soft = model, weights, soft
+        self.orbits, self.least = model.follow(theta, begin.x), np.inf
+        self.counts = np.isfinite(begin.x[:, 0]) & weights.used.any(axis=1) & self.orbits.closes
+
+    def sum(self, place: Float[np.ndarray, " k"]) -> Sum:
+        """Return the sum of squares at unknowns, outliers softened; infinite where an orbit is lost."""
+        model, counts, (mean, strength) = self.model, self.counts, self.model.prior
+        with np.errstate(all="ignore"):
+            orbits = model.follow(place, self.orbits.x, most=12)
+            if not orbits.closes[counts].all():
+                return Sum(np.inf, np.zeros(1), np.zeros((1, place.size)))
+            off = np.where(self.weights.used & counts[:, None], orbits.readings - model.data.read, 0.0)
+            white = np.einsum("nij,nj->ni", self.weights.whitening, off)
+            slope = np.where(counts[:, None, None], model.slopes(place, orbits), 0.0)
+            white_slope = np.einsum("nij,njk->nik", self.weights.whitening, np.nan_to_num(slope))
+        size, known = np.sum(white**2, axis=1), strength * (place - mean)
+        share = (1.0 + size / self.soft**2) ** -0.25
+        residual = np.concatenate([(share[:, None] * white).ravel(), known])
+        jacobian = np.concatenate([(share[:, None, None] * white_slope).reshape(-1, place.size), np.diag(strength)])
+        # 2 s^2 (sqrt(1 + x/s^2) - 1), written so that nothing cancels
+        chi2 = float(np.sum(2.0 * size / (1.0 + np.sqrt(1.0 + size / self.soft**2))) + known @ known)
+        if chi2 < self.least:
+            self.least, self.orbits = chi2, orbits
+        return Sum(chi2, residual, jacobian)
+
+    def value_and_gradient(self, place: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
+        """Return the sum and its gradient 2 J^T r."""
+        here = self.sum(place)
+        return here.value, 2.0 * here.jacobian.T @ here.residual
+
+    def descent(self, place: Float[np.ndarray, " k"], here: Sum, steps: int) -> Descent:
+        """Return where a descent has ended, its best unknowns."""
+        gone = ~self.orbits.closes & ~self.model.data.row.free
+        for column in (self.orbits.x, self.orbits.approach, self.orbits.rebound):
+            column[gone] = np.nan
+        return Descent(place, self.orbits, here.value, here.residual, here.jacobian, steps)
+
+
+def polished_by_optax(
+    model: Model, theta: Float[np.ndarray, " k"], begin: Orbits, weights: Weights
+) -> Float[np.ndarray, " k"]:
+    """Return where Optax's L-BFGS takes unknowns on the soft loss; arguments as of `descend`."""
+    rows = _Followed(model, theta, begin, weights, _SOFT)
+    jacobian = rows.sum(theta).jacobian
+    return minimised(rows.value_and_gradient, theta, jacobian.T @ jacobian, settled=1.0, most=25).place
 
 
 def starts(model: Model, count: int = STARTS) -> Float[np.ndarray, "starts k"]:
@@ -193,9 +213,9 @@ def starts(model: Model, count: int = STARTS) -> Float[np.ndarray, "starts k"]:
             power = {"epsilon": 0, "viscous_loss": 1, "r": 2}[name]
             low, high = np.array([0.03, 2.0]) * lost[0] / lost[1] ** power
         if parameter.width:
-            theta[:, model.names.index(name)] = low + (high - low) * place
+            theta[:, model.names.index(name)] = law.unknown_of(name, low + (high - low) * place)
             continue
-        value = low * (high / low) ** place
+        value = low + (high - low) * place if parameter.even else low * (high / low) ** place
         theta[:, model.names.index(name)] = value if name == "r" else law.unknown_of(name, value)
     return theta
 
@@ -250,19 +270,23 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
     points = starts(model)
     cost = [soft_cost(small.data, orbits_at(small, point, every, roughly=True), every) for point in points]
     nothing = np.zeros(small.data.time.size, bool)
+    with np.errstate(invalid="ignore"):
+        noise = (small.data.error / np.where(np.arange(3) < 2, np.abs(small.data.read), np.rad2deg(1.0)))[every] / _FINER
+    good = float(np.nansum(np.log1p(noise**2) + _GOOD))
     best, least = points[int(np.argmin(cost))], np.inf
     for theta in points[np.argsort(cost, kind="stable")[:POLISHED]]:
-        end = theta
-        for extra in (0.1, 0.03):
-            found = orbits_at(small, end, every)
-            if found.exists[every].sum() < min(6, every.size):
-                break
-            end = descend(
-                small, end, found.orbits, plain_weights(small.data, extra, nothing), soft=_SOFT, most=12, settled=0.1
-            ).theta
-        cost_of = soft_cost(small.data, orbits_at(small, end, every), every, 0.03)
-        if cost_of < least:
-            best, least = end, cost_of
+        found = orbits_at(small, theta, every)
+        if found.exists[every].sum() < min(6, every.size):
+            continue
+        weights = plain_weights(small.data, _WIDTH, nothing)
+        end = polished_by_optax(small, theta, found.orbits, weights)
+        found, weights = orbits_at(small, end, every), plain_weights(small.data, _FINER, nothing)
+        end = descend(small, end, found.orbits, weights, soft=_SOFT, most=12, settled=0.1).theta
+        here = soft_cost(small.data, orbits_at(small, end, every), every, _FINER)
+        if here < least:
+            best, least = end, here
+        if least < good:
+            break
     return best
 
 
@@ -303,7 +327,7 @@ def total(model: Model, theta: Float[np.ndarray, " k"], chi2: float) -> float:
     """Return chi2 with what rows without an orbit add to it."""
     found = orbits_at(model, theta)
     unseen = model.data.no_orbit & found.exists
-    return chi2 + _LOST_COST * float(lost_rows(model.data, found).sum()) + CENSORED**2 * float(unseen.sum())
+    return chi2 + LOST_COST * float(lost_rows(model.data, found).sum()) + CENSORED**2 * float(unseen.sum())
 
 
 def begun(model: Model) -> Descent:

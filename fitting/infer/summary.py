@@ -30,6 +30,7 @@ from fitting.infer.intervals import UNDETERMINED, UNEXPLAINED, Interval, profile
 from fitting.infer.rows import TOO_SLOW
 from fitting.infer.search import descend
 from fitting.models import Task
+from fitting.predict.law import FormulaLaw
 from fitting.parameters import (
     NUISANCE_NAMES,
     PARAMETERS,
@@ -136,7 +137,7 @@ def closest_parameters(explained: Explained, own: tuple[str, ...], fixed: Mappin
     model, theta = explained.model, explained.end.theta
     root, law = root_of(covariance_of_unknowns(explained)), model.law
     known: Any = law
-    if getattr(known, "processes", ()):
+    if law.lasting and isinstance(law, FormulaLaw):
         values, factor, vanishes = _projected(explained, own, fixed)
     else:
         held = _held(explained)
@@ -169,9 +170,11 @@ def _projected(
     law = explained.law_at(speeds)
     there = law.law[0] > 0.0
     u, (rebound, delay), factor = speeds[there], law.law[:, there], law.factor[:, there]
-    if not np.isfinite(factor).all():
+    if u.size < len(own) or not np.isfinite(factor).all():
+        known: Any = explained.model.law
+        values = known.values(explained.model.of_law(explained.end.theta))
         nothing = np.full((len(own), factor.shape[2]), np.nan)
-        return np.full(len(own), np.nan), nothing, (False,) * len(own)
+        return np.array([values[name] for name in own]), nothing, (False,) * len(own)
     weight = 1.0 / np.maximum(np.linalg.norm(factor, axis=2), 1e-300)
     losses, late = ([name for name in own if name in kind] for kind in (_LOSSES, DELAY_TERMS))
     values = dict(fixed) | closest_loss(losses, u, rebound, weight[0], fixed, _ROUNDS)
@@ -288,6 +291,10 @@ def _profile_of(fitted: Fitted, name: str, own: bool) -> Interval:
     parameter, first = parameter_called(name), len(model.names) - len(model.instrument)
     if own:
         ends = sorted(float(law.unknown_of(name, max(end_of, 1e-300))) for end_of in (parameter.lowest, parameter.highest))
+
+        if law.lasting:
+            # a loss of a thousandth of it is none
+            ends[0] = float(end.theta[place]) - np.log(1e3)
 
         def value_of(y: float) -> float:
             return float(law.value_of(name, y))
@@ -430,6 +437,9 @@ def summary_of(table: AmplitudeTable | SeveralTables, task: Task, fitted: Fitted
         robust=fitted.robust,
         correlations=_correlations(covariance),
         contact_share=_contact_share(explained),
+        refused=explained.refused,
+        untabulated=_untabulated(explained, rows),
+        held=tuple(fitted.settings["held"]),
         contact=problem.model == "contact",
         pulls=tuple(pull.p_value for pull in pulls),
         run=(fitted.before.run, explained.run),
@@ -520,6 +530,15 @@ def _parameters(task: Task, closest: Closest, errors, intervals) -> dict[str, Fi
             constraint=task.known.get(name),
         )
     return parameters
+
+
+def _untabulated(explained: Explained, rows: FittedRows) -> tuple[int, ...]:
+    """Return the rows whose impacts the table of a contact does not hold to its accuracy."""
+    law: Any = explained.model.law
+    if isinstance(law, FormulaLaw):
+        return ()
+    speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
+    return tuple(np.flatnonzero(law.misses_accuracy(explained.model.of_law(explained.end.theta), speeds)).tolist())
 
 
 def _contact_share(explained: Explained) -> float:

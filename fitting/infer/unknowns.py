@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float
 
 from afm_jax.impact.law_table import LawTable
 from fitting.models import Task
-from fitting.parameters import is_nuisance
+from afm_jax.contact.parameters import PAPER
+from fitting.parameters import CONTACT_NAMES, PARAMETERS, is_nuisance
 from fitting.predict.law import LawModel
 from fitting.predict.orbit import COUNT, READINGS, Local, Orbits, Row, followed, starts_of
 from fitting.tables.several import SeveralTables
@@ -38,6 +39,9 @@ def weak_prior(name: str, mass_ng: float) -> tuple[float, float]:
         "delay_lead_nm": (5.0, 30.0),
         "delay_offset_nm": (0.0, 10.0),
     }
+    if name in CONTACT_NAMES:
+        parameter = PARAMETERS[name]
+        return (0.0, 10.0) if parameter.width else (float(np.log(max(PAPER[name], 1e-3))), 5.0)
     return wide.get(name, (0.0, np.inf))
 
 

@@ -1,0 +1,75 @@
+"""Levenberg's and Marquardt's damped least squares, one step after the other, a step that cannot be evaluated refused."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+_FIRST, _LESS, _MORE, _SMALLEST, _LARGEST = 1e-3, 0.1, 8.0, 1e-9, 1e8
+"""Damping in units of every unknown's own curvature: the first, its factors after steps that are taken or refused, ends."""
+_SURELY = 0.1
+"""Damping below which a small fall of the sum means that a minimum is near."""
+
+
+class Sum(NamedTuple):
+    """A sum of squares: its value, residuals r and Jacobian J with the gradient 2 J^T r; infinite where there is none."""
+
+    value: float
+    residual: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n k"]
+
+
+class Lowest(NamedTuple):
+    """Where the sum is smallest, what it is there, and how many evaluations that took."""
+
+    place: Float[np.ndarray, " k"]
+    sum: Sum
+    steps: int
+
+
+def levenberg_marquardt(
+    evaluate: Callable[[Float[np.ndarray, " k"]], Sum],
+    start: Float[np.ndarray, " k"],
+    *,
+    settled: float,
+    most: int,
+    longest: Float[np.ndarray, " k"] | float = np.inf,
+    fixed: Bool[np.ndarray, " k"] | None = None,
+) -> Lowest:
+    """Return a minimum.
+
+    Args:
+        evaluate: of a place.
+        start: where to begin.
+        settled: fall of the sum in a step at which it has arrived.
+        most: steps that are taken, at most.
+        longest: by how much each unknown may change in a step; longer steps are shortened as a whole.
+        fixed: unknowns that stay; None: none.
+    """
+    moves = np.ones(start.size, bool) if fixed is None else ~fixed
+    place, here, damping, count = start, evaluate(start), _FIRST, 0
+    for _ in range(most):
+        gradient = here.jacobian[:, moves].T @ here.residual
+        normal = here.jacobian[:, moves].T @ here.jacobian[:, moves]
+        unit = np.sqrt(np.diag(normal)) + 1e-30
+        normal = normal / np.outer(unit, unit)
+        taken = False
+        while damping < _LARGEST and not taken:
+            step = np.zeros_like(start)
+            step[moves] = -np.linalg.solve(normal + damping * np.eye(unit.size), gradient / unit) / unit
+            promised = -float(gradient @ step[moves])
+            if promised < 1e-2 * settled:
+                return Lowest(place, here, count)
+            step *= min(1.0, float(np.min(longest / np.maximum(np.abs(step), 1e-300))))
+            there, count = evaluate(place + step), count + 1
+            taken = there.value < here.value
+            if not taken:
+                damping = max(_MORE * damping, 1e-4)
+        if not taken:
+            break
+        fall, place, here = here.value - there.value, place + step, there
+        if fall < settled * (1.0 if damping < _SURELY else 1e-3):
+            break
+        damping = max(_LESS * damping, _SMALLEST)
+    return Lowest(place, here, count)

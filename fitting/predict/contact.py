@@ -1,0 +1,159 @@
+"""The law of a resolved contact as a function of its parameters: those that are fitted, and those that are held.
+
+What is held is an unknown like any other, with a prior as wide as its error: law, band and intervals contain it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR, tabulated
+from afm_jax.contact.parameters import EFFECTS, PAPER
+from afm_jax.impact.lasting_impact import TabulatedImpact
+from afm_jax.impact.law_table import EXCESS, LawTable, table_of
+from afm_jax.solve.lanes import compiled_quickly
+from fitting.models import Held
+from fitting.parameters import PARAMETERS
+from fitting.predict.law import LawAt
+
+_SPEEDS = 160
+"""Approach speeds beside the knots that one call takes at most, or a multiple."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactLaw:
+    """The law of a contact.
+
+    Attributes:
+        own: the parameters that are fitted: logarithms, but for those of any sign.
+        fixed: values of others that are not the paper's.
+        held: those that are not fitted, with their errors.
+        effects: that the contact has.
+        mass_ng: of the tip.
+    """
+
+    own: tuple[str, ...]
+    fixed: Mapping[str, float]
+    held: tuple[Held, ...] = ()
+    effects: tuple[str, ...] = EFFECTS
+    mass_ng: float = 1.0
+    lasting: bool = True
+    _kept: dict[bytes, Any] = field(default_factory=dict)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The unknowns: what is fitted, then what is held, in standard errors."""
+        return (*self.own, *(f"held {one.name}" for one in self.held))
+
+    @property
+    def length_nm(self) -> float:
+        """Length over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
+        return float((PAPER | dict(self.fixed))["bridge_breaks_nm"])
+
+    def value_of(self, name: str, unknown: Any) -> Any:
+        """Return a parameter's value for its unknown."""
+        parameter = PARAMETERS[name]
+        return parameter.reference + parameter.width * unknown if parameter.width else np.exp(unknown)
+
+    def unknown_of(self, name: str, value: Any) -> Any:
+        """Return the unknown for a parameter's value."""
+        parameter = PARAMETERS[name]
+        return (value - parameter.reference) / parameter.width if parameter.width else np.log(value)
+
+    def values(self, theta: Float[np.ndarray, " k"]) -> dict[str, float]:
+        """Return the parameters that are fitted, by name."""
+        return {name: float(self.value_of(name, y)) for name, y in zip(self.own, theta.tolist(), strict=False)}
+
+    def _evaluated(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> Any:
+        """Return the law at the knots and at speeds in nm/us, its coefficients and all derivatives; kept for a while."""
+        size = -(-max(u.size, 1) // _SPEEDS) * _SPEEDS
+        speeds = np.concatenate([u, np.full(size - u.size, 50.0)])
+        key = theta.tobytes() + speeds.tobytes()
+        if key not in self._kept:
+            while len(self._kept) > 3:  # noqa: PLR2004
+                del self._kept[next(iter(self._kept))]
+            linear = np.array([PARAMETERS[name].width for name in self.own])
+            reference = np.array([PARAMETERS[name].reference for name in self.own])
+            held = np.array([(one.value, one.error) for one in self.held]).reshape(-1, 2)
+            ends = np.array([(PARAMETERS[one.name].lowest, PARAMETERS[one.name].highest) for one in self.held])
+            fixed = {name: np.asarray(float(value)) for name, value in self.fixed.items() if name not in self._of_held}
+            found = _law(
+                theta, speeds, linear, reference, held, ends.reshape(-1, 2), fixed, np.asarray(self.mass_ng),
+                names=(self.own, tuple(one.name for one in self.held), tuple(self.effects)),
+            )  # fmt: skip
+            self._kept[key] = jax.tree.map(np.asarray, found)
+        return self._kept[key]
+
+    @cached_property
+    def _of_held(self) -> set[str]:
+        return {one.name for one in self.held}
+
+    def at(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> LawAt:
+        """Return the law at approach speeds in nm/us."""
+        (square, time, _), (square_slope, time_slope, _) = self._evaluated(theta, u)
+        some = slice(EXCESS.size - 1, EXCESS.size - 1 + u.size)
+        return LawAt(square[some], time[some], square_slope[some], time_slope[some])
+
+    def coefficients(self, theta: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "4 k"]]:
+        """Return a, b, d and f of the delay, and their derivatives by the unknowns."""
+        (_, _, found), (_, _, slope) = self._evaluated(theta, np.zeros(0))
+        return found[:4], slope[:4]
+
+    def capture(self, theta: Float[np.ndarray, " k"]) -> float:
+        """Return the capture speed in nm/us."""
+        return float(self._evaluated(theta, np.zeros(0))[0][2][4])
+
+    def capture_slope(self, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Return its derivatives by the unknowns."""
+        return self._evaluated(theta, np.zeros(0))[1][2][4]
+
+    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
+        """Return the table."""
+        (square, time, found), _ = self._evaluated(theta, np.zeros(0))
+        count = EXCESS.size - 1
+        return table_of(
+            float(found[4]), np.append(0.0, square[:count]), np.append(time[0], time[:count]), found[:4], self.length_nm
+        )
+
+    def misses_accuracy(
+        self, theta: Float[np.ndarray, " k"], approach: Float[np.ndarray, " rows"]
+    ) -> Bool[np.ndarray, " rows"]:
+        """Say at which approach speeds in nm/us the contact's own table misses its accuracy; not at NaN."""
+        known = {name: jnp.asarray(value) for name, value in (dict(self.fixed) | self.values(theta)).items()}
+        impact = tabulated(Contact.paper(effects=self.effects, **known), jnp.asarray(self.mass_ng))
+        speed, delay = (np.asarray(part) for part in _errors(impact, jnp.asarray(approach)))
+        return np.isfinite(approach) & ~((speed <= SPEED_ERROR) & (delay <= DELAY_ERROR_US))
+
+
+@compiled_quickly()
+def _errors(impact: TabulatedImpact, approach: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    return impact.errors(approach)
+
+
+@partial(compiled_quickly(static_argnames="names", level=0))
+def _law(theta, speeds, linear, reference, held, ends, fixed, mass_ng, *, names):  # noqa: PLR0913
+    """Return w^2 and T at the knots and at speeds, a, b, d, f and the capture speed; and their derivatives."""
+    own, of_held, effects = names
+
+    def columns(theta):
+        free = jnp.where(linear != 0.0, reference + linear * theta[: len(own)], jnp.exp(theta[: len(own)]))
+        stays = jnp.clip(held[:, 0] + held[:, 1] * theta[len(own) :], ends[:, 0], ends[:, 1])
+        known = dict(zip(own, free, strict=True)) | dict(zip(of_held, stays, strict=True))
+        impact = tabulated(Contact.paper(effects=effects, **(fixed | known)), mass_ng)
+        capture = impact.capture
+        knots = jnp.sqrt(jax.lax.stop_gradient(capture) ** 2 + jnp.asarray(EXCESS[1:]) ** 2)
+        u = jnp.concatenate([knots, speeds])
+        at = jax.vmap(impact.speeds)(u)
+        closest = impact.closest
+        time = at.delay + closest.lead_nm * (1.0 / at.rebound - 1.0 / u)
+        found = jnp.stack([closest.hertz, closest.lead_nm, 2.0 * closest.raised_nm, 0.0 * capture, capture])
+        return at.rebound**2, time, found
+
+    return columns(theta), jax.jacfwd(columns)(theta)
