@@ -15,7 +15,7 @@ from scipy.stats import genhyperbolic
 
 from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square, softened
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.sampling.posterior_result import Posterior
 from fitting.sampling.refit import Refit, objective_of, telling_rows
 

@@ -27,10 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.fits.fit import find_fit, fit, summarise
+from fitting.infer.fit import find_fit, fit, summarise
 from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.law_after import ModelLaw
-from fitting.fits.result import FittedLaw, law_with_band
+from fitting.infer.result import FittedLaw, law_with_band
 from fitting.simulated.experiment import with_noise
 from fitting.tables.table import AmplitudeTable
 from tests.contact_truths import ERROR_OF_Q, ContactTruth, contact_truth, exact_table

@@ -19,7 +19,7 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting import fit
 from fitting.fits.objective import Objective
-from fitting.fits.result import FitResult, FittedParameter, WithInterval
+from fitting.infer.result import FitResult, FittedParameter, WithInterval
 from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable, read_table
 

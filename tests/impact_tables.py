@@ -17,7 +17,7 @@ from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.impact.orbits import steady_orbits
 from fitting import read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.forward import orbit_problem
 from fitting.models import Problem, measurement_of
 from fitting.tables.table import AmplitudeTable

@@ -8,7 +8,7 @@ import numpy as np
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
-from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
+from fitting.infer.result import FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, PARAMETERS
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import amplitudes_and_errors, table_of

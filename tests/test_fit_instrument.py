@@ -7,7 +7,7 @@ import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,

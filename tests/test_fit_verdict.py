@@ -10,7 +10,7 @@ import pytest
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
 from fitting.fits.intervals import UNSETTLED, Convergence
-from fitting.fits.verdict import Evidence, correlation_excess, judge_fit
+from fitting.infer.verdict import Evidence, correlation_excess, judge_fit
 from tests.fit_tables import example_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
 

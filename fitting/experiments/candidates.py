@@ -13,7 +13,7 @@ from fitting.experiments.prior import Prior
 from fitting.fits.discrepancy import ModelDiscrepancy
 from fitting.fits.law_after import member_after, speed_range
 from fitting.fits.minimum import model_errors_of, padding
-from fitting.fits.objective import BATCH, Objective
+from fitting.infer.rows import BATCH, Objective
 from fitting.fits.step import rows_of_fit, system_of
 from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of

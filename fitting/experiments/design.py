@@ -18,7 +18,7 @@ from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, known, text_table, with_error
 from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.prior import Prior, prior_of_fit
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.parameters import DELAY_NAMES, Parameter
 from fitting.simulated.experiment import Drives
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import covariance_of
-from fitting.fits.law_after import LawAfter, root_of
+from fitting.infer.law import LawAt, root_of
 from fitting.infer.rows import Weights, few_left, remainders_of, weights_of
 from fitting.infer.search import (
     CENSORED,
@@ -30,7 +30,7 @@ from fitting.infer.search import (
 from fitting.infer.unknowns import Model
 from fitting.predict.law import SMOOTH, FormulaLaw, Process, of_short_range
 
-_ROUNDS, _SETTLED = 8, 0.02
+_ROUNDS, _SETTLED = 12, 0.02
 """Rounds of orbits, weights and descent at most, and the change of chi2 at which they have settled."""
 _RECOVERIES = 2
 """How often laws around one that lacks measured orbits are looked at."""
@@ -78,7 +78,7 @@ class Explained:
         """Of all unknowns, infinite where the readings and priors determine nothing."""
         return covariance_of(self.end.jacobian.T @ self.end.jacobian)
 
-    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAfter:
+    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAt:
         """Return rebound speeds and delays at approach speeds in nm/us, with their change by independent unknowns."""
         law, count = self.model.law, len(self.model.law.names)
         theta = self.model.of_law(self.end.theta)
@@ -89,7 +89,9 @@ class Explained:
         late = found.time - lead * (1.0 / w - 1.0 / speeds) + twice * (1.0 / w**2 - 1.0 / speeds**2)
         by_rebound = found.square_slope / (2.0 * w[:, None])
         by_delay = found.time_slope + (lead / w**2 - 2.0 * twice / w**3)[:, None] * by_rebound
-        by_delay += np.outer(1.0 / speeds - 1.0 / w, by_unknown[1]) + np.outer(1.0 / w**2 - 1.0 / speeds**2, by_unknown[3])
+        by_delay += np.outer(1.0 / speeds - 1.0 / w, by_unknown[1]) + np.outer(
+            1.0 / w**2 - 1.0 / speeds**2, by_unknown[3]
+        )
         root = root_of(self.covariance)[:count]
         capture = law.capture(theta)
         ends = capture * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])
@@ -100,7 +102,7 @@ class Explained:
         if not isinstance(law, FormulaLaw):
             of_capture = known.capture_slope(theta)
         factor = np.stack([by_rebound, by_delay]) @ root
-        return LawAfter(
+        return LawAt(
             np.where(leaves, np.stack([w, late]), 0.0),
             np.where(leaves[:, None], factor, 0.0),
             capture,
@@ -222,7 +224,10 @@ def run_of_residuals(explained: Explained) -> float:
     slopes = np.einsum("nij,njk->nik", weights.whitening, np.nan_to_num(orbits.slopes[:, :, :2]))
     lost = np.where(seen, u**2 - orbits.rebound**2, 0.0)
     tried = np.concatenate(
-        [slopes[:, :, 0, None] * (bumps * lost[:, None])[:, None], slopes[:, :, 1, None] * (bumps / u[:, None])[:, None]],
+        [
+            slopes[:, :, 0, None] * (bumps * lost[:, None])[:, None],
+            slopes[:, :, 1, None] * (bumps / u[:, None])[:, None],
+        ],
         axis=2,
     ).reshape(3 * len(u), -1)
     tried = np.concatenate([tried, np.zeros((end.residual.size - len(tried), tried.shape[1]))])

@@ -15,7 +15,7 @@ import numpy as np
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.infer.explain import Explained, fit_lasting
 from fitting.infer.instantaneous import fit_instantaneous, profile_instantaneous, with_scaled_errors
 from fitting.infer.optimiser import OPTIMISER

@@ -83,7 +83,9 @@ def _groups(model: Model) -> list[_Rows]:
     data, groups = model.data, []
     for drive, some in data.groups:
         padded = filled(some, some.size + -some.size % _PADDED)
-        groups.append(_Rows(some, drive, data.row.take(padded), data.read[padded], np.nan_to_num(data.error[padded], nan=1.0)))
+        groups.append(
+            _Rows(some, drive, data.row.take(padded), data.read[padded], np.nan_to_num(data.error[padded], nan=1.0))
+        )
     return groups
 
 
@@ -117,7 +119,9 @@ def evaluated(
             change = -0.5 / max(values["r"], 1e-9) if name == "r" else 1.0
             along[group.some, :, i] = by_numbers[:, :, _LAW.index(name)] * change
         orbits_slopes[group.some, :, COUNT - 6 :] = by_numbers[:, :, 3:]
-    whole = jax.tree.map(lambda *columns: np.zeros((count, *columns[0].shape[1:]), columns[0].dtype), *[p for _, p in parts])
+    whole = jax.tree.map(
+        lambda *columns: np.zeros((count, *columns[0].shape[1:]), columns[0].dtype), *[p for _, p in parts]
+    )
     for some, part in parts:
         for column, values_of in zip(whole, part, strict=True):
             column[some] = values_of[: some.size]

@@ -234,7 +234,9 @@ def _lost_squared(model: Model) -> tuple[float, float] | None:
     free, amplitude, lag = data.row.drive_amplitude_nm, data.read[:, 1], np.deg2rad(data.read[:, 2])
     size = np.hypot(1.0 - ratio**2, ratio / data.quality_factor)
     frequency = RAD_PER_US_PER_KHZ * data.free_frequency_khz
-    lost = 2.0 * np.pi * frequency**2 * amplitude * (free * size * np.sin(lag) - ratio * amplitude / data.quality_factor)
+    lost = (
+        2.0 * np.pi * frequency**2 * amplitude * (free * size * np.sin(lag) - ratio * amplitude / data.quality_factor)
+    )
     lost = lost[some & (np.nan_to_num(lost) > 0.0)]
     if not lost.size:
         return None
@@ -271,7 +273,9 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
     cost = [soft_cost(small.data, orbits_at(small, point, every, roughly=True), every) for point in points]
     nothing = np.zeros(small.data.time.size, bool)
     with np.errstate(invalid="ignore"):
-        noise = (small.data.error / np.where(np.arange(3) < 2, np.abs(small.data.read), np.rad2deg(1.0)))[every] / _FINER
+        noise = (small.data.error / np.where(np.arange(3) < 2, np.abs(small.data.read), np.rad2deg(1.0)))[
+            every
+        ] / _FINER
     good = float(np.nansum(np.log1p(noise**2) + _GOOD))
     best, least = points[int(np.argmin(cost))], np.inf
     for theta in points[np.argsort(cost, kind="stable")[:POLISHED]]:

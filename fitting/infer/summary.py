@@ -11,9 +11,10 @@ from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.least_squares import chi2_tail, covariance_of
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
-from fitting.fits.law_after import (
+from fitting.infer.law import (
     DELAY_TERMS,
     AtSpeeds,
+    bounded,
     closest_loss,
     containing,
     delay_by_formula,
@@ -21,10 +22,17 @@ from fitting.fits.law_after import (
     root_of,
     speed_range,
 )
-from fitting.fits.result import FitResult, FittedParameter, FittedRows, FittedTable, law_with_band, loss_of
-from fitting.fits.several import Parts, Pull, pulls_of
-from fitting.fits.step import bounded
-from fitting.fits.verdict import Evidence, judge_fit, misfits
+from fitting.infer.result import (
+    Convergence,
+    FitResult,
+    FittedParameter,
+    FittedRows,
+    FittedTable,
+    law_with_band,
+    loss_of,
+)
+from fitting.infer.several import Parts, Pull, pulls_of
+from fitting.infer.verdict import Evidence, judge_fit, misfits
 from fitting.infer.explain import Explained
 from fitting.infer.intervals import UNDETERMINED, UNEXPLAINED, Interval, profile_interval, within_range
 from fitting.infer.rows import TOO_SLOW
@@ -51,27 +59,6 @@ _LOSSES = {"r": 2, "viscous_loss": 1, "epsilon": 0}
 """Powers of the speed of the formula's losses."""
 _ROUNDS = 8
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
-
-
-@dataclass(frozen=True)
-class Convergence:
-    """The state of a minimum.
-
-    Attributes:
-        converged: chi2 is at a minimum, and orbits and weights have settled.
-        optimiser: what the search was done with.
-        iterations: of it.
-        gradient: largest slope of chi2 by an unknown, per standard error.
-        estimated_distance: by how much chi2 lies above its minimum, g H^-1 g.
-        reason: why there is nothing to check, None if there is.
-    """
-
-    converged: bool
-    optimiser: str
-    iterations: int
-    gradient: float
-    estimated_distance: float
-    reason: str | None = None
 
 
 class Closest(NamedTuple):
@@ -290,7 +277,9 @@ def _profile_of(fitted: Fitted, name: str, own: bool) -> Interval:
     error = float(np.sqrt(covariance_of_unknowns(fitted.explained)[place, place]))
     parameter, first = parameter_called(name), len(model.names) - len(model.instrument)
     if own:
-        ends = sorted(float(law.unknown_of(name, max(end_of, 1e-300))) for end_of in (parameter.lowest, parameter.highest))
+        ends = sorted(
+            float(law.unknown_of(name, max(end_of, 1e-300))) for end_of in (parameter.lowest, parameter.highest)
+        )
 
         if law.lasting:
             # a loss of a thousandth of it is none
@@ -484,9 +473,7 @@ def _result(table, task, fitted, evidence, closest, shown, pulls, reasons, warni
     loss = None
     if np.isfinite(speeds).any():
         reached = speed_range(rows.approach_speed_nm_per_us[rows.used])
-        loss = loss_of(
-            at, reached, table.mass_ng, evidence.parameters, None if problem.model == "contact" else values
-        )
+        loss = loss_of(at, reached, table.mass_ng, evidence.parameters, None if problem.model == "contact" else values)
     common = [i for i, name in enumerate(closest.names) if not is_of_one_table(name)]
     return FitResult(
         model=problem.model,

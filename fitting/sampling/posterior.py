@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from afm_jax.checks import checked
-from fitting.fits.objective import ROBUST
-from fitting.fits.result import FitResult
+from fitting.infer.rows import ROBUST
+from fitting.infer.result import FitResult
 from fitting.forward import Lanes, impacts_of, linearised
 from fitting.models import Measurement, Problem
 from fitting.parameters import Parameter

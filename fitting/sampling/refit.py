@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
-from fitting.fits.intervals import at_bound, covariance
-from fitting.fits.objective import Objective
-from fitting.fits.result import FitResult
+from fitting.infer.intervals import at_bound, covariance
+from fitting.infer.rows import Objective
+from fitting.infer.result import FitResult
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
 from fitting.tables.several import SeveralTables
 

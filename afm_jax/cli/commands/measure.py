@@ -8,7 +8,7 @@ import click
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
-from afm_jax.cli.session import FIT_PROGRAMS, Session
+from afm_jax.cli.session import Session
 from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError, option_of
 from fitting.parameters import (
     CONTACT_DEFAULT,
@@ -246,7 +246,6 @@ FIT = Command(
         flag("--example", "Fit the bundled table instead of a file."),
     ),
     check=check_fit,
-    programs=lambda _: FIT_PROGRAMS,
 )
 
 

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN, chi2_tail
 from afm_jax.outcomes import Rule, Rules, judge
-from fitting.fits.intervals import UNSETTLED, Convergence
-from fitting.fits.minimum import TOO_SLOW
-from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
-from fitting.fits.result import NO_MASS, FittedParameter, FittedRows
+from fitting.infer.explain import MOST_OUTLIERS, OUTLIER
+from fitting.infer.intervals import UNSETTLED
+from fitting.infer.result import NO_MASS, Convergence, FittedParameter, FittedRows
+from fitting.infer.rows import TOO_SLOW
 from fitting.models import Held
 from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
