@@ -18,9 +18,10 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting import fit
-from fitting.fits.objective import Objective
 from fitting.infer.result import FitResult, FittedParameter, WithInterval
-from fitting.models import measurement_of, problem_of
+from fitting.infer.fit import model_of
+from fitting.infer.unknowns import Model
+from fitting.models import task_of
 from fitting.tables.table import AmplitudeTable, read_table
 
 EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
@@ -51,10 +52,10 @@ def law() -> FitResult:
 
 
 @pytest.fixture(scope="session")
-def objective() -> Objective:
-    """Its chi2 by the law; tests only ask it."""
-    problem = problem_of(example_amplitudes(), "law")
-    return Objective(measurement_of(example_amplitudes(), problem), problem)
+def model() -> Model:
+    """What is unknown of it by the law; tests only ask it."""
+    whole = example_amplitudes()
+    return model_of(whole, task_of(whole, "law"), {"fixed": {}, "held": ()})
 
 
 @cache

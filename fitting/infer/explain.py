@@ -8,7 +8,6 @@ from.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -94,19 +93,12 @@ class Explained:
         )
         root = root_of(self.covariance)[:count]
         capture = law.capture(theta)
-        ends = capture * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])
-        edge = law.at(theta, ends)
-        rise = (edge.square[2] - edge.square[0]) / (ends[2] - ends[0])
-        known: Any = law
-        of_capture = -edge.square_slope[1] / rise
-        if not isinstance(law, FormulaLaw):
-            of_capture = known.capture_slope(theta)
         factor = np.stack([by_rebound, by_delay]) @ root
         return LawAt(
             np.where(leaves, np.stack([w, late]), 0.0),
             np.where(leaves[:, None], factor, 0.0),
             capture,
-            of_capture @ root,
+            law.capture_slope(theta) @ root,
         )
 
 

@@ -99,7 +99,7 @@ def evaluated(
         theta: its unknowns.
         slopes: derivatives are wanted; else they are 0.
     """
-    law: Any = model.law
+    law = model.law
     values, count, own = law.values(theta[: len(law.names)]), model.data.time.size, len(law.names)
     numbers = np.array([values[name] for name in _LAW])
     instrument = np.stack(model.instrument_columns(theta), axis=1)

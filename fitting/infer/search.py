@@ -193,7 +193,7 @@ def polished_by_optax(
 
 def starts(model: Model, count: int = STARTS) -> Float[np.ndarray, "starts k"]:
     """Return unknowns to start from: a low-discrepancy sequence over what the formula's parameters may be."""
-    law: Any = model.law
+    law = model.law
     data, own = model.data, law.own
     ratio = 2.0
     for _ in range(60):

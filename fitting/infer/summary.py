@@ -89,7 +89,7 @@ def convergence_of(explained: Explained, optimiser: str, iterations: int) -> Con
 
 def _held(explained: Explained) -> np.ndarray:
     """Say which unknowns are losses that vanish: of instantaneous laws."""
-    law: Any = explained.model.law
+    law = explained.model.law
     held = np.zeros(explained.end.theta.size, bool)
     if not law.lasting:
         normal = np.diag(explained.end.jacobian.T @ explained.end.jacobian)
@@ -123,7 +123,6 @@ def closest_parameters(explained: Explained, own: tuple[str, ...], fixed: Mappin
     """
     model, theta = explained.model, explained.end.theta
     root, law = root_of(covariance_of_unknowns(explained)), model.law
-    known: Any = law
     if law.lasting and isinstance(law, FormulaLaw):
         values, factor, vanishes = _projected(explained, own, fixed)
     else:
@@ -131,9 +130,9 @@ def closest_parameters(explained: Explained, own: tuple[str, ...], fixed: Mappin
         places = [model.names.index(name) for name in own]
         unknowns = np.array([theta[i] for i in places])
         step = 1e-6
-        values = np.array([float(known.value_of(name, y)) for name, y in zip(own, unknowns, strict=True)])
+        values = np.array([float(law.value_of(name, y)) for name, y in zip(own, unknowns, strict=True)])
         slope = [
-            (float(known.value_of(name, y + step)) - float(known.value_of(name, y - step))) / (2.0 * step)
+            (float(law.value_of(name, y + step)) - float(law.value_of(name, y - step))) / (2.0 * step)
             for name, y in zip(own, unknowns, strict=True)
         ]
         factor = np.array(slope)[:, None] * root[places]
@@ -158,8 +157,7 @@ def _projected(
     there = law.law[0] > 0.0
     u, (rebound, delay), factor = speeds[there], law.law[:, there], law.factor[:, there]
     if u.size < len(own) or not np.isfinite(factor).all():
-        known: Any = explained.model.law
-        values = known.values(explained.model.of_law(explained.end.theta))
+        values = explained.model.law.values(explained.model.of_law(explained.end.theta))
         nothing = np.full((len(own), factor.shape[2]), np.nan)
         return np.array([values[name] for name in own]), nothing, (False,) * len(own)
     weight = 1.0 / np.maximum(np.linalg.norm(factor, axis=2), 1e-300)
@@ -249,7 +247,7 @@ def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
     bound.
     """
     explained = fitted.explained
-    law: Any = explained.model.law
+    law = explained.model.law
     errors = np.linalg.norm(closest.factor, axis=1)
     own, intervals = len(closest.names) - len(explained.model.instrument), []
     for i, (name, value) in enumerate(zip(closest.names, closest.values.tolist(), strict=True)):
@@ -272,7 +270,7 @@ def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
 def _profile_of(fitted: Fitted, name: str, own: bool) -> Interval:
     """Return the profile interval of a parameter, by its unknown."""
     model, end = fitted.explained.model, fitted.explained.end
-    law: Any = model.law
+    law = model.law
     place = model.names.index(name)
     error = float(np.sqrt(covariance_of_unknowns(fitted.explained)[place, place]))
     parameter, first = parameter_called(name), len(model.names) - len(model.instrument)
@@ -338,7 +336,7 @@ def _rows_of(fitted: Fitted, table: AmplitudeTable | SeveralTables, read: np.nda
     """Return measured and predicted readings."""
     explained, data = fitted.explained, fitted.explained.model.data
     orbits, weights, found = explained.end.orbits, explained.weights, explained.found
-    lasting = explained.model.law.lasting  # pyright: ignore[reportAttributeAccessIssue]
+    lasting = explained.model.law.lasting
     exists = found.count > 0
     predicted = np.where(exists[:, None], orbits.readings, np.nan)
     padded = np.concatenate([np.abs(data.read[:, :2]), np.full((len(exists), 1), np.rad2deg(0.125))], axis=1)
@@ -396,7 +394,7 @@ def summary_of(table: AmplitudeTable | SeveralTables, task: Task, fitted: Fitted
         read: the readings of the table, those that no fit looks at too.
     """
     explained, problem = fitted.explained, task.problem
-    law: Any = explained.model.law
+    law = explained.model.law
     fixed = dict(fitted.settings["fixed"])
     closest = closest_parameters(explained, problem.own, fixed)
     rows = _rows_of(fitted, table, read)
@@ -454,7 +452,7 @@ def summary_of(table: AmplitudeTable | SeveralTables, task: Task, fitted: Fitted
 
 def _result(table, task, fitted, evidence, closest, shown, pulls, reasons, warnings) -> FitResult:  # noqa: PLR0913
     explained, problem = fitted.explained, task.problem
-    law: Any = explained.model.law
+    law = explained.model.law
 
     def with_band(speeds: np.ndarray):
         known = explained.law_at(speeds)
@@ -521,7 +519,7 @@ def _parameters(task: Task, closest: Closest, errors, intervals) -> dict[str, Fi
 
 def _untabulated(explained: Explained, rows: FittedRows) -> tuple[int, ...]:
     """Return the rows whose impacts the table of a contact does not hold to its accuracy."""
-    law: Any = explained.model.law
+    law = explained.model.law
     if isinstance(law, FormulaLaw):
         return ()
     speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
@@ -544,7 +542,7 @@ def _compare_tables(explained: Explained, table: AmplitudeTable | SeveralTables)
     if not isinstance(table, SeveralTables):
         return []
     model, end = explained.model, explained.end
-    law: Any = model.law
+    law = model.law
     count, tables = len(model.names), len(table.labels)
     number = np.full(end.residual.size, tables)
     number[: 3 * table.rows] = np.repeat(table.number, 3)

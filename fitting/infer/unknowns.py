@@ -212,7 +212,7 @@ class Model:
     def prior(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Mean of every unknown, and one over the standard deviation: 0 where nothing is known."""
         mean, strength = np.zeros(len(self.names)), np.ones(len(self.names))
-        own = getattr(self.law, "own", ())
+        own = self.law.own
         for i, name in enumerate(self.law.names):
             if name in own:
                 mean[i], strength[i] = self._known_of(name)
@@ -220,7 +220,7 @@ class Model:
 
     def _known_of(self, name: str) -> tuple[float, float]:
         """Return what is known of a parameter's unknown: the mean, and one over the standard deviation."""
-        law: Any = self.law
+        law = self.law
         if name not in (self.known or {}):
             value, error = weak_prior(name, self.data.mass_ng) if law.lasting else (0.0, np.inf)
             return value, 1.0 / error

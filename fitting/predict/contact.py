@@ -21,14 +21,14 @@ from afm_jax.impact.law_table import EXCESS, LawTable, table_of
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.models import Held
 from fitting.parameters import PARAMETERS
-from fitting.predict.law import LawAt
+from fitting.predict.law import LawAt, LawModel
 
 _SPEEDS = 160
 """Approach speeds beside the knots that one call takes at most, or a multiple."""
 
 
 @dataclass(frozen=True, eq=False)
-class ContactLaw:
+class ContactLaw(LawModel):
     """The law of a contact.
 
     Attributes:
@@ -77,7 +77,7 @@ class ContactLaw:
         speeds = np.concatenate([u, np.full(size - u.size, 50.0)])
         key = theta.tobytes() + speeds.tobytes()
         if key not in self._kept:
-            while len(self._kept) > 3:  # noqa: PLR2004
+            while len(self._kept) > 3:
                 del self._kept[next(iter(self._kept))]
             linear = np.array([PARAMETERS[name].width for name in self.own])
             reference = np.array([PARAMETERS[name].reference for name in self.own])

@@ -11,10 +11,11 @@ full contacts say. The unknowns of losses are 1 - r^2, c and ln epsilon (epsilon
 for there it may vanish); of the delay ln a, b and d.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -65,31 +66,58 @@ class LawAt(NamedTuple):
     time_slope: Float[np.ndarray, "n k"]
 
 
-class LawModel(Protocol):
-    """What a fit asks of its law; `theta` are the values of its unknowns, in the order of `names`."""
+class LawModel(ABC):
+    """What a fit asks of its law; `theta` are the values of its unknowns, in the order of `names`.
 
-    names: tuple[str, ...]
-    length_nm: float
+    Attributes:
+        own: the parameters that are fitted, by their names in reports; their unknowns come first.
+        names: all unknowns; those that are not of `own` have priors N(0, 1).
+        lasting: impacts take time.
+        length_nm: length over which a leaving tip keeps its energy.
+    """
 
+    own: tuple[str, ...]
+    names: Any
+    lasting: bool
+    length_nm: Any
+
+    @abstractmethod
+    def value_of(self, name: str, unknown: Any) -> Any:
+        """Return a parameter's value for its unknown."""
+
+    @abstractmethod
+    def unknown_of(self, name: str, value: Any) -> Any:
+        """Return the unknown for a parameter's value."""
+
+    @abstractmethod
+    def values(self, theta: Float[np.ndarray, " k"]) -> dict[str, float]:
+        """Return the parameters by name."""
+
+    @abstractmethod
     def at(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> LawAt:
         """Return the law at approach speeds in nm/us."""
-        ...
 
+    @abstractmethod
     def coefficients(self, theta: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "4 k"]]:
         """Return a, b, d and f of the delay, and their derivatives by the unknowns."""
-        ...
 
+    @abstractmethod
     def capture(self, theta: Float[np.ndarray, " k"]) -> float:
         """Return the capture speed in nm/us."""
-        ...
 
+    @abstractmethod
     def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
         """Return the table."""
-        ...
+
+    def capture_slope(self, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Return the derivatives of the capture speed by the unknowns: where w^2 vanishes."""
+        ends = self.capture(theta) * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])
+        edge = self.at(theta, ends)
+        return -edge.square_slope[1] * (ends[2] - ends[0]) / (edge.square[2] - edge.square[0])
 
 
 @dataclass(frozen=True)
-class FormulaLaw:
+class FormulaLaw(LawModel):
     """A formula, with smooth functions beside it or without.
 
     Attributes:
