@@ -5,9 +5,12 @@ u = sqrt(u_c^2 + v^2), so that an orbit keeps its coordinate while u_c moves. Th
 
     w^2 = r^2 v^2 - M(s),    tau = T(s) - b (1/w - 1/u) + f (1/w^2 - 1/u^2),
 
-r the restitution of fast impacts, so that eq. 6 is exact, M and T cubic splines in s, even at capture and natural at the end: two vectors and a constant matrix. Formulas, contacts
-and measured laws all become such tables, so that whatever follows orbits is one compiled program.
+r the restitution of fast impacts, so that eq. 6 is exact, M and T cubic splines in s, even at capture and natural at the
+end: two vectors and a constant matrix. Formulas, contacts and measured laws all become such tables, so that whatever
+follows orbits is one compiled program.
 """
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -128,8 +131,7 @@ def table_of(
     """
     loss = kept * EXCESS**2 - square
     loss[0] = 0.0
-    a, b, d, f = coefficients
-    return LawTable(
-        np.asarray(capture), np.asarray(float(kept)), np.stack([loss, _SLOPES @ loss]), np.stack([time, _SLOPES @ time]),
-        *(np.asarray(float(number)) for number in (a, b, d, f, length_nm)),
-    )  # fmt: skip
+    splines = [np.stack([values, _SLOPES @ values]) for values in (loss, time)]
+    numbers = [np.asarray(float(number)) for number in (capture, kept, *coefficients, length_nm)]
+    columns: Any = (*numbers[:2], *splines, *numbers[2:])
+    return LawTable(*columns)

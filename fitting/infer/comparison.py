@@ -15,7 +15,7 @@ from afm_jax.checks import checked, require_float64
 from afm_jax.results import Result, public_result
 from fitting.infer.fit import fit, tables_of
 from fitting.infer.law import closest_loss, rebound_by_formula
-from fitting.infer.result import FittedLaw, FitResult
+from fitting.infer.result import FitResult, FittedLaw
 from fitting.parameters import CONTACT_NAMES, LAW, LAWS, MODELS, model_parameters
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, TableLike
@@ -136,7 +136,7 @@ def _fitted(
 
 def _by_information(results: Mapping[str, FitResult]) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
     """Return instantaneous models by their AIC, and their rebound speeds at the points of the best one's law."""
-    rows = [_row(model, result) | {"aic": result.aic} for model, result in results.items()]
+    rows: list[dict[str, Any]] = [_row(model, result) | {"aic": result.aic} for model, result in results.items()]
     rows = sorted(rows, key=lambda row: row["aic"])
     for row in rows:
         row["delta_aic"] = row["aic"] - rows[0]["aic"]

@@ -17,6 +17,11 @@ class LawAt(NamedTuple):
     capture: float
     capture_factor: Float[np.ndarray, " m"]
 
+    def without_errors(self) -> "LawAt":
+        """Return the law with nothing known of its errors: NaN."""
+        nothing = np.full_like(self.factor, np.nan), np.full_like(self.capture_factor, np.nan)
+        return self._replace(factor=nothing[0], capture_factor=nothing[1])
+
 
 AtSpeeds = Callable[[Float[np.ndarray, " n"]], LawAt]
 """A law with its errors, of approach speeds in nm/us."""

@@ -1,8 +1,8 @@
 """What rows count for: which are excluded, how uncertain the picture of impacts is for each, and their covariance.
 
-A law of impacts lacks what slow impacts are: with the capture speed u_c, the length L over which a leaving tip keeps its
-energy and s = omega L/w, amplitudes of eight full contacts are off by less than about 0.05 % + 1.2 % s^3 +
-1.6 % (1.5 u_c/u)^6. Peak and lock-in of a row share that error. Rows where it is too large are excluded.
+A law of impacts lacks what slow impacts are: with the capture speed u_c, the length L over which a leaving tip keeps
+its energy and s = omega L/w, amplitudes of eight full contacts are off by less than about 0.05 % + 1.2 % s^3 + 1.6 %
+(1.5 u_c/u)^6. Peak and lock-in of a row share that error. Rows where it is too large are excluded.
 """
 
 from typing import NamedTuple
@@ -24,7 +24,7 @@ BY_LEVER = 1.2
 """Pull times Hertz time over the approach speed from which rows of a driven tip are excluded."""
 _MOST_LOST, _MOST_IRREGULAR = 0.05, 0.2
 """Share at most of the rows without an orbit that are taken to be slow impacts, or irregular motion of a driven tip."""
-_TURNED = np.rad2deg(0.125)
+SIZE_OF_PHASE = float(np.rad2deg(0.125))
 """Error of the phase in degrees over the relative error of the amplitude: what the tip loses fixes the phase."""
 _TOGETHER, _APART = 2.0, 1.0 / 16.0
 """Variance of the mean and of the difference of peak and lock-in of a slow row (times root 2), over that of each."""
@@ -125,7 +125,7 @@ def _whitening(
     data: Data, used: Bool[np.ndarray, "rows 3"], model_error: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, "rows 3 3"]:
     """Return the inverse Cholesky factors of the rows' covariances: noise, and what peak and lock-in lack together."""
-    size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(used), 1), _TURNED)], axis=1)
+    size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(used), 1), SIZE_OF_PHASE)], axis=1)
     padding = np.where(used, model_error[:, None] * size, 0.0)
     both = used[:, 0] & used[:, 1]
     shares = np.tile(np.eye(READINGS), (len(used), 1, 1))

@@ -1,12 +1,12 @@
 """Where the fit begins: starts are screened and polished; rows that a law has no orbit for are asked for again.
 
-Leaving out a measured row without an orbit lets a minimiser run into a false minimum, so that rows come before residuals:
-`orbits_at` searches for every row's orbits and takes the steady one that explains it best, `recovered` looks around a
-law for laws that have the missing ones.
+Leaving out a measured row without an orbit lets a minimiser run into a false minimum, so that rows come before
+residuals: `orbits_at` searches for every row's orbits and takes the steady one that explains it best, `recovered` looks
+around a law for laws that have the missing ones.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -32,6 +32,8 @@ LOST_COST = 50.0
 """What a measured row without an orbit adds to chi2 where laws are compared."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
+_STEPS = 40
+"""Steps of a descent at most."""
 _SOFT = 2.0
 """Residual of a row from which it counts linearly in a search."""
 _DRAWN, _ERRORS = 24, (1.0, 3.0, 5.0)
@@ -41,10 +43,10 @@ _LIKELY = 0.2
 
 
 class Found(NamedTuple):
-    """The orbits of all rows at unknowns: NaN where there is none; and how many steady ones each row has."""
+    """The orbits of all rows at unknowns: NaN where there is none; and the number of steady ones of each row."""
 
     orbits: Orbits
-    count: Int[np.ndarray, " rows"]
+    number: Int[np.ndarray, " rows"]
 
     @property
     def exists(self) -> Bool[np.ndarray, " rows"]:
@@ -70,9 +72,9 @@ def orbits_at(
         column[~free] = np.nan
     whole.x[free] = 20.0
     count = free.astype(int)
-    rows = np.flatnonzero(~free) if rows is None else rows[~free[rows]]
-    which, orbits = model.candidates(theta, rows, most=4 if roughly else 14, judge=not roughly)
-    fine = np.isfinite(orbits.readings).all(axis=1) if roughly else orbits.steady
+    wanted = np.flatnonzero(~free) if rows is None else rows[~free[rows]]
+    which, orbits = model.candidates(theta, wanted, most=4 if roughly else 14, judge=not roughly)
+    fine = np.asarray(np.isfinite(orbits.readings).all(axis=1) if roughly else orbits.steady)
     error = np.maximum(data.error[which], 0.02 * np.abs(data.read[which]))
     with np.errstate(invalid="ignore"):
         misfit = np.where(fine, np.nansum(((orbits.readings - data.read[which]) / error) ** 2, axis=1), np.inf)
@@ -117,7 +119,6 @@ def descend(
     weights: Weights,
     *,
     soft: float = np.inf,
-    most: int = 40,
     settled: float = 1e-3,
     fixed: Bool[np.ndarray, " k"] | None = None,
 ) -> Descent:
@@ -129,13 +130,12 @@ def descend(
         begin: orbits there; rows without one do not count.
         weights: of the rows.
         soft: whitened residual of a row from which it counts linearly.
-        most: steps at most.
-        settled: estimated distance of chi2 to its minimum at which a descent has arrived.
+        settled: fall of chi2 in a step at which a descent has arrived.
         fixed: unknowns that stay; None: none.
     """
     rows = _Followed(model, theta, begin, weights, soft)
     longest = np.array([1.0 if name in ("epsilon", "delay_hertz") else np.inf for name in model.names])
-    end = levenberg_marquardt(rows.sum, theta, settled=settled, most=most, longest=longest, fixed=fixed)
+    end = levenberg_marquardt(rows.sum, theta, settled=settled, most=_STEPS, longest=longest, fixed=fixed)
     return rows.descent(end.place, end.sum, end.steps)
 
 
@@ -285,7 +285,7 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
         weights = plain_weights(small.data, _WIDTH, nothing)
         end = polished_by_optax(small, theta, found.orbits, weights)
         found, weights = orbits_at(small, end, every), plain_weights(small.data, _FINER, nothing)
-        end = descend(small, end, found.orbits, weights, soft=_SOFT, most=12, settled=0.1).theta
+        end = descend(small, end, found.orbits, weights, soft=_SOFT, settled=0.1).theta
         here = soft_cost(small.data, orbits_at(small, end, every), every, _FINER)
         if here < least:
             best, least = end, here
@@ -368,7 +368,7 @@ def _polished(model: Model, theta: Float[np.ndarray, " k"], extras: tuple[float,
             if extra is None
             else plain_weights(model.data, extra, nothing)
         )
-        end = descend(model, theta, found.orbits, weights, soft=_SOFT, most=25, settled=0.01)
+        end = descend(model, theta, found.orbits, weights, soft=_SOFT, settled=0.01)
         theta = end.theta
     assert end is not None  # noqa: S101
     return end

@@ -1,8 +1,8 @@
 """Everything that is unknown in a fit as one vector with priors, and what the rows read as a function of it.
 
-The vector holds the unknowns of the law (`fitting.predict.law`), one factor of N(0, 1) for each leading remainder of the
-corrections of impacts that last, and the instrument's quantities, each in standard errors of what is known of it. A new
-nuisance is an entry of `_MOVES`, and a term of `Model.local`.
+The vector holds the unknowns of the law (`fitting.predict.law`), one factor of N(0, 1) for each leading remainder of
+the corrections of impacts that last, and the instrument's quantities, each in standard errors of what is known of it. A
+new nuisance is an entry of `_MOVES`, and a term of `Model.local`.
 """
 
 from collections.abc import Mapping
@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.contact.parameters import PAPER
 from afm_jax.impact.law_table import LawTable
 from fitting.models import Reach, Task, drifts, reach_of, readings_of
-from afm_jax.contact.parameters import PAPER
 from fitting.parameters import CONTACT_NAMES, PARAMETERS, is_nuisance, name_of_table
 from fitting.predict.law import LawModel
 from fitting.predict.orbit import COUNT, READINGS, Local, Orbits, Row, followed, starts_of
@@ -162,6 +162,12 @@ class Quantity(NamedTuple):
         if self.kind in _FACTORS:
             return self.value * numpy.exp(self.error / self.value * unknown)
         return self.value + self.error * unknown
+
+    def unknown(self, value: float) -> float:
+        """Return the unknown for a value."""
+        if self.kind in _FACTORS:
+            return float(np.log(value / self.value)) * self.value / self.error
+        return (value - self.value) / self.error
 
     def slope(self, unknown: float) -> float:
         """Return d value/d unknown."""

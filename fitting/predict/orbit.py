@@ -8,7 +8,7 @@ runs in NumPy (`followed`): inside a compiled loop its program would take ten ti
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -48,14 +48,17 @@ _HEIGHTS = np.linspace(0.0, 1.0, 258)[1:-1]
 
 
 class Row(NamedTuple):
-    """What is known of rows: columns of a table, of shape (rows,); ``phase_deg`` is the measured one, 0 for none."""
+    """What is known of rows: columns of a table, of shape (rows,); ``phase_deg`` is the measured one, 0 for none.
 
-    order: Float[Array, " rows"]
-    drive_frequency_khz: Float[Array, " rows"]
-    drive_amplitude_nm: Float[Array, " rows"]
-    offset_nm: Float[Array, " rows"]
-    phase_deg: Float[Array, " rows"]
-    free: Bool[Array, " rows"]
+    Arrays of NumPy outside compiled programs, of JAX and of one row inside.
+    """
+
+    order: Any
+    drive_frequency_khz: Any
+    drive_amplitude_nm: Any
+    offset_nm: Any
+    phase_deg: Any
+    free: Any
 
     def take(self, which: Int[np.ndarray, " some"]) -> "Row":
         """Return some of the rows."""
@@ -352,9 +355,9 @@ def _solved(
     matrix: Float[np.ndarray, "rows 3 3"], right: Float[np.ndarray, "rows 3 k"]
 ) -> Float[np.ndarray, "rows 3 k"]:
     """Return the solutions of linear systems; 0 where one is singular or not finite."""
-    sound = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2))
-    safe = np.where(sound[:, None, None], matrix, np.eye(3)) + 1e-300 * np.eye(3)
-    return np.linalg.solve(safe, np.where(sound[:, None, None], right, 0.0))
+    sound = np.asarray(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2)))[:, None, None]
+    safe = np.where(sound, matrix, np.eye(3)) + 1e-300 * np.eye(3)
+    return np.linalg.solve(safe, np.where(sound, right, 0.0))
 
 
 def _stable(x, gaps, state, row: Row) -> Bool[np.ndarray, " rows"]:
