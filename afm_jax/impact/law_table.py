@@ -5,8 +5,8 @@ u = sqrt(u_c^2 + v^2), so that an orbit keeps its coordinate while u_c moves. Th
 
     w^2 = r^2 v^2 - M(s),    tau = T(s) - b (1/w - 1/u) + f (1/w^2 - 1/u^2),
 
-r the restitution of fast impacts, so that eq. 6 is exact, M and T cubic splines in s, even at capture and natural at the
-end: two vectors and a constant matrix. Formulas, contacts and measured laws all become such tables, so that whatever
+r the restitution of fast impacts, so that eq. 6 is exact, M and T cubic splines in s, even at capture and natural at
+the end: two vectors and a constant matrix. Formulas, contacts and measured laws all become such tables, so that what
 follows orbits is one compiled program.
 """
 

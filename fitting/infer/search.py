@@ -15,12 +15,12 @@ from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.infer.optimiser import minimised
 from fitting.infer.rows import Weights, plain_weights, weights_of
-from fitting.infer.unknowns import Data, Model
+from fitting.infer.unknowns import Data, Model, no_orbits
 from fitting.parameters import PARAMETERS
 from fitting.predict.orbit import Orbits
 
 STARTS, POLISHED, ROWS = 32, 6, 32
-"""Starts that are screened, how many of them are polished at most, and the rows that both look at, at most."""
+"""Starts that are screened, by every second of the rows, how many are polished at most, and the rows, at most."""
 _GOOD = 0.3
 """Cost of a reading above what its noise makes up to which a polished start is good enough."""
 _WIDTH = 0.1
@@ -66,11 +66,11 @@ def orbits_at(
         roughly: after three steps of Newton's method, steady or not: to screen starts.
     """
     data = model.data
-    whole = model.follow(theta, np.full((data.time.size, 3), 20.0), most=1)
-    free = data.row.free
+    free, somewhere = data.row.free, np.full((data.time.size, 3), 20.0)
+    # of free tips there is nothing to search for
+    whole = model.follow(theta, somewhere, most=1) if free.any() else no_orbits(data.time.size)
     for column in (whole.x, whole.approach, whole.rebound):
         column[~free] = np.nan
-    whole.x[free] = 20.0
     count = free.astype(int)
     wanted = np.flatnonzero(~free) if rows is None else rows[~free[rows]]
     which, orbits = model.candidates(theta, wanted, most=4 if roughly else 14, judge=not roughly)
@@ -270,7 +270,8 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
     small = model if len(set(model.data.drives)) > 1 else _narrowed(model, rows)
     every = np.arange(small.data.time.size) if small is not model else rows
     points = starts(model)
-    cost = [soft_cost(small.data, orbits_at(small, point, every, roughly=True), every) for point in points]
+    some = every[::2]
+    cost = [soft_cost(small.data, orbits_at(small, point, some, roughly=True), some) for point in points]
     nothing = np.zeros(small.data.time.size, bool)
     with np.errstate(invalid="ignore"):
         noise = (small.data.error / np.where(np.arange(3) < 2, np.abs(small.data.read), np.rad2deg(1.0)))[

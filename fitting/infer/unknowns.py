@@ -326,7 +326,7 @@ class Model:
                 at = mine[which]
                 parts.append((at, followed(x, local[at], self.data.row.take(at), table, drive, most=most, judge=judge)))
         if not parts:
-            return np.zeros(0, int), _nothing(0)
+            return np.zeros(0, int), no_orbits(0)
         return np.concatenate([at for at, _ in parts]), Orbits(
             *map(np.concatenate, zip(*(o for _, o in parts), strict=True))
         )
@@ -336,7 +336,8 @@ def _column(name: str) -> int:
     return Local._fields.index(name)
 
 
-def _nothing(count: int) -> Orbits:
+def no_orbits(count: int) -> Orbits:
+    """Return room for the orbits of so many rows."""
     shapes = {"x": (3,), "readings": (READINGS,), "slopes": (READINGS, COUNT)}
     kinds = {"closes": bool, "steady": bool}
     return Orbits(*(np.zeros((count, *shapes.get(name, ())), kinds.get(name, float)) for name in Orbits._fields))
@@ -344,7 +345,7 @@ def _nothing(count: int) -> Orbits:
 
 def _gathered(parts) -> Orbits:
     parts = list(parts)
-    whole = _nothing(sum(some.size for some, _ in parts))
+    whole = no_orbits(sum(some.size for some, _ in parts))
     for some, orbits in parts:
         for column, part in zip(whole, orbits, strict=True):
             column[some] = part

@@ -264,7 +264,7 @@ class FormulaLaw(LawModel):
 
     def capture(self, theta: Float[np.ndarray, " k"]) -> float:
         """Return the speed in nm/us up to which the tip is captured: the fastest root of w^2."""
-        grid = np.geomspace(_SLOWEST, _FASTEST, 1600)
+        grid = np.geomspace(_SLOWEST, _FASTEST, 400)
         stays = np.flatnonzero(self.at(theta, grid).square <= 0.0)
         if not stays.size or stays[-1] == grid.size - 1:
             return float(grid[0] if not stays.size else grid[-1])

@@ -281,7 +281,7 @@ def starts_of(
     """
     local = local.copy()
     local[:, :2] = 0.0
-    x, there = _in_blocks(lambda *block: _scanned(*block, table, drive), local, row)
+    x, there = _in_blocks(lambda *block: _scanned.outside(*block, table, drive), local, row)
     which, slot = np.nonzero(there)
     return which, x[which, slot]
 
@@ -325,7 +325,7 @@ def followed(
         for left in reversed(range(most)):
             some = row.take(moving)
             slopes[moving], found[moving], state[moving] = _in_blocks(
-                lambda *block: _evaluated(*block, table, drive), x[moving], local[moving], some
+                lambda *block: _evaluated.outside(*block, table, drive), x[moving], local[moving], some
             )
             if not left:
                 break
