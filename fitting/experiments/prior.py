@@ -92,7 +92,8 @@ class Prior(Result):
         normal[0] = 0.0
         width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
         values = self.values + spread * ((normal * width) @ axes.T)
-        return np.clip(values, *self.problem.ends)
+        ends = np.array([(known.lowest, known.highest) for known in self.problem.parameters]).T
+        return np.clip(values, *ends)
 
 
 @checked
