@@ -144,28 +144,20 @@ def model_of(prior: Prior, drives: Drives, values: Float[np.ndarray, " p"]) -> t
     The unknowns are those of the prior's parameters, in their order.
     """
     problem, mass, count = prior.problem, prior.mass_ng or 1.0, len(drives.order)
-    zero, never = np.zeros(count), np.zeros(count, bool)
-    data = Data(
-        row=Row(*(np.asarray(column, float) for column in drives), phase_deg=zero, free=never),
-        read=np.full((count, READINGS), np.nan),
-        error=np.ones((count, READINGS)),
-        no_orbit=never,
-        time=zero,
-        number=zero.astype(int),
-        drives=(problem.drive,),
-        free_frequency_khz=zero + prior.free_frequency_khz,
-        quality_factor=zero + (prior.quality_factor or np.inf),
-        mass_ng=mass,
-    )
+    zero, never, own = np.zeros(count), np.zeros(count, bool), len(problem.own)
+    row = Row(*(np.asarray(column, float) for column in drives), phase_deg=zero, free=never)
+    lever = zero + prior.free_frequency_khz, zero + (prior.quality_factor or np.inf), mass
+    blank = np.full((count, READINGS), np.nan)
+    data = Data(row, blank, np.ones_like(blank), never, zero, zero.astype(int), (problem.drive,), *lever)
     if problem.model == "contact":
         from fitting.predict.contact import ContactLaw  # noqa: PLC0415  # for contacts alone
 
         law = ContactLaw(problem.own, prior.fixed, (), problem.effects, mass)
     else:
         law = FormulaLaw(problem.own, prior.fixed, mass, lasting=problem.lasting)
-    theta, own = np.zeros(len(values)), len(problem.own)
+    theta = np.zeros(len(values))
     for i, (parameter, value) in enumerate(zip(problem.parameters[:own], values.tolist(), strict=False)):
-        # unknowns that are logarithms know no 0
+        # a logarithm knows no 0
         theta[i] = law.unknown_of(parameter.name, value if parameter.lowest < 0.0 else max(value, _LEAST))
     pairs = zip(problem.names[own:], values[own:].tolist(), strict=True)
     return Model(data, law, tuple(Quantity(name, value, 1.0, ~never) for name, value in pairs)), theta
@@ -310,29 +302,26 @@ def forecast(
 
 
 def _stated(prior: Prior, rows: _Rows, count: int) -> Float[np.ndarray, " p"]:
-    """Return the standard errors that a fit of the first rows states: with everything unknown, as it has."""
-    model, orbits, law = rows.model, rows.orbits, rows.model.law
-    names, flat = prior.problem.names, ()
+    """Return the standard errors that a fit of the first rows states: with everything unknown that it has."""
+    orbits, law, names, flat = rows.orbits, rows.model.law, prior.problem.names, ()
     if isinstance(law, FormulaLaw):
         if not len(prior.measured) and "viscous_loss" not in (*law.own, *law.fixed):
-            # a fit has it whatever the formula is; a prior that a fit left is of the formula alone
+            # a fit has drag whatever the formula is; a prior that a fit left is of the formula alone
             flat = ("viscous_loss",)
-        speeds = orbits.approach[:count]
-        law = replace(law, own=(*law.own, *flat)).beside((float(speeds.min()), float(speeds.max())), SMOOTH)
-    whole = replace(model, law=law, remainders=remainders_of(model, rows.theta, orbits))
-    places, theta = [whole.names.index(name) for name in names], np.zeros(len(whole.names))
+        ends = float(orbits.approach[:count].min()), float(orbits.approach[:count].max())
+        law = replace(law, own=(*law.own, *flat)).beside(ends, SMOOTH)
+    model = replace(rows.model, law=law, remainders=remainders_of(rows.model, rows.theta, orbits))
+    places, theta = [model.names.index(name) for name in names], np.zeros(len(model.names))
     theta[places] = rows.theta
-    size = prior.sizes
-    known, axes = np.linalg.eigh(size[:, None] * prior.information * size)
+    of_rows = (rows.weights.whitening @ model.slopes(theta, orbits))[:count].reshape(-1, theta.size)
     of_prior = np.zeros((len(names), theta.size))
-    of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size * rows.change
-    rest = np.eye(theta.size)[[name not in (*names, *flat) for name in whole.names]]
-    there = (np.arange(len(orbits.x)) < count)[:, None]
-    weights = rows.weights._replace(used=rows.weights.used & there)
-    white = (weights.whitening @ whole.slopes(theta, orbits))[:count].reshape(-1, theta.size)
-    jacobian = np.concatenate([white, of_prior, rest])
+    known, axes = np.linalg.eigh(prior.sizes[:, None] * prior.information * prior.sizes)
+    of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / prior.sizes * rows.change
+    of_rest = np.eye(theta.size)[[name not in (*names, *flat) for name in model.names]]
+    jacobian = np.concatenate([of_rows, of_prior, of_rest])
+    weights = rows.weights._replace(used=rows.weights.used & (np.arange(len(orbits.x)) < count)[:, None])
     end = Descent(theta, orbits, 0.0, np.zeros(len(jacobian)), jacobian)
-    fit = Explained(whole, end, weights, Found(orbits, rows.count), 0.0, settled=True)
+    fit = Explained(model, end, weights, Found(orbits, rows.count), 0.0, settled=True)
     if len(prior.measured) or not np.isfinite(fit.covariance).all():
         return np.sqrt(np.diag(fit.covariance))[places] * np.abs(rows.change)
     factor = closest_parameters(fit, prior.problem.own, prior.fixed).factor

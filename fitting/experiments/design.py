@@ -113,17 +113,15 @@ class Design(Result):
         return self._known_after(-1)
 
     def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
-        entries = {}
-        columns = zip(
-            self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist(), strict=True
-        )
-        for parameter, value, error in columns:
+        entries, columns = {}, (self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist())
+        for parameter, value, error in zip(*columns, strict=True):
             entry = {"value": value, "unit": parameter.unit, "standard_error": _finite(error)}
-            entry["interval95"] = [None, None]
-            if np.isfinite(error):
-                low, high = value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error
-                entry["interval95"] = [max(low, parameter.lowest), min(high, parameter.highest)]
-            else:
+            ends = (
+                max(value - TWO_SIDED_95 * error, parameter.lowest),
+                min(value + TWO_SIDED_95 * error, parameter.highest),
+            )
+            entry["interval95"] = [*ends] if np.isfinite(error) else [None, None]
+            if not np.isfinite(error):
                 entry["reason"] = "the measurements do not determine it"
             entries[parameter.name] = entry
         return entries

@@ -47,7 +47,6 @@ class Prior(Result):
         fixed: values of the model's parameters that a fit held; of a contact those not the paper's.
         uncertainty: how far values may be off, relative, where `information` does not say: an orbit that is not there
             for some of these values is not planned with.
-        constraints: value and standard error of what is known apart from the measured drives; part of `information`.
         measured: drives that were measured already, rows of order, frequency, amplitude, offset.
         source: where the prior comes from, in words.
         notes: what a reader of the design should know of it; a sentence each.
@@ -62,7 +61,6 @@ class Prior(Result):
     mass_ng: float | None = None
     fixed: dict[str, float] = field(default_factory=dict)
     uncertainty: float = UNCERTAINTY
-    constraints: dict[str, tuple[float, float]] = field(default_factory=dict)
     measured: Float[np.ndarray, "rows 4"] = field(default_factory=lambda: np.zeros((0, 4)))
     source: str = "values given"
     notes: tuple[str, ...] = ()
@@ -81,14 +79,12 @@ class Prior(Result):
             count: how many.
             least: the uncertainty, relative to the parameters' sizes, that is left to any combination of them.
         """
-        spread = self.uncertainty * self.sizes
-        # a share of the frequency would be many widths of the resonance
-        if "free_frequency_khz" in self.constraints:
-            spread[self.problem.names.index("free_frequency_khz")] = self.constraints["free_frequency_khz"][1]
-        # In units of the spread: the information then has eigenvalues of at least 1.
-        scaled = spread[:, None] * self.information * spread + np.eye(len(spread))
-        curvature, axes = np.linalg.eigh(scaled)
-        normal = np.random.default_rng(DRAW_SEED).normal(size=(count, len(spread)))
+        own, spread = len(self.problem.own), self.uncertainty * self.sizes
+        # what is known of the instrument says how far that may be off
+        spread[own:] = 1.0 / np.sqrt(np.maximum(np.diag(self.information)[own:], spread[own:] ** -2.0))
+        # in units of the spread the information has eigenvalues of at least 1
+        curvature, axes = np.linalg.eigh(spread[:, None] * self.information * spread + np.eye(spread.size))
+        normal = np.random.default_rng(DRAW_SEED).normal(size=(count, spread.size))
         normal[0] = 0.0
         width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
         values = self.values + spread * ((normal * width) @ axes.T)
@@ -154,7 +150,6 @@ def prior_of_values(  # noqa: PLR0913
         quality_factor=quality_factor,
         mass_ng=mass_ng,
         uncertainty=uncertainty,
-        constraints=known,
         source="values assumed" if assumed else "values given",
         notes=tuple(notes),
     )
@@ -222,8 +217,6 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
     driven = [one for one in tables if (one.get("drive") or "sample") == drive]
     columns = "order", "drive_frequency_khz", f"{'free' if problem.tapping else 'drive'}_amplitude_nm", "offset_nm"
-    known = {name: entry["constraint"] for name, entry in found.items() if entry.get("constraint")}
-    constraints = {name: (float(value), float(error)) for name, (value, error) in known.items()}
     law, notes = payload.get("law"), []
     if not payload["valid"]:
         reason = " ".join(payload.get("reasons") or ["no reason given."])
@@ -233,13 +226,12 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     return Prior(
         problem=problem,
         values=_checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
-        information=_information(found, correlations[np.ix_(places, places)], constraints),
+        information=_information(found, correlations[np.ix_(places, places)]),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
         mass_ng=table.get("mass_ng"),
         fixed=dict(settings.get("fixed") or {}),
         uncertainty=uncertainty,
-        constraints=constraints,
         measured=np.array([[place for one in driven for place in one[name]] for name in columns], float).T,
         source=f"fit of {table.get('source', 'a table')}",
         notes=tuple(notes),
@@ -247,9 +239,7 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     )
 
 
-def _information(
-    found: Mapping[str, Any], matrix: Float[np.ndarray, "p p"], constraints: Mapping[str, tuple[float, float]]
-) -> Float[np.ndarray, "p p"]:
+def _information(found: Mapping[str, Any], matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Return the Fisher information of a fit: of what it determined, and the constraints on what it did not."""
     error = np.array([entry["standard_error"] for entry in found.values()], dtype=float)
     if np.any(beyond(error, positive=True)):
@@ -258,7 +248,7 @@ def _information(
     inner = matrix[np.ix_(known, known)]
     if not np.all(np.isfinite(inner)) or (known.any() and np.linalg.eigvalsh(inner)[0] < 1e-14):
         raise TableError("the saved fit's correlations contradict each other; fit the table again")
-    information = np.diag([constraints[name][1] ** -2.0 if name in constraints else 0.0 for name in found])
+    information = np.diag([float(e["constraint"][1]) ** -2.0 if e.get("constraint") else 0.0 for e in found.values()])
     # errors may be far apart in size: the correlations are inverted, which have none
     information[np.ix_(known, known)] = np.linalg.inv(inner) / np.outer(error[known], error[known])
     return information
