@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int, Shaped
 from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.prior import Prior
+from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained
-from fitting.infer.instantaneous import evaluated, plain
-from fitting.infer.rows import Weights, remainders_of, weights_of
+from fitting.infer.instantaneous import evaluated
+from fitting.infer.rows import Weights, plain_weights, remainders_of, weights_of
 from fitting.infer.search import Descent, Found, orbits_at
-from fitting.infer.summary import closest_parameters
 from fitting.infer.unknowns import Data, Model, Quantity
 from fitting.predict.law import SMOOTH, FormulaLaw
 from fitting.predict.orbit import READINGS, Row
@@ -204,7 +204,7 @@ def _rows_of(
     error = np.concatenate([noise * orbits.readings[:, :2], np.full((len(count), 1), phase_noise_deg)], axis=1)
     expected = np.where(read & (count > 0)[:, None], orbits.readings, np.nan)
     model, out = replace(model, data=replace(model.data, read=expected, error=error)), np.zeros(len(count), bool)
-    weights = weights_of(model, theta, orbits, out) if law.lasting else plain(model, out)
+    weights = weights_of(model, theta, orbits, out) if law.lasting else plain_weights(model.data, 0.0, out)
     step, change = 1e-6, np.ones(len(theta))
     for i, (name, unknown) in enumerate(zip(law.own, theta.tolist(), strict=False)):
         change[i] = (law.value_of(name, unknown + step) - law.value_of(name, unknown - step)) / (2.0 * step)
@@ -238,7 +238,7 @@ def candidates_of(
     for values in prior.draws(DRAWS, least=MARGIN)[1:]:
         drawn = model_of(prior, drives, values)
         if prior.problem.lasting:
-            sure &= orbits_at(*drawn, np.flatnonzero(sure)).count == 1
+            sure &= orbits_at(*drawn, np.flatnonzero(sure)).number == 1
         else:
             sure &= evaluated(*drawn, slopes=False)[0].orbits == 1
     kinds, expected = 3 if tapping else 2, rows.orbits.readings
