@@ -303,13 +303,12 @@ def forecast(
 
 def _stated(prior: Prior, rows: _Rows, count: int) -> Float[np.ndarray, " p"]:
     """Return the standard errors that a fit of the first rows states: with everything unknown that it has."""
-    orbits, law, names, flat = rows.orbits, rows.model.law, prior.problem.names, ()
+    orbits, law, names = rows.orbits, rows.model.law, prior.problem.names
     if isinstance(law, FormulaLaw):
-        if not len(prior.measured) and "viscous_loss" not in (*law.own, *law.fixed):
-            # a fit has drag whatever the formula is; a prior that a fit left is of the formula alone
-            flat = ("viscous_loss",)
+        # a fit has drag whatever the formula is; a prior that a fit left is of the formula alone
+        drag = not len(prior.measured) and "viscous_loss" not in (*law.own, *law.fixed)
         ends = float(orbits.approach[:count].min()), float(orbits.approach[:count].max())
-        law = replace(law, own=(*law.own, *flat)).beside(ends, SMOOTH)
+        law = replace(law, own=(*law.own, "viscous_loss") if drag else law.own).beside(ends, SMOOTH)
     model = replace(rows.model, law=law, remainders=remainders_of(rows.model, rows.theta, orbits))
     places, theta = [model.names.index(name) for name in names], np.zeros(len(model.names))
     theta[places] = rows.theta
@@ -317,12 +316,13 @@ def _stated(prior: Prior, rows: _Rows, count: int) -> Float[np.ndarray, " p"]:
     of_prior = np.zeros((len(names), theta.size))
     known, axes = np.linalg.eigh(prior.sizes[:, None] * prior.information * prior.sizes)
     of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / prior.sizes * rows.change
-    of_rest = np.eye(theta.size)[[name not in (*names, *flat) for name in model.names]]
-    jacobian = np.concatenate([of_rows, of_prior, of_rest])
+    of_law = np.diag(model.prior[1])[: theta.size - len(model.instrument)]
+    jacobian = np.concatenate([of_rows, of_prior, of_law])
     weights = rows.weights._replace(used=rows.weights.used & (np.arange(len(orbits.x)) < count)[:, None])
     end = Descent(theta, orbits, 0.0, np.zeros(len(jacobian)), jacobian)
     fit = Explained(model, end, weights, Found(orbits, rows.count), 0.0, settled=True)
-    if len(prior.measured) or not np.isfinite(fit.covariance).all():
-        return np.sqrt(np.diag(fit.covariance))[places] * np.abs(rows.change)
-    factor = closest_parameters(fit, prior.problem.own, prior.fixed).factor
-    return np.nan_to_num(np.linalg.norm(factor, axis=1), nan=np.inf)
+    errors = np.sqrt(np.diag(fit.covariance))[places] * np.abs(rows.change)
+    if not len(prior.measured):
+        own = prior.problem.own
+        errors[: len(own)] = np.nan_to_num(closest_parameters(fit, own, prior.fixed).errors[: len(own)], nan=np.inf)
+    return errors
