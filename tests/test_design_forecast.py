@@ -84,7 +84,8 @@ def refitted(designed) -> np.ndarray:
     there = np.append(weights.used.ravel(), np.ones(len(known), bool))
     assert np.abs(whitened(begin, orbits.x)[0]).max() < 1e-9
     for _ in range(EXPERIMENTS):
-        theta, x, noise, moved = begin, orbits.x, random.normal(size=there.size) * there, prior.values
+        theta, x, noise = begin, orbits.x, random.normal(size=there.size) * there
+        before, moved = prior.values, prior.values
         for _ in range(STEPS):
             residual, slopes, x = whitened(theta, x)
             before, size = moved, np.linalg.norm(slopes, axis=0)

@@ -60,17 +60,16 @@ def drive_grid(
         ValueError: if a list is empty or a number impossible, or there are too many combinations.
     """
     check_drive(drive)
-    check_parameter("free_frequency_khz", free_frequency_khz, "positive")
-    for name, numbers in {"orders": orders, "amplitudes_nm": amplitudes_nm, "detunings": detunings}.items():
+    sample, places = drive == "sample", offsets_nm if heights is None else heights
+    positive = {"free_frequency_khz": free_frequency_khz, "orders": orders, "amplitudes_nm": amplitudes_nm}
+    for name, numbers in (positive | {"detunings": detunings}).items():
         check_parameter(name, np.asarray(numbers), "positive")
-    sample = drive == "sample"
+    check_parameter("offsets_nm" if heights is None else "heights", np.asarray(places), "finite")
     if any(order != int(order) or not (sample or order == 1) for order in orders):
         allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
         raise ValueError(f"`orders` must hold {allowed}, but is {list(orders)}")
     if heights is not None and sample:
         raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
-    places = offsets_nm if heights is None else heights
-    check_parameter("offsets_nm" if heights is None else "heights", np.asarray(places), "finite")
     count = len(orders) * len(detunings) * len(amplitudes_nm) * len(places)
     if count > MOST:
         raise ValueError(f"these are {count} drives, more than the {MOST} a design looks at; take coarser steps")
@@ -93,7 +92,7 @@ def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.nda
 LEFT_OUT = {
     "measured": "already measured",
     "no orbit": "no steady single-impact orbit",
-    "unsure": "several steady orbits, or none, or one near its end, for some of the values that the prior allows",
+    "unsure": "several steady orbits, or none, for some of the values that the prior allows",
     "too large": "amplitudes above what the instrument takes",
     "inaccurate": "impacts too slow, or under too strong a pull, for the model: a fit excludes such rows",
 }
@@ -175,7 +174,7 @@ class _Rows(NamedTuple):
         theta: its unknowns at the prior's values.
         change: derivatives of these values by the unknowns.
         orbits: of the rows.
-        count: of steady ones.
+        number: of steady ones.
         slopes: derivatives of the readings by the unknowns.
         weights: of the readings.
     """
@@ -184,7 +183,7 @@ class _Rows(NamedTuple):
     theta: Float[np.ndarray, " p"]
     change: Float[np.ndarray, " p"]
     orbits: Any
-    count: Int[np.ndarray, " rows"]
+    number: Int[np.ndarray, " rows"]
     slopes: Float[np.ndarray, "rows 3 p"]
     weights: Weights
 
@@ -234,7 +233,7 @@ def candidates_of(
     tapping = prior.problem.tapping
     read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak", False])
     rows = _rows_of(prior, drives, noise, phase_noise_deg, read)
-    sure = rows.count == 1
+    sure = rows.number == 1
     for values in prior.draws(DRAWS, least=MARGIN)[1:]:
         drawn = model_of(prior, drives, values)
         if prior.problem.lasting:
@@ -244,7 +243,7 @@ def candidates_of(
     kinds, expected = 3 if tapping else 2, rows.orbits.readings
     holds = {
         "measured": same_drives(drives, prior.measured),
-        "no orbit": rows.count == 0,
+        "no orbit": rows.number == 0,
         "unsure": ~sure | ~np.isfinite(rows.slopes).all(axis=(1, 2)),
         "too large": (drives.amplitude_nm if tapping else expected[:, 0]) > largest_nm,
         "inaccurate": rows.weights.reasons != "",
@@ -320,7 +319,7 @@ def _stated(prior: Prior, rows: _Rows, count: int) -> Float[np.ndarray, " p"]:
     jacobian = np.concatenate([of_rows, of_prior, of_law])
     weights = rows.weights._replace(used=rows.weights.used & (np.arange(len(orbits.x)) < count)[:, None])
     end = Descent(theta, orbits, 0.0, np.zeros(len(jacobian)), jacobian)
-    fit = Explained(model, end, weights, Found(orbits, rows.count), 0.0, settled=True)
+    fit = Explained(model, end, weights, Found(orbits, rows.number), 0.0, settled=True)
     errors = np.sqrt(np.diag(fit.covariance))[places] * np.abs(rows.change)
     if not len(prior.measured):
         own = prior.problem.own

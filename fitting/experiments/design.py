@@ -86,7 +86,7 @@ class Design(Result):
         """The drives under the names of a table's columns, the readings to expect, and their errors."""
         found, chosen, tapping = self.candidates, self.chosen, self.prior.problem.tapping
         names = "order", "drive_frequency_khz", f"{'free' if tapping else 'drive'}_amplitude_nm", "offset_nm"
-        columns = dict(zip(names, self.drives, strict=True))
+        columns: dict[str, Any] = dict(zip(names, self.drives, strict=True))
         readings = zip(_READINGS, found.amplitude_nm[chosen].T, found.error_nm[chosen].T, strict=False)
         for (name, unit), value, error in readings:
             if np.isfinite(error).all():
@@ -128,23 +128,19 @@ class Design(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax design`; what is not known is None."""
-        prior = self.prior
+        problem, found = self.prior.problem, self.candidates
+        names = ("valid", "reasons", "warnings", "noise", "expected", "measured_so_far")
         return {
             "format": "afm-jax design",
             "format_version": FORMAT_VERSION,
-            "drive": prior.problem.drive,
-            "model": prior.problem.model,
-            "valid": self.valid,
-            "reasons": self.reasons,
-            "warnings": self.warnings,
+            "drive": problem.drive,
+            "model": problem.model,
+            **{name: getattr(self, name) for name in names},
             "interest": list(self.interest),
-            "noise": self.noise,
             "points": self.points(),
-            "expected": self.expected,
-            "measured_so_far": self.measured_so_far,
-            "candidates": int(self.candidates.usable.sum()),
-            "left_out": self.candidates.left_out,
-            "prior": {"source": prior.source, "rows_measured": len(prior.measured)},
+            "candidates": int(found.usable.sum()),
+            "left_out": found.left_out,
+            "prior": {"source": self.prior.source, "rows_measured": len(self.prior.measured)},
         }
 
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -232,7 +228,7 @@ def design(  # noqa: PLR0913
     for name in interest:
         if name not in names:
             raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(names)}")
-    if not interest or len(set(interest)) < len(interest):
+    if not interest or len({*interest}) < len(interest):
         raise ValueError("`interest` must name at least one parameter, and none twice")
     if points < 1:
         raise ValueError(f"`points` must be at least 1, but is {points}")
@@ -241,14 +237,12 @@ def design(  # noqa: PLR0913
     check_parameter("noise", noise, "between 0 and 1")
     check_parameter("largest_nm", largest_nm, "positive", optional=True)
     check_parameter("phase_noise_deg", phase_noise_deg, "positive")
-    largest = np.inf if largest_nm is None else float(largest_nm)
-    candidates = candidates_of(
-        prior, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
-    )
+    errors_of = {"noise": float(noise), "phase_noise_deg": phase_noise_deg}
+    candidates = candidates_of(prior, drives, amplitudes=amplitudes, largest_nm=largest_nm or np.inf, **errors_of)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
     matters = np.array([name in interest for name in names])
     chosen = usable[choose_points(prior.information, each[usable], points, matters)]
-    errors = forecast(prior, candidates, chosen, float(noise), phase_noise_deg)
+    errors = forecast(prior, candidates, chosen, **errors_of)
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
     reasons, warnings = [], list(prior.notes)
     if not len(chosen):
