@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from afm_jax.impact.law_table import LawTable
 from fitting.models import Reach, Task, drifts, reach_of, readings_of
@@ -66,7 +66,7 @@ class Data:
     error: Float[np.ndarray, "rows 3"]
     no_orbit: Bool[np.ndarray, " rows"]
     time: Float[np.ndarray, " rows"]
-    number: Float[np.ndarray, " rows"]
+    number: Int[np.ndarray, " rows"]
     drives: tuple[str, ...]
     free_frequency_khz: Float[np.ndarray, " rows"]
     quality_factor: Float[np.ndarray, " rows"]
