@@ -137,6 +137,16 @@ def steady_amplitudes(table: AmplitudeTable, law: ImpactLaw, quality_factor: flo
     return steady_readings(drives, law, quality_factor)[:, :2]
 
 
+def chi2_residuals(table: AmplitudeTable, r: float, epsilon: float, quality_factor: float) -> np.ndarray:
+    """Return (amplitude - read)/error of a table by the paper's map, amplitudes without an orbit 0, and ln Q's own."""
+    amplitude, error = amplitudes_and_errors(table)
+    predicted = np.nan_to_num(steady_amplitudes(table, ImpactLaw(r, epsilon), quality_factor))
+    assert table.quality_factor is not None
+    assert table.quality_factor_error is not None
+    of_q = np.log(quality_factor / table.quality_factor) / (table.quality_factor_error / table.quality_factor)
+    return np.append(((predicted - amplitude) / error).ravel(), of_q)
+
+
 @jax.jit
 def _orbits(cantilever: Cantilever, law: ImpactLaw, *drives: jax.Array):
     def one(order, frequency_khz, drive_nm, offset_nm):

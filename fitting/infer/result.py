@@ -267,7 +267,7 @@ class FitResult(Result):
             over the speeds of the rows that were used, with errors that contain what the formula leaves out.
         correlations: matrix in the parameters' order; NaN where a variance is unknown.
         chi2: sum of squared normalised residuals, constraints included, and where impacts last what the model leaves
-            out; with a robust fit the soft sum of the residuals alone.
+            out; of a robust fit without outliers.
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
         aic: chi2 + 2 k, chi2 here of the formula alone: the model discrepancy would make up for what it lacks.

@@ -355,9 +355,8 @@ def _gathered(parts) -> Orbits:
 def quantities_of(data: Data, task: Task, labels: tuple[str, ...]) -> tuple[Quantity, ...]:
     """Return what is unknown of the instrument, from what a task knows of it beforehand."""
     found = []
-    for name, (value, error) in task.known.items():
-        if not is_nuisance(name):
-            continue
+    for name in filter(is_nuisance, task.problem.names):
+        value, error = task.known[name]
         _, _, label = name.partition(" of ")
         mine = data.number == labels.index(label) if label else np.ones(data.number.size, bool)
         found.append(Quantity(name, value, error, mine))

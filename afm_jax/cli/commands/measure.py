@@ -206,7 +206,7 @@ FIT = Command(
         NOISE,
         QUALITY_FACTOR,
         flag("--scale-errors", "Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1."),
-        flag("--robust", "Let outliers, one row in ten at most, count linearly from two errors on."),
+        flag("--robust", "Leave outliers out, one row in ten at most."),
         click.option(
             "--free",
             type=Names(),
