@@ -323,5 +323,7 @@ def _stated(prior: Prior, rows: _Rows, count: int) -> Float[np.ndarray, " p"]:
     errors = np.sqrt(np.diag(fit.covariance))[places] * np.abs(rows.change)
     if not len(prior.measured):
         own = prior.problem.own
-        errors[: len(own)] = np.nan_to_num(closest_parameters(fit, own, prior.fixed).errors[: len(own)], nan=np.inf)
+        stated = closest_parameters(fit, own, prior.fixed).errors[: len(own)]
+        # NaN where rows are too few, 0 of a lead that does nothing because no impact loses speed
+        errors[: len(own)] = np.where(stated > 0.0, stated, np.inf)
     return errors
