@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,23 +40,33 @@ def linear_interval(parameter: Parameter, value: float, error: float) -> Interva
     return _with_open_ends(parameter, ends, [None, None], "linear")
 
 
+class Unknown(NamedTuple):
+    """What stands for a parameter in a fit: where it is, its standard error, and the two ways between it and a value."""
+
+    place: float
+    error: float
+    of_value: Callable[[float], float]
+    value: Callable[[float], float]
+
+
 def profile_interval(
-    rise: Callable[[float], float], parameter: Parameter, value: float, error: float, least: float = -np.inf
+    rise: Callable[[float], float], parameter: Parameter, unknown: Unknown, least: float = -np.inf
 ) -> Interval:
     """Return the interval over which the smallest chi2, the others following, rises by less than 3.84.
 
     Args:
-        rise: of chi2 over its minimum, at a value; infinite where a row has lost its orbit.
+        rise: of chi2 over its minimum, at an unknown; infinite where a row has lost its orbit.
         parameter: for its range.
-        value: where chi2 is smallest.
-        error: linear standard error.
+        unknown: where chi2 is smallest.
         least: value that stands for the lower end of the range, where the value's logarithm is the unknown.
     """
-    found = [
-        _end(rise, value, error, direction, last)
-        for direction, last in ((-1.0, max(least, parameter.lowest)), (1.0, parameter.highest))
-    ]
-    return _with_open_ends(parameter, [end for end, _ in found], [reason for _, reason in found], "profile")
+    ends, reasons = [], []
+    for last in (max(least, parameter.lowest), parameter.highest):
+        far = unknown.of_value(last) - unknown.place
+        distance, reason = _end(lambda d, side=np.sign(far): rise(unknown.place + side * d), unknown.error, abs(far))
+        ends.append(None if distance is None else unknown.value(unknown.place + np.sign(far) * distance))
+        reasons.append(reason)
+    return _with_open_ends(parameter, ends, reasons, "profile")
 
 
 def _with_open_ends(parameter: Parameter, ends: list[float | None], reasons: list[str | None], kind: str) -> Interval:
@@ -70,17 +81,15 @@ def _with_open_ends(parameter: Parameter, ends: list[float | None], reasons: lis
     return Interval(ends[0], ends[1], "; ".join(said) or None, "limit" if None in ends else kind)
 
 
-def _end(
-    rise: Callable[[float], float], value: float, error: float, direction: float, last: float
-) -> tuple[float | None, str | None]:
-    """Return one end, or why there is none: the root of sqrt(rise) = 1.96, which is nearly linear in the distance."""
-    wanted, most = float(np.sqrt(CHI2_95)), abs(last - value)
+def _end(rise: Callable[[float], float], error: float, most: float) -> tuple[float | None, str | None]:
+    """Return how far one end is, or why there is none: the root of sqrt(rise) = 1.96, nearly linear in the distance."""
+    wanted = float(np.sqrt(CHI2_95))
     (low, below), (high, above) = (0.0, 0.0), (np.inf, np.inf)
     trial = min(wanted * error, most)
     for _ in range(_TRIALS):
-        root = float(np.sqrt(max(rise(value + direction * trial), 0.0)))
+        root = float(np.sqrt(max(rise(trial), 0.0)))
         if abs(root - wanted) < _CLOSE * wanted:
-            return value + direction * trial, None
+            return trial, None
         if root < wanted:
             if trial >= most:
                 return None, END_OF_RANGE
@@ -94,7 +103,7 @@ def _end(
             continue
         # an orbit that was seen must be there: where it is lost the interval ends
         if high - low < (1e-5 * high if np.isfinite(above) else _NEAREST * error):
-            return value + direction * low, None
+            return low, None
         share = (wanted - below) / (above - below) if np.isfinite(above) else 0.5
-        trial = low + float(np.clip(share, 0.02, 0.98)) * (high - low)
+        trial = low + float(np.clip(share, 0.05, 0.95)) * (high - low)
     return None, UNSETTLED

@@ -12,7 +12,7 @@ from afm_jax.least_squares import chi2_tail, covariance_of
 from afm_jax.version import version_of
 from fitting.infer.closest import Closest, closest_parameters, covariance_of_unknowns, held_at_bound
 from fitting.infer.explain import Explained
-from fitting.infer.intervals import UNDETERMINED, UNEXPLAINED, Interval, linear_interval, profile_interval
+from fitting.infer.intervals import UNDETERMINED, UNEXPLAINED, Interval, Unknown, linear_interval, profile_interval
 from fitting.infer.law import AtSpeeds, LawAt, containing, speed_range
 from fitting.infer.result import (
     Convergence,
@@ -167,20 +167,19 @@ def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
 def _profile_of(fitted: Fitted, name: str, error: float) -> Interval:
     """Return the profile interval of a parameter that is an unknown itself, whose standard error is given."""
     model, end = fitted.explained.model, fitted.explained.end
-    place = model.names.index(name)
-    here, least = float(end.theta[place]), -np.inf
-    if name in model.law.own:
-        value, unknown_of = float(model.law.value_of(name, here)), lambda value: model.law.unknown_of(name, value)
-        error = abs(float(model.law.value_of(name, here + 1e-6)) - value) / 1e-6 * error
-        least = _VANISHING * value if model.law.lasting else least
+    place, law, least = model.names.index(name), model.law, -np.inf
+    here = float(end.theta[place])
+    if name in law.own:
+        of_value, value = (lambda value: float(law.unknown_of(name, value))), lambda y: float(law.value_of(name, y))
+        least = _VANISHING * value(here) if law.lasting else least
     else:
         quantity = model.instrument[place - len(model.names) + len(model.instrument)]
-        value, error, unknown_of = float(quantity.at(here)), abs(quantity.slope(here)) * error, quantity.unknown
+        of_value, value = quantity.unknown, lambda y: float(quantity.at(y))
 
-    def rise(value: float) -> float:
-        return fitted.profile(fitted.explained, place, float(unknown_of(value))) - end.chi2
+    def rise(y: float) -> float:
+        return fitted.profile(fitted.explained, place, y) - end.chi2
 
-    return profile_interval(rise, parameter_called(name), value, error, least)
+    return profile_interval(rise, parameter_called(name), Unknown(here, error, of_value, value), least)
 
 
 def _rows_of(explained: Explained, table: AmplitudeTable | SeveralTables) -> FittedRows:
