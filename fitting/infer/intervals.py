@@ -63,8 +63,9 @@ def profile_interval(
     ends, reasons = [], []
     for last in (max(least, parameter.lowest), parameter.highest):
         far = unknown.of_value(last) - unknown.place
-        distance, reason = _end(lambda d, side=np.sign(far): rise(unknown.place + side * d), unknown.error, abs(far))
-        ends.append(None if distance is None else unknown.value(unknown.place + np.sign(far) * distance))
+        side = float(np.sign(far))
+        distance, reason = _end(rise, unknown, side, abs(far))
+        ends.append(None if distance is None else unknown.value(unknown.place + side * distance))
         reasons.append(reason)
     return _with_open_ends(parameter, ends, reasons, "profile")
 
@@ -81,13 +82,14 @@ def _with_open_ends(parameter: Parameter, ends: list[float | None], reasons: lis
     return Interval(ends[0], ends[1], "; ".join(said) or None, "limit" if None in ends else kind)
 
 
-def _end(rise: Callable[[float], float], error: float, most: float) -> tuple[float | None, str | None]:
-    """Return how far one end is, or why there is none: the root of sqrt(rise) = 1.96, nearly linear in the distance."""
+def _end(rise: Callable[[float], float], unknown: Unknown, side: float, most: float) -> tuple[float | None, str | None]:
+    """Return how far one end is, or why there is none: where sqrt(rise), nearly linear in the distance, is 1.96."""
+    error = unknown.error
     wanted = float(np.sqrt(CHI2_95))
     (low, below), (high, above) = (0.0, 0.0), (np.inf, np.inf)
     trial = min(wanted * error, most)
     for _ in range(_TRIALS):
-        root = float(np.sqrt(max(rise(trial), 0.0)))
+        root = float(np.sqrt(max(rise(unknown.place + side * trial), 0.0)))
         if abs(root - wanted) < _CLOSE * wanted:
             return trial, None
         if root < wanted:
