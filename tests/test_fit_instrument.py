@@ -130,3 +130,14 @@ def test_outliers_hardly_move_a_robust_fit_and_are_named(table, plain):
     assert robust.chi2 == pytest.approx(np.sum(residual**2) + pull**2, rel=1e-9)
     alone = fit(rows(spoilt, kept), model="law")
     np.testing.assert_allclose(values_of(robust), values_of(alone), rtol=1e-6)
+
+
+def test_as_many_outliers_as_may_be_do_not_hide_behind_the_rows_they_pull(table, plain):
+    """By plain least squares three rows in ten are beyond four errors here."""
+    amplitude, error = amplitudes_and_errors(table)
+    wrong = np.sort(np.random.default_rng(0).choice(table.rows, 8, replace=False))
+    amplitude[wrong] *= 1.5
+    result = fit(table_with(table, amplitude, error), model="law", robust=True)
+    assert result.valid
+    assert np.flatnonzero(result.rows.set_aside).tolist() == wrong.tolist()
+    assert np.all(np.abs(values_of(result) - values_of(plain)) < standard_errors_of(plain))

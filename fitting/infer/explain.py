@@ -37,7 +37,7 @@ _RECOVERIES = 2
 """How often laws around one that lacks measured orbits are looked at."""
 _DECIDED = 3
 """Round after which rows are no longer excluded or taken in."""
-_SOFT, OUTLIER, MOST_OUTLIERS = 2.0, 4.0, 0.1
+ROBUST, OUTLIER, MOST_OUTLIERS = 2.0, 4.0, 0.1
 """Residual of a row from which a robust fit counts it linearly, that of an outlier, and their share at most."""
 _RUN_BY_CHANCE, _SHARE_PER_RUN, _LARGEST_SHARE = 2.2, 0.25, 1.0
 """Standard deviations of a run of residuals that mean nothing, share of the loss for each beyond, and the largest."""
@@ -130,7 +130,7 @@ def fit_lasting(model: Model, *, robust: bool = False) -> tuple[Explained, Expla
     """
     out = np.zeros(model.data.time.size, bool)
     formula = begun(model)
-    whole = freed(model, formula, out, (SMOOTH,), soft=_SOFT if robust else np.inf)
+    whole = freed(model, formula, out, (SMOOTH,), soft=ROBUST if robust else np.inf)
     if whole.refused:
         return whole, whole
     if robust:

@@ -15,7 +15,7 @@ import numpy as np
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from fitting.infer.explain import Explained, fit_lasting
+from fitting.infer.explain import ROBUST, Explained, fit_lasting
 from fitting.infer.instantaneous import fit_instantaneous, profile
 from fitting.infer.optimiser import OPTIMISER
 from fitting.infer.result import FitResult
@@ -26,9 +26,6 @@ from fitting.parameters import is_nuisance, model_parameters
 from fitting.predict.law import FormulaLaw
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, as_table
-
-ROBUST = 2.0
-"""Residual in errors from which a robust fit counts rows linearly while it looks for outliers."""
 
 
 @checked

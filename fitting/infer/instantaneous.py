@@ -16,7 +16,7 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.law_table import coordinate_of
 from afm_jax.least_squares import Box, Searches, descended
 from afm_jax.solve.lanes import compiled_quickly, filled
-from fitting.infer.explain import MOST_OUTLIERS, OUTLIER, Explained
+from fitting.infer.explain import MOST_OUTLIERS, OUTLIER, ROBUST, Explained
 from fitting.infer.optimiser import Minimised, minimised
 from fitting.infer.rows import Weights, plain_weights
 from fitting.infer.search import CENSORED, Descent, Found, starts
@@ -113,6 +113,8 @@ class Chi2(NamedTuple):
 
     model: Model
     weights: Weights
+    soft: float = np.inf
+    """Residual of a row from which it counts linearly."""
 
     def at(
         self, theta: Float[np.ndarray, " k"], *, slopes: bool = True
@@ -121,10 +123,16 @@ class Chi2(NamedTuple):
         (mean, strength), data = self.model.prior, self.model.data
         seen, along = evaluated(self.model, theta, slopes=slopes)
         off = np.where(self.weights.used, seen.readings - data.read, 0.0)
-        white = np.einsum("nij,nj->ni", self.weights.whitening, off).ravel()
+        white = np.einsum("nij,nj->ni", self.weights.whitening, off)
+        slope = np.einsum("nij,njk->nik", self.weights.whitening, np.nan_to_num(along))
+        # rows count 2 s^2 (sqrt(1 + x^2/s^2) - 1), of which these residuals are the roots
+        bent = np.sqrt(1.0 + np.sum(white**2, axis=1) / self.soft**2)[:, None]
+        part = white / (2.0 * self.soft**2 * bent * (1.0 + bent))
+        slope = slope - part[:, :, None] * np.einsum("ni,nik->nk", white, slope)[:, None]
+        share = np.sqrt(2.0 / (1.0 + bent))
+        white, slope = (share * white).ravel(), (share[:, :, None] * slope).reshape(white.size, -1)
         unseen = np.where(data.no_orbit & (seen.orbits > 0), CENSORED, 0.0)
         residual = np.concatenate([white, unseen, strength * (theta - mean)])
-        slope = np.einsum("nij,njk->nik", self.weights.whitening, np.nan_to_num(along)).reshape(white.size, -1)
         return seen, residual, np.concatenate([slope, np.zeros((unseen.size, theta.size)), np.diag(strength)])
 
     def minimised(self, start: Float[np.ndarray, " k"]) -> Minimised:
@@ -198,7 +206,7 @@ def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained,
         robust: find outliers, and leave them out.
     """
     out = np.zeros(model.data.time.size, bool)
-    chi2 = Chi2(model, plain_weights(model.data, 0.0, out))
+    chi2 = Chi2(model, plain_weights(model.data, 0.0, out), ROBUST if robust else np.inf)
     points = starts(model, STARTS)
     with np.errstate(all="ignore"):
         cost = [_softened(chi2.at(point, slopes=False)[1]) for point in points]
@@ -209,7 +217,8 @@ def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained,
         with np.errstate(invalid="ignore"):
             off = (explained.end.orbits.readings - model.data.read) / model.data.error
         far = np.nan_to_num(np.abs(off)).max(axis=1) > OUTLIER
-        if (far == out).all() or far.sum() > max(1.0, MOST_OUTLIERS * model.data.measured.any(axis=1).sum()):
+        same = np.isinf(chi2.soft) and (far == out).all()
+        if same or far.sum() > max(1.0, MOST_OUTLIERS * model.data.measured.any(axis=1).sum()):
             break
         chi2, out = Chi2(model, plain_weights(model.data, 0.0, far)), far
         explained = chi2.explained(chi2.descended(explained.end.theta))

@@ -63,7 +63,7 @@ def plain_weights(data: Data, extra: float, out: Bool[np.ndarray, " rows"]) -> W
     size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(used), 1), np.rad2deg(1.0))], axis=1)
     error = np.where(used, np.hypot(data.error, extra * size), np.inf)
     whitening = np.eye(READINGS) / np.where(used, error, np.inf)[:, None]
-    return Weights(whitening, used, np.zeros(len(used)), np.full(len(used), "", dtype=object))
+    return Weights(whitening, used, np.zeros(len(used)), np.where(out, OUTLIER_LEFT_OUT, "").astype(object))
 
 
 def weights_of(
