@@ -41,7 +41,7 @@ def linear_interval(parameter: Parameter, value: float, error: float) -> Interva
 
 
 class Unknown(NamedTuple):
-    """What stands for a parameter in a fit: where it is, its standard error, and the two ways between it and a value."""
+    """What stands for a parameter in a fit: where it is, its standard error, and the ways between it and a value."""
 
     place: float
     error: float
