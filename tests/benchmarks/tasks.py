@@ -81,8 +81,8 @@ def collisions(tips: int, slopes: str = "", **how: Any) -> Work:
         "forward": lambda contact, speeds: jax.jvp(lambda moved: outputs(moved, speeds), (contact,), (ones,))[1],
         "reverse": jax.grad(total, argnums=(0, 1)),
     }
-    # slower than 13 nm/us a tip is close to capture, where slopes are large
-    program = jax.jit(functions[slopes])
+    # as users call it: a batch by itself, its derivatives compiled; slower than 13 nm/us slopes are large
+    program = jax.jit(functions[slopes]) if slopes else outputs
     return Work(lambda: jax.block_until_ready(program(contact, speeds + (5.0 if slopes else 0.0))), tips)
 
 
