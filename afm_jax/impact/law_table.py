@@ -16,6 +16,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.impact.law import BRIDGE_NM, HertzContact, Impact, Speeds
 
+AnyArray = Array | np.ndarray
+"""NumPy's outside of compiled programs."""
 KNOTS = 97
 _SCALE, _FASTEST = 3.0, 2e4
 """Speed in nm/us from which knots stand at equal ratios, and speed v of the last one."""
@@ -55,15 +57,15 @@ class LawTable(Impact):
         length_nm: length over which a leaving tip keeps its energy.
     """
 
-    capture: Float[Array, "..."]
-    kept: Float[Array, "..."]
-    loss: Float[Array, "... 2 knots"]
-    time: Float[Array, "... 2 knots"]
-    hertz: Float[Array, "..."]
-    lead_nm: Float[Array, "..."]
-    offset_nm: Float[Array, "..."]
-    lead_square: Float[Array, "..."]
-    length_nm: Float[Array, "..."]
+    capture: Float[AnyArray, "..."]
+    kept: Float[AnyArray, "..."]
+    loss: Float[AnyArray, "... 2 knots"]
+    time: Float[AnyArray, "... 2 knots"]
+    hertz: Float[AnyArray, "..."]
+    lead_nm: Float[AnyArray, "..."]
+    offset_nm: Float[AnyArray, "..."]
+    lead_square: Float[AnyArray, "..."]
+    length_nm: Float[AnyArray, "..."]
 
     @property
     def lowest(self) -> Float[Array, ""]:
@@ -83,8 +85,8 @@ class LawTable(Impact):
         """Return the speeds with a change of w^2 in nm^2/us^2 and one of the delay in us."""
         excess = _SCALE * jnp.sinh(_STEP * coordinate)
         approach = jnp.sqrt(self.capture**2 + excess**2)
-        left = jnp.clip(jnp.floor(lax.stop_gradient(coordinate)), 0, KNOTS - 2).astype(int)
-        x = coordinate - left
+        below = jnp.clip(jnp.floor(lax.stop_gradient(coordinate)), 0.0, KNOTS - 2.0)
+        left, x = below.astype(int), coordinate - below
         to_right = x * x * (3.0 - 2.0 * x)
         ends = jnp.stack([1.0 - to_right, x * (1.0 - x) ** 2, to_right, -x * x * (1.0 - x)])
 

@@ -114,8 +114,7 @@ def evaluated(
         by_numbers = np.asarray(_slopes(*there, seen.coordinate, group.drive))[: group.some.size]
         by_numbers = np.where(exists, by_numbers, 0.0)
         for i, name in enumerate(law.names):
-            change = -0.5 / max(values["r"], 1e-9) if name == "r" else 1.0
-            along[group.some, :, i] = by_numbers[:, :, _LAW.index(name)] * change
+            along[group.some, :, i] = by_numbers[:, :, _LAW.index(name)] * law.slope_of(name, theta[i])
         orbits_slopes[group.some, :, COUNT - 6 :] = by_numbers[:, :, 3:]
     whole = jax.tree.map(lambda *columns: np.zeros((count, *columns[0].shape[1:]), columns[0].dtype), *[p for _, p in parts])
     for some, part in parts:
@@ -252,18 +251,24 @@ def explained_at(chi2: _Chi2, end: Searches) -> Explained:
     """Return the rows as a law explains them."""
     model, theta = chi2.model, end.place[0]
     seen, residual, jacobian = chi2.at(theta)
+    orbits = orbits_of(model, theta, seen)
+    descent = Descent(theta, orbits, float(end.chi2[0]), residual, jacobian)
+    return Explained(model, descent, chi2.weights, Found(orbits, seen.orbits), 0.0, settled=True)
+
+
+def orbits_of(model: Model, theta: Float[np.ndarray, " k"], seen: Seen) -> Orbits:
+    """Return the orbits of rows as of impacts that last; of their slopes nothing."""
     count, exists = model.data.time.size, seen.orbits > 0
-    capture = model.law.capture(theta[: len(model.law.names)])
+    capture = model.law.capture(model.of_law(theta))
     x = np.full((count, 3), np.nan)
     x[exists, 0] = np.nan_to_num(coordinate_of(seen.approach[exists], capture))
+    x[exists, 1:] = np.stack([seen.phase[exists], np.zeros(exists.sum())], axis=1)
     nothing = np.zeros(count)
-    law = model.law.at(theta[: len(model.law.names)], np.where(exists, np.nan_to_num(seen.approach, nan=1.0), 1.0))
-    orbits = Orbits(
+    law = model.law.at(model.of_law(theta), np.where(exists, np.nan_to_num(seen.approach, nan=1.0), 1.0))
+    return Orbits(
         x, exists, exists, seen.readings, np.zeros((count, 3, COUNT)), seen.approach,
         np.sqrt(np.maximum(law.square, 0.0)), nothing, nothing, np.where(seen.near_fold, 0.0, 1.0),
     )  # fmt: skip
-    descent = Descent(theta, orbits, float(end.chi2[0]), residual, jacobian)
-    return Explained(model, descent, chi2.weights, Found(orbits, seen.orbits), 0.0, settled=True)
 
 
 def profile_instantaneous(explained: Explained):

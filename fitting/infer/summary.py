@@ -31,6 +31,7 @@ from fitting.infer.rows import TOO_SLOW
 from fitting.infer.search import descend
 from fitting.models import Task
 from fitting.predict.law import FormulaLaw
+from fitting.predict.orbit import NEAR_FOLD
 from fitting.parameters import (
     NUISANCE_NAMES,
     PARAMETERS,
@@ -143,12 +144,8 @@ def closest_parameters(explained: Explained, own: tuple[str, ...], fixed: Mappin
         held = _held(explained)
         places = [model.names.index(name) for name in own]
         unknowns = np.array([theta[i] for i in places])
-        step = 1e-6
         values = np.array([float(known.value_of(name, y)) for name, y in zip(own, unknowns, strict=True)])
-        slope = [
-            (float(known.value_of(name, y + step)) - float(known.value_of(name, y - step))) / (2.0 * step)
-            for name, y in zip(own, unknowns, strict=True)
-        ]
+        slope = [known.slope_of(name, y) for name, y in zip(own, unknowns, strict=True)]
         factor = np.array(slope)[:, None] * root[places]
         vanishes = tuple(bool(held[i]) for i in places)
     first = len(model.names) - len(model.instrument)
@@ -383,14 +380,13 @@ def _rows_of(fitted: Fitted, table: AmplitudeTable | SeveralTables, read: np.nda
         set_aside=(reasons != "").astype(bool),
         approach_speed_nm_per_us=np.where(exists & ~data.row.free, orbits.approach, np.nan),
         orbits=found.count,
-        near_fold=exists & (np.abs(orbits.fold) < _NEAR_FOLD) & ~data.row.free,
+        near_fold=exists & (np.abs(orbits.fold) < NEAR_FOLD) & ~data.row.free,
         reasons=tuple(reasons.tolist()),
         **phases,
     )
 
 
 ATTRACTED = "none: the sample only draws the tip"
-_NEAR_FOLD = 1e-3
 
 
 def _padded(read: np.ndarray) -> np.ndarray:

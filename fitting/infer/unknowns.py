@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from afm_jax.impact.law_table import LawTable
 from fitting.models import Task
@@ -22,6 +22,8 @@ from fitting.predict.orbit import COUNT, READINGS, Local, Orbits, Row, followed,
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
+_UNDAMPED = 1e15
+"""Quality factor of no air damping: by an infinite one there is no derivative."""
 REMAINDERS = 7
 """Leading terms that the corrections of impacts that last leave out."""
 
@@ -58,7 +60,7 @@ class Data:
         time: from -1/2 to 1/2 where a table's rows stand in order of time, else 0.
         number: of the row's table.
         drives: what is driven in each table.
-        free_frequency_khz, quality_factor: as each row's table gives them; infinite Q: no air damping.
+        free_frequency_khz, quality_factor: as each row's table gives them; `_UNDAMPED`: no air damping.
         mass_ng: of the tip.
     """
 
@@ -67,7 +69,7 @@ class Data:
     error: Float[np.ndarray, "rows 3"]
     no_orbit: Bool[np.ndarray, " rows"]
     time: Float[np.ndarray, " rows"]
-    number: Float[np.ndarray, " rows"]
+    number: Int[np.ndarray, " rows"]
     drives: tuple[str, ...]
     free_frequency_khz: Float[np.ndarray, " rows"]
     quality_factor: Float[np.ndarray, " rows"]
@@ -105,7 +107,7 @@ def data_of(table: AmplitudeTable | SeveralTables, task: Task) -> Data:
     number = np.zeros(count, int) if rows.table is None else np.asarray(rows.table)[:count]
     joint = task.measurement.joint
     levers = (task.measurement.cantilever,) if joint is None else joint.cantilevers
-    quality = [np.inf if lever.quality_factor is None else float(lever.quality_factor) for lever in levers]
+    quality = [_UNDAMPED if lever.quality_factor is None else float(lever.quality_factor) for lever in levers]
     return Data(
         row=Row(
             *(np.asarray(getattr(rows, name), float)[:count] for name in Row._fields[:4]),

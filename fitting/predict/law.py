@@ -14,7 +14,7 @@ for there it may vanish); of the delay ln a, b and d.
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -65,11 +65,19 @@ class LawAt(NamedTuple):
     time_slope: Float[np.ndarray, "n k"]
 
 
+@runtime_checkable
 class LawModel(Protocol):
     """What a fit asks of its law; `theta` are the values of its unknowns, in the order of `names`."""
 
-    names: tuple[str, ...]
-    length_nm: float
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The unknowns."""
+        ...
+
+    @property
+    def length_nm(self) -> float:
+        """Length over which a leaving tip keeps its energy."""
+        ...
 
     def at(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> LawAt:
         """Return the law at approach speeds in nm/us."""
@@ -120,6 +128,12 @@ class FormulaLaw:
         if name == "r":
             return 1.0 - value**2
         return np.log(value) if self._logarithmic(name) else value
+
+    def slope_of(self, name: str, unknown: float) -> float:
+        """Return d value/d unknown of a parameter."""
+        if name == "r":
+            return -0.5 / self.value_of(name, min(unknown, _MOST_LOST))
+        return self.value_of(name, unknown) if self._logarithmic(name) else 1.0
 
     def _logarithmic(self, name: str) -> bool:
         return self.lasting and name in ("epsilon", "delay_hertz")
