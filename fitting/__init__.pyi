@@ -15,7 +15,7 @@ from fitting.experiments.prior import Prior as Prior
 from fitting.experiments.prior import prior_of_values as prior_of_values
 from fitting.fits.comparison import Comparison as Comparison
 from fitting.fits.comparison import compare as compare
-from fitting.fits.fit import fit as fit
+from fitting.infer.fit import fit as fit
 from fitting.fits.result import FitResult as FitResult
 from fitting.gradients import AmplitudeGradients as AmplitudeGradients
 from fitting.gradients import amplitude_gradients as amplitude_gradients

@@ -12,7 +12,7 @@ from fitting.fits.estimate import Found
 from fitting.fits.fit import find_fit, summarise
 from fitting.fits.result import FitResult
 from fitting.report.report import summary, write_report
-from fitting.sampling.posterior import posterior, require_blackjax
+from fitting.sampling.posterior import posterior, require_blackjax, sampled_by_gaussian
 from fitting.tables.several import SeveralTables
 
 
@@ -26,7 +26,7 @@ def fit(
     **options: Any,
 ) -> Output:
     """Return the fit of one law to tables, with what was asked for besides."""
-    if options["posterior"]:
+    if options["posterior"] and not sampled_by_gaussian(model):
         require_blackjax()
     read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))

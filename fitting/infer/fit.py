@@ -21,7 +21,7 @@ from fitting.infer.instantaneous import fit_instantaneous, profile_instantaneous
 from fitting.infer.optimiser import OPTIMISER
 from fitting.infer.summary import Fitted, convergence_of, profile_lasting, summary_of
 from fitting.infer.unknowns import Model, data_of, quantities_of
-from fitting.models import Task, held_of, readings_of, split_held, task_of
+from fitting.models import Held, Task, held_of, readings_of, split_held, task_of
 from fitting.parameters import is_nuisance, model_parameters
 from fitting.predict.law import FormulaLaw
 from fitting.tables.several import SeveralTables
@@ -167,6 +167,17 @@ def _fitted(model: Model, task: Task, settings: dict[str, Any], scale_errors: bo
         explained, before, other, profile, convergence_of(explained, optimiser, steps),
         settings | {"error_scale": total}, total, robust,
     )  # fmt: skip
+
+
+def explained_of(result: FitResult) -> Explained:
+    """Return the minimum of a fit with all its unknowns, which its result does not keep: found again by its settings."""
+    table, settings = result.table, result.settings
+    names = ("free", "fixed", "constraints")
+    options = {name: settings[name] for name in names} | {"effects": settings["effects"] or EFFECTS}
+    task = task_of(table, result.model, **options)
+    begin = model_of(table, task, settings | {"held": tuple(Held(*one) for one in settings["held"])})
+    begin = with_scaled_errors(begin, settings["error_scale"] or 1.0)
+    return _minimum(begin, task.problem.lasting, settings["robust"] is not None)[0]
 
 
 def _minimum(model: Model, lasting: bool, robust: bool):
