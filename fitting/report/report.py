@@ -145,7 +145,9 @@ def _sampled(posterior: Posterior) -> ReportSection:
     said = "95 % credible intervals (posterior, flat priors):"
     if posterior.method == "gaussian":
         worth = posterior.chains.effective_samples[0]
-        said = f"95 % intervals of samples of the Gaussian around the fit (of 120, weighted to chi2, {worth:.0f} count):"
+        said = (
+            f"95 % intervals of samples of the Gaussian around the fit (of 120, weighted to chi2, {worth:.0f} count):"
+        )
     wrong = [f"Not converged: {reason}" for reason in posterior.reasons]
     return ReportSection("Posterior", [Text(said), Table("By parameter", head, rows), Bullets(wrong)])
 
