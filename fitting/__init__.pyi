@@ -13,12 +13,12 @@ from fitting.experiments.design import Design as Design
 from fitting.experiments.design import design as design
 from fitting.experiments.prior import Prior as Prior
 from fitting.experiments.prior import prior_of_values as prior_of_values
-from fitting.fits.comparison import Comparison as Comparison
-from fitting.fits.comparison import compare as compare
-from fitting.infer.fit import fit as fit
-from fitting.fits.result import FitResult as FitResult
 from fitting.gradients import AmplitudeGradients as AmplitudeGradients
 from fitting.gradients import amplitude_gradients as amplitude_gradients
+from fitting.infer.comparison import Comparison as Comparison
+from fitting.infer.comparison import compare as compare
+from fitting.infer.fit import fit as fit
+from fitting.infer.result import FitResult as FitResult
 from fitting.instruments.curve import MeasuredCurve as MeasuredCurve
 from fitting.instruments.curve import read_curve as read_curve
 from fitting.instruments.curve import read_curves as read_curves

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.infer.explain import Explained
-from fitting.infer.instantaneous import _Chi2, evaluated, explained_at
+from fitting.infer.instantaneous import Chi2, evaluated
 from fitting.infer.search import Followed, descend
 from fitting.infer.unknowns import _FACTORS
 
@@ -58,8 +58,8 @@ def refitted(explained: Explained) -> Explained:
     if law.lasting:
         end = descend(explained.model, explained.end.theta, explained.end.orbits, explained.weights)
         return replace(explained, end=end)
-    chi2 = _Chi2(explained.model, explained.weights)
-    return explained_at(chi2, chi2.descended(explained.end.theta))
+    chi2 = Chi2(explained.model, explained.weights)
+    return chi2.explained(chi2.descended(explained.end.theta))
 
 
 def fit_data_sets(explained: Explained, data: DataSets) -> list[Explained]:
@@ -73,7 +73,7 @@ def chi2_of(explained: Explained, theta: Float[np.ndarray, "draws k"]) -> Float[
     if law.lasting:
         rows = Followed(explained.model, explained.end.theta, explained.end.orbits, explained.weights, np.inf)
         return np.array([rows.sum(one).value for one in theta])
-    chi2 = _Chi2(explained.model, explained.weights)
+    chi2 = Chi2(explained.model, explained.weights)
     return np.array([np.sum(chi2.at(one, slopes=False)[1] ** 2) for one in theta])
 
 

@@ -19,18 +19,22 @@ import dataclasses
 import sys
 import tempfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from fitting.fits.fit import find_fit, fit, summarise
-from fitting.fits.intervals import at_bound, covariance
-from fitting.fits.law_after import ModelLaw
-from fitting.fits.result import FittedLaw, law_with_band
+from afm_jax.units import TWO_SIDED_95
+from fitting.infer.explain import Explained
+from fitting.infer.fit import fit, model_of
+from fitting.infer.law import AtSpeeds
+from fitting.infer.result import FittedLaw
+from fitting.infer.rows import weights_of
+from fitting.infer.search import begun, orbits_at
+from fitting.models import task_of
 from fitting.simulated.experiment import with_noise
 from fitting.tables.table import AmplitudeTable
 from tests.contact_truths import ERROR_OF_Q, ContactTruth, contact_truth, exact_table
@@ -78,15 +82,8 @@ def noisy(exact: AmplitudeTable, noise: float, random: np.random.Generator) -> A
 
 def measured(truth: ContactTruth, table: AmplitudeTable, model: str) -> Measured:
     """Return what a fit of a table amounts to."""
-    found = find_fit(table, model)
-    result = summarise(table, found)
-    values = found.objective.problem.values(found.minimum.coordinates)
-    objective = found.objective.following(values)
-    own = covariance(objective, values, ~at_bound(objective, values))
+    result = fit(table, model)
     used = np.where(result.rows.used, result.rows.approach_speed_nm_per_us, np.nan)
-    law = ModelLaw(objective.problem, objective.measurement, values, own)
-    formula = objective.problem.law(jnp.asarray(values), objective.measurement.fixed)
-    word = law_with_band(law.at, used, lasting=objective.problem.lasting, formula=formula)
     if not (result.valid and np.isfinite(used).any()):
         return Measured(truth.number, False, *(np.full(5, np.nan).tolist()))  # noqa: FBT003
     speeds = np.geomspace(max(SLOWEST, np.nanmin(used)), min(FASTEST, np.nanmax(used)), _SPEEDS)
@@ -100,10 +97,23 @@ def measured(truth: ContactTruth, table: AmplitudeTable, model: str) -> Measured
         valid=True,
         coverage=float(np.mean(z <= 1.0)),
         worst_z=float(z.max()),
-        growth=float(np.median(half / law_at(word, speeds)[1])),
+        growth=float(np.median(half / half_width_at_its_word(table, model)(speeds))),
         error=float(np.median(np.abs(fitted / right - 1.0))),
         per_degree=result.chi2 / result.degrees_of_freedom,
     )
+
+
+def half_width_at_its_word(table: AmplitudeTable, model: str) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the half-width of the band of the formula alone, taken at its word, at approach speeds."""
+    task = task_of(table, model)
+    whole = model_of(table, task, {"fixed": {}, "held": ()})
+    end = begun(whole)
+    nothing = np.zeros(table.rows, bool)
+    alone = Explained(
+        whole, end, weights_of(whole, end.theta, end.orbits, nothing), orbits_at(whole, end.theta), 0.0, settled=True
+    )
+    at: AtSpeeds = alone.law_at
+    return lambda speeds: TWO_SIDED_95 * np.linalg.norm(at(speeds).factor[0], axis=1)
 
 
 INTERVALS = 0.9, 0.98

@@ -25,9 +25,9 @@ from jaxtyping import Float
 
 import fitting.examples
 from fitting import FitResult, fit, posterior, read_table
-from fitting.fits.law_after import root_of
 from fitting.infer.explain import Explained
 from fitting.infer.fit import explained_of
+from fitting.infer.law import root_of
 from fitting.infer.summary import convergence_of
 from fitting.sampling.posterior import sampled_by_gaussian
 from tests.batched_refit import chi2_of, noise_of, readings_of, refitted, unknowns_of, with_data
@@ -152,10 +152,8 @@ def _posterior(
     root, law = root_of(found.covariance), found.model.law
     z = random.normal(size=(DRAWS, root.shape[1]))
     drawn = found.end.theta + z @ root.T
-    lost = np.zeros(DRAWS, bool)
-    if not law.lasting:  # pyright: ignore[reportAttributeAccessIssue]
-        # losses, which are not negative
-        lost = (drawn[:, : len(law.names)] < 0.0).any(axis=1)
+    # losses of an instantaneous law are not negative
+    lost = np.any(drawn[:, : 0 if law.lasting else len(law.own)] < 0.0, axis=1)
     chi2 = chi2_of(found, np.where(lost[:, None], found.end.theta, drawn))
     raw = np.where(lost | ~np.isfinite(chi2), -np.inf, -0.5 * chi2 + 0.5 * np.sum(z**2, axis=1))
     with_chi2 = np.append(drawn, chi2[:, None], axis=1)

@@ -18,9 +18,10 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting import fit
-from fitting.fits.objective import Objective
-from fitting.fits.result import FitResult, FittedParameter, WithInterval
-from fitting.models import measurement_of, problem_of
+from fitting.infer.result import FitResult, FittedParameter, WithInterval
+from fitting.infer.fit import model_of
+from fitting.infer.unknowns import Model
+from fitting.models import task_of
 from fitting.tables.table import AmplitudeTable, read_table
 
 EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
@@ -51,10 +52,10 @@ def law() -> FitResult:
 
 
 @pytest.fixture(scope="session")
-def objective() -> Objective:
-    """Its chi2 by the law; tests only ask it."""
-    problem = problem_of(example_amplitudes(), "law")
-    return Objective(measurement_of(example_amplitudes(), problem), problem)
+def model() -> Model:
+    """What is unknown of it by the law; tests only ask it."""
+    whole = example_amplitudes()
+    return model_of(whole, task_of(whole, "law"), {"fixed": {}, "held": ()})
 
 
 @cache
@@ -134,6 +135,16 @@ def steady_amplitudes(table: AmplitudeTable, law: ImpactLaw, quality_factor: flo
     assert table.free_frequency_khz == 90.0
     drives = (table.order, table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
     return steady_readings(drives, law, quality_factor)[:, :2]
+
+
+def chi2_residuals(table: AmplitudeTable, r: float, epsilon: float, quality_factor: float) -> np.ndarray:
+    """Return (amplitude - read)/error of a table by the paper's map, amplitudes without an orbit 0, and ln Q's own."""
+    amplitude, error = amplitudes_and_errors(table)
+    predicted = np.nan_to_num(steady_amplitudes(table, ImpactLaw(r, epsilon), quality_factor))
+    assert table.quality_factor is not None
+    assert table.quality_factor_error is not None
+    of_q = np.log(quality_factor / table.quality_factor) / (table.quality_factor_error / table.quality_factor)
+    return np.append(((predicted - amplitude) / error).ravel(), of_q)
 
 
 @jax.jit

@@ -11,22 +11,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
+from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.impact.orbits import steady_orbits
 from fitting import read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE
-from fitting.fits.result import FitResult
-from fitting.forward import orbit_problem
-from fitting.models import Problem, measurement_of
+from fitting.infer.result import FitResult
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import rows as some_rows
 from tests.fit_tables import with_amplitudes
 
 _TERMS = 96
 """Of series that hold a change of the loss a fifth of a decade wide."""
-_PROBLEM = Problem("contact", ())
 
 
 def drives() -> AmplitudeTable:
@@ -57,20 +57,23 @@ def bump(middle: float, height: float = 0.4, decades: float = 0.2) -> Callable[[
 
 def steady_amplitudes(table: AmplitudeTable, impact: TabulatedImpact) -> np.ndarray:
     """Return peak and lock-in amplitude (rows, 2) of the largest steady orbit of each row; NaN where there is none."""
-    found: Any = _orbits(measurement_of(table, _PROBLEM), impact)
-    steady, amplitude = np.asarray(found[0])[: table.rows], np.asarray(found[1])[: table.rows, :, :2]
+    columns = (table.order, table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
+    cantilever = Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng)
+    found: Any = _orbits(cantilever, impact, *(jnp.asarray(column, float) for column in columns))
+    steady, amplitude = np.asarray(found[0]), np.asarray(found[1])[:, :, :2]
     size = np.where(steady, amplitude[:, :, 0], -np.inf)
     found = amplitude[np.arange(table.rows), np.argmax(size, axis=1)]
     return np.where(np.any(steady, axis=1, keepdims=True), found, np.nan)
 
 
 @jax.jit
-def _orbits(measurement, impact):
-    def one(row):
-        found = steady_orbits(orbit_problem(jnp.zeros(0), impact, row, measurement, _PROBLEM))
+def _orbits(cantilever, impact, *drives):
+    def one(order, frequency_khz, amplitude_nm, offset_nm):
+        platform = Platform(amplitude_nm, frequency_khz, offset_nm)
+        found = steady_orbits(OrbitProblem(cantilever, platform, impact, order))
         return found.steady, found.amplitude_nm
 
-    return jax.vmap(one)(measurement.rows)
+    return jax.vmap(one)(*drives)
 
 
 def measured(table: AmplitudeTable, exact: np.ndarray, noise: float, seed: int) -> AmplitudeTable:

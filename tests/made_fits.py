@@ -7,8 +7,7 @@ import numpy as np
 
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.units import TWO_SIDED_95
-from fitting.fits.intervals import Convergence
-from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
+from fitting.infer.result import Convergence, FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, PARAMETERS
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import amplitudes_and_errors, table_of
@@ -49,7 +48,7 @@ def made_fit(model: str, *, width: float = 1e-3, table: AmplitudeTable | None = 
         warnings=[],
         law=made_law(names, width=width, lasting="+" in model or model == "contact"),
         rows=made_rows(table),
-        convergence=Convergence(True, 1e-6, [1.0] * size, 1e-12, True),  # noqa: FBT003
+        convergence=Convergence(True, "optax.lbfgs 0.2", 20, 1e-6, 1e-12),  # noqa: FBT003
         table=table,
         settings={"model": model, "error_scale": None, "constraints": {"quality_factor": (40.0, 0.4)}},
         versions={"afm-jax": "0.0"},
@@ -68,6 +67,7 @@ def made_parameter(name: str, value: float, **changes: Any) -> FittedParameter:
         standard_error=error,
         interval95=interval,
         interval_reason="lower end: reaches the end of its range, 0" if bound else None,
+        interval_kind="limit" if bound else "profile",
         undetermined=False,
         at_bound=bound,
         constraint=None,

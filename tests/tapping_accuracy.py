@@ -27,8 +27,8 @@ from afm_jax.apparatus.surface import detected
 from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
-from fitting.fits.fit import fit
-from fitting.fits.result import FitResult
+from fitting.infer.fit import fit
+from fitting.infer.result import FitResult
 from fitting.report.words import interval_in_words
 from fitting.simulated.experiment import with_noise
 from fitting.tables.table import AmplitudeTable

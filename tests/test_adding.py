@@ -50,7 +50,7 @@ DELAY = {
         '"delay_offset_nm": 0.726{ => , "delay_late_nm2_per_us": 0.0}',
         "- delay_offset_nm/u_in{ =>  + delay_late_nm2_per_us/u_in^2}",
     ],
-    "fitting/fits/law_after.py": [
+    "fitting/infer/law.py": [
         '{ =>     "delay_late_nm2_per_us": lambda u, w: 1.0 / u**2,\n}    "delay_offset_nm": lambda'
     ],
 }

@@ -5,10 +5,10 @@ import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit
-from fitting.fits.result import FitResult
+from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained
 from fitting.infer.fit import explained_of
-from fitting.infer.summary import closest_parameters
+from fitting.infer.result import FitResult
 from tests.batched_refit import chi2_of, draw_data, fit_data_sets, refitted
 from tests.fit_tables import (
     example_amplitudes,

@@ -8,7 +8,7 @@ import pytest
 
 from afm_jax.contact.parameters import PAPER
 from fitting import fit
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.parameters import CONTACT_DEFAULT
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import amplitudes_and_errors, rows, with_amplitudes

@@ -6,9 +6,9 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from fitting.fits import comparison
-from fitting.fits.comparison import compare
-from fitting.fits.fit import find_fit, summarise
+from fitting.infer import comparison
+from fitting.infer.comparison import compare
+from fitting.infer.fit import find_fit, summarise
 from tests.fit_tables import EXAMPLE, table
 from tests.strict_reading import strictly
 

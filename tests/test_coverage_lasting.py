@@ -4,7 +4,7 @@ The truth is the fitted model itself: what is proved is the fit and its errors, 
 of all experiments, and of the instantaneous law profile intervals for two hundred of them.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -14,11 +14,11 @@ import fitting.examples
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.units import TWO_SIDED_95
 from fitting import fit, read_table
+from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained
 from fitting.infer.fit import explained_of
-from fitting.infer.instantaneous import profile_instantaneous
-from fitting.infer.intervals import profile_interval
-from fitting.infer.summary import closest_parameters, convergence_of
+from fitting.infer.instantaneous import profile
+from fitting.infer.summary import Fitted, convergence_of, intervals_of
 from tests.batched_refit import draw_data, fit_data_sets
 from tests.fit_tables import example_amplitudes, rows, simulated
 
@@ -84,9 +84,8 @@ def test_linear_intervals_cover_the_truth_and_pulls_have_mean_0_and_width_1(expe
 
 
 def test_bands_cover_the_true_law(experiments):
-    law: Any = experiments.truth.model.law
     pulls = experiments.pulls_of_law()
-    check(pulls if law.lasting else pulls[:, 0])
+    check(pulls if experiments.truth.model.law.lasting else pulls[:, 0])
 
 
 def test_chi2_is_distributed_as_such(experiments):
@@ -98,22 +97,16 @@ def test_chi2_is_distributed_as_such(experiments):
 
 
 def test_profile_intervals_cover_the_truth(experiments):
-    truth: Any = experiments.truth
-    if truth.model.law.lasting:
-        pytest.skip("two hundred profiles of a lasting model take minutes")
-    ends = np.array([[0.0, 1.0 - 1e-4], [0.0, np.inf], [-np.inf, np.inf]])
-    covered = np.zeros(len(ends), dtype=int)
+    if experiments.truth.model.law.lasting:
+        pytest.skip("intervals are linear where impacts last")
+    true = closest_parameters(experiments.truth, experiments.own, {}).values
+    covered = np.zeros(len(true), dtype=int)
     for one in experiments.fits[:PROFILED]:
-        profile, errors = profile_instantaneous(one), np.sqrt(np.diag(one.covariance))
-        for i, (value, error) in enumerate(zip(one.end.theta.tolist(), errors.tolist(), strict=True)):
-
-            def rise(y: float, i=i, profile=profile, least=one.end.chi2) -> float:
-                return profile(i, y) - least
-
-            interval = profile_interval(rise, value, error, *ends[i])
+        fitted = Fitted(one, one, None, profile, convergence_of(one, "", 0))
+        for i, interval in enumerate(intervals_of(fitted, closest_parameters(one, experiments.own, {}))):
             low = -np.inf if interval.low is None else interval.low
             high = np.inf if interval.high is None else interval.high
-            covered[i] += low <= truth.end.theta[i] <= high
+            covered[i] += low <= true[i] <= high
     # once in ten thousand of right intervals would lie outside on either side
     limits = binom.ppf(1e-4, PROFILED, 0.95), binom.ppf(1.0 - 1e-4, PROFILED, 0.95)
     assert np.all((limits[0] <= covered) & (covered <= limits[1])), covered

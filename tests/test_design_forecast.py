@@ -1,5 +1,6 @@
 """Forecasts that come true: synthetic experiments at the designed points, each fitted, scatter as was forecast."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,11 @@ from scipy.stats import chi2, kstest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from fitting import design, drive_grid, fit, prior_of_values, simulate_experiment
-from fitting.experiments.candidates import standard_errors
+from fitting.experiments.candidates import model_of, standard_errors
 from fitting.experiments.design import Design
-from fitting.fits.objective import BATCH, Objective
-from fitting.models import measurement_of
-from fitting.tables.table import AmplitudeTable
+from fitting.infer.rows import weights_of
+from fitting.infer.search import orbits_at
+from fitting.infer.unknowns import Data
 from tests.fit_tables import table_of
 
 pytestmark = pytest.mark.slow
@@ -52,53 +53,57 @@ def by_noise(result: Design) -> np.ndarray:
     return standard_errors(information_of(result))
 
 
-def exact_table(result: Design) -> AmplitudeTable:
-    """Return the readings that the prior expects at the points, without noise."""
-    drives, chosen = result.drives, result.chosen
-    amplitude, error = result.candidates.amplitude_nm[chosen], result.candidates.error_nm[chosen]
-    if not result.prior.problem.tapping:
-        return table_of(drives, amplitude, error, quality_factor_error=0.4)
-    return AmplitudeTable(
-        drive="force",
-        drive_frequency_khz=drives.frequency_khz,
-        free_amplitude_nm=drives.amplitude_nm,
-        offset_nm=drives.offset_nm,
-        free_frequency_khz=90.0,
-        quality_factor=KNOWN["quality_factor"][0],
-        quality_factor_error=KNOWN["quality_factor"][1],
-        mass_ng=16.81,
-        calibration={name: KNOWN[name] for name in ("tip_calibration", "phase_zero_deg")},
-        lockin_amplitude_nm=amplitude[:, 1],
-        lockin_amplitude_error_nm=error[:, 1],
-        phase_lag_deg=amplitude[:, 2],
-        phase_lag_error_deg=error[:, 2],
-    )
-
-
 @pytest.fixture(scope="module")
 def refitted(designed) -> np.ndarray:
     """The values (experiments, p) that Gauss-Newton steps find for data with noise, Q measured anew each time."""
     prior, errors = designed.prior, by_noise(designed)
-    searching = Objective(measurement_of(exact_table(designed), prior.problem), prior.problem)
-    objective = searching.following(prior.values)
-    random = np.random.default_rng(11)
-    answers = []
-    for _ in range(EXPERIMENTS // BATCH):
-        values, step, noise = np.repeat(prior.values[None], BATCH, axis=0), np.zeros(0), np.zeros(0)
-        for count in range(STEPS):
-            linear = objective.at_values(values)
-            jacobian = np.asarray(linear.jacobian) * errors
-            if count == 0:
-                assert np.abs(linear.residual).max() < 1e-9
-                # of each reading and of the constraint; nothing where a padded row has no reading
-                noise = random.normal(size=linear.residual.shape) * jacobian.any(axis=2)
-            pairs = zip(jacobian, noise - linear.residual, strict=True)
-            step = np.array([np.linalg.lstsq(slopes, missing, rcond=None)[0] for slopes, missing in pairs])
-            values = values + errors * step
+    model, begin = model_of(prior, designed.drives, prior.values)
+    orbits = orbits_at(model, begin).orbits
+    model = replace(model, data=data_of_readings(designed, model.data, orbits.readings))
+    weights = weights_of(model, begin, orbits, np.zeros(len(designed.chosen), bool))
+    known = [model.names.index(name) for name in prior.problem.names if name in KNOWN]
+    strength = np.sqrt(np.diag(prior.information))[known]
+    law, own = model.law, len(model.law.names)
+
+    def values_of(theta: np.ndarray) -> np.ndarray:
+        of_law = [law.value_of(name, unknown) for name, unknown in zip(law.own, theta[:own], strict=True)]
+        return np.array([*of_law, *(q.at(unknown) for q, unknown in zip(model.instrument, theta[own:], strict=True))])
+
+    def whitened(theta: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        found = model.follow(theta, x)
+        assert found.closes.all()
+        off = np.where(weights.used, found.readings - model.data.read, 0.0)
+        of_readings = np.einsum("nij,nj->ni", weights.whitening, off).ravel()
+        slopes = (weights.whitening @ model.slopes(theta, found)).reshape(-1, theta.size)
+        of_known = np.zeros((len(known), theta.size))
+        of_known[np.arange(len(known)), known] = strength * [model.instrument[i - own].slope(theta[i]) for i in known]
+        residual = np.append(of_readings, strength * (values_of(theta) - prior.values)[known])
+        return residual, np.concatenate([slopes, of_known]), found.x
+
+    random, answers = np.random.default_rng(11), []
+    there = np.append(weights.used.ravel(), np.ones(len(known), bool))
+    assert np.abs(whitened(begin, orbits.x)[0]).max() < 1e-9
+    for _ in range(EXPERIMENTS):
+        theta, x, noise = begin, orbits.x, random.normal(size=there.size) * there
+        before, moved = prior.values, prior.values
+        for _ in range(STEPS):
+            residual, slopes, x = whitened(theta, x)
+            before, size = moved, np.linalg.norm(slopes, axis=0)
+            theta = theta + np.linalg.lstsq(slopes / size, noise - residual, rcond=None)[0] / size
+            moved = values_of(theta)
         # settled to a hundredth of a standard error
-        assert np.abs(step).max() < 0.01
-        answers.append(values)
-    return np.concatenate(answers)
+        assert np.abs((moved - before) / errors).max() < 0.01
+        answers.append(moved)
+    return np.array(answers)
+
+
+def data_of_readings(result: Design, data: Data, readings: np.ndarray) -> Data:
+    """Return rows with readings, as many of them as a design has, and the errors of their noise."""
+    tapping = result.prior.problem.tapping
+    relative = result.noise * readings[:, :2]
+    error = np.concatenate([relative, np.full((len(readings), 1), 0.01 if tapping else 0.2)], axis=1)
+    read = np.where([not tapping, True, tapping], readings, np.nan)
+    return replace(data, read=read, error=error)
 
 
 def test_the_forecast_is_what_a_fit_states(designed):

@@ -19,7 +19,7 @@ from fitting.fits.law_after import (
     root_of,
 )
 from fitting.fits.objective import Objective
-from fitting.fits.result import Loss, WithInterval, energy_lost, interval_of, scaled
+from fitting.infer.result import Loss, WithInterval, energy_lost, interval_of, scaled
 from fitting.fits.step import LinearStep, StepRows, StepSystem, descending_part, longest_run, settled_step, system_of
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of

@@ -24,7 +24,7 @@ def test_detunings_are_about_each_orders_resonance_and_every_combination_is_ther
 def test_faults_are_named():
     for changes, fault in (
         ({"orders": (1.5,)}, "whole numbers"),
-        ({"offsets_nm": (float("nan"),)}, "`offsets_nm` must hold finite"),
+        ({"offsets_nm": (float("nan"),)}, "`offsets_nm` must be a finite number, but is nan"),
     ):
         given: Any = {"orders": (1,), "amplitudes_nm": (2.0,), "detunings": (1.0,)} | changes
         with pytest.raises(ValueError, match=fault):

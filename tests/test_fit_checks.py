@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from afm_jax.strict_json import strict_json
 from fitting import fit
-from fitting.fits.fit import find_fit, summarise
+from fitting.infer.fit import find_fit, summarise
 from fitting.fits.intervals import check_minimum, covariance
 from fitting.fits.objective import FINE, PLAIN, Objective, polish
 from tests.fit_tables import law, objective, standard_errors_of, table, values_of

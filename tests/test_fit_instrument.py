@@ -7,7 +7,7 @@ import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
@@ -48,7 +48,7 @@ def test_a_wrong_calibration_of_the_tip_is_found(table):
     for name, truth in {"r": 0.95, "epsilon": 60.0, "tip_calibration": 1.04}.items():
         assert holds(result.parameters[name], truth), name
     calibration, quality = (result.parameters[name].value for name in ("tip_calibration", "quality_factor"))
-    pulls = ((calibration - 1.0) / 0.05) ** 2 + ((quality - 40.0) / 0.4) ** 2
+    pulls = ((calibration - 1.0) / 0.05) ** 2 + (np.log(quality / 40.0) / 0.01) ** 2
     assert result.chi2 == pytest.approx(np.nansum(result.rows.residual**2) + pulls, rel=1e-12)
     assert result.degrees_of_freedom == 2 * table.rows + 2 - 4
 
@@ -117,14 +117,27 @@ def test_outliers_hardly_move_a_robust_fit_and_are_named(table, plain):
     assert shift.max() < 1.0
     assert shift.max() < np.abs(values_of(plainly) - values_of(plain)).max()
     assert (plainly.valid, robust.valid, np.isnan(robust.p_value)) == (False, True, True)
-    (said,) = [warning for warning in robust.warnings if "Robust loss" in warning]
+    (said,) = [warning for warning in robust.warnings if "Robust fit" in warning]
     named = ", ".join(str(int(spoilt.lines[row])) for row in (5, 30, 60))
     assert f"outliers: lines {named}" in said
-    # residuals are reported as they are
-    amplitude, error = amplitudes_and_errors(spoilt)
-    residual = (robust.rows.predicted_nm - amplitude) / error
-    np.testing.assert_allclose(robust.rows.residual, residual, rtol=1e-12)
-    pull = (robust.parameters["quality_factor"].value - 40.0) / 0.4
-    every = np.append(residual.ravel(), pull)
-    # 2 s^2 (sqrt(1 + x^2/s^2) - 1) with s = 2
-    assert robust.chi2 == pytest.approx(np.sum(8.0 * (np.sqrt(1.0 + every**2 / 4.0) - 1.0)), rel=1e-9)
+    # their rows are left out, and nothing else
+    assert np.flatnonzero(robust.rows.set_aside).tolist() == [5, 30, 60]
+    kept = ~robust.rows.set_aside
+    amplitude, error = amplitudes_and_errors(rows(spoilt, kept))
+    residual = (robust.rows.predicted_nm[kept] - amplitude) / error
+    np.testing.assert_allclose(robust.rows.residual[kept], residual, rtol=1e-12)
+    pull = np.log(robust.parameters["quality_factor"].value / 40.0) / 0.01
+    assert robust.chi2 == pytest.approx(np.sum(residual**2) + pull**2, rel=1e-9)
+    alone = fit(rows(spoilt, kept), model="law")
+    np.testing.assert_allclose(values_of(robust), values_of(alone), rtol=1e-6)
+
+
+def test_as_many_outliers_as_may_be_do_not_hide_behind_the_rows_they_pull(table, plain):
+    """By plain least squares three rows in ten are beyond four errors here."""
+    amplitude, error = amplitudes_and_errors(table)
+    wrong = np.sort(np.random.default_rng(0).choice(table.rows, 8, replace=False))
+    amplitude[wrong] *= 1.5
+    result = fit(table_with(table, amplitude, error), model="law", robust=True)
+    assert result.valid
+    assert np.flatnonzero(result.rows.set_aside).tolist() == wrong.tolist()
+    assert np.all(np.abs(values_of(result) - values_of(plain)) < standard_errors_of(plain))

@@ -13,9 +13,9 @@ from afm_jax.impact.closure import OrbitPlace
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit
-from fitting.fits.fit import find_fit, summarise
+from fitting.infer.fit import find_fit, summarise
 from fitting.fits.objective import Objective
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.forward import branch_of, impact_of, orbit_problem
 from fitting.models import measurement_of, problem_of
 from fitting.tables.table import AmplitudeTable
@@ -156,7 +156,7 @@ def test_band_and_intervals_hold_another_minimum_that_the_data_hardly_tell(table
     other = best + np.array([-0.02, 10.0, 0.0])[: best.size]
     alone = summarise(table, replace(found, minimum=replace(found.minimum, ends=best[None], chi2=np.zeros(1))))
     # as if chi2 said next to nothing
-    monkeypatch.setattr("fitting.fits.fit._HARDLY_TOLD", 1e9)
+    monkeypatch.setattr("fitting.infer.fit._HARDLY_TOLD", 1e9)
     ends = replace(found.minimum, ends=np.stack([best, other]), chi2=np.zeros(2))
     both = summarise(table, replace(found, minimum=ends))
     square = (other[0] * both.law.approach_speed_nm_per_us) ** 2 - other[1]

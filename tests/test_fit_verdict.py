@@ -9,8 +9,9 @@ import pytest
 
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
-from fitting.fits.intervals import UNSETTLED, Convergence
-from fitting.fits.verdict import Evidence, correlation_excess, judge_fit
+from fitting.infer.intervals import UNSETTLED
+from fitting.infer.result import Convergence
+from fitting.infer.verdict import Evidence, correlation_excess, judge_fit
 from tests.fit_tables import example_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
 
@@ -45,7 +46,7 @@ def assert_said(given: Evidence, words: str, where: str) -> None:
 
 STUCK = "would lower chi2 from 150.2 to 120.1, but computed"
 OTHER = "Another minimum explains the data about as well (chi2 7.2, here 5.0): r = 0.9, epsilon = 12; the band"
-ADRIFT = Convergence(False, 1e-6, [1.0] * 2, float("inf"), True)  # noqa: FBT003
+ADRIFT = Convergence(False, "optax.lbfgs 0.2", 20, 1e-6, float("inf"))  # noqa: FBT003
 RUN = "residuals run together over the approach speed (5.0"
 
 

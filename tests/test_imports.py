@@ -105,7 +105,7 @@ def test_files_import_each_other_in_no_circle():
 def test_a_call_needs_few_files():
     # four of them because the path of a scene may be given instead, five because results are written into files
     contacts = {"afm_jax.contact.collide": 33, "afm_jax.motion.simulate": 39}
-    for module, most in {**contacts, "afm_jax.studies.effects": 57, "fitting.fits.fit": 63}.items():
+    for module, most in {**contacts, "afm_jax.studies.effects": 57, "fitting.infer.fit": 63}.items():
         files, ahead = {module}, [module]
         while ahead:
             further = needs()[ahead.pop()] - files
@@ -134,7 +134,7 @@ scene = afm_jax.Scene(afm_jax.Cantilever(90.0), afm_jax.Platform(4.0, 180.0), af
 afm_jax.save_scene(scene, "/dev/null")
 assert not [name for name in sys.modules if name.startswith(("afm_jax.contact", "diffrax", "scipy.optimize"))]
 # statistics alone take as long as JAX, and posteriors import them
-import fitting.fits.fit, fitting.report.report
+import fitting.infer.fit, fitting.report.report
 assert "scipy" not in sys.modules
 import afm_jax.plots.motion
 assert "matplotlib.pyplot" not in sys.modules

@@ -10,7 +10,7 @@ from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
 from fitting.fits.minimum import model_errors_of, with_inflated_errors
 from fitting.fits.objective import Objective
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.models import measurement_of, problem_of
 from fitting.simulated.experiment import simulate_experiment
 from fitting.tables.table import AmplitudeTable

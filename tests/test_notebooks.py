@@ -61,7 +61,7 @@ def test_names_of_rooms_are_found():
     )
     assert names_that_are_not_public(source) == [
         "afm_jax.impact.map",
-        "fitting.fits.fit",
+        "fitting.infer.fit",
         "afm_jax.solve",
         "afm_jax.motion",
     ]

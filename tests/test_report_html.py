@@ -7,8 +7,8 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from fitting.fits.comparison import Comparison
-from fitting.fits.result import FitResult
+from fitting.infer.comparison import Comparison
+from fitting.infer.result import FitResult
 from fitting.report.plots import law_figure, rows_figure, speed_figure
 from fitting.report.report import fit_page, fit_report, summary
 from fitting.report.words import band_width, interval_in_words

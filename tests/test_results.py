@@ -29,7 +29,7 @@ from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import ContactKind, Contacts, State
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from afm_jax.studies.effects import EffectStudy
-from fitting.fits.comparison import Comparison
+from fitting.infer.comparison import Comparison
 from tests.fit_tables import EXAMPLE, example_fit
 from tests.fresh_python import python
 from tests.lockin_traces import noisy_bounce

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from afm_jax.apparatus.cantilever import Cantilever
-from fitting.fits.fit import fit
-from fitting.fits.result import FitResult
+from fitting.infer.fit import fit
+from fitting.infer.result import FitResult
 from fitting.models import reach_of, rows_of, tip_work
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable

@@ -7,10 +7,9 @@ from typing import Any
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import example_path, tables_with
-from fitting.fits.comparison import compare, rivals
-from fitting.fits.estimate import Found
-from fitting.fits.fit import find_fit, summarise
-from fitting.fits.result import FitResult
+from fitting.infer.comparison import compare, rivals
+from fitting.infer.fit import fit as fit_tables
+from fitting.infer.result import FitResult
 from fitting.report.report import summary, write_report
 from fitting.sampling.posterior import posterior, require_blackjax, sampled_by_gaussian
 from fitting.tables.several import SeveralTables
@@ -30,12 +29,11 @@ def fit(
         require_blackjax()
     read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
-    first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
+    first = "the first run compiles for ten seconds" if "delay" in model or model == "contact" else "some seconds"
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
     with session.working(f"fitting {rows}, model {model} ({first})"):
-        found = find_fit(measured, model, **settings)
-        result = summarise(measured, found)
-    extras, failure = _extras(session, found, result, settings, options)
+        result = fit_tables(measured, model, **settings)
+    extras, failure = _extras(session, result, settings, options)
     return Output(
         payload=result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()},
         text=[partial(summary, result, **extras)],
@@ -46,7 +44,7 @@ def fit(
 
 
 def _extras(
-    session: Session, found: Found, result: FitResult, settings: dict[str, Any], options: dict[str, Any]
+    session: Session, result: FitResult, settings: dict[str, Any], options: dict[str, Any]
 ) -> tuple[dict[str, Any], Exception | None]:
     """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
@@ -56,7 +54,7 @@ def _extras(
         if options["comparing"]:
             models = rivals(result.model, settings["fixed"])
             with session.working(f"comparing {', '.join(models)}"):
-                known = {result.model: (found, result)}
+                known = {result.model: result}
                 extras["comparison"] = compare(result.table, models, known=known, **settings)
         if options["posterior"] and result.valid:
             with session.working("sampling the posterior"):

@@ -29,13 +29,6 @@ if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
 
 
-FIT_PROGRAMS = tuple(
-    f"fitting.forward:{name}"
-    for name in ("impacts_of", "search_pairs", "follow_pairs", "judge_pairs", "linearise_pairs", "predict_pairs")
-)
-"""Jitted functions of a fit of the impact law whose traces are kept (see `Session.start_computing`)."""
-
-
 def prepare_folder(folder: Path) -> None:
     """Make a folder, with those above it, and check that a file can be written there.
 

@@ -9,7 +9,7 @@ import click
 
 from afm_jax.cli.command import Output
 from afm_jax.cli.commands.measure import READING_OPTIONS
-from afm_jax.cli.session import FIT_PROGRAMS, Session, add_note, prepare_folder
+from afm_jax.cli.session import Session, add_note, prepare_folder
 from afm_jax.cli.values import option_of
 from afm_jax.whole_files import check_plain
 from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS
@@ -60,7 +60,7 @@ def _analysed(session: Session, table: AmplitudeTable, model: str, *, no_law: bo
     result = tapping(table, law=False, scale_errors=scale_errors)
     if no_law or not result.law_allowed:
         return result
-    session.start_computing(*FIT_PROGRAMS)
+    session.start_computing()
     with session.working("fitting the impact law (the first run compiles for half a minute)"):
         return with_law(result, model)
 

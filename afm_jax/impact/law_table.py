@@ -5,9 +5,12 @@ u = sqrt(u_c^2 + v^2), so that an orbit keeps its coordinate while u_c moves. Th
 
     w^2 = r^2 v^2 - M(s),    tau = T(s) - b (1/w - 1/u) + f (1/w^2 - 1/u^2),
 
-r the restitution of fast impacts, so that eq. 6 is exact, M and T cubic splines in s, even at capture and natural at the end: two vectors and a constant matrix. Formulas, contacts
-and measured laws all become such tables, so that whatever follows orbits is one compiled program.
+r the restitution of fast impacts, so that eq. 6 is exact, M and T cubic splines in s, even at capture and natural at
+the end: two vectors and a constant matrix. Formulas, contacts and measured laws all become such tables, so that what
+follows orbits is one compiled program.
 """
+
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.impact.law import BRIDGE_NM, HertzContact, Impact, Speeds
 
 AnyArray = Array | np.ndarray
-"""NumPy's outside of compiled programs."""
+"""JAX's within programs, NumPy's outside."""
 KNOTS = 97
 _SCALE, _FASTEST = 3.0, 2e4
 """Speed in nm/us from which knots stand at equal ratios, and speed v of the last one."""
@@ -85,8 +88,8 @@ class LawTable(Impact):
         """Return the speeds with a change of w^2 in nm^2/us^2 and one of the delay in us."""
         excess = _SCALE * jnp.sinh(_STEP * coordinate)
         approach = jnp.sqrt(self.capture**2 + excess**2)
-        below = jnp.clip(jnp.floor(lax.stop_gradient(coordinate)), 0.0, KNOTS - 2.0)
-        left, x = below.astype(int), coordinate - below
+        left = jnp.clip(jnp.floor(lax.stop_gradient(coordinate)), 0, KNOTS - 2).astype(int)
+        x = coordinate - left.astype(coordinate.dtype)
         to_right = x * x * (3.0 - 2.0 * x)
         ends = jnp.stack([1.0 - to_right, x * (1.0 - x) ** 2, to_right, -x * x * (1.0 - x)])
 
@@ -130,8 +133,7 @@ def table_of(
     """
     loss = kept * EXCESS**2 - square
     loss[0] = 0.0
-    a, b, d, f = coefficients
-    return LawTable(
-        np.asarray(capture), np.asarray(float(kept)), np.stack([loss, _SLOPES @ loss]), np.stack([time, _SLOPES @ time]),
-        *(np.asarray(float(number)) for number in (a, b, d, f, length_nm)),
-    )  # fmt: skip
+    splines = [np.stack([values, _SLOPES @ values]) for values in (loss, time)]
+    numbers = [np.asarray(float(number)) for number in (capture, kept, *coefficients, length_nm)]
+    columns: Any = (*numbers[:2], *splines, *numbers[2:])
+    return LawTable(*columns)

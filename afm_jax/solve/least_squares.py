@@ -1,4 +1,4 @@
-"""Levenberg's and Marquardt's damped least squares, one step after the other, a step that cannot be evaluated refused."""
+"""Levenberg's and Marquardt's damped least squares: steps that cannot be evaluated are refused."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 _FIRST, _LESS, _MORE, _SMALLEST, _LARGEST = 1e-3, 0.1, 8.0, 1e-9, 1e8
-"""Damping in units of every unknown's own curvature: the first, its factors after steps that are taken or refused, ends."""
+"""Damping in units of every unknown's own curvature: the first, its factors after steps taken and refused, its ends."""
 _SURELY = 0.1
 """Damping below which a small fall of the sum means that a minimum is near."""
 
 
 class Sum(NamedTuple):
-    """A sum of squares: its value, residuals r and Jacobian J with the gradient 2 J^T r; infinite where there is none."""
+    """A sum of squares: value, infinite where there is none, residuals r and Jacobian J; the gradient is 2 J^T r."""
 
     value: float
     residual: Float[np.ndarray, " n"]
@@ -54,8 +54,8 @@ def levenberg_marquardt(
         normal = here.jacobian[:, moves].T @ here.jacobian[:, moves]
         unit = np.sqrt(np.diag(normal)) + 1e-30
         normal = normal / np.outer(unit, unit)
-        taken = False
-        while damping < _LARGEST and not taken:
+        step, there = np.zeros_like(start), here
+        while damping < _LARGEST and not there.value < here.value:
             step = np.zeros_like(start)
             step[moves] = -np.linalg.solve(normal + damping * np.eye(unit.size), gradient / unit) / unit
             promised = -float(gradient @ step[moves])
@@ -63,10 +63,9 @@ def levenberg_marquardt(
                 return Lowest(place, here, count)
             step *= min(1.0, float(np.min(longest / np.maximum(np.abs(step), 1e-300))))
             there, count = evaluate(place + step), count + 1
-            taken = there.value < here.value
-            if not taken:
+            if not there.value < here.value:
                 damping = max(_MORE * damping, 1e-4)
-        if not taken:
+        if not there.value < here.value:
             break
         fall, place, here = here.value - there.value, place + step, there
         if fall < settled * (1.0 if damping < _SURELY else 1e-3):

@@ -1,8 +1,8 @@
 """The drives among which an experiment is designed: what each would read, and what it would say of the law."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -10,18 +10,20 @@ from jaxtyping import Bool, Float, Int, Shaped
 from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.prior import Prior
-from fitting.fits.discrepancy import ModelDiscrepancy
-from fitting.fits.law_after import member_after, speed_range
-from fitting.fits.minimum import model_errors_of, padding
-from fitting.fits.objective import BATCH, Objective
-from fitting.fits.step import rows_of_fit, system_of
-from fitting.forward import ImpactSlopes
-from fitting.models import Measurement, measurement_of
+from fitting.infer.closest import closest_parameters
+from fitting.infer.explain import Explained
+from fitting.infer.instantaneous import evaluated
+from fitting.infer.rows import Weights, plain_weights, remainders_of, weights_of
+from fitting.infer.search import Descent, Found, orbits_at
+from fitting.infer.unknowns import Data, Model, Quantity
+from fitting.predict.law import SMOOTH, FormulaLaw
+from fitting.predict.orbit import READINGS, Row
 from fitting.simulated.experiment import Drives, check_drive
-from fitting.tables.table import AmplitudeTable
 
 MOST = 20_000
 """Drives that a design looks at: some minutes of computing."""
+DRAWS = 8
+"""Sets of values that an orbit must bear."""
 MARGIN = 0.05
 """Uncertainty of every parameter, relative to its size (the loss, for r), that an orbit must bear however well the law
 seems to be known: a law is none of a real contact to better than that where its orbits end."""
@@ -58,43 +60,26 @@ def drive_grid(
         ValueError: if a list is empty or a number impossible, or there are too many combinations.
     """
     check_drive(drive)
-    check_parameter("free_frequency_khz", free_frequency_khz, "positive")
-    lists = {"orders": orders, "amplitudes_nm": amplitudes_nm, "offsets_nm": offsets_nm, "heights": heights}
-    for name, numbers in (lists | {"detunings": detunings}).items():
-        if numbers is not None:
-            _check_list(name, numbers, positive=name not in {"offsets_nm", "heights"})
-    sample = drive == "sample"
+    sample, places = drive == "sample", offsets_nm if heights is None else heights
+    positive = {"free_frequency_khz": free_frequency_khz, "orders": orders, "amplitudes_nm": amplitudes_nm}
+    for name, numbers in (positive | {"detunings": detunings}).items():
+        check_parameter(name, np.asarray(numbers), "positive")
+    check_parameter("offsets_nm" if heights is None else "heights", np.asarray(places), "finite")
     if any(order != int(order) or not (sample or order == 1) for order in orders):
         allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
         raise ValueError(f"`orders` must hold {allowed}, but is {list(orders)}")
     if heights is not None and sample:
         raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
-    resonance = (2.0 if sample else 1.0) * free_frequency_khz
-    places = offsets_nm if heights is None else heights
+    count = len(orders) * len(detunings) * len(amplitudes_nm) * len(places)
+    if count > MOST:
+        raise ValueError(f"these are {count} drives, more than the {MOST} a design looks at; take coarser steps")
+    grid = np.meshgrid(orders, detunings, amplitudes_nm, places)
+    order, detuning, amplitude, place = (np.ravel(axis).astype(float) for axis in grid)
+    frequency = (2.0 if sample else 1.0) * free_frequency_khz * order * detuning
+    offset = place if heights is None else -place * amplitude
     # rounded to what an instrument is told: a thousandth of a hertz, a femtometre
-    rows = {
-        (
-            order,
-            round(resonance * order * detuning, 6),
-            float(amplitude),
-            float(place) if heights is None else round(-place * amplitude, 6),
-        )
-        for order, detuning, amplitude, place in product(orders, detunings, amplitudes_nm, places)
-    }
-    if len(rows) > MOST:
-        raise ValueError(f"these are {len(rows)} drives, more than the {MOST} a design looks at; take coarser steps")
-    columns = np.array(sorted(rows), float).T
+    columns = np.unique(np.round([order, frequency, amplitude, offset], 6), axis=1)
     return Drives(columns[0].astype(np.int64), *columns[1:])
-
-
-def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
-    if np.ndim(numbers) != 1:
-        raise ValueError(f"`{name}` must be a list of numbers, but has the shape {np.shape(numbers)}")
-    if len(numbers) == 0:
-        raise ValueError(f"`{name}` is empty; give at least one number")
-    for number in numbers:
-        if not np.isfinite(number) or (positive and number <= 0.0):
-            raise ValueError(f"`{name}` must hold {'positive' if positive else 'finite'} numbers, but one is {number}")
 
 
 def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.ndarray:
@@ -107,7 +92,7 @@ def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.nda
 LEFT_OUT = {
     "measured": "already measured",
     "no orbit": "no steady single-impact orbit",
-    "unsure": "several steady orbits, or none, or one near its end, for some of the values that the prior allows",
+    "unsure": "several steady orbits, or none, for some of the values that the prior allows",
     "too large": "amplitudes above what the instrument takes",
     "inaccurate": "impacts too slow, or under too strong a pull, for the model: a fit excludes such rows",
 }
@@ -123,9 +108,10 @@ class Candidates:
         why_not: a key of `LEFT_OUT` for each drive; empty for those that can be planned with.
         amplitude_nm: expected peak and lock-in amplitude, shape (rows, 2); of a cantilever that is driven itself
             its lag in degrees too, shape (rows, 3).
-        error_nm: standard errors of their measurement, the model's own error included; infinite where not measured.
+        error_nm: standard errors of their measurement, the model's own error included; infinite where not usable.
         approach_speed_nm_per_us: expected.
-        slope: d amplitude/d parameter in units of the error, shape (rows, k, p); 0 where not usable.
+        slope: derivatives of the readings by the parameters, made independent and of unit variance as a fit does it
+            (without a model error: divided by their errors), shape (rows, k, p); 0 where not usable.
     """
 
     drives: Drives
@@ -151,6 +137,79 @@ class Candidates:
         return {name: self.why_not.count(name) for name in LEFT_OUT if name in self.why_not}
 
 
+def model_of(prior: Prior, drives: Drives, values: Float[np.ndarray, " p"]) -> tuple[Model, Float[np.ndarray, " p"]]:
+    """Return what a fit of the drives' readings fits, none of them read yet, and its unknowns at values.
+
+    The unknowns are those of the prior's parameters, in their order.
+    """
+    problem, mass, count = prior.problem, prior.mass_ng or 1.0, len(drives.order)
+    zero, never, own = np.zeros(count), np.zeros(count, bool), len(problem.own)
+    row = Row(*(np.asarray(column, float) for column in drives), phase_deg=zero, free=never)
+    lever = zero + prior.free_frequency_khz, zero + (prior.quality_factor or np.inf), mass
+    blank = np.full((count, READINGS), np.nan)
+    data = Data(row, blank, np.ones_like(blank), never, zero, zero.astype(int), (problem.drive,), *lever)
+    if problem.model == "contact":
+        from fitting.predict.contact import ContactLaw  # noqa: PLC0415  # for contacts alone
+
+        law = ContactLaw(problem.own, prior.fixed, (), problem.effects, mass)
+    else:
+        law = FormulaLaw(problem.own, prior.fixed, mass, lasting=problem.lasting)
+    theta = np.zeros(len(values))
+    for i, (parameter, value) in enumerate(zip(problem.parameters[:own], values.tolist(), strict=False)):
+        # a logarithm knows no 0
+        theta[i] = law.unknown_of(parameter.name, value if parameter.lowest < 0.0 else max(value, _LEAST))
+    pairs = zip(problem.names[own:], values[own:].tolist(), strict=True)
+    return Model(data, law, tuple(Quantity(name, value, 1.0, ~never) for name, value in pairs)), theta
+
+
+_LEAST = 1e-12
+"""Stands for 0 where an unknown is the logarithm of a parameter."""
+
+
+class _Rows(NamedTuple):
+    """Drives as rows of a fit that read what is expected.
+
+    Attributes:
+        model: with these readings.
+        theta: its unknowns at the prior's values.
+        change: derivatives of these values by the unknowns.
+        orbits: of the rows.
+        number: of steady ones.
+        slopes: derivatives of the readings by the unknowns.
+        weights: of the readings.
+    """
+
+    model: Model
+    theta: Float[np.ndarray, " p"]
+    change: Float[np.ndarray, " p"]
+    orbits: Any
+    number: Int[np.ndarray, " rows"]
+    slopes: Float[np.ndarray, "rows 3 p"]
+    weights: Weights
+
+
+def _rows_of(
+    prior: Prior, drives: Drives, noise: float, phase_noise_deg: float, read: Bool[np.ndarray, "... 3"]
+) -> _Rows:
+    """Return drives as rows of a fit; ``read`` says which readings are taken."""
+    model, theta = model_of(prior, drives, prior.values)
+    law: Any = model.law
+    if law.lasting:
+        orbits, count = orbits_at(model, theta)
+        slopes = model.slopes(theta, orbits)
+    else:
+        orbits, slopes = evaluated(model, theta)
+        count = orbits.orbits
+    error = np.concatenate([noise * orbits.readings[:, :2], np.full((len(count), 1), phase_noise_deg)], axis=1)
+    expected = np.where(read & (count > 0)[:, None], orbits.readings, np.nan)
+    model, out = replace(model, data=replace(model.data, read=expected, error=error)), np.zeros(len(count), bool)
+    weights = weights_of(model, theta, orbits, out) if law.lasting else plain_weights(model.data, 0.0, out)
+    step, change = 1e-6, np.ones(len(theta))
+    for i, (name, unknown) in enumerate(zip(law.own, theta.tolist(), strict=False)):
+        change[i] = (law.value_of(name, unknown + step) - law.value_of(name, unknown - step)) / (2.0 * step)
+    return _Rows(model, theta, change, orbits, count, slopes, weights)
+
+
 def candidates_of(
     prior: Prior,
     drives: Drives,
@@ -171,80 +230,38 @@ def candidates_of(
         largest_nm: peak amplitude that the instrument takes; of a cantilever that is driven itself the free one.
         phase_noise_deg: standard error of the lag in degrees.
     """
-    count, tapping = len(drives.order), prior.problem.tapping
-    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
-    # of readings of 1 nm with an error of 1 nm the Jacobian is that of the amplitudes
-    one = np.ones((count, read.size))
-    objective = Objective(_measured(prior, drives, np.where(read, one, np.nan), one), prior.problem)
-    linear = objective.at_values(prior.draws(BATCH, least=MARGIN))
-    prediction = linear.prediction
-    expected = np.asarray(prediction.amplitude_nm)[0]
-    # the model's own error goes with what is read
-    model_errors = model_errors_of(
-        objective.with_rows(amplitude_nm=np.where(expected, expected, 1.0)) if tapping else objective, prior.values
-    )
-    amplitude, kinds = expected[:count], expected.shape[1]
-    own = padding(model_errors.model_error, expected)[:count]
-    error = np.where(read, np.hypot(_noise_of(amplitude, noise, phase_noise_deg), own), np.inf)
-    raw = np.asarray(linear.jacobian)[0, : kinds * count].reshape(count, kinds, -1)
-    orbits = np.asarray(prediction.orbits)[:, :count]
-    fold = np.asarray(prediction.near_fold)[:, :count]
+    tapping = prior.problem.tapping
+    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak", False])
+    rows = _rows_of(prior, drives, noise, phase_noise_deg, read)
+    sure = rows.number == 1
+    for values in prior.draws(DRAWS, least=MARGIN)[1:]:
+        drawn = model_of(prior, drives, values)
+        if prior.problem.lasting:
+            sure &= orbits_at(*drawn, np.flatnonzero(sure)).number == 1
+        else:
+            sure &= evaluated(*drawn, slopes=False)[0].orbits == 1
+    kinds, expected = 3 if tapping else 2, rows.orbits.readings
     holds = {
         "measured": same_drives(drives, prior.measured),
-        "no orbit": orbits[0] == 0,
-        "unsure": np.any((orbits != 1) | fold, axis=0) | ~np.isfinite(raw).all(axis=(1, 2)),
-        "too large": (drives.amplitude_nm if tapping else amplitude[:, 0]) > largest_nm,
-        "inaccurate": model_errors.set_aside[:count],
+        "no orbit": rows.number == 0,
+        "unsure": ~sure | ~np.isfinite(rows.slopes).all(axis=(1, 2)),
+        "too large": (drives.amplitude_nm if tapping else expected[:, 0]) > largest_nm,
+        "inaccurate": rows.weights.reasons != "",
     }
-    why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), "") for row in range(count))
-    usable = np.array([not reason for reason in why_not])
-    safe = np.where(usable[:, None] & np.isfinite(error), error, np.inf)
+    why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), "") for row in range(len(sure)))
+    usable = np.array([not reason for reason in why_not])[:, None]
+    whitening = np.where(usable[:, :, None], rows.weights.whitening, 0.0)
+    # the covariance of what is used is the inverse of W^T W
+    variance = np.diagonal(np.linalg.pinv(np.swapaxes(whitening, 1, 2) @ whitening), axis1=1, axis2=2)
+    slope = whitening @ np.where(usable[:, :, None], rows.slopes / rows.change, 0.0)
     return Candidates(
         drives=drives,
         why_not=why_not,
-        amplitude_nm=amplitude,
-        error_nm=error,
-        approach_speed_nm_per_us=np.asarray(prediction.approach_speed_nm_per_us)[0, :count],
-        slope=np.where(usable[:, None, None], raw, 0.0) / safe[:, :, None],
+        amplitude_nm=expected[:, :kinds],
+        error_nm=np.sqrt(np.where(rows.weights.used & usable, variance, np.inf))[:, :kinds],
+        approach_speed_nm_per_us=rows.orbits.approach,
+        slope=slope[:, :kinds],
     )
-
-
-def _noise_of(
-    amplitude: Float[np.ndarray, "rows k"], noise: float, phase_noise_deg: float
-) -> Float[np.ndarray, "rows k"]:
-    """Return the errors of amplitudes, and of lags if there are any."""
-    lag = np.full((len(amplitude), amplitude.shape[1] - 2), phase_noise_deg)
-    return np.concatenate([noise * amplitude[:, :2], lag], axis=1)
-
-
-def _measured(
-    prior: Prior, drives: Drives, amplitude: Float[np.ndarray, "rows k"], error: Float[np.ndarray, "rows k"]
-) -> Measurement:
-    """Return readings (a column of NaN: not read) with their errors as a measurement."""
-    tapping, columns = prior.problem.tapping, {}
-    columns["free_amplitude_nm" if tapping else "drive_amplitude_nm"] = drives.amplitude_nm
-    kinds = (("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg"))
-    for i, (name, unit) in enumerate(kinds[: amplitude.shape[1]]):
-        if np.isfinite(amplitude[:, i]).all():
-            columns |= {f"{name}_{unit}": amplitude[:, i], f"{name}_error_{unit}": error[:, i]}
-    table = AmplitudeTable(
-        drive=prior.problem.drive,
-        order=drives.order,
-        drive_frequency_khz=drives.frequency_khz,
-        offset_nm=drives.offset_nm,
-        free_frequency_khz=prior.free_frequency_khz,
-        quality_factor=prior.quality_factor,
-        mass_ng=prior.mass_ng,
-        source="the drives",
-        **columns,
-    )
-    found = measurement_of(table, prior.problem, fixed=prior.fixed)
-    if not tapping:
-        return found
-    # nothing was read that could tell which rows are free
-    there = np.arange(len(found.rows.order)) < len(drives.order)
-    measured = there[:, None] & np.array([False, True, True])
-    return found._replace(rows=found.rows._replace(measured=measured, free=np.zeros_like(there)))
 
 
 def standard_errors(information: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p"]:
@@ -261,8 +278,8 @@ def forecast(
 ) -> Float[np.ndarray, "steps p"]:
     """Return the standard errors that a fit will state, before and after each chosen point.
 
-    Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points,
-    and are those of the formula that is then closest to the law. A prior that a fit left is of that formula already.
+    Where impacts last these contain what a formula leaves out, and are those of the formula closest to the law. A prior
+    that a fit left is of that formula already.
 
     Args:
         prior: the law and the instrument.
@@ -271,35 +288,42 @@ def forecast(
         noise: standard error of an amplitude relative to it.
         phase_noise_deg: standard error of a lag in degrees.
     """
-    problem, each = prior.problem, candidates.information[chosen]
+    each = candidates.information[chosen]
     steps = prior.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
     errors = standard_errors(steps)
-    if not problem.lasting or not chosen.size:
-        return errors
-    drives = Drives(*(column[chosen] for column in candidates.drives))
-    amplitude = candidates.amplitude_nm[chosen]
-    read = np.where(np.isfinite(candidates.error_nm[chosen]), amplitude, np.nan)
-    objective = Objective(_measured(prior, drives, read, _noise_of(amplitude, noise, phase_noise_deg)), problem)
-    model_errors = model_errors_of(objective, prior.values)
-    rows = rows_of_fit(objective, objective.following(prior.values), prior.values, model_errors, 1.0)
-    values = prior.fixed | dict(zip(problem.names, prior.values.tolist(), strict=True))
-    discrepancy = ModelDiscrepancy(problem, values, speed_range(rows.approach[: len(chosen)]), prior.mass_ng or 1.0)
-    size = prior.sizes
-    known, axes = np.linalg.eigh(size[:, None] * prior.information * size)
-    known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size
-    readings, free = rows.measurement_error.shape, np.ones(len(size), dtype=bool)
-    by_row = rows.jacobian[: rows.measurement_error.size].reshape(*readings, -1)
-    for count in range(1, len(chosen) + 1):
-        # a reading without slopes says nothing
-        seen = np.arange(readings[0])[:, None] < count
-        jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
-        slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
-        some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
-        step = system_of(some, discrepancy, free).step()
-        covariance = step.covariance
-        if not len(prior.measured):
-            speeds = rows.approach[:count]
-            member = member_after(step, discrepancy, objective.measurement, prior.values, speeds, free, computed=False)
-            covariance = covariance if member is None else member.covariance
-        errors[count] = np.sqrt(np.diag(covariance))[: len(size)]
+    if prior.problem.lasting and chosen.size:
+        read = np.isfinite(candidates.error_nm[chosen])
+        read = np.pad(read, ((0, 0), (0, READINGS - read.shape[1])))
+        drives = Drives(*(column[chosen] for column in candidates.drives))
+        rows = _rows_of(prior, drives, noise, phase_noise_deg, read)
+        errors[1:] = [_stated(prior, rows, count) for count in range(1, len(chosen) + 1)]
+    return errors
+
+
+def _stated(prior: Prior, rows: _Rows, count: int) -> Float[np.ndarray, " p"]:
+    """Return the standard errors that a fit of the first rows states: with everything unknown that it has."""
+    orbits, law, names = rows.orbits, rows.model.law, prior.problem.names
+    if isinstance(law, FormulaLaw):
+        # a fit has drag whatever the formula is; a prior that a fit left is of the formula alone
+        drag = not len(prior.measured) and "viscous_loss" not in (*law.own, *law.fixed)
+        ends = float(orbits.approach[:count].min()), float(orbits.approach[:count].max())
+        law = replace(law, own=(*law.own, "viscous_loss") if drag else law.own).beside(ends, SMOOTH)
+    model = replace(rows.model, law=law, remainders=remainders_of(rows.model, rows.theta, orbits))
+    places, theta = [model.names.index(name) for name in names], np.zeros(len(model.names))
+    theta[places] = rows.theta
+    of_rows = (rows.weights.whitening @ model.slopes(theta, orbits))[:count].reshape(-1, theta.size)
+    of_prior = np.zeros((len(names), theta.size))
+    known, axes = np.linalg.eigh(prior.sizes[:, None] * prior.information * prior.sizes)
+    of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / prior.sizes * rows.change
+    of_law = np.diag(model.prior[1])[: theta.size - len(model.instrument)]
+    jacobian = np.concatenate([of_rows, of_prior, of_law])
+    weights = rows.weights._replace(used=rows.weights.used & (np.arange(len(orbits.x)) < count)[:, None])
+    end = Descent(theta, orbits, 0.0, np.zeros(len(jacobian)), jacobian)
+    fit = Explained(model, end, weights, Found(orbits, rows.number), 0.0, settled=True)
+    errors = np.sqrt(np.diag(fit.covariance))[places] * np.abs(rows.change)
+    if not len(prior.measured):
+        own = prior.problem.own
+        stated = closest_parameters(fit, own, prior.fixed).errors[: len(own)]
+        # NaN where rows are too few, 0 of a lead that does nothing because no impact loses speed
+        errors[: len(own)] = np.where(stated > 0.0, stated, np.inf)
     return errors

@@ -18,13 +18,26 @@ from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, known, text_table, with_error
 from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.prior import Prior, prior_of_fit
-from fitting.fits.result import FitResult
-from fitting.parameters import DELAY_NAMES, Parameter
+from fitting.infer.result import FitResult
+from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import Drives
 
 FORMAT_VERSION = 2
 """Version of the JSON layout; raised when a key changes its meaning or goes."""
 AMPLITUDES = ("both", "peak", "lockin")
+_READINGS = ("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg")
+_PRINTED = {
+    "order": ("N", "d"),
+    "drive_frequency_khz": ("kHz", ".8g"),
+    "drive_amplitude_nm": ("nm", ".5g"),
+    "free_amplitude_nm": ("free nm", ".5g"),
+    "offset_nm": ("offset", ".4g"),
+    "expected_peak_amplitude_nm": ("peak nm", ".2f"),
+    "expected_lockin_amplitude_nm": ("lock-in nm", ".2f"),
+    "expected_phase_lag_deg": ("lag deg", ".2f"),
+    "expected_approach_speed_nm_per_us": ("u_in", ".1f"),
+}
+"""Head and format of the columns that are printed."""
 _RIDGE = 1e-9
 """Information added to every parameter, relative to that of all candidates together, while points are chosen: with it
 the first points, which alone determine nothing, can be compared."""
@@ -69,30 +82,25 @@ class Design(Result):
         return next(iter(self.reasons), None)
 
     @property
-    def drive_columns(self) -> tuple[str, ...]:
-        """The columns of a table that say how a row is driven."""
-        return "order", "drive_frequency_khz", f"{'free' if self._tapping else 'drive'}_amplitude_nm", "offset_nm"
-
-    @property
-    def _tapping(self) -> bool:
-        return self.prior.problem.tapping
+    def columns(self) -> dict[str, list[Any]]:
+        """The drives under the names of a table's columns, the readings to expect, and their errors."""
+        found, chosen, tapping = self.candidates, self.chosen, self.prior.problem.tapping
+        names = "order", "drive_frequency_khz", f"{'free' if tapping else 'drive'}_amplitude_nm", "offset_nm"
+        columns: dict[str, Any] = dict(zip(names, self.drives, strict=True))
+        readings = zip(_READINGS, found.amplitude_nm[chosen].T, found.error_nm[chosen].T, strict=False)
+        for (name, unit), value, error in readings:
+            if np.isfinite(error).all():
+                columns[f"expected_{name}_{unit}"] = value % 360.0 if unit == "deg" else value
+                columns[f"expected_{name}_error_{unit}"] = error
+        columns["expected_approach_speed_nm_per_us"] = found.approach_speed_nm_per_us[chosen]
+        return {name: column.tolist() for name, column in columns.items()}
 
     def points(self) -> list[dict[str, Any]]:
         """Return the points as mappings: the drive, what is expected to be read, and the errors once it is."""
-        found, answer = self.candidates, []
-        readings = ("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg")
-        for row, errors in zip(self.chosen.tolist(), self.errors[1:].tolist(), strict=True):
-            point: dict[str, Any] = {
-                name: column[row].item() for name, column in zip(self.drive_columns, found.drives, strict=True)
-            }
-            for (name, unit), value, error in zip(readings, found.amplitude_nm[row], found.error_nm[row], strict=False):
-                if np.isfinite(error):
-                    point[f"expected_{name}_{unit}"] = float(value) % 360.0 if unit == "deg" else float(value)
-                    point[f"expected_{name}_error_{unit}"] = float(error)
-            point["expected_approach_speed_nm_per_us"] = float(found.approach_speed_nm_per_us[row])
-            point["standard_errors"] = dict(zip(self.prior.problem.names, map(_finite, errors), strict=True))
-            answer.append(point)
-        return answer
+        names, columns = self.prior.problem.names, self.columns
+        errors = [dict(zip(names, map(_finite, row), strict=True)) for row in self.errors[1:].tolist()]
+        rows = zip(*columns.values(), errors, strict=True)
+        return [dict(zip((*columns, "standard_errors"), row, strict=True)) for row in rows]
 
     @property
     def measured_so_far(self) -> dict[str, dict[str, Any]]:
@@ -105,84 +113,69 @@ class Design(Result):
         return self._known_after(-1)
 
     def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
-        columns = zip(self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count], strict=True)
-        return {parameter.name: _expected(parameter, value, float(error)) for parameter, value, error in columns}
+        entries, columns = {}, (self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist())
+        for parameter, value, error in zip(*columns, strict=True):
+            entry = {"value": value, "unit": parameter.unit, "standard_error": _finite(error)}
+            ends = (
+                max(value - TWO_SIDED_95 * error, parameter.lowest),
+                min(value + TWO_SIDED_95 * error, parameter.highest),
+            )
+            entry["interval95"] = [*ends] if np.isfinite(error) else [None, None]
+            if not np.isfinite(error):
+                entry["reason"] = "the measurements do not determine it"
+            entries[parameter.name] = entry
+        return entries
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax design`; what is not known is None."""
-        prior = self.prior
+        problem, found = self.prior.problem, self.candidates
+        names = ("valid", "reasons", "warnings", "noise", "expected", "measured_so_far")
         return {
             "format": "afm-jax design",
             "format_version": FORMAT_VERSION,
-            "drive": prior.problem.drive,
-            "model": prior.problem.model,
-            "valid": self.valid,
-            "reasons": self.reasons,
-            "warnings": self.warnings,
+            "drive": problem.drive,
+            "model": problem.model,
+            **{name: getattr(self, name) for name in names},
             "interest": list(self.interest),
-            "noise": self.noise,
             "points": self.points(),
-            "expected": self.expected,
-            "measured_so_far": self.measured_so_far,
-            "candidates": int(self.candidates.usable.sum()),
-            "left_out": self.candidates.left_out,
-            "prior": {"source": prior.source, "rows_measured": len(prior.measured)},
+            "candidates": int(found.usable.sum()),
+            "left_out": found.left_out,
+            "prior": {"source": self.prior.source, "rows_measured": len(self.prior.measured)},
         }
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of design.csv: the drive, then what is expected."""
-        points = self.points()
-        names = [name for name in (points[0] if points else self.drive_columns) if name != "standard_errors"]
-        return {"design.csv": {name: [point[name] for point in points] for name in names}}
+        return {"design.csv": self.columns}
 
     def printed(self) -> list[Any]:
         """Return the verdict, the points, what they will determine, and notes."""
-        found, tapping, shown = self.candidates, self._tapping, self.interest[:4]
-        read = {"peak nm": "peak_amplitude_{}nm", "lock-in nm": "lockin_amplitude_{}nm", "lag deg": "phase_lag_{}deg"}
-        del read["peak nm" if tapping else "lag deg"]
-        head = ["N", "kHz", "free nm" if tapping else "nm", "offset", *read, "u_in", *(f"+- {name}" for name in shown)]
-        rows = [
-            [
-                f"{point['order']}",
-                f"{point['drive_frequency_khz']:.8g}",
-                f"{point[self.drive_columns[2]]:.5g}",
-                f"{point['offset_nm']:.4g}",
-                *(_reading(point, f"expected_{name}") for name in read.values()),
-                f"{point['expected_approach_speed_nm_per_us']:.1f}",
-                *(known(point["standard_errors"][name], ".2g") for name in shown),
-            ]
-            for point in self.points()
-        ]
+        prior, columns, usable = self.prior, self.columns, self.candidates.usable
+        title, table = f"{len(self.chosen)} points to measure next for {', '.join(self.interest)}", {}
+        for name, (head, form) in _PRINTED.items():
+            stem, _, unit = name.rpartition("_")
+            errors = columns.get(f"{stem}_error_{unit}")
+            cells = [f"{value:{form}}" for value in columns.get(name, ())]
+            if errors:
+                cells = [f"{cell} +- {error:{form}}" for cell, error in zip(cells, errors, strict=True)]
+            if name in columns:
+                table[head] = cells
+        for name in self.interest[:4]:
+            table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in self.points()]
         then = [
             f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
             for name, entry in self.expected.items()
         ]
-        title = f"{len(self.chosen)} points to measure next for {', '.join(self.interest)}"
-        left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in found.left_out.items()]
+        left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in self.candidates.left_out.items()]
         return [
-            f"{'VALID' if self.valid else 'NOT VALID'}: {title} ({self.prior.problem.model}, {self.prior.source})",
+            f"{'VALID' if self.valid else 'NOT VALID'}: {title} ({prior.problem.model}, {prior.source})",
             *bullets("Reasons:", self.reasons),
             "",
-            *text_table(head, rows, words=()),
+            *text_table([*table], zip(*table.values(), strict=True), words=()),
             "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
             f"After all: {', '.join(then)}",
-            *bullets(f"{found.usable.sum()} of {len(found.why_not)} drives can be planned with.", left_out),
+            *bullets(f"{usable.sum()} of {usable.size} drives can be planned with.", left_out),
             *bullets("Notes:", self.warnings),
         ]
-
-
-def _reading(point: dict[str, Any], name: str) -> str:
-    """Return a reading with its error; a dash where it is not read."""
-    value, error = point.get(name.format("")), point.get(name.format("error_"))
-    return "-" if value is None else f"{value:.2f} +- {error:.2f}"
-
-
-def _expected(parameter: Parameter, value: float, error: float) -> dict[str, Any]:
-    entry = {"value": value, "unit": parameter.unit, "standard_error": _finite(error)}
-    if not np.isfinite(error):
-        return entry | {"interval95": [None, None], "reason": "the measurements do not determine it"}
-    half = TWO_SIDED_95 * error
-    return entry | {"interval95": [max(value - half, parameter.lowest), min(value + half, parameter.highest)]}
 
 
 def _finite(number: float) -> float | None:
@@ -235,7 +228,7 @@ def design(  # noqa: PLR0913
     for name in interest:
         if name not in names:
             raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(names)}")
-    if not interest or len(set(interest)) < len(interest):
+    if not interest or len({*interest}) < len(interest):
         raise ValueError("`interest` must name at least one parameter, and none twice")
     if points < 1:
         raise ValueError(f"`points` must be at least 1, but is {points}")
@@ -244,14 +237,12 @@ def design(  # noqa: PLR0913
     check_parameter("noise", noise, "between 0 and 1")
     check_parameter("largest_nm", largest_nm, "positive", optional=True)
     check_parameter("phase_noise_deg", phase_noise_deg, "positive")
-    largest = np.inf if largest_nm is None else float(largest_nm)
-    candidates = candidates_of(
-        prior, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
-    )
+    errors_of = {"noise": float(noise), "phase_noise_deg": phase_noise_deg}
+    candidates = candidates_of(prior, drives, amplitudes=amplitudes, largest_nm=largest_nm or np.inf, **errors_of)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
     matters = np.array([name in interest for name in names])
     chosen = usable[choose_points(prior.information, each[usable], points, matters)]
-    errors = forecast(prior, candidates, chosen, float(noise), phase_noise_deg)
+    errors = forecast(prior, candidates, chosen, **errors_of)
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
     reasons, warnings = [], list(prior.notes)
     if not len(chosen):

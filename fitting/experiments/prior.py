@@ -16,9 +16,9 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
-from fitting.fits.result import FitResult
+from fitting.infer.result import FitResult
 from fitting.models import Problem, check_constraints
-from fitting.parameters import MODELS, NUISANCE_NAMES, PARAMETERS, Parameter, model_parameters, paper_values
+from fitting.parameters import MODELS, NUISANCE_NAMES, PARAMETERS, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
 from fitting.tables.csv_text import TableError, beyond, read_fit_json
 
@@ -47,7 +47,6 @@ class Prior(Result):
         fixed: values of the model's parameters that a fit held; of a contact those not the paper's.
         uncertainty: how far values may be off, relative, where `information` does not say: an orbit that is not there
             for some of these values is not planned with.
-        constraints: value and standard error of what is known apart from the measured drives; part of `information`.
         measured: drives that were measured already, rows of order, frequency, amplitude, offset.
         source: where the prior comes from, in words.
         notes: what a reader of the design should know of it; a sentence each.
@@ -62,7 +61,6 @@ class Prior(Result):
     mass_ng: float | None = None
     fixed: dict[str, float] = field(default_factory=dict)
     uncertainty: float = UNCERTAINTY
-    constraints: dict[str, tuple[float, float]] = field(default_factory=dict)
     measured: Float[np.ndarray, "rows 4"] = field(default_factory=lambda: np.zeros((0, 4)))
     source: str = "values given"
     notes: tuple[str, ...] = ()
@@ -71,7 +69,8 @@ class Prior(Result):
     @property
     def sizes(self) -> Float[np.ndarray, " p"]:
         """What a relative error of each parameter refers to: the loss (1 - r for r), else the value; never 0."""
-        return np.array([_size_of(p, v) for p, v in zip(self.problem.parameters, self.values.tolist(), strict=True)])
+        pairs = zip(self.problem.parameters, self.values.tolist(), strict=True)
+        return np.array([abs(value - known.reference) or known.width or 1.0 for known, value in pairs])
 
     def draws(self, count: int, *, least: float = 0.0) -> Float[np.ndarray, "count p"]:
         """Return values that are as likely as the prior is uncertain, the prior ones first; seeded.
@@ -80,23 +79,17 @@ class Prior(Result):
             count: how many.
             least: the uncertainty, relative to the parameters' sizes, that is left to any combination of them.
         """
-        spread = self.uncertainty * self.sizes
-        # a share of the frequency would be many widths of the resonance
-        if "free_frequency_khz" in self.constraints:
-            spread[self.problem.names.index("free_frequency_khz")] = self.constraints["free_frequency_khz"][1]
-        # In units of the spread: the information then has eigenvalues of at least 1.
-        scaled = spread[:, None] * self.information * spread + np.eye(len(spread))
-        curvature, axes = np.linalg.eigh(scaled)
-        normal = np.random.default_rng(DRAW_SEED).normal(size=(count, len(spread)))
+        own, spread = len(self.problem.own), self.uncertainty * self.sizes
+        # what is known of the instrument says how far that may be off
+        spread[own:] = 1.0 / np.sqrt(np.maximum(np.diag(self.information)[own:], spread[own:] ** -2.0))
+        # in units of the spread the information has eigenvalues of at least 1
+        curvature, axes = np.linalg.eigh(spread[:, None] * self.information * spread + np.eye(spread.size))
+        normal = np.random.default_rng(DRAW_SEED).normal(size=(count, spread.size))
         normal[0] = 0.0
         width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
         values = self.values + spread * ((normal * width) @ axes.T)
-        return np.clip(values, *self.problem.ends)
-
-
-def _size_of(parameter: Parameter, value: float) -> float:
-    size = abs(value - parameter.reference) if parameter.sign else abs(value)
-    return size or parameter.width or 1.0
+        ends = np.array([(known.lowest, known.highest) for known in self.problem.parameters]).T
+        return np.clip(values, *ends)
 
 
 @checked
@@ -131,17 +124,16 @@ def prior_of_values(  # noqa: PLR0913
     check_parameter("free_frequency_khz", free_frequency_khz, "positive")
     check_parameter("quality_factor", quality_factor, "above 0.5", optional=True)
     check_parameter("mass_ng", mass_ng, "positive", optional=True)
+    check_parameter("uncertainty", uncertainty, "between 0 and 1")
     own = model_parameters(model)
-    known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
-    check_constraints(known, model, own, drive)
-    given = dict(values or {})
-    for name in given:
+    for name in values or {}:
         if name not in own:
             raise ValueError(f"the model {model!r} has no parameter {name!r}; it has {', '.join(own)}")
-    check_parameter("uncertainty", uncertainty, "between 0 and 1")
+    known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
+    check_constraints(known, model, own, drive)
+    given = {name: value for name, (value, _) in known.items()} | dict(values or {})
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), drive=drive)
-    assumed = [name for name in own if name not in given and name not in known]
-    start = paper_values(model, mass_ng or 1.0) | {name: value for name, (value, _) in known.items()} | given
+    assumed = [name for name in own if name not in given]
     notes = []
     if assumed:
         notes.append(
@@ -152,13 +144,12 @@ def prior_of_values(  # noqa: PLR0913
         notes.append(EXACT_QUALITY_FACTOR)
     return Prior(
         problem=problem,
-        values=_checked_values(problem, start),
+        values=_checked_values(problem, paper_values(model, mass_ng or 1.0) | given),
         information=np.diag([known[name][1] ** -2.0 if name in known else 0.0 for name in problem.names]),
         free_frequency_khz=float(free_frequency_khz),
         quality_factor=quality_factor,
         mass_ng=mass_ng,
         uncertainty=uncertainty,
-        constraints=known,
         source="values assumed" if assumed else "values given",
         notes=tuple(notes),
     )
@@ -211,16 +202,22 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         ValueError: if the model or a parameter is none.
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
-    if payload["model"] not in MODELS or not {*payload["parameters"]} <= {*PARAMETERS}:
-        raise ValueError("a model or a parameter that no fit has")
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"
-    driven = [one for one in tables if (one.get("drive") or "sample") == drive]
-    columns = "order", "drive_frequency_khz", f"{'drive' if drive == 'sample' else 'free'}_amplitude_nm", "offset_nm"
-    found, law = payload["parameters"], payload.get("law")
+    label = payload["tables"][0]["name"] if payload.get("tables") else ""
+    mine = [name for name in payload["parameters"] if name.partition(" of ")[2] in ("", label)]
+    found = {name.partition(" of ")[0]: payload["parameters"][name] for name in mine}
+    if payload["model"] not in MODELS or not {*found} <= {*PARAMETERS}:
+        raise ValueError("a model or a parameter that no fit has")
+    places = [[*payload["parameters"]].index(name) for name in mine]
+    correlations = np.array(payload["correlations"]["matrix"], float)
+    if correlations.shape != 2 * (len(payload["parameters"]),):
+        raise ValueError("not a correlation for each pair of parameters")
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
-    notes = []
+    driven = [one for one in tables if (one.get("drive") or "sample") == drive]
+    columns = "order", "drive_frequency_khz", f"{'free' if problem.tapping else 'drive'}_amplitude_nm", "offset_nm"
+    law, notes = payload.get("law"), []
     if not payload["valid"]:
         reason = " ".join(payload.get("reasons") or ["no reason given."])
         notes.append(f"The fit that the design rests on is not valid: {reason}")
@@ -229,17 +226,12 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     return Prior(
         problem=problem,
         values=_checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
-        information=_information(found, payload["correlations"]["matrix"]),
+        information=_information(found, correlations[np.ix_(places, places)]),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
         mass_ng=table.get("mass_ng"),
         fixed=dict(settings.get("fixed") or {}),
         uncertainty=uncertainty,
-        constraints={
-            name: (float(entry["constraint"][0]), float(entry["constraint"][1]))
-            for name, entry in found.items()
-            if entry.get("constraint")
-        },
         measured=np.array([[place for one in driven for place in one[name]] for name in columns], float).T,
         source=f"fit of {table.get('source', 'a table')}",
         notes=tuple(notes),
@@ -247,17 +239,16 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     )
 
 
-def _information(found: Mapping[str, Any], correlations: list[list[float | None]]) -> Float[np.ndarray, "p p"]:
+def _information(found: Mapping[str, Any], matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Return the Fisher information of a fit: of what it determined, and the constraints on what it did not."""
-    matrix = np.array(correlations, dtype=float)
     error = np.array([entry["standard_error"] for entry in found.values()], dtype=float)
-    if matrix.shape != 2 * error.shape or np.any(beyond(error, positive=True)):
-        raise ValueError("not a correlation for each pair of parameters, or an error beyond what can be computed with")
+    if np.any(beyond(error, positive=True)):
+        raise ValueError("an error beyond what can be computed with")
     known = np.isfinite(error) & np.isfinite(np.diag(matrix)) & (error > 0.0)
     inner = matrix[np.ix_(known, known)]
     if not np.all(np.isfinite(inner)) or (known.any() and np.linalg.eigvalsh(inner)[0] < 1e-14):
         raise TableError("the saved fit's correlations contradict each other; fit the table again")
     information = np.diag([float(e["constraint"][1]) ** -2.0 if e.get("constraint") else 0.0 for e in found.values()])
-    # Errors far apart in size: invert the correlations, which have none.
+    # errors may be far apart in size: the correlations are inverted, which have none
     information[np.ix_(known, known)] = np.linalg.inv(inner) / np.outer(error[known], error[known])
     return information

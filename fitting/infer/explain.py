@@ -1,20 +1,19 @@
 """A law with everything free: formula, smooth functions beside it, remainders of corrections, instrument.
 
-`fit_lasting` reads as the fit runs: the formula's minimum is searched for; smooth functions beside the formula, what the
-corrections of impacts leave out and the instrument are freed with it, rows are weighed and their orbits searched for
-anew until chi2 stays; outliers are left out where that is asked for; residuals that run together over the speed widen
-the smooth functions. The covariance of everything, (J^T J)^-1, is where the law's band, intervals and correlations come
-from.
+`fit_lasting` reads as the fit runs: the formula's minimum is searched for; smooth functions beside the formula, what
+the corrections of impacts leave out and the instrument are freed with it, rows are weighed and their orbits searched
+for anew until chi2 stays; outliers are left out where that is asked for; residuals that run together over the speed
+widen the smooth functions. The covariance of everything, (J^T J)^-1, is where the law's band, intervals and
+correlations come from.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import covariance_of
-from fitting.fits.law_after import LawAfter, root_of
+from fitting.infer.law import LawAt, root_of
 from fitting.infer.rows import Weights, few_left, remainders_of, weights_of
 from fitting.infer.search import (
     CENSORED,
@@ -30,18 +29,20 @@ from fitting.infer.search import (
 from fitting.infer.unknowns import Model
 from fitting.predict.law import SMOOTH, FormulaLaw, Process, of_short_range
 
-_ROUNDS, _SETTLED = 8, 0.02
+_ROUNDS, _SETTLED = 12, 0.02
 """Rounds of orbits, weights and descent at most, and the change of chi2 at which they have settled."""
+_PROFILE_SETTLED = 1e-2
+"""The same for the descent of a profile."""
 _RECOVERIES = 2
 """How often laws around one that lacks measured orbits are looked at."""
 _DECIDED = 3
 """Round after which rows are no longer excluded or taken in."""
-_SOFT, OUTLIER, MOST_OUTLIERS = 2.0, 4.0, 0.1
+ROBUST, OUTLIER, MOST_OUTLIERS = 2.0, 4.0, 0.1
 """Residual of a row from which a robust fit counts it linearly, that of an outlier, and their share at most."""
 _RUN_BY_CHANCE, _SHARE_PER_RUN, _LARGEST_SHARE = 2.2, 0.25, 1.0
-"""Standard deviations of a run of residuals that mean nothing, the share of the loss for each beyond, and the largest."""
+"""Standard deviations of a run of residuals that mean nothing, share of the loss for each beyond, and the largest."""
 _BUMP, _BUMP_STEP, _LEAST_LEFT = 0.2, 0.1, 1e-3
-"""Width of the bumps in ln u that runs are looked for with, their distance, and what must be left beside the unknowns."""
+"""Width of the bumps in ln u that runs are looked for with, their distance, and what is left beside the unknowns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,8 @@ class Explained:
     settled: bool
     refused: bool = False
     """Hardly a row of a driven tip is left that a law of impacts can be read off."""
+    short: float = 0.0
+    """Share of the loss by which a smooth function of short range was added for runs of residuals."""
 
     @property
     def residual(self) -> Float[np.ndarray, "rows 3"]:
@@ -78,7 +81,22 @@ class Explained:
         """Of all unknowns, infinite where the readings and priors determine nothing."""
         return covariance_of(self.end.jacobian.T @ self.end.jacobian)
 
-    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAfter:
+    def beside(self, place: int, value: float) -> Float[np.ndarray, " k"]:
+        """Return the unknowns with one held at a value, the others following to first order."""
+        theta, covariance = self.end.theta.copy(), self.covariance
+        if np.isfinite(covariance).all() and covariance[place, place] > 0.0:
+            theta = theta + covariance[place] / covariance[place, place] * (value - theta[place])
+        theta[place] = value
+        return theta
+
+    def profile(self, place: int, value: float) -> float:
+        """Return chi2 with one unknown held at a value, the others following, weights as they are."""
+        fixed = np.zeros(self.end.theta.size, bool)
+        fixed[place] = True
+        theta = self.beside(place, value)
+        return descend(self.model, theta, self.end.orbits, self.weights, settled=_PROFILE_SETTLED, fixed=fixed).chi2
+
+    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAt:
         """Return rebound speeds and delays at approach speeds in nm/us, with their change by independent unknowns."""
         law, count = self.model.law, len(self.model.law.names)
         theta = self.model.of_law(self.end.theta)
@@ -89,22 +107,17 @@ class Explained:
         late = found.time - lead * (1.0 / w - 1.0 / speeds) + twice * (1.0 / w**2 - 1.0 / speeds**2)
         by_rebound = found.square_slope / (2.0 * w[:, None])
         by_delay = found.time_slope + (lead / w**2 - 2.0 * twice / w**3)[:, None] * by_rebound
-        by_delay += np.outer(1.0 / speeds - 1.0 / w, by_unknown[1]) + np.outer(1.0 / w**2 - 1.0 / speeds**2, by_unknown[3])
+        by_delay += np.outer(1.0 / speeds - 1.0 / w, by_unknown[1]) + np.outer(
+            1.0 / w**2 - 1.0 / speeds**2, by_unknown[3]
+        )
         root = root_of(self.covariance)[:count]
         capture = law.capture(theta)
-        ends = capture * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])
-        edge = law.at(theta, ends)
-        rise = (edge.square[2] - edge.square[0]) / (ends[2] - ends[0])
-        known: Any = law
-        of_capture = -edge.square_slope[1] / rise
-        if not isinstance(law, FormulaLaw):
-            of_capture = known.capture_slope(theta)
         factor = np.stack([by_rebound, by_delay]) @ root
-        return LawAfter(
+        return LawAt(
             np.where(leaves, np.stack([w, late]), 0.0),
             np.where(leaves[:, None], factor, 0.0),
             capture,
-            of_capture @ root,
+            law.capture_slope(theta) @ root,
         )
 
 
@@ -117,7 +130,7 @@ def fit_lasting(model: Model, *, robust: bool = False) -> tuple[Explained, Expla
     """
     out = np.zeros(model.data.time.size, bool)
     formula = begun(model)
-    whole = freed(model, formula, out, (SMOOTH,), soft=_SOFT if robust else np.inf)
+    whole = freed(model, formula, out, (SMOOTH,), soft=ROBUST if robust else np.inf)
     if whole.refused:
         return whole, whole
     if robust:
@@ -128,7 +141,8 @@ def fit_lasting(model: Model, *, robust: bool = False) -> tuple[Explained, Expla
     share = min(_SHARE_PER_RUN * (whole.run - _RUN_BY_CHANCE), _LARGEST_SHARE)
     if share <= 0.0:
         return whole, whole
-    return freed(model, whole.end, out, (SMOOTH, of_short_range(share)), before=whole.model), whole
+    wider = freed(model, whole.end, out, (SMOOTH, of_short_range(share)), before=whole.model)
+    return replace(wider, short=share), whole
 
 
 def freed(
@@ -222,7 +236,10 @@ def run_of_residuals(explained: Explained) -> float:
     slopes = np.einsum("nij,njk->nik", weights.whitening, np.nan_to_num(orbits.slopes[:, :, :2]))
     lost = np.where(seen, u**2 - orbits.rebound**2, 0.0)
     tried = np.concatenate(
-        [slopes[:, :, 0, None] * (bumps * lost[:, None])[:, None], slopes[:, :, 1, None] * (bumps / u[:, None])[:, None]],
+        [
+            slopes[:, :, 0, None] * (bumps * lost[:, None])[:, None],
+            slopes[:, :, 1, None] * (bumps / u[:, None])[:, None],
+        ],
         axis=2,
     ).reshape(3 * len(u), -1)
     tried = np.concatenate([tried, np.zeros((end.residual.size - len(tried), tried.shape[1]))])

@@ -1,8 +1,8 @@
 """The fit of an impact law to amplitude tables: the public function, and what it does, from top to bottom.
 
-What is unknown is one vector with priors (`fitting.infer.unknowns`): the law's, the instrument's, and where impacts last
-smooth functions and remainders that stand for what a formula leaves out. One least squares finds it: instantaneous laws
-by Optax on chi2 (`fitting.infer.instantaneous`), lasting ones by a search that keeps every row's orbit, then with
+What is unknown is one vector with priors (`fitting.infer.unknowns`): the law's, the instrument's, and where impacts
+last smooth functions and remainders that stand for what a formula leaves out. One least squares finds it: instantaneous
+laws by Optax on chi2 (`fitting.infer.instantaneous`), lasting ones by a search that keeps every row's orbit, then with
 everything free (`fitting.infer.explain`). The covariance of that vector, (J^T J)^-1, is where the law's band, intervals
 and correlations come from (`fitting.infer.summary`).
 """
@@ -15,20 +15,17 @@ import numpy as np
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from fitting.fits.result import FitResult
-from fitting.infer.explain import Explained, fit_lasting
-from fitting.infer.instantaneous import fit_instantaneous, profile_instantaneous, with_scaled_errors
+from fitting.infer.explain import ROBUST, Explained, fit_lasting
+from fitting.infer.instantaneous import fit_instantaneous, profile
 from fitting.infer.optimiser import OPTIMISER
-from fitting.infer.summary import Fitted, convergence_of, profile_lasting, summary_of
+from fitting.infer.result import FitResult
+from fitting.infer.summary import Fitted, convergence_of, summary_of
 from fitting.infer.unknowns import Model, data_of, quantities_of
-from fitting.models import Held, Task, held_of, readings_of, split_held, task_of
+from fitting.models import Held, Task, held_of, split_held, task_of
 from fitting.parameters import is_nuisance, model_parameters
 from fitting.predict.law import FormulaLaw
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, as_table
-
-ROBUST = 2.0
-"""Residual in errors from which a robust fit counts rows linearly while it looks for outliers."""
 
 
 @checked
@@ -106,8 +103,11 @@ def fit(  # noqa: PLR0913
     }
     if isinstance(whole, SeveralTables):
         settings["share"] = list(share)
-    begin = model_of(whole, task, settings)
-    return summary_of(whole, task, _fitted(begin, task, settings, scale_errors, robust), readings_of(whole)[0])
+    minimum, scale = _minimum_with_scale(
+        model_of(whole, task, settings), scaling=len(task.problem.own) if scale_errors else None, robust=robust
+    )
+    settings["error_scale"] = scale
+    return summary_of(whole, task, minimum, settings)
 
 
 def tables_of(given: Any) -> AmplitudeTable | SeveralTables:
@@ -127,7 +127,15 @@ def tables_of(given: Any) -> AmplitudeTable | SeveralTables:
 
 
 def model_of(table: AmplitudeTable | SeveralTables, task: Task, settings: dict[str, Any]) -> Model:
-    """Return everything that is unknown, and the rows. Where impacts last drag always is: without it r would make up for it."""
+    """Return everything that is unknown, and the rows.
+
+    Where impacts last drag always is unknown: r alone would be biased by what it does.
+
+    Args:
+        table: the rows.
+        task: what is fitted, and what is known beforehand.
+        settings: of the fit: what is held (`fixed`, and of a contact `held`).
+    """
     data, problem = data_of(table, task), task.problem
     fixed = settings["fixed"]
     known = {name: pair for name, pair in task.known.items() if not is_nuisance(name)}
@@ -145,44 +153,56 @@ def model_of(table: AmplitudeTable | SeveralTables, task: Task, settings: dict[s
 
 
 _SCALINGS = 3
+"""How often errors are scaled: what is known of the instrument makes the minimum depend on the scale a little."""
 
 
-def _fitted(model: Model, task: Task, settings: dict[str, Any], scale_errors: bool, robust: bool) -> Fitted:
-    """Return the minimum, with errors scaled until chi2 equals its degrees of freedom where that is asked for."""
-    lasting, total = task.problem.lasting, None
-    explained, before, other, steps, optimiser, gradient = _minimum(model, lasting, robust)
-    for _ in range(_SCALINGS if scale_errors else 0):
-        residual = explained.residual[np.isfinite(explained.residual)]
-        freedom = residual.size - len(task.problem.own)
-        if freedom < 1:
+def _minimum_with_scale(model: Model, *, scaling: int | None, robust: bool) -> tuple[Fitted, float | None]:
+    """Return the minimum, and the factor of the errors that makes chi2 equal its degrees of freedom.
+
+    Args:
+        model: what is unknown, and the rows.
+        scaling: how many parameters the readings determine; None: errors stay as they are.
+        robust: leave outliers out.
+
+    Raises:
+        ValueError: if there are no degrees of freedom to take the scale from.
+    """
+    fitted, scale = minimum_of(model, robust=robust), None
+    if scaling is None:
+        return fitted, scale
+    for _ in range(_SCALINGS):
+        residual = fitted.explained.residual[np.isfinite(fitted.explained.residual)]
+        if residual.size <= scaling:
             raise ValueError("scaling the errors needs more amplitudes than parameters; give their errors instead")
-        factor = float(np.sqrt(np.sum(residual**2) / freedom))
+        factor = float(np.sqrt(np.sum(residual**2) / (residual.size - scaling)))
         if factor == 0.0:
             break
-        total = (total or 1.0) * factor
-        model = with_scaled_errors(model, factor)
-        explained, before, other, steps, optimiser, gradient = _minimum(model, lasting, robust)
-    profile = profile_lasting(explained) if lasting else profile_instantaneous(explained)
-    return Fitted(
-        explained, before, other, profile, convergence_of(explained, optimiser, steps),
-        settings | {"error_scale": total}, total, robust,
-    )  # fmt: skip
+        scale, model = (scale or 1.0) * factor, replace(model, data=model.data.scaled(factor))
+        fitted = minimum_of(model, robust=robust)
+    return fitted, scale
 
 
 def explained_of(result: FitResult) -> Explained:
-    """Return the minimum of a fit with all its unknowns, which its result does not keep: found again by its settings."""
+    """Return the minimum of a fit with all its unknowns, which its result does not keep: found by its settings again."""
     table, settings = result.table, result.settings
-    names = ("free", "fixed", "constraints")
-    options = {name: settings[name] for name in names} | {"effects": settings["effects"] or EFFECTS}
+    options: dict[str, Any] = {name: settings[name] for name in ("free", "fixed", "constraints")}
+    options["effects"] = settings["effects"] or EFFECTS
     task = task_of(table, result.model, **options)
-    begin = model_of(table, task, settings | {"held": tuple(Held(*one) for one in settings["held"])})
-    begin = with_scaled_errors(begin, settings["error_scale"] or 1.0)
-    return _minimum(begin, task.problem.lasting, settings["robust"] is not None)[0]
+    model = model_of(table, task, settings | {"held": tuple(Held(*one) for one in settings["held"])})
+    model = replace(model, data=model.data.scaled(settings["error_scale"] or 1.0))
+    return minimum_of(model, robust=settings["robust"] is not None).explained
 
 
-def _minimum(model: Model, lasting: bool, robust: bool):
-    if lasting:
+def minimum_of(model: Model, *, robust: bool = False) -> Fitted:
+    """Return what explains a model's rows best: the search itself.
+
+    Args:
+        model: what is unknown, and the rows.
+        robust: leave outliers out.
+    """
+    if model.law.lasting:
         explained, before = fit_lasting(model, robust=robust)
-        return explained, before, None, 0, "Levenberg-Marquardt", 0.0
+        steps = OPTIMISER + ", then Levenberg-Marquardt"
+        return Fitted(explained, before, None, Explained.profile, convergence_of(explained, steps, explained.end.steps))
     explained, best, other = fit_instantaneous(model, robust=robust)
-    return explained, explained, other, best.steps, OPTIMISER, best.gradient_norm
+    return Fitted(explained, explained, other, profile, convergence_of(explained, OPTIMISER, best.steps))

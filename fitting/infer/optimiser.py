@@ -1,4 +1,4 @@
-"""Optax's L-BFGS around a function of NumPy: value and gradient come from the caller, steps are halved until they descend.
+"""Optax's L-BFGS around a function of NumPy: values and gradients come from the caller, steps are halved.
 
 The start's Gauss-Newton curvature makes steps of one standard error each the unit, so that steep valleys look round.
 """

@@ -1,8 +1,8 @@
 """What rows count for: which are excluded, how uncertain the picture of impacts is for each, and their covariance.
 
-A law of impacts lacks what slow impacts are: with the capture speed u_c, the length L over which a leaving tip keeps its
-energy and s = omega L/w, amplitudes of eight full contacts are off by less than about 0.05 % + 1.2 % s^3 +
-1.6 % (1.5 u_c/u)^6. Peak and lock-in of a row share that error. Rows where it is too large are excluded.
+A law of impacts lacks what slow impacts are: with the capture speed u_c, the length L over which a leaving tip keeps
+its energy and s = omega L/w, amplitudes of eight full contacts are off by less than about 0.05 % + 1.2 % s^3 + 1.6 %
+(1.5 u_c/u)^6. Peak and lock-in of a row share that error. Rows where it is too large are excluded.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
 from afm_jax.units import RAD_PER_US_PER_KHZ
-from fitting.fits.discrepancy import remainders
 from fitting.infer.unknowns import Data, Model
 from fitting.predict.orbit import READINGS, Orbits
 
@@ -25,7 +24,7 @@ BY_LEVER = 1.2
 """Pull times Hertz time over the approach speed from which rows of a driven tip are excluded."""
 _MOST_LOST, _MOST_IRREGULAR = 0.05, 0.2
 """Share at most of the rows without an orbit that are taken to be slow impacts, or irregular motion of a driven tip."""
-_TURNED = np.rad2deg(0.125)
+SIZE_OF_PHASE = float(np.rad2deg(0.125))
 """Error of the phase in degrees over the relative error of the amplitude: what the tip loses fixes the phase."""
 _TOGETHER, _APART = 2.0, 1.0 / 16.0
 """Variance of the mean and of the difference of peak and lock-in of a slow row (times root 2), over that of each."""
@@ -64,7 +63,7 @@ def plain_weights(data: Data, extra: float, out: Bool[np.ndarray, " rows"]) -> W
     size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(used), 1), np.rad2deg(1.0))], axis=1)
     error = np.where(used, np.hypot(data.error, extra * size), np.inf)
     whitening = np.eye(READINGS) / np.where(used, error, np.inf)[:, None]
-    return Weights(whitening, used, np.zeros(len(used)), np.full(len(used), "", dtype=object))
+    return Weights(whitening, used, np.zeros(len(used)), np.where(out, OUTLIER_LEFT_OUT, "").astype(object))
 
 
 def weights_of(
@@ -101,7 +100,9 @@ def weights_of(
     reasons[out] = OUTLIER_LEFT_OUT
     reasons = reasons if kept is None else kept
     near = np.minimum(1.5 * capture / approach, 1.5 / NEAREST)
-    frame = IN_FRAME * (1.0 + data.row.drive_amplitude_nm / np.abs(np.where(data.measured[:, 1], data.read[:, 1], np.inf)))
+    frame = IN_FRAME * (
+        1.0 + data.row.drive_amplitude_nm / np.abs(np.where(data.measured[:, 1], data.read[:, 1], np.inf))
+    )
     error = np.where(data.tapping, frame, BASE) + SLOW * near**6
     error += np.where(data.tapping, TAPPED, GROWTH) * np.minimum(s, LONGEST) ** 3
     error = np.where(data.row.free, 0.0, np.where(exists, error, BASE))
@@ -124,7 +125,7 @@ def _whitening(
     data: Data, used: Bool[np.ndarray, "rows 3"], model_error: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, "rows 3 3"]:
     """Return the inverse Cholesky factors of the rows' covariances: noise, and what peak and lock-in lack together."""
-    size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(used), 1), _TURNED)], axis=1)
+    size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(used), 1), SIZE_OF_PHASE)], axis=1)
     padding = np.where(used, model_error[:, None] * size, 0.0)
     both = used[:, 0] & used[:, 1]
     shares = np.tile(np.eye(READINGS), (len(used), 1, 1))
@@ -161,6 +162,46 @@ def remainders_of(model: Model, theta: Float[np.ndarray, " k"], orbits: Orbits) 
         some = exists & (data.tapping == tapping)
         if some.any():
             u, w = orbits.approach[some], np.maximum(orbits.rebound[some], 1.0)
-            change = remainders(u, w, orbits.pull[some], orbits.change[some], hertz * u**-0.2, tapping=tapping)
+            change = _remainders(u, w, orbits.pull[some], orbits.change[some], hertz * u**-0.2, tapping=tapping)
             found[:, some] = change
     return found
+
+
+_CORRECTIONS = 1.5
+"""Standard deviation of a correction's remainder over what was seen."""
+
+
+def _remainders(
+    u: Float[np.ndarray, " rows"],
+    w: Float[np.ndarray, " rows"],
+    pull: Float[np.ndarray, " rows"],
+    change: Float[np.ndarray, " rows"],
+    time: Float[np.ndarray, " rows"],
+    *,
+    tapping: bool,
+) -> Float[np.ndarray, "2 rows m"]:
+    """Return the leading remainders of the corrections, of the squared rebound speed and of the delay, for each row.
+
+    Args:
+        u: approach speed in nm/us.
+        w: rebound speed in nm/us.
+        pull: acceleration at mid contact in nm/us^2.
+        change: its derivative by time in nm/us^3.
+        time: Hertz time in us.
+        tapping: the cantilever is driven itself.
+    """
+    # slope in nm/us of the loss u^2 - w^2 over the speed, by regression; 0 where all rows have one speed
+    apart = u - u.mean()
+    slope = max(float(apart @ (u**2 - w**2)) / max(float(apart @ apart), 1e-9), 0.0)
+    nothing = np.zeros_like(u)
+    # where the lever's own pull is most of it, it hardly changes during the contact: full contacts say so
+    by_square = 0.02 if tapping else 5.0
+    late = (0.5 * pull / w**3, 0.008 * pull * time**2 / u, 8.0 * change / w**4)
+    gained = (
+        15.0 * slope * change / w**2,
+        2.0 * slope * pull / u,
+        0.06 * change * time**2 * u,
+        by_square * pull**2 / w**2,
+    )
+    columns = [(nothing, one) for one in late] + [(one, nothing) for one in gained]
+    return _CORRECTIONS * np.moveaxis(np.array(columns), 0, 2)

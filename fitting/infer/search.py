@@ -1,12 +1,12 @@
 """Where the fit begins: starts are screened and polished; rows that a law has no orbit for are asked for again.
 
-Leaving out a measured row without an orbit lets a minimiser run into a false minimum, so that rows come before residuals:
-`orbits_at` searches for every row's orbits and takes the steady one that explains it best, `recovered` looks around a
-law for laws that have the missing ones.
+Leaving out a measured row without an orbit lets a minimiser run into a false minimum, so that rows come before
+residuals: `orbits_at` searches for every row's orbits and takes the steady one that explains it best, `recovered` looks
+around a law for laws that have the missing ones.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,12 +15,12 @@ from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.infer.optimiser import minimised
 from fitting.infer.rows import Weights, plain_weights, weights_of
-from fitting.infer.unknowns import Data, Model
+from fitting.infer.unknowns import Data, Model, no_orbits
 from fitting.parameters import PARAMETERS
 from fitting.predict.orbit import Orbits
 
 STARTS, POLISHED, ROWS = 32, 6, 32
-"""Starts that are screened, how many of them are polished at most, and the rows that both look at, at most."""
+"""Starts that are screened, by every second of the rows, how many are polished at most, and the rows, at most."""
 _GOOD = 0.3
 """Cost of a reading above what its noise makes up to which a polished start is good enough."""
 _WIDTH = 0.1
@@ -32,6 +32,8 @@ LOST_COST = 50.0
 """What a measured row without an orbit adds to chi2 where laws are compared."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
+_STEPS = 40
+"""Steps of a descent at most."""
 _SOFT = 2.0
 """Residual of a row from which it counts linearly in a search."""
 _DRAWN, _ERRORS = 24, (1.0, 3.0, 5.0)
@@ -41,10 +43,10 @@ _LIKELY = 0.2
 
 
 class Found(NamedTuple):
-    """The orbits of all rows at unknowns: NaN where there is none; and how many steady ones each row has."""
+    """The orbits of all rows at unknowns: NaN where there is none; and the number of steady ones of each row."""
 
     orbits: Orbits
-    count: Int[np.ndarray, " rows"]
+    number: Int[np.ndarray, " rows"]
 
     @property
     def exists(self) -> Bool[np.ndarray, " rows"]:
@@ -64,15 +66,15 @@ def orbits_at(
         roughly: after three steps of Newton's method, steady or not: to screen starts.
     """
     data = model.data
-    whole = model.follow(theta, np.full((data.time.size, 3), 20.0), most=1)
-    free = data.row.free
+    free, somewhere = data.row.free, np.full((data.time.size, 3), 20.0)
+    # of free tips there is nothing to search for
+    whole = model.follow(theta, somewhere, most=1) if free.any() else no_orbits(data.time.size)
     for column in (whole.x, whole.approach, whole.rebound):
         column[~free] = np.nan
-    whole.x[free] = 20.0
     count = free.astype(int)
-    rows = np.flatnonzero(~free) if rows is None else rows[~free[rows]]
-    which, orbits = model.candidates(theta, rows, most=4 if roughly else 14, judge=not roughly)
-    fine = np.isfinite(orbits.readings).all(axis=1) if roughly else orbits.steady
+    wanted = np.flatnonzero(~free) if rows is None else rows[~free[rows]]
+    which, orbits = model.candidates(theta, wanted, most=4 if roughly else 14, judge=not roughly)
+    fine = np.asarray(np.isfinite(orbits.readings).all(axis=1) if roughly else orbits.steady)
     error = np.maximum(data.error[which], 0.02 * np.abs(data.read[which]))
     with np.errstate(invalid="ignore"):
         misfit = np.where(fine, np.nansum(((orbits.readings - data.read[which]) / error) ** 2, axis=1), np.inf)
@@ -117,7 +119,6 @@ def descend(
     weights: Weights,
     *,
     soft: float = np.inf,
-    most: int = 40,
     settled: float = 1e-3,
     fixed: Bool[np.ndarray, " k"] | None = None,
 ) -> Descent:
@@ -129,13 +130,12 @@ def descend(
         begin: orbits there; rows without one do not count.
         weights: of the rows.
         soft: whitened residual of a row from which it counts linearly.
-        most: steps at most.
-        settled: estimated distance of chi2 to its minimum at which a descent has arrived.
+        settled: fall of chi2 in a step at which a descent has arrived.
         fixed: unknowns that stay; None: none.
     """
     rows = Followed(model, theta, begin, weights, soft)
     longest = np.array([1.0 if name in ("epsilon", "delay_hertz") else np.inf for name in model.names])
-    end = levenberg_marquardt(rows.sum, theta, settled=settled, most=most, longest=longest, fixed=fixed)
+    end = levenberg_marquardt(rows.sum, theta, settled=settled, most=_STEPS, longest=longest, fixed=fixed)
     return rows.descent(end.place, end.sum, end.steps)
 
 
@@ -193,7 +193,7 @@ def polished_by_optax(
 
 def starts(model: Model, count: int = STARTS) -> Float[np.ndarray, "starts k"]:
     """Return unknowns to start from: a low-discrepancy sequence over what the formula's parameters may be."""
-    law: Any = model.law
+    law = model.law
     data, own = model.data, law.own
     ratio = 2.0
     for _ in range(60):
@@ -234,7 +234,9 @@ def _lost_squared(model: Model) -> tuple[float, float] | None:
     free, amplitude, lag = data.row.drive_amplitude_nm, data.read[:, 1], np.deg2rad(data.read[:, 2])
     size = np.hypot(1.0 - ratio**2, ratio / data.quality_factor)
     frequency = RAD_PER_US_PER_KHZ * data.free_frequency_khz
-    lost = 2.0 * np.pi * frequency**2 * amplitude * (free * size * np.sin(lag) - ratio * amplitude / data.quality_factor)
+    lost = (
+        2.0 * np.pi * frequency**2 * amplitude * (free * size * np.sin(lag) - ratio * amplitude / data.quality_factor)
+    )
     lost = lost[some & (np.nan_to_num(lost) > 0.0)]
     if not lost.size:
         return None
@@ -268,10 +270,13 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
     small = model if len(set(model.data.drives)) > 1 else _narrowed(model, rows)
     every = np.arange(small.data.time.size) if small is not model else rows
     points = starts(model)
-    cost = [soft_cost(small.data, orbits_at(small, point, every, roughly=True), every) for point in points]
+    some = every[::2]
+    cost = [soft_cost(small.data, orbits_at(small, point, some, roughly=True), some) for point in points]
     nothing = np.zeros(small.data.time.size, bool)
     with np.errstate(invalid="ignore"):
-        noise = (small.data.error / np.where(np.arange(3) < 2, np.abs(small.data.read), np.rad2deg(1.0)))[every] / _FINER
+        noise = (small.data.error / np.where(np.arange(3) < 2, np.abs(small.data.read), np.rad2deg(1.0)))[
+            every
+        ] / _FINER
     good = float(np.nansum(np.log1p(noise**2) + _GOOD))
     best, least = points[int(np.argmin(cost))], np.inf
     for theta in points[np.argsort(cost, kind="stable")[:POLISHED]]:
@@ -281,7 +286,7 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
         weights = plain_weights(small.data, _WIDTH, nothing)
         end = polished_by_optax(small, theta, found.orbits, weights)
         found, weights = orbits_at(small, end, every), plain_weights(small.data, _FINER, nothing)
-        end = descend(small, end, found.orbits, weights, soft=_SOFT, most=12, settled=0.1).theta
+        end = descend(small, end, found.orbits, weights, soft=_SOFT, settled=0.1).theta
         here = soft_cost(small.data, orbits_at(small, end, every), every, _FINER)
         if here < least:
             best, least = end, here
@@ -364,7 +369,7 @@ def _polished(model: Model, theta: Float[np.ndarray, " k"], extras: tuple[float,
             if extra is None
             else plain_weights(model.data, extra, nothing)
         )
-        end = descend(model, theta, found.orbits, weights, soft=_SOFT, most=25, settled=0.01)
+        end = descend(model, theta, found.orbits, weights, soft=_SOFT, settled=0.01)
         theta = end.theta
     assert end is not None  # noqa: S101
     return end

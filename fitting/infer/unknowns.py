@@ -1,8 +1,8 @@
 """Everything that is unknown in a fit as one vector with priors, and what the rows read as a function of it.
 
-The vector holds the unknowns of the law (`fitting.predict.law`), one factor of N(0, 1) for each leading remainder of the
-corrections of impacts that last, and the instrument's quantities, each in standard errors of what is known of it. A new
-nuisance is an entry of `_MOVES`, and a term of `Model.local`.
+The vector holds the unknowns of the law (`fitting.predict.law`), one factor of N(0, 1) for each leading remainder of
+the corrections of impacts that last, and the instrument's quantities, each in standard errors of what is known of it. A
+new nuisance is an entry of `_MOVES`, and a term of `Model.local`.
 """
 
 from collections.abc import Mapping
@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.impact.law_table import LawTable
-from fitting.models import Task
 from afm_jax.contact.parameters import PAPER
-from fitting.parameters import CONTACT_NAMES, PARAMETERS, is_nuisance
+from afm_jax.impact.law_table import LawTable
+from fitting.models import Reach, Task, drifts, reach_of, readings_of
+from fitting.parameters import CONTACT_NAMES, PARAMETERS, is_nuisance, name_of_table
 from fitting.predict.law import LawModel
 from fitting.predict.orbit import COUNT, READINGS, Local, Orbits, Row, followed, starts_of
 from fitting.tables.several import SeveralTables
@@ -45,7 +45,6 @@ def weak_prior(name: str, mass_ng: float) -> tuple[float, float]:
         parameter = PARAMETERS[name]
         return (0.0, 10.0) if parameter.width else (float(np.log(max(PAPER[name], 1e-3))), 5.0)
     return wide.get(name, (0.0, np.inf))
-
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,33 +96,54 @@ class Data:
 
 
 def data_of(table: AmplitudeTable | SeveralTables, task: Task) -> Data:
-    """Return the rows that a fit has to explain."""
-    rows, count = task.measurement.rows, table.rows
-    kinds = np.asarray(rows.amplitude_nm).shape[1]
-    measured = np.asarray(rows.measured)[:count]
-    read, error = np.full((count, READINGS), np.nan), np.full((count, READINGS), np.nan)
-    read[:, :kinds] = np.where(measured, np.asarray(rows.amplitude_nm)[:count], np.nan)
-    error[:, :kinds] = np.where(measured, np.asarray(rows.error_nm)[:count], np.nan)
-    number = np.zeros(count, int) if rows.table is None else np.asarray(rows.table)[:count]
-    joint = task.measurement.joint
-    levers = (task.measurement.cantilever,) if joint is None else joint.cantilevers
-    quality = [_UNDAMPED if lever.quality_factor is None else float(lever.quality_factor) for lever in levers]
+    """Return the rows that a fit has to explain; a Q that the table leaves open is what is known of it besides."""
+    tables, columns, heads = table.tables, [], []
+    for member, label in zip(tables, table.labels, strict=True):
+        quality = member.quality_factor
+        if quality is not None and np.isnan(quality):
+            known = task.known.get(name_of_table("quality_factor", label)) or task.known["quality_factor"]
+            quality = known[0]
+        heads.append((member.free_frequency_khz, _UNDAMPED if quality is None else float(quality)))
+        columns.append(_columns_of(member, quality))
+    number = np.repeat(np.arange(len(tables)), [member.rows for member in tables])
+    whole = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
+    read = whole["read"]
     return Data(
-        row=Row(
-            *(np.asarray(getattr(rows, name), float)[:count] for name in Row._fields[:4]),
-            phase_deg=np.nan_to_num(read[:, 2]),
-            free=np.asarray(rows.free)[:count],
-        ),
+        row=Row(*(whole[name] for name in Row._fields[:4]), phase_deg=np.nan_to_num(read[:, 2]), free=whole["free"]),
         read=read,
-        error=error,
-        no_orbit=np.asarray(rows.no_orbit)[:count],
-        time=np.asarray(rows.time)[:count],
+        error=whole["error"],
+        no_orbit=whole["no_orbit"],
+        time=whole["time"],
         number=number,
-        drives=(task.problem.drive,) if joint is None else joint.drives,
-        free_frequency_khz=np.array([float(lever.frequency_khz) for lever in levers])[number],
-        quality_factor=np.array(quality)[number],
-        mass_ng=float(task.measurement.cantilever.mass_ng),
+        drives=tuple(member.drive for member in tables),
+        free_frequency_khz=np.array([float(frequency) for frequency, _ in heads])[number],
+        quality_factor=np.array([quality for _, quality in heads])[number],
+        mass_ng=1.0 if table.mass_ng is None else float(table.mass_ng),
     )
+
+
+def _columns_of(table: AmplitudeTable, quality_factor: float | None) -> dict[str, np.ndarray]:
+    """Return the rows of one table; of a driven tip those that are only drawn to the sample count as not measured."""
+    values, errors = readings_of(table)
+    measured, free = np.isfinite(values), np.zeros(table.rows, bool)
+    if table.tapping:
+        reach = reach_of(table, quality_factor)
+        measured, free = measured & (reach != Reach.ATTRACTED)[:, None], reach == Reach.FREE
+    missing = ((0, 0), (0, READINGS - values.shape[1]))
+    read, error = (
+        np.pad(np.where(measured, part, np.nan), missing, constant_values=np.nan) for part in (values, errors)
+    )
+    return {
+        "order": np.asarray(table.order, float),
+        "drive_frequency_khz": np.asarray(table.drive_frequency_khz, float),
+        "drive_amplitude_nm": np.asarray(table.excitation_nm, float),
+        "offset_nm": np.asarray(table.offset_nm, float),
+        "read": read,
+        "error": error,
+        "no_orbit": np.zeros(table.rows, bool) if table.no_orbit is None else np.nan_to_num(table.no_orbit) > 0.0,
+        "time": np.linspace(-0.5, 0.5, table.rows) if drifts(table) else np.zeros(table.rows),
+        "free": free,
+    }
 
 
 class Quantity(NamedTuple):
@@ -144,6 +164,12 @@ class Quantity(NamedTuple):
         if self.kind in _FACTORS:
             return self.value * numpy.exp(self.error / self.value * unknown)
         return self.value + self.error * unknown
+
+    def unknown(self, value: float) -> float:
+        """Return the unknown for a value."""
+        if self.kind in _FACTORS:
+            return float(np.log(value / self.value)) * self.value / self.error
+        return (value - self.value) / self.error
 
     def slope(self, unknown: float) -> float:
         """Return d value/d unknown."""
@@ -194,7 +220,7 @@ class Model:
     def prior(self) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Mean of every unknown, and one over the standard deviation: 0 where nothing is known."""
         mean, strength = np.zeros(len(self.names)), np.ones(len(self.names))
-        own = getattr(self.law, "own", ())
+        own = self.law.own
         for i, name in enumerate(self.law.names):
             if name in own:
                 mean[i], strength[i] = self._known_of(name)
@@ -202,7 +228,7 @@ class Model:
 
     def _known_of(self, name: str) -> tuple[float, float]:
         """Return what is known of a parameter's unknown: the mean, and one over the standard deviation."""
-        law: Any = self.law
+        law = self.law
         if name not in (self.known or {}):
             value, error = weak_prior(name, self.data.mass_ng) if law.lasting else (0.0, np.inf)
             return value, 1.0 / error
@@ -302,15 +328,18 @@ class Model:
                 at = mine[which]
                 parts.append((at, followed(x, local[at], self.data.row.take(at), table, drive, most=most, judge=judge)))
         if not parts:
-            return np.zeros(0, int), _nothing(0)
-        return np.concatenate([at for at, _ in parts]), Orbits(*map(np.concatenate, zip(*(o for _, o in parts), strict=True)))
+            return np.zeros(0, int), no_orbits(0)
+        return np.concatenate([at for at, _ in parts]), Orbits(
+            *map(np.concatenate, zip(*(o for _, o in parts), strict=True))
+        )
 
 
 def _column(name: str) -> int:
     return Local._fields.index(name)
 
 
-def _nothing(count: int) -> Orbits:
+def no_orbits(count: int) -> Orbits:
+    """Return room for the orbits of so many rows."""
     shapes = {"x": (3,), "readings": (READINGS,), "slopes": (READINGS, COUNT)}
     kinds = {"closes": bool, "steady": bool}
     return Orbits(*(np.zeros((count, *shapes.get(name, ())), kinds.get(name, float)) for name in Orbits._fields))
@@ -318,7 +347,7 @@ def _nothing(count: int) -> Orbits:
 
 def _gathered(parts) -> Orbits:
     parts = list(parts)
-    whole = _nothing(sum(some.size for some, _ in parts))
+    whole = no_orbits(sum(some.size for some, _ in parts))
     for some, orbits in parts:
         for column, part in zip(whole, orbits, strict=True):
             column[some] = part
@@ -328,9 +357,8 @@ def _gathered(parts) -> Orbits:
 def quantities_of(data: Data, task: Task, labels: tuple[str, ...]) -> tuple[Quantity, ...]:
     """Return what is unknown of the instrument, from what a task knows of it beforehand."""
     found = []
-    for name, (value, error) in task.known.items():
-        if not is_nuisance(name):
-            continue
+    for name in filter(is_nuisance, task.problem.names):
+        value, error = task.known[name]
         _, _, label = name.partition(" of ")
         mine = data.number == labels.index(label) if label else np.ones(data.number.size, bool)
         found.append(Quantity(name, value, error, mine))

@@ -5,7 +5,7 @@ What is held is an unknown like any other, with a prior as wide as its error: la
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -21,14 +21,14 @@ from afm_jax.impact.law_table import EXCESS, LawTable, table_of
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.models import Held
 from fitting.parameters import PARAMETERS
-from fitting.predict.law import LawAt
+from fitting.predict.law import LawAt, LawModel
 
 _SPEEDS = 160
 """Approach speeds beside the knots that one call takes at most, or a multiple."""
 
 
 @dataclass(frozen=True, eq=False)
-class ContactLaw:
+class ContactLaw(LawModel):
     """The law of a contact.
 
     Attributes:
@@ -76,22 +76,19 @@ class ContactLaw:
         return {name: float(self.value_of(name, y)) for name, y in zip(self.own, theta.tolist(), strict=False)}
 
     def _evaluated(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> Any:
-        """Return the law at the knots and at speeds in nm/us, its coefficients and all derivatives; kept for a while."""
+        """Return the law at the knots and at speeds in nm/us, its coefficients, all derivatives; kept for a while."""
         size = -(-max(u.size, 1) // _SPEEDS) * _SPEEDS
         speeds = np.concatenate([u, np.full(size - u.size, 50.0)])
         key = theta.tobytes() + speeds.tobytes()
         if key not in self._kept:
-            while len(self._kept) > 3:  # noqa: PLR2004
+            while len(self._kept) > 3:
                 del self._kept[next(iter(self._kept))]
-            linear = np.array([PARAMETERS[name].width for name in self.own])
-            reference = np.array([PARAMETERS[name].reference for name in self.own])
-            held = np.array([(one.value, one.error) for one in self.held]).reshape(-1, 2)
-            ends = np.array([(PARAMETERS[one.name].lowest, PARAMETERS[one.name].highest) for one in self.held])
+            linear = np.array([(PARAMETERS[name].reference, PARAMETERS[name].width) for name in self.own])
+            ends = [(PARAMETERS[one.name].lowest, PARAMETERS[one.name].highest) for one in self.held]
+            held = np.array([(one.value, one.error, *end) for one, end in zip(self.held, ends, strict=True)])
             fixed = {name: np.asarray(float(value)) for name, value in self.fixed.items() if name not in self._of_held}
-            found = _law(
-                theta, speeds, linear, reference, held, ends.reshape(-1, 2), fixed, np.asarray(self.mass_ng),
-                names=(self.own, tuple(one.name for one in self.held), tuple(self.effects)),
-            )  # fmt: skip
+            names = self.own, tuple(one.name for one in self.held), tuple(self.effects)
+            found = _law(theta, speeds, linear, held.reshape(-1, 4), fixed, np.asarray(self.mass_ng), names=names)
             self._kept[key] = jax.tree.map(np.asarray, found)
         return self._kept[key]
 
@@ -141,14 +138,27 @@ def _errors(impact: TabulatedImpact, approach: Float[Array, " n"]) -> tuple[Floa
     return impact.errors(approach)
 
 
-@partial(compiled_quickly(static_argnames="names", level=0))
-def _law(theta, speeds, linear, reference, held, ends, fixed, mass_ng, *, names):  # noqa: PLR0913
-    """Return w^2 and T at the knots and at speeds, a, b, d, f and the capture speed; and their derivatives."""
+@compiled_quickly(static_argnames="names", level=0)
+def _law(
+    theta: Float[Array, " k"],
+    speeds: Float[Array, " n"],
+    linear: Float[Array, "own 2"],
+    held: Float[Array, "held 4"],
+    fixed: dict[str, Float[Array, ""]],
+    mass_ng: Float[Array, ""],
+    *,
+    names: tuple[tuple[str, ...], ...],
+):
+    """Return w^2 and T at the knots and at speeds, a, b, d, f and the capture speed; and their derivatives.
+
+    ``linear``: reference and width of parameters of any sign (width 0: logarithms); ``held``: values, errors, ranges.
+    """
     own, of_held, effects = names
 
     def columns(theta):
-        free = jnp.where(linear != 0.0, reference + linear * theta[: len(own)], jnp.exp(theta[: len(own)]))
-        stays = jnp.clip(held[:, 0] + held[:, 1] * theta[len(own) :], ends[:, 0], ends[:, 1])
+        mine, others = theta[: len(own)], theta[len(own) :]
+        free = jnp.where(linear[:, 1] != 0.0, linear[:, 0] + linear[:, 1] * mine, jnp.exp(mine))
+        stays = jnp.clip(held[:, 0] + held[:, 1] * others, held[:, 2], held[:, 3])
         known = dict(zip(own, free, strict=True)) | dict(zip(of_held, stays, strict=True))
         impact = tabulated(Contact.paper(effects=effects, **(fixed | known)), mass_ng)
         capture = impact.capture

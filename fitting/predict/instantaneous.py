@@ -69,9 +69,7 @@ def searched(
     )
 
 
-def read_at(
-    coordinate: Float[Array, ""], law: ImpactLaw, local: Local, row: Row, drive: str
-) -> Float[Array, " 3"]:
+def read_at(coordinate: Float[Array, ""], law: ImpactLaw, local: Local, row: Row, drive: str) -> Float[Array, " 3"]:
     """Return the readings of the orbit whose impact has a coordinate; the other arguments as of `searched`."""
     cantilever, platform = platform_and_cantilever(local, row, drive)
     seen = amplitudes(OrbitPlace(coordinate, jnp.zeros(())), OrbitProblem(cantilever, platform, law, row.order))

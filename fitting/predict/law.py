@@ -6,15 +6,16 @@ w^2 and the delay without its leads, T, at any speed, and the table that orbits 
     w^2 = u^2 - [(1 - r^2) u^2 + c sqrt(u^2 + q) + epsilon] exp(L(ln u))
     T = a u^(-1/5) - d/u - P(ln u)/u,    tau = T - b (1/w - 1/u) + f (1/w^2 - 1/u^2)
 
-L and P are Gaussian processes, values of which are unknowns with priors N(0, 1); q and f too have priors of a width that
-full contacts say. The unknowns of losses are 1 - r^2, c and ln epsilon (epsilon itself where impacts are instantaneous,
-for there it may vanish); of the delay ln a, b and d.
+L and P are Gaussian processes, values of which are unknowns with priors N(0, 1); q and f too have priors of a width
+that full contacts say. The unknowns of losses are 1 - r^2, c and ln epsilon (epsilon itself where impacts are
+instantaneous, for there it may vanish); of the delay ln a, b and d.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -65,39 +66,62 @@ class LawAt(NamedTuple):
     time_slope: Float[np.ndarray, "n k"]
 
 
-@runtime_checkable
-class LawModel(Protocol):
-    """What a fit asks of its law; `theta` are the values of its unknowns, in the order of `names`."""
+class LawModel(ABC):
+    """What a fit asks of its law; `theta` are the values of its unknowns, in the order of `names`.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The unknowns."""
-        ...
+    Attributes:
+        own: the parameters that are fitted, by their names in reports; their unknowns come first.
+        names: all unknowns; those that are not of `own` have priors N(0, 1).
+        lasting: impacts take time.
+        length_nm: length over which a leaving tip keeps its energy.
+    """
 
-    @property
-    def length_nm(self) -> float:
-        """Length over which a leaving tip keeps its energy."""
-        ...
+    own: tuple[str, ...]
+    names: Any
+    lasting: bool
+    length_nm: Any
 
+    @abstractmethod
+    def value_of(self, name: str, unknown: Any) -> Any:
+        """Return a parameter's value for its unknown."""
+
+    @abstractmethod
+    def unknown_of(self, name: str, value: Any) -> Any:
+        """Return the unknown for a parameter's value."""
+
+    @abstractmethod
+    def slope_of(self, name: str, unknown: float) -> float:
+        """Return d value/d unknown of a parameter."""
+
+    @abstractmethod
+    def values(self, theta: Float[np.ndarray, " k"]) -> dict[str, float]:
+        """Return the parameters by name."""
+
+    @abstractmethod
     def at(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> LawAt:
         """Return the law at approach speeds in nm/us."""
-        ...
 
+    @abstractmethod
     def coefficients(self, theta: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "4 k"]]:
         """Return a, b, d and f of the delay, and their derivatives by the unknowns."""
-        ...
 
+    @abstractmethod
     def capture(self, theta: Float[np.ndarray, " k"]) -> float:
         """Return the capture speed in nm/us."""
-        ...
 
+    @abstractmethod
     def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
         """Return the table."""
-        ...
+
+    def capture_slope(self, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
+        """Return the derivatives of the capture speed by the unknowns: where w^2 vanishes."""
+        ends = self.capture(theta) * np.array([1.0 - 1e-5, 1.0, 1.0 + 1e-5])
+        edge = self.at(theta, ends)
+        return -edge.square_slope[1] * (ends[2] - ends[0]) / (edge.square[2] - edge.square[0])
 
 
 @dataclass(frozen=True)
-class FormulaLaw:
+class FormulaLaw(LawModel):
     """A formula, with smooth functions beside it or without.
 
     Attributes:
@@ -250,7 +274,7 @@ class FormulaLaw:
 
     def capture(self, theta: Float[np.ndarray, " k"]) -> float:
         """Return the speed in nm/us up to which the tip is captured: the fastest root of w^2."""
-        grid = np.geomspace(_SLOWEST, _FASTEST, 1600)
+        grid = np.geomspace(_SLOWEST, _FASTEST, 400)
         stays = np.flatnonzero(self.at(theta, grid).square <= 0.0)
         if not stays.size or stays[-1] == grid.size - 1:
             return float(grid[0] if not stays.size else grid[-1])

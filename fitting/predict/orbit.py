@@ -8,7 +8,7 @@ runs in NumPy (`followed`): inside a compiled loop its program would take ten ti
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,14 +50,17 @@ _HEIGHTS = np.linspace(0.0, 1.0, 258)[1:-1]
 
 
 class Row(NamedTuple):
-    """What is known of rows: columns of a table, of shape (rows,); ``phase_deg`` is the measured one, 0 for none."""
+    """What is known of rows: columns of a table, of shape (rows,); ``phase_deg`` is the measured one, 0 for none.
 
-    order: Float[Array, " rows"]
-    drive_frequency_khz: Float[Array, " rows"]
-    drive_amplitude_nm: Float[Array, " rows"]
-    offset_nm: Float[Array, " rows"]
-    phase_deg: Float[Array, " rows"]
-    free: Bool[Array, " rows"]
+    Arrays of NumPy outside compiled programs, of JAX and of one row inside.
+    """
+
+    order: Any
+    drive_frequency_khz: Any
+    drive_amplitude_nm: Any
+    offset_nm: Any
+    phase_deg: Any
+    free: Any
 
     def take(self, which: Int[np.ndarray, " some"]) -> "Row":
         """Return some of the rows."""
@@ -280,7 +283,7 @@ def starts_of(
     """
     local = local.copy()
     local[:, :2] = 0.0
-    x, there = _in_blocks(lambda *block: _scanned(*block, table, drive), local, row)
+    x, there = _in_blocks(lambda *block: _scanned.outside(*block, table, drive), local, row)
     which, slot = np.nonzero(there)
     return which, x[which, slot]
 
@@ -324,7 +327,7 @@ def followed(
         for left in reversed(range(most)):
             some = row.take(moving)
             slopes[moving], found[moving], state[moving] = _in_blocks(
-                lambda *block: _evaluated(*block, table, drive), x[moving], local[moving], some
+                lambda *block: _evaluated.outside(*block, table, drive), x[moving], local[moving], some
             )
             if not left:
                 break
@@ -354,9 +357,9 @@ def _solved(
     matrix: Float[np.ndarray, "rows 3 3"], right: Float[np.ndarray, "rows 3 k"]
 ) -> Float[np.ndarray, "rows 3 k"]:
     """Return the solutions of linear systems; 0 where one is singular or not finite."""
-    sound = np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2))
-    safe = np.where(sound[:, None, None], matrix, np.eye(3)) + 1e-300 * np.eye(3)
-    return np.linalg.solve(safe, np.where(sound[:, None, None], right, 0.0))
+    sound = np.asarray(np.isfinite(matrix).all(axis=(1, 2)) & np.isfinite(right).all(axis=(1, 2)))[:, None, None]
+    safe = np.where(sound, matrix, np.eye(3)) + 1e-300 * np.eye(3)
+    return np.linalg.solve(safe, np.where(sound, right, 0.0))
 
 
 def _stable(x, gaps, state, row: Row) -> Bool[np.ndarray, " rows"]:

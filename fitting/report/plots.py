@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import pixels_of, png_of_pixels, svg_of
-from fitting.fits.comparison import Comparison
-from fitting.fits.result import FitResult
+from fitting.infer.comparison import Comparison
+from fitting.infer.result import FitResult
 from fitting.report.words import has_delay
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
@@ -70,24 +70,22 @@ def speed_figure(result: FitResult) -> Figure:
 
 
 def models_figure(compared: Comparison) -> Figure:
-    """Return the figure of what the models say: each one's rebound speed as deviation from the best one's."""
+    """Return the figure of what the models say: each one's rebound speed as deviation from the law's."""
     figure = Figure(figsize=(_WIDTH_INCHES, 4.0), layout="constrained")
     axes = figure.subplots()
-    best = compared.results[compared.rows[0]["model"]].law
+    first = compared.rows[0]["model"]
+    best = compared.results.get(first, next(iter(compared.results.values()))).law
     speed, reference = best.approach_speed_nm_per_us, best.rebound_speed_nm_per_us
     with np.errstate(invalid="ignore", divide="ignore"):
         low, high = (
             100.0 * (end / reference - 1.0) for end in (best.rebound_low_nm_per_us, best.rebound_high_nm_per_us)
         )
-        axes.fill_between(speed, low, high, color="0.85", lw=0, label="95 % band of the best")
+        axes.fill_between(speed, low, high, color="0.85", lw=0, label="95 % band of the law")
         for name in (row["model"] for row in compared.rows):
-            law = compared.results[name].law
-            own, rebound = law.approach_speed_nm_per_us, law.rebound_speed_nm_per_us
-            there = np.interp(speed, own, rebound, left=np.nan, right=np.nan)
-            axes.plot(speed, 100.0 * (there / reference - 1.0), label=name)
+            axes.plot(speed, 100.0 * (compared.rebounds[name] / reference - 1.0), label=name)
     log_speed_axis(axes)
     axes.set_xlabel(_APPROACH)
-    axes.set_ylabel(f"rebound speed: deviation from\n{compared.rows[0]['model']} (%)")
+    axes.set_ylabel("rebound speed: deviation from\nthe law of the fit (%)")
     axes.legend(fontsize=SMALL, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 

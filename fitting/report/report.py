@@ -9,9 +9,9 @@ import numpy as np
 
 from afm_jax.saved import saved
 from afm_jax.scenefile.law_files import save_law_csv
-from afm_jax.words import known
-from fitting.fits.comparison import Comparison
-from fitting.fits.result import FitResult, FittedParameter, FittedRows
+from afm_jax.words import known, percent
+from fitting.infer.comparison import Comparison
+from fitting.infer.result import FitResult, FittedParameter, FittedRows
 from fitting.report.files import write_report_files
 from fitting.report.sections import (
     Bullets,
@@ -121,19 +121,30 @@ def _table_sections(result: FitResult) -> list[ReportSection]:
 
 
 def _compared(comparison: Comparison) -> ReportSection:
+    by_distance = "largest_distance" in comparison.rows[0]
     rows = [
         [
             row["model"],
             f"{row['chi2']:.1f}/{row['degrees_of_freedom']}",
-            f"{row['aic']:.1f}",
-            f"{row['delta_aic']:.1f}",
+            *(
+                [known(row.get("largest_distance"), ".2g"), percent_or_none(row.get("largest_relative_distance"))]
+                if by_distance
+                else [f"{row['aic']:.1f}", f"{row['delta_aic']:.1f}"]
+            ),
             "yes" if row["valid"] else "no",
         ]
         for row in comparison.rows
     ]
-    head = ["model", "chi2/dof", "AIC", "above the best", "valid"]
-    said = "Models, best first (AIC: of the formula alone, on the rows that all models use):"
+    said, head = "Models, best first:", ["model", "chi2/dof", "AIC", "above the best", "valid"]
+    if by_distance:
+        said = "Formulas and the law that was found without them, the closest first:"
+        head[2:4] = ["at most off (band half-widths)", "of u_out"]
     return ReportSection("Comparison", [Text(said), Table("Models", head, rows), Text(f"  {comparison.verdict}")])
+
+
+def percent_or_none(share: float | None) -> str:
+    """Return a share in per cent, "-" where it is not known."""
+    return "-" if share is None else percent(share)
 
 
 def _sampled(posterior: Posterior) -> ReportSection:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from afm_jax.words import decimals, interval, known, percent, value_alone
-from fitting.fits.intervals import END_OF_RANGE, UNEXPLAINED
-from fitting.fits.result import FitResult, FittedParameter, WithInterval
-from fitting.fits.verdict import value_at_bound
+from fitting.infer.intervals import END_OF_RANGE, UNEXPLAINED
+from fitting.infer.result import FitResult, FittedParameter, WithInterval
+from fitting.infer.verdict import value_at_bound
 from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
 
 _EXACT = 1e-8

@@ -20,12 +20,12 @@ from jaxtyping import Array, Float
 from afm_jax.checks import checked, require_float64
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.solve.lanes import compiled_quickly
-from fitting.fits.law_after import root_of
-from fitting.fits.result import FitResult
+from fitting.infer.closest import closest_parameters, covariance_of_unknowns
 from fitting.infer.explain import Explained
 from fitting.infer.fit import explained_of
+from fitting.infer.law import root_of
+from fitting.infer.result import FitResult
 from fitting.infer.search import CENSORED, Followed
-from fitting.infer.summary import closest_parameters, covariance_of_unknowns
 from fitting.parameters import PARAMETERS, Parameter, parameter_called
 from fitting.predict.instantaneous import read_at, searched
 from fitting.predict.orbit import COUNT, Local
@@ -96,7 +96,7 @@ def require_blackjax() -> Any:
 
 
 def _gaussian(explained: Explained, result: FitResult, samples: int, seed: int) -> PosteriorChains:
-    """Return draws of the Gaussian around a fit whose impacts last, and what some of them are worth, weighted to chi2."""
+    """Return draws of the Gaussian around a fit whose impacts last, and what some are worth once weighted to chi2."""
     names, end = tuple(result.parameters), explained.end
     closest = closest_parameters(explained, tuple(result.settings["free"]), result.settings["fixed"])
     root = root_of(covariance_of_unknowns(explained))
@@ -149,7 +149,8 @@ class LogDensity:
         model, weights = self.explained.model, self.explained.weights
         law: Any = model.law
         values, instrument, _ = self.place(z)
-        impact = ImpactLaw(**({"r": 1.0, "epsilon": 0.0} | dict(law.fixed) | values))
+        known: dict[str, Any] = {"r": 1.0, "epsilon": 0.0} | dict(law.fixed) | values
+        impact = ImpactLaw(**known)
         unknowns = [law.unknown_of(name, value) for name, value in values.items()]
         data, theta = model.data, jnp.stack([*unknowns, *instrument])
 

@@ -96,7 +96,7 @@ class Posterior(Result):
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError("ArviZ is not installed: pip install arviz", name="arviz") from error
         columns = np.moveaxis(self.chains.samples, -1, 0)
-        groups = {"posterior": dict(zip(self.mean, columns, strict=True))}
+        groups: dict[str, Any] = {"posterior": dict(zip(self.mean, columns, strict=True))}
         # from 1.0 on it takes the groups as one mapping
         return arviz.from_dict(**groups) if arviz.__version__.startswith("0.") else arviz.from_dict(groups)
 

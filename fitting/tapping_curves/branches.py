@@ -403,7 +403,7 @@ def rough_rows(curve: TappingCurve, chosen: Bool[np.ndarray, " rows"]) -> Bool[n
 def _off_parabola(place: Rows, amplitude: Rows, allowed: Rows, chosen: Bool[np.ndarray, " rows"]) -> Rows:
     """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow.
 
-    Rows far off have hardly a pull by Cauchy's loss; by that of robust fits (`fitting.fits.objective`) they would keep
+    Rows far off have hardly a pull by Cauchy's loss; by that of robust fits (`fitting.infer.rows`) they would keep
     that of a row a few errors off.
     """
 

@@ -37,7 +37,7 @@ from fitting.tapping_curves.verdict import (
 )
 
 if TYPE_CHECKING:
-    from fitting.fits.result import FitResult
+    from fitting.infer.result import FitResult
 
 
 @dataclass(frozen=True)
@@ -474,7 +474,7 @@ def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
     """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive.
 
     Within its errors an energy is linear in what is fitted, so that no chi2 needs to be profiled as for laws
-    (`fitting.fits.intervals`).
+    (`fitting.infer.intervals`).
     """
     low, high = energy - TWO_SIDED_95 * error, energy + TWO_SIDED_95 * error
     if share == 0.0 or energy <= 0.0:

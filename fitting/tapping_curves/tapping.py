@@ -475,7 +475,7 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
 
 def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
     """Return a result with the law fitted to its fast rows."""
-    from fitting.fits.fit import fit  # noqa: PLC0415
+    from fitting.infer.fit import fit  # noqa: PLC0415
 
     if result.speeds is None:
         return result

@@ -8,7 +8,7 @@ import click
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
-from afm_jax.cli.session import FIT_PROGRAMS, Session
+from afm_jax.cli.session import Session
 from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError, option_of
 from fitting.parameters import (
     CONTACT_DEFAULT,
@@ -206,7 +206,7 @@ FIT = Command(
         NOISE,
         QUALITY_FACTOR,
         flag("--scale-errors", "Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1."),
-        flag("--robust", "Let outliers, one row in ten at most, count linearly from two errors on."),
+        flag("--robust", "Leave outliers out, one row in ten at most."),
         click.option(
             "--free",
             type=Names(),
@@ -246,7 +246,6 @@ FIT = Command(
         flag("--example", "Fit the bundled table instead of a file."),
     ),
     check=check_fit,
-    programs=lambda _: FIT_PROGRAMS,
 )
 
 

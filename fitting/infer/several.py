@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import chi2_tail, covariance_of
-from fitting.fits.step import StepSystem
 
 _LEAST_SHARE = 1e-9
 """Variance that a table takes from a direction of the law, over the variance there, below which it says nothing."""
@@ -49,51 +48,6 @@ class Parts(NamedTuple):
         change = np.zeros(there.size)
         change[there] = -np.linalg.lstsq(matrix, vector, rcond=None)[0]
         return covariance_of(matrix)[np.ix_(self.law, self.law)], change
-
-
-def parts_of(
-    system: StepSystem, table: Int[np.ndarray, " rows"], place: Int[np.ndarray, "tables p"], own: int
-) -> Parts:
-    """Return the normal equations of a fit to several tables, part by part.
-
-    Args:
-        system: the fit.
-        table: which each row is of.
-        place: of each table's parameters, as of `Joint`.
-        own: how many parameters the law has; they come first.
-    """
-    size, count, tables, free = system.unknown.shape[0], system.jacobian.shape[1], len(place), system.parameters.free
-    of = np.repeat(table, size // len(table))
-    holders = np.array([np.isin(np.arange(count), row) for row in place])
-    owner = np.where(holders.sum(axis=0) == 1, np.argmax(holders, axis=0), tables)
-    whole = np.zeros((len(system.residual), count + system.unknown.shape[1]))
-    whole[:, :count] = system.jacobian * free
-    whole[:size, count:] = system.unknown
-    white = _whitened(system, np.column_stack([system.residual, whole]), len(table))
-    # after the readings: rows without orbit, and what is known of each parameter and shape
-    part = np.concatenate([of, table, owner])
-    blocks = [white[part == t] for t in range(tables + 1)]
-    matrix = np.array([block[:, 1:].T @ block[:, 1:] for block in blocks])
-    owned = np.append(owner, np.full(system.unknown.shape[1], tables))
-    prior = np.append(np.flatnonzero(~free), np.arange(count, owned.size))
-    matrix[owned[prior], prior, prior] += 1.0
-    return Parts(
-        matrix=matrix,
-        vector=np.array([block[:, 1:].T @ block[:, 0] for block in blocks]),
-        square=np.array([block[:, 0] @ block[:, 0] for block in blocks]),
-        own=owned == np.arange(tables)[:, None],
-        law=np.flatnonzero(free[:own]),
-    )
-
-
-def _whitened(system: StepSystem, columns: Float[np.ndarray, "n m"], rows: int) -> Float[np.ndarray, "n m"]:
-    """Return columns in units of the readings' noise, which is that of each row by itself."""
-    size = system.noise.shape[0]
-    kinds = size // rows
-    one = np.arange(rows)
-    blocks = system.noise.reshape(rows, kinds, rows, kinds)[one, :, one, :]
-    white = np.linalg.solve(np.linalg.cholesky(blocks), columns[:size].reshape(rows, kinds, -1))
-    return np.concatenate([white.reshape(size, -1), columns[size:]])
 
 
 class Pull(NamedTuple):

@@ -20,10 +20,30 @@ from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
 from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.strict_json import plain
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
-from fitting.fits.intervals import Convergence
-from fitting.fits.law_after import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_formula
+from fitting.infer.law import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_formula
 from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """The state of a minimum.
+
+    Attributes:
+        converged: chi2 is at a minimum, and orbits and weights have settled.
+        optimiser: what the search was done with.
+        iterations: of it.
+        gradient: largest slope of chi2 by an unknown, per standard error.
+        estimated_distance: by how much chi2 lies above its minimum, g H^-1 g.
+        reason: why there is nothing to check, None if there is.
+    """
+
+    converged: bool
+    optimiser: str
+    iterations: int
+    gradient: float
+    estimated_distance: float
+    reason: str | None = None
 
 
 @dataclass(frozen=True)
@@ -247,7 +267,7 @@ class FitResult(Result):
             over the speeds of the rows that were used, with errors that contain what the formula leaves out.
         correlations: matrix in the parameters' order; NaN where a variance is unknown.
         chi2: sum of squared normalised residuals, constraints included, and where impacts last what the model leaves
-            out; with a robust fit the soft sum of the residuals alone.
+            out; of a robust fit without outliers.
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
         aic: chi2 + 2 k, chi2 here of the formula alone: the model discrepancy would make up for what it lacks.

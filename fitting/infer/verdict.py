@@ -1,7 +1,7 @@
 """Whether to trust a fit, in words: what makes it invalid, and what a reader should know besides.
 
 A fit is valid only if what is left of the amplitudes passes an absolute test, whatever the options:
-chi2 by its probability; with a robust loss the share of outliers, and chi2 without them by its probability; with scaled
+chi2 by its probability; with a robust fit the share of outliers, and chi2 without them by its probability; with scaled
 errors the scale, and what is known of the parameters; always that neighbouring residuals are not correlated, neither in
 the table's order (a drift, a sweep the model does not follow) nor over the approach speed (a wrong law).
 
@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN, chi2_tail
 from afm_jax.outcomes import Rule, Rules, judge
-from fitting.fits.intervals import UNSETTLED, Convergence
-from fitting.fits.minimum import TOO_SLOW
-from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
-from fitting.fits.result import NO_MASS, FittedParameter, FittedRows
+from fitting.infer.explain import MOST_OUTLIERS, OUTLIER
+from fitting.infer.intervals import UNSETTLED
+from fitting.infer.result import NO_MASS, Convergence, FittedParameter, FittedRows
+from fitting.infer.rows import OUTLIER_LEFT_OUT, TOO_SLOW
 from fitting.models import Held
 from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
@@ -416,6 +416,7 @@ def _excluded(evidence: Evidence) -> list[str]:
     return [
         f"{reason}: {_lines(evidence, [row for row in rows if reasons[row] == reason])}"
         for reason in dict.fromkeys(reasons[row] for row in rows)
+        if reason != OUTLIER_LEFT_OUT
     ]
 
 
@@ -439,7 +440,8 @@ def _robust_loss(evidence: Evidence) -> list[str]:
         return []
     chi2, freedom, p_value = _without_outliers(evidence)
     probability = f" (probability {p_value:.2g})" if freedom > 0 else ""
-    outliers = "".join(f"; outliers: {lines}" for lines in _named(evidence, evidence.outliers))
+    left_out = np.isin(evidence.rows.reasons or "", OUTLIER_LEFT_OUT)
+    outliers = "".join(f"; outliers: {lines}" for lines in _named(evidence, evidence.outliers | left_out))
     return [f"{chi2:.1f}/{freedom}{probability}{outliers}"]
 
 
@@ -483,7 +485,7 @@ MISFITS: Rules[Evidence] = (
         Rule(
             lambda e: [(n, e.rows.used.sum()) for n in [e.outliers.sum()] if e.robust and n > e.most_outliers],
             "{case[0]} of {case[1]} rows are off by more than "
-            f"{OUTLIER:g} errors, and robust loss is for outliers in at most one row of {1.0 / MOST_OUTLIERS:g}",
+            f"{OUTLIER:g} errors, and a robust fit leaves at most one row of {1.0 / MOST_OUTLIERS:g} out",
         ),
         Rule(
             lambda e: [
@@ -590,7 +592,7 @@ WARNINGS: Rules[Evidence] = (
         "Several stable orbits coexist for {case}: the one closest to the measurement was taken.",
     ),
     Rule(lambda e: _named(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
-    Rule(_robust_loss, "Robust loss: chi2 counts outliers linearly; without them chi2/dof = {case}."),
+    Rule(_robust_loss, "Robust fit: outliers are left out; without them chi2/dof = {case}."),
     Rule(
         lambda e: e.error_scale is not None,
         "The amplitudes' errors were scaled by {e.error_scale:.3g} so that chi2/dof = 1: whether they are of the right "

@@ -1,1 +1,0 @@
-"""The fit of an impact law: screen, polish, check, intervals, verdict, comparison."""
