@@ -6,7 +6,7 @@ orbit, the derivatives of amplitudes are NaN and a sentence says why.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -23,7 +23,7 @@ from fitting.infer.fit import model_of
 from fitting.infer.instantaneous import evaluated, orbits_of
 from fitting.infer.search import orbits_at
 from fitting.models import task_of
-from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
+from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, is_nuisance, model_parameters
 from fitting.predict.orbit import NEAR_FOLD, Local, Row, platform_and_cantilever
 from fitting.tables.table import TableLike, as_table
 
@@ -83,9 +83,10 @@ def amplitude_gradients(
     task = task_of(table, model, free=own, fixed=held, effects=effects)
     # an error of 1: derivatives by the unknown are those by the value
     known = task.known | {name: (values[name], 1.0) for name in NUISANCE_NAMES if name in values}
+    problem = replace(task.problem, names=(*own, *filter(is_nuisance, known)))
     # nothing but what was asked for: a fit adds a viscous loss where impacts last
     settings = {"fixed": held if model == "contact" else {"viscous_loss": 0.0} | held, "held": ()}
-    whole = model_of(table, task._replace(known=known), settings)
+    whole = model_of(table, task._replace(known=known, problem=problem), settings)
     law: Any = whole.law
     theta = np.zeros(len(whole.names))
     # 0 has no logarithm
