@@ -2,30 +2,29 @@
 
 By the implicit function theorem an orbit moves smoothly with the parameters, except at a fold, where it meets another
 one and ends, and where the tip grazes the platform, at the impact or on the way. There, and where there is no steady
-orbit, the derivatives of amplitudes, forward or reverse, are NaN and a sentence says why.
+orbit, the derivatives of amplitudes are NaN and a sentence says why.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.closure import OrbitPlace, OrbitProblem
-from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.map import NEAR_GRAZING
-from afm_jax.impact.orbits import amplitudes, orbit_state
 from afm_jax.results import Result, public_result
-from afm_jax.solve.lanes import compiled_quickly, in_blocks
-from fitting.forward import branch_of, impact_of, orbit_problem, shown
-from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
-from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
+from afm_jax.solve.lanes import compiled_quickly
+from fitting.infer.fit import model_of
+from fitting.infer.instantaneous import evaluated, orbits_of
+from fitting.infer.search import orbits_at
+from fitting.models import task_of
+from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, is_nuisance, model_parameters
+from fitting.predict.orbit import NEAR_FOLD, Local, Row, platform_and_cantilever
 from fitting.tables.table import TableLike, as_table
 
 NO_ORBIT = "there is no steady single-impact orbit at these values"
@@ -52,24 +51,12 @@ class AmplitudeGradients(Result):
     reasons: tuple[str | None, ...]
 
 
-class _Judged(NamedTuple):
-    """Amplitudes and their slopes of every row, and what speaks against the slopes."""
-
-    amplitude_nm: Float[Array, "rows 2"]
-    slope: Float[Array, "rows 2 p"]
-    exists: Bool[Array, " rows"]
-    near_fold: Bool[Array, " rows"]
-    slow: Bool[Array, " rows"]
-    touching: Bool[Array, " rows"]
-
-
 @checked
 def amplitude_gradients(
     table: TableLike,
     model: str,
     values: Mapping[str, float],
     *,
-    mode: str = "forward",
     fixed: dict[str, float] | None = None,
     effects: Sequence[str] = EFFECTS,
 ) -> AmplitudeGradients:
@@ -82,42 +69,54 @@ def amplitude_gradients(
         model: as for `fit`.
         values: the model's parameters (for "contact" any of them) and any nuisances, by name: what is not named is the
             table's.
-        mode: "forward" costs as much as there are parameters, "reverse" as there are amplitudes; same numbers.
         fixed: values of the model's parameters that are not differentiated by; of a contact else the paper's.
         effects: for "contact": the effects there are.
 
     Raises:
-        ValueError: if there is no such model, mode or parameter, or one is missing or outside its range.
+        ValueError: if there is no such model or parameter, or one is missing or outside its range.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
     require_float64()
-    if mode not in ("forward", "reverse"):
-        raise ValueError(f'`mode` must be "forward" or "reverse", but is {mode!r}')
-    problem = replace(_problem(model, values, effects, fixed), drive=table.drive)
-    measurement = measurement_of(table, problem, fixed=fixed)
-    point = jnp.asarray([float(values[name]) for name in problem.names])
-    judged = in_blocks(
-        lambda rows: _judged(point, measurement._replace(rows=rows), problem, mode),
-        measurement.rows,
-        block=ROWS_PER_PROGRAM,
-        widths=(),
-    )
-    judged = jax.tree.map(lambda column: column[: table.rows], judged)
-    reasons = tuple(map(_reason, judged.exists, judged.near_fold, judged.slow, judged.touching))
-    refused = np.array([reason is not None for reason in reasons])
-    return AmplitudeGradients(
-        parameters=problem.names,
-        predicted_nm=np.where(judged.exists[:, None], judged.amplitude_nm, np.nan),
-        gradient=np.where(refused[:, None, None], np.nan, judged.slope),
-        reasons=reasons,
-    )
+    held = dict(fixed or {})
+    own = _own_parameters(model, values, held)
+    task = task_of(table, model, free=own, fixed=held, effects=effects)
+    # an error of 1: derivatives by the unknown are those by the value
+    known = task.known | {name: (values[name], 1.0) for name in NUISANCE_NAMES if name in values}
+    problem = replace(task.problem, names=(*own, *filter(is_nuisance, known)))
+    # nothing but what was asked for: a fit adds a viscous loss where impacts last
+    settings = {"fixed": held if model == "contact" else {"viscous_loss": 0.0} | held, "held": ()}
+    whole = model_of(table, task._replace(known=known, problem=problem), settings)
+    law: Any = whole.law
+    theta = np.zeros(len(whole.names))
+    # 0 has no logarithm
+    theta[: len(own)] = [law.unknown_of(name, max(values[name], 1e-300)) for name in own]
+    if law.lasting:
+        orbits = orbits_at(whole, theta).orbits
+        slopes = whole.slopes(theta, orbits)
+    else:
+        seen, slopes = evaluated(whole, theta)
+        orbits = orbits_of(whole, theta, seen)
+    exists, hits = np.isfinite(orbits.x[:, 0]), ~whole.data.row.free
+    slow, touching = _grazes(orbits.x, orbits.approach, whole.local(theta), whole.data.row, table.drive)
+    near_fold = hits & (np.abs(orbits.fold) < NEAR_FOLD)
+    faults = {NO_ORBIT: ~exists, AT_A_FOLD: near_fold, SLOW_GRAZE: hits & slow, GRAZE_ON_THE_WAY: hits & touching}
+    reasons = [next((reason for reason, rows in faults.items() if rows[i]), None) for i in range(table.rows)]
+    names = (*own, *(name for name in NUISANCE_NAMES if name in values))
+    slope_of_value = [law.slope_of(name, y) for name, y in zip(own, theta, strict=False)]
+    gradient = slopes[:, :2, [whole.names.index(name) for name in names]]
+    gradient[:, :, : len(own)] /= slope_of_value
+    gradient[[reason is not None for reason in reasons]] = np.nan
+    predicted = np.where(exists[:, None], orbits.readings[:, :2], np.nan)
+    return AmplitudeGradients(names, predicted, gradient, tuple(reasons))
 
 
-def _problem(
-    model: str, values: Mapping[str, float], effects: Sequence[str], fixed: dict[str, float] | None
-) -> Problem:
-    """Return the parameters that are differentiated by, the model's own first."""
+def _own_parameters(model: str, values: Mapping[str, float], fixed: Mapping[str, float]) -> tuple[str, ...]:
+    """Return the model's parameters that are differentiated by.
+
+    Raises:
+        ValueError: if a value is missing, of no parameter, or outside its range.
+    """
     chosen = tuple(name for name in values if name in CONTACT_NAMES)
     own = model_parameters(model, chosen if model == "contact" else None, fixed)
     missing = [name for name in own if name not in values]
@@ -131,27 +130,7 @@ def _problem(
             raise ValueError(
                 f"`values`: {name} must lie between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
             )
-    return Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in values), tuple(effects))
-
-
-@compiled_quickly(static_argnames=("problem", "mode"))
-def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
-    impact = impact_of(values, measurement, problem)
-    differentiated = jax.jacfwd if mode == "forward" else jax.jacrev
-
-    def one(row: Rows):
-        orbit = orbit_problem(values, impact, row, measurement, problem)
-        branch = lax.stop_gradient(branch_of(orbit, row, values, problem))
-
-        def predicted(v):
-            orbit = orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
-            return shown(amplitudes(branch.place, orbit), orbit, row, v, problem)[:2]
-
-        slow, touching = _grazes(branch.place, orbit)
-        slope = differentiated(predicted)(values)
-        return _Judged(predicted(values), slope, branch.exists, branch.near_fold, slow, touching)
-
-    return jax.vmap(one)(measurement.rows)
+    return own
 
 
 _LOOKS = 512
@@ -160,23 +139,26 @@ _TOUCHING = 1e-3
 """Smallest gap on the way, in terms of the drive's amplitude, below which a flight counts as grazing."""
 
 
-def _grazes(place: OrbitPlace, orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Say whether the impact is a graze, and whether the flight touches the platform on the way."""
-    state = orbit_state(place, orbit)
-    slow = state.speeds.approach < NEAR_GRAZING * orbit.platform.top_speed_nm_per_us
-    flight = Flight(orbit.cantilever, orbit.platform, state.flight.start_us, state.flight.start_velocity)
-    begin = jnp.maximum(-state.speeds.delay, 0.0)
-    times = begin + (state.flight.duration_us - begin) * jnp.asarray(np.linspace(0.0, 1.0, _LOOKS))
-    gap = jax.vmap(lambda time: flight_gap(time, flight))(times)
-    before, here, after = gap[:-2], gap[1:-1], gap[2:]
-    bend = before - 2.0 * here + after
-    dip = (here <= before) & (here <= after) & (bend > 0.0)
-    # the parabola through three neighbours: between two looks the flight may come closer
-    lowest = here - (after - before) ** 2 / (8.0 * jnp.where(dip, bend, 1.0))
-    return slow, jnp.any(dip & (lowest < _TOUCHING * orbit.platform.amplitude_nm))
+@compiled_quickly(static_argnames="drive")
+def _grazes(
+    x: Float[Array, "rows 3"], approach: Float[Array, " rows"], local: Float[Array, "rows local"], row: Row, drive: str
+) -> tuple[Bool[Array, " rows"], Bool[Array, " rows"]]:
+    """Say of rows whether the impact is a graze, and whether the flight before it touches the platform on the way."""
 
+    def one(x, approach, local, row):
+        cantilever, platform = platform_and_cantilever(Local(*local), row, drive)
+        arrival, delay = x[1] / platform.angular_frequency, x[2]
+        landing = platform.motion(arrival)
+        # back from the impact to where the flight begins to count: at max(t_in, t_out)
+        times = (jnp.maximum(delay, 0.0) - row.order * platform.period_us) * jnp.asarray(np.linspace(1.0, 0.0, _LOOKS))
+        height, _ = cantilever.propagator(times)(landing.position, landing.velocity - approach)
+        gap = height - platform.position(arrival + times)
+        before, here, after = gap[:-2], gap[1:-1], gap[2:]
+        bend = before - 2.0 * here + after
+        dip = (here <= before) & (here <= after) & (bend > 0.0)
+        # the parabola through three neighbours: between two looks the flight may come closer
+        lowest = here - (after - before) ** 2 / (8.0 * jnp.where(dip, bend, 1.0))
+        slow = approach < NEAR_GRAZING * platform.top_speed_nm_per_us
+        return slow, jnp.any(dip & (lowest < _TOUCHING * platform.amplitude_nm))
 
-def _reason(exists: np.bool_, near_fold: np.bool_, slow: np.bool_, touching: np.bool_) -> str | None:
-    """Return why a row has no gradient, None if it has one."""
-    faults = (not exists, NO_ORBIT), (near_fold, AT_A_FOLD), (slow, SLOW_GRAZE), (touching, GRAZE_ON_THE_WAY)
-    return next((reason for there, reason in faults if there), None)
+    return jax.vmap(one)(x, approach, local, row)

@@ -1,237 +1,97 @@
-"""Many synthetic tables of one fit, fitted at once, and densities of its posterior: for studies of coverage and ranks.
+"""Many synthetic tables of one fit, each fitted, and densities of its posterior: for studies of coverage and ranks.
 
-A data set enters the residuals only as a shift: (predicted - measured_k)/error = (predicted - measured)/error +
-(measured - measured_k)/error. One compiled program therefore serves all of them, and since every fit starts at the same
-values, the first linearisation serves all of them too.
+The fitted law is the truth: readings scatter about the fitted ones by the rows' covariances, and what is known
+beforehand of an unknown, a measurement as well, about the fitted unknown.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from scipy.special import kve
-from scipy.stats import genhyperbolic
+from jaxtyping import Float
 
-from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
-from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square, softened
-from fitting.infer.result import FitResult
-from fitting.sampling.posterior_result import Posterior
-from fitting.sampling.refit import Refit, objective_of, telling_rows
-
-DRAWS = 250
-"""Draws of each chain that are taken, evenly spaced."""
-_STEPS = 40
-_SETTLED = 1e-6
-"""Estimated distance of chi2 to its minimum at which a data set is done: values within a thousandth of an error."""
+from fitting.infer.explain import Explained
+from fitting.infer.instantaneous import Chi2, evaluated
+from fitting.infer.search import Followed, descend
+from fitting.infer.unknowns import _FACTORS
 
 
 class DataSets(NamedTuple):
-    """Readings of shape (sets, rows, k), and the measured values of the constrained parameters, shape (sets, p)."""
+    """Readings, and the means of what is known beforehand of each unknown."""
 
-    amplitude_nm: Float[np.ndarray, "sets rows k"]
-    constraint_value: Float[np.ndarray, "sets p"]
-
-
-class BatchFit(NamedTuple):
-    """The fits of several data sets.
-
-    Attributes:
-        values: of the parameters.
-        chi2: there; with a robust loss the soft sum.
-        covariance: Fisher's, infinite where a direction is not determined.
-        converged: the estimated distance to the minimum is small.
-    """
-
-    values: Float[np.ndarray, "sets p"]
-    chi2: Float[np.ndarray, " sets"]
-    covariance: Float[np.ndarray, "sets p p"]
-    converged: Bool[np.ndarray, " sets"]
+    read: Float[np.ndarray, "sets rows 3"]
+    mean: Float[np.ndarray, "sets k"]
 
 
-def draw_data(refit: Refit, sets: int, random: np.random.Generator) -> DataSets:
-    """Return data sets as they would have been measured if the fitted values were the truth.
-
-    Amplitudes scatter about the fitted ones by the rows' errors, and constraints, which are measurements as well, about
-    the fitted parameters by theirs.
-
-    Args:
-        refit: the fit, from `fitting.sampling.refit.objective_of`.
-        sets: how many.
-        random: the generator that is drawn from.
-    """
-    objective, values = refit
-    rows, constraint = objective.measurement.rows, objective.measurement.constraint_error
-    predicted = np.asarray(objective.at_values(values[None]).prediction.amplitude_nm)[0]
-    errors = np.where(np.asarray(rows.measured), np.asarray(rows.error_nm), 0.0)
-    known = np.where(np.isfinite(np.asarray(constraint)), np.asarray(constraint), 0.0)
+def draw_data(explained: Explained, sets: int, random: np.random.Generator) -> DataSets:
+    """Return data sets as they would have been measured if the fitted unknowns were the truth."""
+    theta, (_, strength) = explained.end.theta, explained.model.prior
+    error = np.where(strength > 0.0, 1.0 / np.where(strength > 0.0, strength, 1.0), 0.0)
+    clean = explained.end.orbits.readings
     return DataSets(
-        amplitude_nm=predicted + errors * random.normal(size=(sets, *errors.shape)),
-        constraint_value=values + known * random.normal(size=(sets, known.size)),
+        read=clean + noise_of(explained, sets, random),
+        mean=theta + error * random.normal(size=(sets, theta.size)),
     )
 
 
-def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
-    """Fit every data set by damped Gauss-Newton steps (Levenberg, Marquardt) from the fit's values.
-
-    Args:
-        refit: the fit that the data sets resemble; its orbits are followed.
-        data: from `draw_data`.
-
-    Returns:
-        The fits. A parameter at an end of its range is held there while chi2 falls towards the outside.
-    """
-    objective, sets = refit.objective, len(data.amplitude_nm)
-    shift = shifts(objective, data)
-    start = np.broadcast_to(refit.values, (1, refit.values.size))
-    one = plain(objective).at_values(start)
-    residual = np.asarray(one.residual) + shift
-    jacobian = np.repeat(np.asarray(one.jacobian), sets, axis=0)
-    start = _searches(objective, np.repeat(start, sets, axis=0), residual, jacobian)
-
-    def look(values: Float[np.ndarray, "some p"], some: Int[np.ndarray, " some"]) -> Searches:
-        found = plain(objective).at_values(values)
-        return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
-
-    lowest, highest = objective.problem.ends
-    box = Box(lowest, highest, np.zeros((sets, refit.values.size), dtype=bool))
-    end = descended(look, start, box, settled=_SETTLED, most=_STEPS)
-    normal = np.einsum("snp,snq->spq", end.jacobian, end.jacobian)
-    return BatchFit(end.place, end.chi2, whole_covariance_of(normal), distance(end, box) <= _SETTLED)
+def noise_of(explained: Explained, sets: int, random: np.random.Generator) -> Float[np.ndarray, "sets rows 3"]:
+    """Return noise of readings with the rows' covariances, 0 where nothing counts."""
+    # zero rows and columns are those of what does not count
+    root = np.linalg.pinv(explained.weights.whitening)
+    return np.einsum("nij,snj->sni", root, random.normal(size=(sets, *explained.weights.used.shape)))
 
 
-def shifts(objective: Objective, data: DataSets) -> Float[np.ndarray, "sets n"]:
-    """Return what each data set adds to the residuals of the table itself."""
-    rows, known = objective.measurement.rows, objective.measurement
-    weight = np.where(np.asarray(rows.measured), 1.0 / np.asarray(rows.error_nm), 0.0)
-    amplitudes = weight * (np.asarray(rows.amplitude_nm) - data.amplitude_nm)
-    constraints = (np.asarray(known.constraint_value) - data.constraint_value) / np.asarray(known.constraint_error)
-    sets, count = amplitudes.shape[:2]
-    return np.concatenate([amplitudes.reshape(sets, -1), np.zeros((sets, count)), constraints], axis=1)
+def with_data(
+    explained: Explained, read: Float[np.ndarray, "rows 3"], mean: Float[np.ndarray, " k"], *, sharper: float = 1.0
+) -> Explained:
+    """Return a fit, not at its minimum, whose table has other readings, with errors over a number."""
+    model = replace(explained.model, data=replace(explained.model.data, read=read))
+    # it is computed when it is asked for first, and kept
+    vars(model)["prior"] = mean, explained.model.prior[1]
+    weights = explained.weights._replace(whitening=sharper * explained.weights.whitening)
+    return replace(explained, model=model, weights=weights)
 
 
-def plain(objective: Objective) -> Objective:
-    """Return the objective without its soft loss, which is applied after the shift."""
-    return Objective(objective.measurement, objective.problem, near=objective.near)
+def refitted(explained: Explained) -> Explained:
+    """Return the minimum for a table's readings, from the fit of another one, by the same weights."""
+    law: Any = explained.model.law
+    if law.lasting:
+        end = descend(explained.model, explained.end.theta, explained.end.orbits, explained.weights)
+        return replace(explained, end=end)
+    chi2 = Chi2(explained.model, explained.weights)
+    return chi2.explained(chi2.descended(explained.end.theta))
 
 
-def _searches(objective: Objective, values, residual, jacobian) -> Searches:
-    """Return the searches with the loss applied: residuals whose squares add up to it."""
-    if objective.robust:
-        residual, slope = softened(residual)
-        jacobian = jacobian * slope[:, :, None]
-    return Searches(values, residual, jacobian, np.sum(residual**2, axis=1))
+def fit_data_sets(explained: Explained, data: DataSets) -> list[Explained]:
+    """Return the fit of every data set."""
+    return [refitted(with_data(explained, read, mean)) for read, mean in zip(*data, strict=True)]
 
 
-@dataclass(frozen=True, eq=False)
-class PosteriorDraws:
-    """Draws of a posterior and what they predict for the rows that say something.
-
-    Attributes:
-        names: of the parameters, nuisances included.
-        rows: places of these rows in the table.
-        measured: what was read there: peak, lock-in amplitude and, if the table has one, the phase; NaN: not used.
-        error: of the readings, with the model's.
-        values: of the parameters.
-        log_density: logarithm of the posterior's density but for a constant, of shape (chains, draws).
-        predicted: readings without noise.
-        replicated: readings with noise, as another experiment would give them.
-        log_likelihood: of each row's readings together.
-    """
-
-    names: tuple[str, ...]
-    rows: Int[np.ndarray, " rows"]
-    measured: Float[np.ndarray, "rows k"]
-    error: Float[np.ndarray, "rows k"]
-    values: Float[np.ndarray, "chains draws p"]
-    log_density: Float[np.ndarray, "chains draws"]
-    predicted: Float[np.ndarray, "chains draws rows k"]
-    replicated: Float[np.ndarray, "chains draws rows k"]
-    log_likelihood: Float[np.ndarray, "chains draws rows"]
+def chi2_of(explained: Explained, theta: Float[np.ndarray, "draws k"]) -> Float[np.ndarray, " draws"]:
+    """Return chi2 at unknowns; infinite where a row has lost its orbit."""
+    law: Any = explained.model.law
+    if law.lasting:
+        rows = Followed(explained.model, explained.end.theta, explained.end.orbits, explained.weights, np.inf)
+        return np.array([rows.sum(one).value for one in theta])
+    chi2 = Chi2(explained.model, explained.weights)
+    return np.array([np.sum(chi2.at(one, slopes=False)[1] ** 2) for one in theta])
 
 
-def posterior_draws(result: FitResult, found: Posterior, *, seed: int = 0) -> PosteriorDraws:
-    """Return draws of a fit's posterior, `DRAWS` of each chain at most, and what they predict.
-
-    Args:
-        result: from `fitting.fit`.
-        found: its posterior, from `fitting.posterior`.
-        seed: of the replicated noise.
-    """
-    refit, rows = refit_of_rows(result)
-    step = max(found.chains.samples.shape[1] // DRAWS, 1)
-    values = found.chains.samples[:, ::step]
-    dense = densities(refit.objective, values.reshape(-1, values.shape[2]))
-    noise = noise_of(refit.objective, len(dense.predicted), np.random.default_rng(seed))
-    used = np.asarray(refit.objective.measurement.rows.measured)
-
-    def in_chains(column):
-        return column.reshape(*values.shape[:2], *column.shape[1:])
-
-    return PosteriorDraws(
-        names=refit.objective.problem.names,
-        rows=rows,
-        measured=np.where(used, np.asarray(refit.objective.measurement.rows.amplitude_nm), np.nan),
-        error=np.where(used, np.asarray(refit.objective.measurement.rows.error_nm), np.nan),
-        values=values,
-        log_density=in_chains(dense.log_density),
-        predicted=in_chains(dense.predicted),
-        replicated=in_chains(dense.predicted + noise),
-        log_likelihood=in_chains(dense.log_likelihood),
-    )
+def readings_of(explained: Explained, theta: Float[np.ndarray, "draws k"]) -> Float[np.ndarray, "draws rows 3"]:
+    """Return what unknowns predict without noise; NaN of a row without an orbit where impacts last."""
+    model = explained.model
+    law: Any = model.law
+    if law.lasting:
+        found = [model.follow(one, explained.end.orbits.x) for one in theta]
+        return np.array([np.where(one.closes[:, None], one.readings, np.nan) for one in found])
+    return np.array([evaluated(model, one, slopes=False)[0].readings for one in theta])
 
 
-def refit_of_rows(result: FitResult) -> tuple[Refit, Int[np.ndarray, " rows"]]:
-    """Return the fit's objective with the rows that say something alone, and their places in the table."""
-    refit = objective_of(result)
-    rows = telling_rows(refit.objective)
-    return Refit(refit.objective.of_rows(rows), refit.values), rows
-
-
-class Densities(NamedTuple):
-    """What sets of values predict, and how likely: logarithms of the rows' likelihoods and the posterior's density."""
-
-    predicted: Float[np.ndarray, "sets rows k"]
-    log_likelihood: Float[np.ndarray, "sets rows"]
-    log_density: Float[np.ndarray, " sets"]
-
-
-def densities(
-    objective: Objective,
-    values: Float[np.ndarray, "sets p"],
-    shift: Float[np.ndarray, "... n"] | float = 0.0,
-) -> Densities:
-    """Return what sets of values predict and how likely that makes the readings.
-
-    With a robust loss errors have the distribution that this loss stands for, the symmetric hyperbolic one.
-
-    Args:
-        objective: of the rows.
-        values: of the parameters, within their ranges.
-        shift: what other readings add to the residuals, of all sets or of each.
-    """
-    prediction = plain(objective).at_values(values)
-    rows, predicted = objective.measurement.rows, np.asarray(prediction.prediction.amplitude_nm)
-    residual = np.asarray(prediction.residual) + shift
-    half = 0.5 * soft_square(residual, ROBUST if objective.robust else PLAIN)
-    readings, unseen = predicted[0].size, predicted.shape[1]
-    weight = 2.0 * ROBUST * kve(1, ROBUST**2) if objective.robust else np.sqrt(2.0 * np.pi)
-    norm = np.where(np.asarray(rows.measured), np.log(weight * np.asarray(rows.error_nm)), 0.0)
-    each = -half[:, :readings].reshape(predicted.shape) - norm
-    return Densities(
-        predicted=predicted,
-        log_likelihood=each.sum(axis=2) - half[:, readings : readings + unseen],
-        log_density=-half.sum(axis=1),
-    )
-
-
-def noise_of(objective: Objective, sets: int, random: np.random.Generator) -> Float[np.ndarray, "sets rows k"]:
-    """Return noise of readings, 0 where nothing was read."""
-    rows = objective.measurement.rows
-    used: Bool[np.ndarray, "rows k"] = np.asarray(rows.measured)
-    shape: Any = (sets, *used.shape)
-    standard = random.normal(size=shape)
-    if objective.robust:
-        # e^(-s^2 sqrt(1 + x^2/s^2)), with s the softness
-        standard = genhyperbolic(1.0, ROBUST**2, 0.0, scale=ROBUST).rvs(size=shape, random_state=random)
-    return np.where(used, np.asarray(rows.error_nm), 0.0) * standard
+def unknowns_of(explained: Explained, values: Float[np.ndarray, "draws p"]) -> Float[np.ndarray, "draws p"]:
+    """Return the unknowns of an instantaneous law and of the instrument for values of the printed parameters."""
+    law: Any = explained.model.law
+    own = [law.unknown_of(name, column) for name, column in zip(law.names, values.T, strict=False)]
+    for quantity, column in zip(explained.model.instrument, values.T[len(own) :], strict=True):
+        off = np.log(column / quantity.value) * quantity.value if quantity.kind in _FACTORS else column - quantity.value
+        own.append(off / quantity.error)
+    return np.stack(own, axis=1)

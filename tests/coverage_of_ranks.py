@@ -24,16 +24,19 @@ import numpy as np
 from jaxtyping import Float
 
 import fitting.examples
-from fitting import fit, posterior, read_table
-from fitting.fits.law_after import root_of
-from fitting.fits.objective import Objective
-from fitting.sampling.refit import Refit
-from tests.batched_refit import DataSets, densities, fit_data_sets, noise_of, posterior_draws, refit_of_rows, shifts
+from fitting import FitResult, fit, posterior, read_table
+from fitting.infer.explain import Explained
+from fitting.infer.fit import explained_of
+from fitting.infer.law import root_of
+from fitting.infer.summary import convergence_of
+from fitting.sampling.posterior import sampled_by_gaussian
+from tests.batched_refit import chi2_of, noise_of, readings_of, refitted, unknowns_of, with_data
 
 TABLES = (
-    ("amplitudes_law.csv", "law"),
-    ("amplitudes_contact.csv", "viscous+delay"),
+    ("amplitudes_law.csv", "law", 1),
+    ("amplitudes_contact.csv", "viscous+delay", 5),
 )
+"""Tables and models; what the number of simulated tables is divided by, for a fit of impacts that last takes longer."""
 PROBABILITY = 1e-3
 DRAWS = 64
 """Of every set's posterior."""
@@ -48,7 +51,7 @@ _UNIFORM_SETS = 4000
 class RankCalibration:
     """Ranks of true values in posteriors of simulated tables, as shares from 0 to 1.
 
-    Of each quantity: the parameters, then the likelihood of the data, which depends on them too: its ranks are not
+    Of each quantity: the unknowns, then the likelihood of the data, which depends on them too: its ranks are not
     uniform if a posterior ignores the data.
 
     Attributes:
@@ -66,31 +69,40 @@ class RankCalibration:
 def main() -> int:
     """Simulate, print and judge."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
-    parser.add_argument("--sets", type=int, default=1000, help="simulated tables of each")
+    parser.add_argument("--sets", type=int, default=1000, help="simulated tables, a fifth where impacts last")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
     missed = 0
-    for name, model in TABLES:
-        result = fit(read_table(Path(fitting.examples.__path__[0]) / name), model)
-        drawn = posterior_draws(result, posterior(result)).values
-        drawn = drawn.reshape(-1, drawn.shape[2])
+    for name, model, fewer in TABLES:
+        result, sets = fit(read_table(Path(fitting.examples.__path__[0]) / name), model), options.sets // fewer
+        explained = explained_of(result)
+        drawn = draws_of(explained, result)
         middle, error = drawn.mean(axis=0), drawn.std(axis=0)
         narrow, shifted = middle + 0.8 * (drawn - middle), drawn + 0.5 * error
         for said, draws in (("as sampled", drawn), ("a fifth too narrow", narrow), ("half an error off", shifted)):
-            ranks = calibrate_ranks(refit_of_rows(result)[0], draws, sets=options.sets)
+            ranks = calibrate_ranks(explained, draws, sets=sets)
             right = (ranks.p_value >= PROBABILITY) == (said == "as sampled")
             missed += not right
             sys.stdout.write(
                 f"{name}, {model}, {said}: probability {ranks.p_value:.2g}, Gaussian {ranks.gaussian_p_value:.2g}, "
-                f"{ranks.failed} of {options.sets} failed{'' if right else '  MISSED'}\n"
+                f"{ranks.failed} of {sets} failed{'' if right else '  MISSED'}\n"
             )
             sys.stdout.flush()
     return 1 if missed else 0
 
 
+def draws_of(explained: Explained, result: FitResult) -> Float[np.ndarray, "draws k"]:
+    """Return draws of all unknowns, those that a posterior's samples are made of."""
+    samples = posterior(result).chains.samples
+    if not sampled_by_gaussian(result.model):
+        return unknowns_of(explained, samples.reshape(-1, samples.shape[2]))
+    root = root_of(explained.covariance)
+    return explained.end.theta + np.random.default_rng(0).normal(size=(4000, root.shape[1])) @ root.T
+
+
 def calibrate_ranks(
-    refit: Refit,
-    draws: Float[np.ndarray, "draws p"],
+    explained: Explained,
+    draws: Float[np.ndarray, "draws k"],
     *,
     sets: int = 100,
     seed: int = 0,
@@ -98,7 +110,7 @@ def calibrate_ranks(
     """Return the ranks of true values in posteriors of simulated tables.
 
     Args:
-        refit: the fit, its rows alone.
+        explained: the fit.
         draws: of its posterior, which is under test.
         sets: how many tables are simulated.
         seed: of the tables.
@@ -108,16 +120,21 @@ def calibrate_ranks(
     """
     random = np.random.default_rng(seed)
     true = draws[random.choice(len(draws), sets, replace=sets > len(draws))]
-    predicted = densities(refit.objective, true).predicted
-    both, data = _both_tables(refit, predicted + noise_of(refit.objective, sets, random))
-    fits, shift = fit_data_sets(both, data), shifts(both.objective, data)
-    here = np.append(true, densities(both.objective, true, shift).log_density[:, None], axis=1)
-    exact, gaussian = [], []
-    for k in np.flatnonzero(fits.converged & np.isfinite(fits.covariance).all(axis=(1, 2))):
-        drawn, weight = _posterior(both.objective, fits.values[k], fits.covariance[k], shift[k], random)
+    second = readings_of(explained, true) + noise_of(explained, sets, random)
+    exact, gaussian, (mean, _) = [], [], explained.model.prior
+    for theta, read in zip(true, second, strict=True):
+        # two Gaussian readings are one at their mean
+        both = with_data(explained, 0.5 * (explained.model.data.read + read), mean, sharper=np.sqrt(2.0))
+        if not np.isfinite(read[both.weights.used]).all():
+            continue
+        found = refitted(both)
+        if not (convergence_of(found, "", 0).converged and np.isfinite(found.covariance).all()):
+            continue
+        drawn, weight = _posterior(found, random)
         if weight is not None and 1.0 / np.sum(weight**2) >= _FEWEST_EFFECTIVE:
-            exact.append(_ranks(drawn, weight, here[k], random))
-            gaussian.append(_ranks(drawn, np.full(DRAWS, 1.0 / DRAWS), here[k], random))
+            here = np.append(theta, chi2_of(found, theta[None]))
+            exact.append(_ranks(drawn, weight, here, random))
+            gaussian.append(_ranks(drawn, np.full(DRAWS, 1.0 / DRAWS), here, random))
     if len(exact) < max(10, sets // 2):
         raise ValueError(f"only {len(exact)} of {sets} simulated tables could be fitted and their posteriors weighted")
     uniform = _deviation(np.random.default_rng(0).random((_UNIFORM_SETS, len(exact))).T)
@@ -128,42 +145,21 @@ def calibrate_ranks(
     return RankCalibration(*p_values, failed=sets - len(exact))
 
 
-def _both_tables(refit: Refit, second: Float[np.ndarray, "sets rows k"]) -> tuple[Refit, DataSets]:
-    """Return a refit of the table with a second one beside it, and the data sets of these; constraints count once."""
-    objective = refit.objective
-    rows = objective.measurement.rows
-    first = np.broadcast_to(np.asarray(rows.amplitude_nm), second.shape)
-    constraint = np.broadcast_to(np.asarray(objective.measurement.constraint_value), (len(second), refit.values.size))
-    if not objective.robust:
-        # two Gaussian readings are one at their mean
-        both = objective.with_rows(error_nm=np.asarray(rows.error_nm) / np.sqrt(2.0))
-        return Refit(both, refit.values), DataSets(0.5 * (first + second), constraint)
-    count = first.shape[1]
-    both = objective.of_rows(np.tile(np.arange(count), 2))
-    both = both.with_rows(no_orbit=np.asarray(both.measurement.rows.no_orbit) & (np.arange(2 * count) < count))
-    return Refit(both, refit.values), DataSets(np.concatenate([first, second], axis=1), constraint)
-
-
 def _posterior(
-    objective: Objective,
-    values: Float[np.ndarray, " p"],
-    covariance: Float[np.ndarray, "p p"],
-    shift: Float[np.ndarray, " n"],
-    random: np.random.Generator,
+    found: Explained, random: np.random.Generator
 ) -> tuple[Float[np.ndarray, "draws q"], Float[np.ndarray, " draws"] | None]:
-    """Return Gaussian draws around a fit with their likelihoods, and weights that make them the exact posterior's."""
-    z = random.normal(size=(DRAWS, values.size))
-    drawn = values + z @ root_of(covariance).T
-    lowest, highest = np.array([(p.lowest, p.highest) for p in objective.problem.parameters]).T
-    inside = np.all((drawn >= lowest) & (drawn <= highest), axis=1)
-    within = np.clip(drawn, lowest, highest)
-    likelihood = densities(objective, within, shift).log_density
-    with_likelihood = np.append(drawn, likelihood[:, None], axis=1)
-    raw = likelihood + 0.5 * np.sum(z**2, axis=1)
-    raw = np.where(inside & np.isfinite(raw), raw, -np.inf)
+    """Return Gaussian draws around a fit with their chi2, and weights that make them the exact posterior's."""
+    root, law = root_of(found.covariance), found.model.law
+    z = random.normal(size=(DRAWS, root.shape[1]))
+    drawn = found.end.theta + z @ root.T
+    # losses of an instantaneous law are not negative
+    lost = np.any(drawn[:, : 0 if law.lasting else len(law.own)] < 0.0, axis=1)
+    chi2 = chi2_of(found, np.where(lost[:, None], found.end.theta, drawn))
+    raw = np.where(lost | ~np.isfinite(chi2), -np.inf, -0.5 * chi2 + 0.5 * np.sum(z**2, axis=1))
+    with_chi2 = np.append(drawn, chi2[:, None], axis=1)
     if not np.isfinite(raw).any():
-        return with_likelihood, None
-    return with_likelihood, np.exp(raw - np.logaddexp.reduce(raw))
+        return with_chi2, None
+    return with_chi2, np.exp(raw - np.logaddexp.reduce(raw))
 
 
 def _ranks(drawn, weight, here, random: np.random.Generator) -> Float[np.ndarray, " q"]:

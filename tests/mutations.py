@@ -203,7 +203,8 @@ MUTATIONS = {
         "tests/test_thermal.py::test_saders_stiffness_is_what_nanosurf_states_in_the_file",
     ),
     "posterior of twice the misfit": Mutation(
-        "{ => 2.0 * }residual**2 / (1.0 + root)", "tests/test_posterior.py::test_the_samplers_density_is_the_objectives"
+        "log_likelihood = {-0.5 => -1.0} * residual @ residual",
+        "tests/test_posterior.py::test_the_samplers_density_is_that_of_another_programs_amplitudes",
     ),
     "nuisances that help": Mutation(
         "whole {- => +} np.linalg.slogdet",

@@ -3,6 +3,7 @@
 import dataclasses
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,15 +11,18 @@ from scipy.integrate import quad
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, posterior
-from fitting.sampling.posterior import log_density_of, space_around
+from fitting.infer.fit import explained_of
+from fitting.sampling.posterior import LogDensity, log_density_of
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
-from fitting.sampling.refit import objective_of, standard_covariance
+from tests.batched_refit import chi2_of as chi2_at
 from tests.fit_tables import (
     amplitudes_and_errors,
     example_amplitudes,
     fit_of_every_fourth,
     rows,
     simulated,
+    standard_errors_of,
+    values_of,
 )
 from tests.fit_tables import steady_amplitudes as amplitudes_of
 from tests.impact_tables import drives
@@ -86,21 +90,22 @@ def test_a_loss_that_vanishes_has_a_one_sided_density(exact_q):
 
 
 def test_the_sampler_agrees_with_importance_sampling(law, sampled):
+    assert sampled.method == "nuts"
     assert sampled.converged, sampled.reasons
     assert sampled.chains.samples.shape[:2] == (4, 1000)
     # 20,000 draws: half as uncertain as two thousand samples at most
-    mean, deviation = importance_sampling(objective_of(law), 20_000)
+    mean, deviation = importance_sampling(law, 20_000)
     for k, name in enumerate(law.parameters):
         assert_close(sampled, name, mean[k], deviation[k])
 
 
-def importance_sampling(refit, draws: int) -> tuple[np.ndarray, np.ndarray]:
+def importance_sampling(result, draws: int) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard deviation of the posterior by weighting draws of a wider Gaussian."""
-    cholesky = np.linalg.cholesky(1.3 * standard_covariance(refit))
-    z = np.random.default_rng(12).normal(size=(draws, len(refit.values)))
-    values = refit.values + z @ cholesky.T
-    chi2 = np.sum(refit.objective.residual(values) ** 2, axis=1)
-    log_weight = -0.5 * chi2 + 0.5 * np.sum(z**2, axis=1)
+    errors = standard_errors_of(result)
+    cholesky = np.linalg.cholesky(1.3 * result.correlations * np.outer(errors, errors))
+    z = np.random.default_rng(12).normal(size=(draws, len(errors)))
+    values = values_of(result) + z @ cholesky.T
+    log_weight = -0.5 * chi2_of(result, values) + 0.5 * np.sum(z**2, axis=1)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     assert 1.0 / np.sum(weight**2) > 0.5 * draws
@@ -108,67 +113,119 @@ def importance_sampling(refit, draws: int) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.sqrt(weight @ (values - mean) ** 2)
 
 
+def chi2_of(result, values: np.ndarray) -> np.ndarray:
+    """Return chi2 at sets of r, epsilon and Q by another program's amplitudes; Q is known by a factor."""
+    amplitude, error = amplitudes_and_errors(result.table)
+    known, known_error = result.table.quality_factor, result.table.quality_factor_error
+    chi2 = [
+        np.sum(((amplitudes_of(result.table, ImpactLaw(r, epsilon), quality_factor=q) - amplitude) / error) ** 2)
+        for r, epsilon, q in values
+    ]
+    return np.array(chi2) + (np.log(values[:, 2] / known) * known / known_error) ** 2
+
+
 @pytest.fixture(scope="module")
-def space(law):
-    refit = objective_of(law)
-    return space_around(refit.objective.problem, refit.values, standard_covariance(refit))
+def log_density(law) -> LogDensity:
+    return log_density_of(explained_of(law))
 
 
 @pytest.mark.parametrize("tie", [1.0, np.nan])
 def test_parameters_that_are_one_have_no_space(law, tie):
-    refit = objective_of(law)
-    values, error = refit.values, 0.01 * refit.values
-    tied = tie * np.outer(error, error)
+    explained = explained_of(law)
+    tied = tie * np.repeat(explained.end.jacobian[:, :1], 3, axis=1)
     with pytest.raises(ValueError, match="hardly tell r, epsilon, quality_factor apart"):
-        space_around(refit.objective.problem, values, tied)
+        log_density_of(dataclasses.replace(explained, end=explained.end._replace(jacobian=tied)))
 
 
-def test_the_samplers_density_is_the_objectives(law, space):
-    refit = objective_of(law)
-    log_density = log_density_of(refit, standard_covariance(refit))
-    here, there = np.array([0.3, -0.4, 0.2]), np.array([-0.6, 0.5, 0.1])
-    values, priors = zip(*(space.values_and_log_prior(jnp.asarray(z)) for z in (here, there)), strict=True)
-    chi2 = np.sum(refit.objective.residual(np.array(values)) ** 2, axis=1)
-    expected = -0.5 * (chi2[0] - chi2[1]) + float(priors[0] - priors[1])
-    found = float(log_density(jnp.asarray(here)) - log_density(jnp.asarray(there)))
-    # the same sums in another order
-    assert found == pytest.approx(expected, rel=1e-9)
+def test_the_samplers_density_is_that_of_another_programs_amplitudes(law, log_density):
+    here, there = jnp.array([0.3, -0.4, 0.2]), jnp.array([-0.6, 0.5, 0.1])
+    values = np.array([log_density.values(z) for z in (here, there)])
+    priors = [float(log_density.place(z)[2]) for z in (here, there)]
+    chi2 = chi2_of(law, values)
+    expected = -0.5 * (chi2[0] - chi2[1]) + priors[0] - priors[1]
+    # amplitudes agree to 1e-9 of themselves, 1e-7 of their errors
+    assert float(log_density(here) - log_density(there)) == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_prior_is_the_derivative_of_the_values(space):
-    z, step = np.array([0.3, -0.4, 0.2]), 1e-5
+def test_the_samplers_gradient_is_that_of_its_density(log_density):
+    z, step = jnp.array([0.3, -0.4, 0.2]), 1e-4
+    density = jax.jit(log_density)
+    slope = [float(density(z + shift) - density(z - shift)) / (2.0 * step) for shift in step * jnp.eye(3)]
+    np.testing.assert_allclose(jax.grad(log_density)(z), slope, rtol=1e-5, atol=1e-6)
+
+
+def test_the_prior_is_the_derivative_of_the_values(log_density):
+    z, step = jnp.array([0.3, -0.4, 0.2]), 1e-5
 
     def values(shift):
-        return np.asarray(space.values_and_log_prior(jnp.asarray(z + shift))[0])
+        of_law, instrument, _ = log_density.place(z + shift)
+        return np.array([*of_law.values(), *instrument])
 
     jacobian = np.array([values(shift) - values(-shift) for shift in step * np.eye(3)]) / (2.0 * step)
-    _, log_prior = space.values_and_log_prior(jnp.asarray(z))
     # up to the constant determinant of axes and errors; central differences to 1e-10
-    constant = np.linalg.slogdet(space.axes)[1] + np.sum(np.log(space.errors))
-    assert np.linalg.slogdet(jacobian)[1] - constant == pytest.approx(float(log_prior), abs=1e-6)
+    constant = np.linalg.slogdet(log_density.axes)[1] + np.sum(np.log(log_density.errors))
+    assert np.linalg.slogdet(jacobian)[1] - constant == pytest.approx(float(log_density.place(z)[2]), abs=1e-6)
 
 
-@pytest.mark.xfail(strict=True, reason="the redrawn fit: posterior and intervals of one residual")
-def test_the_posterior_of_impacts_that_last_is_that_of_the_fit():
-    """Its Gaussian approximation starts at the fit's values and is as wide as the fit's errors."""
+@pytest.fixture(scope="module")
+def of_lasting():
+    """A fit of impacts that last, and its posterior."""
     result = fit(drives(), "viscous+delay")
-    refit = objective_of(result)
-    matrix = standard_covariance(refit)
-    linear = refit.objective.at_values(refit.values[None])
-    to_the_mode = -matrix @ np.asarray(linear.jacobian)[0].T @ np.asarray(linear.residual)[0]
-    errors = np.array([parameter.standard_error for parameter in result.parameters.values()])
-    assert np.all(np.abs(to_the_mode) < 0.5 * errors)
-    np.testing.assert_allclose(np.sqrt(np.diag(matrix)), errors, rtol=0.25)
+    return result, posterior(result)
+
+
+def test_the_posterior_of_impacts_that_last_is_that_of_the_fit(of_lasting):
+    result, found = of_lasting
+    assert found.method == found.to_dict()["method"] == "gaussian"
+    assert found.converged
+    errors = standard_errors_of(result)
+    off = np.array(list(found.mean.values())) - values_of(result)
+    # four standard errors of 4000 draws
+    assert np.all(np.abs(off) < 4.0 * errors / np.sqrt(4000))
+    np.testing.assert_allclose(list(found.standard_deviation.values()), errors, rtol=4.0 / np.sqrt(8000))
+    assert np.corrcoef(found.chains.samples.reshape(-1, len(errors)).T) == pytest.approx(result.correlations, abs=0.07)
+
+
+def test_chi2_itself_agrees_with_the_gaussian_around_the_fit(of_lasting):
+    """Draws weighted to chi2 itself have the fit's mean, as far as so few tell."""
+    result, found = of_lasting
+    explained = explained_of(result)
+    covariance = explained.covariance
+    drawn = np.random.default_rng(3).multivariate_normal(explained.end.theta, covariance, size=300)
+    off = drawn - explained.end.theta
+    raw = -0.5 * (chi2_at(explained, drawn) - np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance), off))
+    weight = np.exp(raw - raw.max())
+    weight /= weight.sum()
+    worth = 1.0 / np.sum(weight**2)
+    # of as many draws as the posterior weighs
+    assert 0.3 < found.chains.effective_samples[0] / (worth * 120 / 300) < 3.0
+    pull = weight @ off / np.sqrt(np.diag(covariance))
+    assert np.abs(pull).max() < 4.5 / np.sqrt(worth)
+
+
+def test_samples_are_given_to_arviz(of_lasting):
+    pytest.importorskip("arviz", reason="it is no dependency")
+    _, found = of_lasting
+    given = found.to_arviz()["posterior"]
+    assert set(given.data_vars) == set(found.mean)
+    assert (given.sizes["chain"], given.sizes["draw"]) == (4, 1000)
+    np.testing.assert_array_equal(given["epsilon"], found.chains.samples[:, :, list(found.mean).index("epsilon")])
+
+
+def test_without_arviz_it_says_what_to_do(of_lasting, monkeypatch):
+    monkeypatch.setitem(sys.modules, "arviz", None)
+    with pytest.raises(ImportError, match="pip install arviz"):
+        of_lasting[1].to_arviz()
 
 
 def test_chains_that_disagree_are_not_believed():
     random = np.random.default_rng(1)
     samples = random.normal(size=(4, 100, 1))
     fine = PosteriorChains(samples, np.array([1.001]), np.array([380.0]), 0, 0)
-    assert posterior_of_chains(fine, ("r",)).converged
+    assert posterior_of_chains(fine, ("r",), "nuts").converged
     bad = {"r_hat": np.array([np.nan])}, {"effective_samples": np.array([20.0])}, {"divergences": 20}
     for changes in bad:
-        found = posterior_of_chains(dataclasses.replace(fine, **changes), ("r",))
+        found = posterior_of_chains(dataclasses.replace(fine, **changes), ("r",), "nuts")
         assert not found.converged
         assert len(found.reasons) == 1
 

@@ -125,7 +125,7 @@ def test_other_models_and_samples_are_shown():
     models = Comparison(rows, "The data do not tell r < 1 from viscous loss.", {})
     drawn = np.linspace(0.9, 0.99, 41)[:, None] * [1.0, 70.0]
     chains = PosteriorChains(drawn[None], np.array([1.31, np.nan]), np.array([50.0, 60.0]), 0, 77)
-    found = posterior_of_chains(chains, ("r", "epsilon"))
+    found = posterior_of_chains(chains, ("r", "epsilon"), "nuts")
     root = read_page(page_of(made_fit("law"), comparison=models, posterior=found))
     assert models.verdict in words_of(section_of(root, "comparison"))
     assert [row[1] for row in table_of(root, "Models")] == ["chi2/dof", "5.0/6", "7.2/6"]

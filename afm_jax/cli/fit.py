@@ -11,7 +11,7 @@ from fitting.infer.comparison import compare, rivals
 from fitting.infer.fit import fit as fit_tables
 from fitting.infer.result import FitResult
 from fitting.report.report import summary, write_report
-from fitting.sampling.posterior import posterior, require_blackjax
+from fitting.sampling.posterior import posterior, require_blackjax, sampled_by_gaussian
 from fitting.tables.several import SeveralTables
 
 
@@ -25,7 +25,7 @@ def fit(
     **options: Any,
 ) -> Output:
     """Return the fit of one law to tables, with what was asked for besides."""
-    if options["posterior"]:
+    if options["posterior"] and not sampled_by_gaussian(model):
         require_blackjax()
     read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))

@@ -20,7 +20,6 @@ _AT_BOUND = 0.01
 _ROUNDS = 8
 """Steps to the closest formula: squared rebound speeds are nearly linear in what is fitted."""
 _BEGIN = {"delay_hertz": 0.2, "delay_lead_nm": 5.0, "delay_offset_nm": 0.0}
-_STEP = 1e-6
 _LOSSES = {parameter.name: parameter.reference for parameter in LAW}
 """Parameters of losses, and the value of each without one."""
 
@@ -79,15 +78,10 @@ def closest_parameters(explained: Explained, own: tuple[str, ...], fixed: Mappin
         found = _projected(explained, own, fixed)
     else:
         places = [model.names.index(name) for name in own]
-        ends = np.array(
-            [
-                [float(law.value_of(name, theta[i] + side)) for side in (-_STEP, 0.0, _STEP)]
-                for name, i in zip(own, places, strict=True)
-            ]
-        )
-        slope = (ends[:, 2] - ends[:, 0]) / (2.0 * _STEP)
+        values = np.array([float(law.value_of(name, theta[i])) for name, i in zip(own, places, strict=True)])
+        slope = np.array([law.slope_of(name, theta[i]) for name, i in zip(own, places, strict=True)])
         vanishes = dict(zip(own, held_at_bound(explained)[places].tolist(), strict=True))
-        found = _Own(ends[:, 1], slope[:, None] * root[places], {name for name in own if vanishes[name]})
+        found = _Own(values, slope[:, None] * root[places], {name for name in own if vanishes[name]})
     first = len(model.names) - len(model.instrument)
     pairs = [(q.at(float(y)), q.slope(float(y))) for q, y in zip(model.instrument, theta[first:], strict=True)]
     of_instrument = np.reshape([slope for _, slope in pairs], (-1, 1)) * root[first:]

@@ -21,7 +21,7 @@ from fitting.infer.optimiser import OPTIMISER
 from fitting.infer.result import FitResult
 from fitting.infer.summary import Fitted, convergence_of, summary_of
 from fitting.infer.unknowns import Model, data_of, quantities_of
-from fitting.models import Task, held_of, split_held, task_of
+from fitting.models import Held, Task, held_of, split_held, task_of
 from fitting.parameters import is_nuisance, model_parameters
 from fitting.predict.law import FormulaLaw
 from fitting.tables.several import SeveralTables
@@ -180,6 +180,17 @@ def _minimum_with_scale(model: Model, *, scaling: int | None, robust: bool) -> t
         scale, model = (scale or 1.0) * factor, replace(model, data=model.data.scaled(factor))
         fitted = minimum_of(model, robust=robust)
     return fitted, scale
+
+
+def explained_of(result: FitResult) -> Explained:
+    """Return the minimum of a fit with all its unknowns, which its result does not keep: found by its settings again."""
+    table, settings = result.table, result.settings
+    options: dict[str, Any] = {name: settings[name] for name in ("free", "fixed", "constraints")}
+    options["effects"] = settings["effects"] or EFFECTS
+    task = task_of(table, result.model, **options)
+    model = model_of(table, task, settings | {"held": tuple(Held(*one) for one in settings["held"])})
+    model = replace(model, data=model.data.scaled(settings["error_scale"] or 1.0))
+    return minimum_of(model, robust=settings["robust"] is not None).explained
 
 
 def minimum_of(model: Model, *, robust: bool = False) -> Fitted:

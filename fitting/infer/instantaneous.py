@@ -97,8 +97,7 @@ def evaluated(
         exists = (seen.orbits > 0)[: some.size, None, None]
         by_both = np.where(exists, np.asarray(_slopes(*there, seen.coordinate, drive))[: some.size], 0.0)
         for i, name in enumerate(law.own):
-            change = -0.5 / max(values["r"], 1e-9) if name == "r" else 1.0
-            along[some, :, i] = by_both[:, :, _LAW.index(name)] * change
+            along[some, :, i] = by_both[:, :, _LAW.index(name)] * law.slope_of(name, theta[i])
         by_local[some, :, COUNT - _INSTRUMENT :] = by_both[:, :, 3:]
     whole = jax.tree.map(lambda column: np.zeros((count, *column.shape[1:]), column.dtype), parts[0][1])
     for some, part in parts:
@@ -170,24 +169,28 @@ class Chi2(NamedTuple):
         """Return the rows as the law at an end explains them."""
         model, theta = self.model, end.place[0]
         seen, residual, jacobian = self.at(theta)
-        exists, law = seen.orbits > 0, model.of_law(theta)
-        approach = np.where(np.isfinite(seen.approach), seen.approach, 1.0)
-        x = np.full((exists.size, 3), np.nan)
-        x[exists, 0] = coordinate_of(approach, model.law.capture(law))[exists]
-        orbits = Orbits(
-            x=x,
-            closes=exists,
-            steady=exists,
-            readings=seen.readings,
-            slopes=np.zeros((exists.size, 3, COUNT)),
-            approach=seen.approach,
-            rebound=np.sqrt(np.maximum(model.law.at(law, approach).square, 0.0)),
-            pull=np.zeros(exists.size),
-            change=np.zeros(exists.size),
-            fold=np.where(seen.near_fold, 0.0, 1.0),
-        )
+        orbits = orbits_of(model, theta, seen)
         descent = Descent(theta, orbits, float(end.chi2[0]), residual, jacobian)
         return Explained(model, descent, self.weights, Found(orbits, seen.orbits), 0.0, settled=True)
+
+
+def orbits_of(model: Model, theta: Float[np.ndarray, " k"], seen: Any) -> Orbits:
+    """Return the orbits that were seen as those of impacts that last; without slopes."""
+    exists, law = seen.orbits > 0, model.of_law(theta)
+    approach = np.where(np.isfinite(seen.approach), seen.approach, 1.0)
+    x = np.stack([coordinate_of(approach, model.law.capture(law)), seen.phase, np.zeros(exists.size)], axis=1)
+    return Orbits(
+        x=np.where(exists[:, None], x, np.nan),
+        closes=exists,
+        steady=exists,
+        readings=seen.readings,
+        slopes=np.zeros((exists.size, 3, COUNT)),
+        approach=seen.approach,
+        rebound=np.sqrt(np.maximum(model.law.at(law, approach).square, 0.0)),
+        pull=np.zeros(exists.size),
+        change=np.zeros(exists.size),
+        fold=np.where(seen.near_fold, 0.0, 1.0),
+    )
 
 
 def profile(explained: Explained, place: int, value: float) -> float:

@@ -133,13 +133,13 @@ def descend(
         settled: fall of chi2 in a step at which a descent has arrived.
         fixed: unknowns that stay; None: none.
     """
-    rows = _Followed(model, theta, begin, weights, soft)
+    rows = Followed(model, theta, begin, weights, soft)
     longest = np.array([1.0 if name in ("epsilon", "delay_hertz") else np.inf for name in model.names])
     end = levenberg_marquardt(rows.sum, theta, settled=settled, most=_STEPS, longest=longest, fixed=fixed)
     return rows.descent(end.place, end.sum, end.steps)
 
 
-class _Followed:
+class Followed:
     """The rows' chi2 over the unknowns, with orbits followed from where they were at the best unknowns so far."""
 
     def __init__(self, model: Model, theta: Float[np.ndarray, " k"], begin: Orbits, weights: Weights, soft: float):
@@ -186,7 +186,7 @@ def polished_by_optax(
     model: Model, theta: Float[np.ndarray, " k"], begin: Orbits, weights: Weights
 ) -> Float[np.ndarray, " k"]:
     """Return where Optax's L-BFGS takes unknowns on the soft loss; arguments as of `descend`."""
-    rows = _Followed(model, theta, begin, weights, _SOFT)
+    rows = Followed(model, theta, begin, weights, _SOFT)
     jacobian = rows.sum(theta).jacobian
     return minimised(rows.value_and_gradient, theta, jacobian.T @ jacobian, settled=1.0, most=25).place
 

@@ -29,7 +29,7 @@ from fitting.infer.verdict import Evidence, judge_fit, misfits
 from fitting.models import Task, readings_of
 from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES, is_of_one_table, name_of_table, parameter_called
 from fitting.predict.contact import ContactLaw
-from fitting.predict.orbit import READINGS
+from fitting.predict.orbit import NEAR_FOLD, READINGS
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
@@ -41,8 +41,6 @@ _VANISHING = 1e-3
 """Part of epsilon that is none, where its logarithm is the unknown."""
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 ATTRACTED = "none: the sample only draws the tip"
-_NEAR_FOLD = 1e-3
-"""Determinant of the gaps' slopes over the product of their norms below which an orbit is close to a fold."""
 
 
 class Fitted(NamedTuple):
@@ -213,7 +211,7 @@ def _rows_of(explained: Explained, table: AmplitudeTable | SeveralTables) -> Fit
         set_aside=(reasons != "").astype(bool),
         approach_speed_nm_per_us=np.where(exists & ~data.row.free, orbits.approach, np.nan),
         orbits=number,
-        near_fold=exists & (np.abs(orbits.fold) < _NEAR_FOLD) & ~data.row.free,
+        near_fold=exists & (np.abs(orbits.fold) < NEAR_FOLD) & ~data.row.free,
         reasons=tuple(reasons.tolist()),
         **phases,
     )

@@ -22,6 +22,8 @@ from fitting.predict.orbit import COUNT, READINGS, Local, Orbits, Row, followed,
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
+_UNDAMPED = 1e15
+"""Quality factor of no air damping: by an infinite one there is no derivative."""
 REMAINDERS = 7
 """Leading terms that the corrections of impacts that last leave out."""
 
@@ -57,7 +59,7 @@ class Data:
         time: from -1/2 to 1/2 where a table's rows stand in order of time, else 0.
         number: of the row's table.
         drives: what is driven in each table.
-        free_frequency_khz, quality_factor: as each row's table gives them; infinite Q: no air damping.
+        free_frequency_khz, quality_factor: as each row's table gives them; `_UNDAMPED`: no air damping.
         mass_ng: of the tip.
     """
 
@@ -101,7 +103,7 @@ def data_of(table: AmplitudeTable | SeveralTables, task: Task) -> Data:
         if quality is not None and np.isnan(quality):
             known = task.known.get(name_of_table("quality_factor", label)) or task.known["quality_factor"]
             quality = known[0]
-        heads.append((member.free_frequency_khz, np.inf if quality is None else float(quality)))
+        heads.append((member.free_frequency_khz, _UNDAMPED if quality is None else float(quality)))
         columns.append(_columns_of(member, quality))
     number = np.repeat(np.arange(len(tables)), [member.rows for member in tables])
     whole = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}

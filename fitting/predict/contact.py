@@ -67,6 +67,10 @@ class ContactLaw(LawModel):
         parameter = PARAMETERS[name]
         return (value - parameter.reference) / parameter.width if parameter.width else np.log(value)
 
+    def slope_of(self, name: str, unknown: float) -> float:
+        """Return d value/d unknown of a parameter."""
+        return PARAMETERS[name].width or float(self.value_of(name, unknown))
+
     def values(self, theta: Float[np.ndarray, " k"]) -> dict[str, float]:
         """Return the parameters that are fitted, by name."""
         return {name: float(self.value_of(name, y)) for name, y in zip(self.own, theta.tolist(), strict=False)}

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.orbits import amplitudes, steady_orbits
+from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
 from fitting.predict.orbit import Local, Row, platform_and_cantilever, shown
 
 
@@ -26,6 +26,7 @@ class Seen(NamedTuple):
         near_fold: the one that was taken is close to a fold.
         approach: its approach speed in nm/us; NaN without one.
         coordinate: of its impact in the law.
+        phase: of the drive at the impact, in rad.
     """
 
     readings: Float[Array, " 3"]
@@ -33,6 +34,7 @@ class Seen(NamedTuple):
     near_fold: Bool[Array, ""]
     approach: Float[Array, ""]
     coordinate: Float[Array, ""]
+    phase: Float[Array, ""]
 
 
 def searched(
@@ -49,7 +51,8 @@ def searched(
         drive: what is driven.
     """
     cantilever, platform = platform_and_cantilever(local, row, drive)
-    roots = steady_orbits(OrbitProblem(cantilever, platform, law, row.order))
+    problem = OrbitProblem(cantilever, platform, law, row.order)
+    roots = steady_orbits(problem)
     of_slots = jax.vmap(lambda seen: shown(seen, local, row, platform, drive))(roots.amplitude_nm)
     size = jnp.sum(jnp.where(jnp.isfinite(read), (of_slots - read) / error, 0.0) ** 2, axis=1)
     slot = jnp.argmin(jnp.where(roots.steady, size, jnp.inf))
@@ -62,6 +65,7 @@ def searched(
         near_fold=impact & roots.near_double[slot],
         approach=jnp.where(impact, law.speeds(coordinate).approach, jnp.nan),
         coordinate=coordinate,
+        phase=orbit_state(OrbitPlace(coordinate, jnp.zeros(())), problem).phase,
     )
 
 

@@ -90,6 +90,10 @@ class LawModel(ABC):
         """Return the unknown for a parameter's value."""
 
     @abstractmethod
+    def slope_of(self, name: str, unknown: float) -> float:
+        """Return d value/d unknown of a parameter."""
+
+    @abstractmethod
     def values(self, theta: Float[np.ndarray, " k"]) -> dict[str, float]:
         """Return the parameters by name."""
 
@@ -148,6 +152,12 @@ class FormulaLaw(LawModel):
         if name == "r":
             return 1.0 - value**2
         return np.log(value) if self._logarithmic(name) else value
+
+    def slope_of(self, name: str, unknown: float) -> float:
+        """Return d value/d unknown of a parameter."""
+        if name == "r":
+            return -0.5 / self.value_of(name, min(unknown, _MOST_LOST))
+        return self.value_of(name, unknown) if self._logarithmic(name) else 1.0
 
     def _logarithmic(self, name: str) -> bool:
         return self.lasting and name in ("epsilon", "delay_hertz")

@@ -42,6 +42,8 @@ _LONGEST_STEP = np.array([1.5, 0.3])
 """Longest step of Newton's method in coordinate and phase."""
 _ARRIVED, _CLOSED = 1e-8, 1e-6
 """Step at which it stops, and gaps that an orbit may have."""
+NEAR_FOLD = 1e-3
+"""`Orbits.fold` below which an orbit is close to one."""
 _NEWTON_STEPS = 14
 _HEIGHTS = np.linspace(0.0, 1.0, 258)[1:-1]
 """Fractions of a flight at which its height over the platform is looked at."""

@@ -153,7 +153,12 @@ def _sampled(posterior: Posterior) -> ReportSection:
         for name, ends in posterior.interval95.items()
     ]
     head = ["parameter", "mean", "from", "to"]
-    said = "95 % credible intervals (posterior, flat priors, of the formula without model error):"
+    said = "95 % credible intervals (posterior, flat priors):"
+    if posterior.method == "gaussian":
+        worth = posterior.chains.effective_samples[0]
+        said = (
+            f"95 % intervals of samples of the Gaussian around the fit (of 120, weighted to chi2, {worth:.0f} count):"
+        )
     wrong = [f"Not converged: {reason}" for reason in posterior.reasons]
     return ReportSection("Posterior", [Text(said), Table("By parameter", head, rows), Bullets(wrong)])
 

@@ -1,47 +1,51 @@
-"""The posterior of a fit, by the no-U-turn sampler of blackjax, an optional package.
+"""Samples of the posterior of a fit: of its one residual, with all its unknowns and what is known of them beforehand.
 
-The density is exp(-chi2/2) with the objective's chi2, constraints of the fit included, times priors flat in the values.
-The sampler moves in coordinates without ends: each parameter's range on the whole line, with its prior. A value with an
-end, such as a loss, is its end plus or minus e log(1 + exp(y)), with e its standard error: linear where the end is
-errors away, exponential close to it. A posterior that is Gaussian but for the end stays nearly so in y.
+Instantaneous laws: the no-U-turn sampler of blackjax, an optional package, on exp(-chi2/2) with the fit's chi2, times
+priors flat in the law's parameters. It moves in coordinates without ends: a loss is its end plus or minus
+e log(1 + exp(y)), with e its standard error: linear where the end is errors away, exponential close to it. A posterior
+that is Gaussian but for the end stays nearly so in y.
+
+Impacts that last have dozens of unknowns, which the fit's Gaussian N(theta, C) describes: samples are drawn from that.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from afm_jax.checks import checked
-from fitting.infer.rows import ROBUST
+from afm_jax.checks import checked, require_float64
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.solve.lanes import compiled_quickly
+from fitting.infer.closest import closest_parameters, covariance_of_unknowns
+from fitting.infer.explain import Explained
+from fitting.infer.fit import explained_of
+from fitting.infer.law import root_of
 from fitting.infer.result import FitResult
-from fitting.forward import Lanes, impacts_of, linearised
-from fitting.models import Measurement, Problem
-from fitting.parameters import Parameter
+from fitting.infer.search import CENSORED, Followed
+from fitting.parameters import PARAMETERS, Parameter, parameter_called
+from fitting.predict.instantaneous import read_at, searched
+from fitting.predict.orbit import COUNT, Local
 from fitting.sampling.posterior_result import Posterior, PosteriorChains, posterior_of_chains
-from fitting.sampling.refit import Refit, compact, objective_of, require_valid, standard_covariance
+from fitting.tables.several import SeveralTables
 
 FEWEST_SAMPLES = 100
 CHAINS = 4
 WARM_UP = 300
-_SPREAD = 1.0
-"""Chains start this many standard deviations apart: R-hat can then tell whether they came together."""
+WEIGHED = 120
+"""Draws of a Gaussian that chi2 itself is computed for, at most."""
 
 
 @checked
-def posterior(
-    result: FitResult,
-    *,
-    samples: int = 1000,
-    seed: int = 0,
-) -> Posterior:
-    """Return samples of the posterior of all parameters, nuisances included, with priors flat in their values.
+def posterior(result: FitResult, *, samples: int = 1000, seed: int = 0) -> Posterior:
+    """Return samples of the posterior of all parameters, nuisances included.
 
-    Constraints of the fit (the quality factor's, calibrations) are Gaussian priors. The model's formula is taken as
-    exact: where impacts last, the fit's values and intervals contain its error, and those of samples may contradict
-    them.
+    Of an instantaneous law by the no-U-turn sampler, with priors flat in the law's parameters. Where impacts last they
+    are draws of the Gaussian around the fit, which contains what the formula leaves out; values beyond the end of a
+    parameter's range are put there. Constraints of the fit (the quality factor's, calibrations) are Gaussian priors.
 
     Args:
         result: from `fitting.fit`; it must be valid.
@@ -49,26 +53,30 @@ def posterior(
         seed: of the sampler.
 
     Raises:
-        ValueError: if the fit is not valid, an option is impossible, or the data do not determine every parameter.
-        ModuleNotFoundError: if blackjax is not installed (extra `nuts`).
+        ValueError: if the fit is not valid or of several tables, an option is impossible, or the data do not determine
+            every parameter.
+        ModuleNotFoundError: if blackjax is needed and not installed (extra `nuts`).
     """
-    require_valid(result)
-    refit = compact(objective_of(result))
+    require_float64()
+    if not result.valid:
+        raise ValueError(f"the fit of the model {result.model!r} is not valid ({result.reasons[0]}); mend it first")
+    if isinstance(result.table, SeveralTables):
+        raise ValueError(  # noqa: TRY004 (a fit of several tables is no wrong type)
+            "a posterior is about one table; the intervals of a joint fit are its own"
+        )
     if samples < FEWEST_SAMPLES:
         raise ValueError(f"`samples` must be at least {FEWEST_SAMPLES}, but is {samples}")
-    blackjax = require_blackjax()
-    covariance = standard_covariance(refit)
-    density = log_density_of(refit, covariance)
-    # blackjax mixes integers of 32 and 64 bits, which strict promotion would refuse
-    with jax.numpy_dtype_promotion("standard"):
-        drawn, diverging = _chains(density, jax.random.split(jax.random.key(seed), CHAINS), samples)
-        values = np.asarray(_values_of(density.space, drawn))
-        halves = jnp.asarray(values[:, : samples // 2 * 2].reshape(2 * CHAINS, samples // 2, -1))
-        # of one parameter they have no axis
-        r_hat = np.atleast_1d(blackjax.diagnostics.potential_scale_reduction(halves))
-        effective = np.atleast_1d(blackjax.diagnostics.effective_sample_size(halves))
-    chains = PosteriorChains(values, r_hat, effective, int(diverging.sum()), seed)
-    return posterior_of_chains(chains, refit.objective.problem.names)
+    lasting = sampled_by_gaussian(result.model)
+    if not lasting:
+        require_blackjax()
+    explained, names = explained_of(result), tuple(result.parameters)
+    chains = _gaussian(explained, result, samples, seed) if lasting else _nuts(log_density_of(explained), samples, seed)
+    return posterior_of_chains(chains, names, "gaussian" if lasting else "nuts")
+
+
+def sampled_by_gaussian(model: str) -> bool:
+    """Say whether the samples of a model are those of a Gaussian: where impacts last."""
+    return model == "contact" or model.endswith("+delay")
 
 
 def require_blackjax() -> Any:
@@ -87,159 +95,147 @@ def require_blackjax() -> Any:
     return blackjax
 
 
-class Space(eqx.Module):
-    """Where the sampler moves: the parameters' coordinates are `middle` + `axes` z, with z about standard normal.
+def _gaussian(explained: Explained, result: FitResult, samples: int, seed: int) -> PosteriorChains:
+    """Return draws of the Gaussian around a fit whose impacts last, and what some are worth once weighted to chi2."""
+    names, end = tuple(result.parameters), explained.end
+    closest = closest_parameters(explained, tuple(result.settings["free"]), result.settings["fixed"])
+    root = root_of(covariance_of_unknowns(explained))
+    drawn = np.random.default_rng(seed).normal(size=(CHAINS, samples, root.shape[1]))
+    ends = np.array([(parameter.lowest, parameter.highest) for parameter in map(parameter_called, names)])
+    values = np.clip(closest.values + drawn @ closest.factor.T, *ends.T)
+    some = drawn.reshape(-1, root.shape[1])[:WEIGHED]
+    rows = Followed(explained.model, end.theta, end.orbits, explained.weights, np.inf)
+    chi2 = np.array([rows.sum(end.theta + root @ z).value for z in some])
+    raw = -0.5 * (chi2 - np.sum(some**2, axis=1))
+    weight = np.exp(raw - raw.max(initial=-1e9))
+    worth = weight.sum() ** 2 / max(np.sum(weight**2), 1e-300)
+    return PosteriorChains(values, np.full(len(names), np.nan), np.full(len(names), worth), 0, seed)
+
+
+@dataclass(frozen=True, eq=False)
+class LogDensity:
+    """The logarithm of the posterior's density of an instantaneous law, at coordinates z about standard normal.
 
     Attributes:
-        problem: the model.
-        errors: standard errors e of the values, shape (p,).
-        middle: coordinates of the fit, shape (p,).
-        axes: its columns are steps of about one standard deviation each, shape (p, p).
+        explained: the fit.
+        law: parameters of the law.
+        errors: their standard errors e.
+        middle: the fit in coordinates y, of law and instrument, whose unknowns are those of the fit.
+        axes: its columns are steps of about one standard deviation each.
     """
 
-    problem: Problem = eqx.field(static=True)
-    errors: Float[Array, " p"]
-    middle: Float[Array, " p"]
-    axes: Float[Array, "p p"]
+    explained: Explained
+    law: tuple[Parameter, ...]
+    errors: Float[np.ndarray, " l"]
+    middle: Float[np.ndarray, " k"]
+    axes: Float[np.ndarray, "k k"]
 
-    def values_and_log_prior(self, z: Float[Array, " p"]) -> tuple[Float[Array, " p"], Float[Array, ""]]:
-        """Return the parameters' values at z, and the logarithm of the prior's density by z."""
-        coordinates = self.middle + self.axes @ z
-        values, logs = [], jnp.zeros(())
-        for i, parameter in enumerate(self.problem.parameters):
-            y = coordinates[i]
-            if parameter.width:
-                values.append(parameter.reference + parameter.width * y)
-                continue
-            distance = jax.nn.softplus(y)
-            values.append(parameter.reference + (parameter.sign or 1) * self.errors[i] * distance)
-            # d value/d y, up to a constant
-            logs = logs + jax.nn.log_sigmoid(y)
-        return jnp.stack(values), logs
+    def place(self, z: Float[Array, " k"]) -> tuple[dict[str, Any], Any, Float[Array, ""]]:
+        """Return the law's parameters, the instrument's unknowns, and the logarithm of the prior's density by z."""
+        y, count = self.middle + self.axes @ z, len(self.law)
+        distance = self.errors * jax.nn.softplus(y[:count])
+        values = {known.name: known.reference + known.sign * off for known, off in zip(self.law, distance, strict=True)}
+        # d value/d y, up to a constant
+        return values, y[count:], jnp.sum(jax.nn.log_sigmoid(y[:count]))
+
+    def values(self, z: Float[Array, " k"]) -> Float[Array, " p"]:
+        """Return the parameters as the fit prints them."""
+        values, instrument, _ = self.place(z)
+        quantities = zip(self.explained.model.instrument, instrument, strict=True)
+        return jnp.stack([*values.values(), *(quantity.at(y, jnp) for quantity, y in quantities)])
+
+    def residual(self, z: Float[Array, " k"]) -> Float[Array, " n"]:
+        """Return the fit's residuals, what is known beforehand included; differentiable forward."""
+        model, weights = self.explained.model, self.explained.weights
+        law: Any = model.law
+        values, instrument, _ = self.place(z)
+        known: dict[str, Any] = {"r": 1.0, "epsilon": 0.0} | dict(law.fixed) | values
+        impact = ImpactLaw(**known)
+        unknowns = [law.unknown_of(name, value) for name, value in values.items()]
+        data, theta = model.data, jnp.stack([*unknowns, *instrument])
+
+        def one(instrument, row, read, error):
+            local = Local(*jnp.zeros(COUNT - instrument.size), *instrument)
+            seen = searched(*lax.stop_gradient((impact, local)), row, read, error, data.drives[0])
+            there = read_at(seen.coordinate, impact, local, row, data.drives[0])
+            return jnp.where(seen.orbits > 0, there, seen.readings), seen.orbits
+
+        columns = jnp.stack(model.instrument_columns(theta, jnp), axis=1)
+        readings, orbits = jax.vmap(one)(columns, data.row, data.read, np.nan_to_num(data.error, nan=1.0))
+        off = jnp.where(weights.used, readings - np.nan_to_num(data.read), 0.0)
+        white = jnp.einsum("nij,nj->ni", weights.whitening, off).ravel()
+        unseen = jnp.where(data.no_orbit & (orbits > 0), CENSORED, 0.0)
+        mean, strength = model.prior
+        return jnp.concatenate([white, unseen, strength * (theta - mean)])
+
+    def __call__(self, z: Float[Array, " k"]) -> Float[Array, ""]:
+        """Return the logarithm of the density by z, but for a constant; minus infinity outside the ranges."""
+
+        def twice(z: Float[Array, " k"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+            residual = self.residual(z)
+            return residual, residual
+
+        # the orbits' slopes come by forward mode: nothing of the search is differentiated backward
+        still = lax.stop_gradient(z)
+        slope, residual = lax.stop_gradient(jax.jacfwd(twice, has_aux=True)(still))
+        log_likelihood = -0.5 * residual @ residual - residual @ slope @ (z - still)
+        values, _, log_prior = self.place(z)
+        inside = jnp.isfinite(log_likelihood)
+        for known in self.law:
+            inside &= (values[known.name] >= known.lowest) & (values[known.name] <= known.highest)
+        return jnp.where(inside, log_likelihood + log_prior, -jnp.inf)
 
 
-def space_around(
-    problem: Problem,
-    values: Float[np.ndarray, " p"],
-    covariance: Float[np.ndarray, "p p"],
-) -> Space:
-    """Return the space in which a posterior is about standard normal.
+def log_density_of(explained: Explained) -> LogDensity:
+    """Return the log density of a fit's posterior.
 
     A loss at its bound is taken to be half a standard error away from it: that is where its posterior lies.
 
     Args:
-        problem: the model.
-        values: of the fit.
-        covariance: its, finite.
+        explained: the fit, of an instantaneous law.
 
     Raises:
         ValueError: if the data hardly tell parameters apart.
     """
-    errors = np.sqrt(np.diag(covariance))
-    triples = zip(problem.parameters, values, errors, strict=True)
-    middle, slope = np.array([_coordinate_and_slope(*triple) for triple in triples]).T
-    scaled = covariance / np.outer(slope, slope)
-    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled / np.trace(scaled))[0] < 1e-15:
-        raise ValueError(f"the data hardly tell {', '.join(problem.names)} apart: hold one fixed, or constrain it")
-    axes = np.linalg.cholesky(scaled)
-    return Space(problem, jnp.asarray(errors), jnp.asarray(middle), jnp.asarray(axes))
+    model, middle = explained.model, explained.end.theta.copy()
+    law: Any = model.law
+    parameters = tuple(PARAMETERS[name] for name in law.names)
+    covariance, slope = covariance_of_unknowns(explained), np.ones(middle.size)
+    errors = np.sqrt(np.diag(covariance))[: len(parameters)]
+    for i, known in enumerate(parameters):
+        by_unknown, off = law.slope_of(known.name, middle[i]), law.value_of(known.name, middle[i]) - known.reference
+        errors[i] *= abs(by_unknown)
+        distance = max(abs(off) / errors[i], 0.5)
+        share = -np.expm1(-distance)
+        middle[i], slope[i] = distance + np.log(share), by_unknown / (known.sign * errors[i] * share)
+    covariance = covariance * np.outer(slope, slope)
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance / np.trace(covariance))[0] < 1e-15:
+        raise ValueError(f"the data hardly tell {', '.join(model.names)} apart: hold one fixed, or constrain it")
+    return LogDensity(explained, parameters, errors, middle, np.linalg.cholesky(covariance))
 
 
-def _coordinate_and_slope(parameter: Parameter, value: float, error: float) -> tuple[float, float]:
-    """Return the coordinate y of a value, and d value/d y there."""
-    if parameter.width:
-        return (value - parameter.reference) / parameter.width, parameter.width
-    distance = max(abs(value - parameter.reference) / error, 0.5)
-    share = -float(np.expm1(-distance))
-    return distance + float(np.log(share)), (parameter.sign or 1) * error * share
-
-
-class LogDensity(eqx.Module):
-    """The logarithm of the posterior's density at coordinates z of a space, with its gradient by forward mode.
-
-    All numbers are traced: one program serves all tables with as many rows.
-
-    Attributes:
-        space: of the sampler.
-        measurement: the rows, and what is known of parameters.
-        near: approach speeds of the orbits to follow; None: they are searched for.
-        robust: whether outliers count linearly.
-    """
-
-    space: Space
-    measurement: Measurement
-    near: Float[Array, " rows"] | None
-    robust: bool = eqx.field(static=True)
-
-    def __call__(self, z: Float[Array, " p"]) -> Float[Array, ""]:
-        """Return the logarithm of the density by z, but for a constant; minus infinity outside the ranges."""
-        # the orbits' slopes come by forward mode: nothing of the search is differentiated backward
-        log_likelihood = jax.custom_jvp(lambda values: self._log_likelihood_and_gradient(values)[0])
-
-        @log_likelihood.defjvp
-        def _(primals, tangents):
-            value, gradient = self._log_likelihood_and_gradient(*primals)
-            return value, gradient @ tangents[0]
-
-        values, log_prior = self.space.values_and_log_prior(z)
-        lowest, highest = jnp.asarray(self.space.problem.ends)
-        inside = jnp.all((values >= lowest) & (values <= highest))
-        return jnp.where(inside, log_likelihood(jnp.clip(values, lowest, highest)) + log_prior, -jnp.inf)
-
-    def _log_likelihood_and_gradient(self, values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, " p"]]:
-        measurement, problem = self.measurement, self.space.problem
-        lanes = jnp.zeros(measurement.rows.order.shape[0], dtype=int)
-        impacts = impacts_of(values[None], measurement, problem)
-        points = jnp.broadcast_to(values, (lanes.size, values.size))
-        block = linearised(Lanes(points, impacts, lanes, measurement), problem, self.near)
-        constraint = (values - measurement.constraint_value) / measurement.constraint_error
-        residual = jnp.concatenate([block.misfit.ravel(), block.unseen, constraint])
-        root = jnp.sqrt(1.0 + (residual / ROBUST) ** 2) if self.robust else jnp.ones_like(residual)
-        # half the loss: r^2/2, or s^2 (sqrt(1 + r^2/s^2) - 1) with the softness s; its derivative is r/root
-        half, weight = residual**2 / (1.0 + root), residual / root
-        count = block.misfit.size
-        slope = block.slope.reshape(count, -1).T @ weight[:count]
-        return -jnp.sum(half), -(slope + weight[-constraint.size :] / measurement.constraint_error)
-
-
-def log_density_of(refit: Refit, covariance: Float[np.ndarray, "p p"]) -> LogDensity:
-    """Return the log density of a fit's posterior, in the space that is scaled by its covariance.
-
-    Args:
-        refit: the fit, from `fitting.sampling.refit.objective_of`; its orbits are followed.
-        covariance: of its values.
-
-    Raises:
-        ValueError: if the data hardly tell parameters apart.
-    """
-    objective = refit.objective
-    space = space_around(objective.problem, refit.values, covariance)
-    near = None if objective.near is None else jnp.asarray(objective.near)
-    measurement = jax.tree.map(jnp.asarray, objective.measurement)
-    return LogDensity(space, measurement, near, robust=objective.robust)
-
-
-@eqx.filter_jit
-def _chains(density: LogDensity, keys, samples: int):
-    """Return draws (chains, draws, p), and of shape (chains, draws) which steps diverged."""
-    blackjax = require_blackjax()
+def _nuts(density: LogDensity, samples: int, seed: int) -> PosteriorChains:
+    """Return chains of the no-U-turn sampler, each started from a place of its own about an error away."""
+    blackjax, log_density, size = require_blackjax(), jax.jit(density.__call__), density.middle.size
 
     def chain(key):
         start, warm, draw = jax.random.split(key, 3)
-        place = _SPREAD * jax.random.normal(start, density.space.middle.shape)
-        adaptation = blackjax.window_adaptation(blackjax.nuts, density, is_mass_matrix_diagonal=False)
-        (state, parameters), _ = adaptation.run(warm, place, WARM_UP)
-        kernel = blackjax.nuts(density, **parameters)
+        adaptation = blackjax.window_adaptation(blackjax.nuts, log_density, is_mass_matrix_diagonal=False)
+        (state, found), _ = adaptation.run(warm, jax.random.normal(start, (size,)), WARM_UP)
+        kernel = blackjax.nuts(log_density, **found)
 
         def step(state, key):
             state, info = kernel.step(key, state)
-            return state, (state.position, info.is_divergent)
+            return state, (density.values(state.position), info.is_divergent)
 
-        return jax.lax.scan(step, state, jax.random.split(draw, samples))[1]
+        return lax.scan(step, state, jax.random.split(draw, samples))[1]
 
-    return jax.vmap(chain)(keys)
-
-
-@eqx.filter_jit
-def _values_of(space: Space, drawn: Float[Array, "chains draws p"]) -> Float[Array, "chains draws p"]:
-    return jax.vmap(jax.vmap(lambda z: space.values_and_log_prior(z)[0]))(drawn)
+    # blackjax mixes integers of 32 and 64 bits, which strict promotion would refuse
+    with jax.numpy_dtype_promotion("standard"):
+        drawn, diverging = compiled_quickly()(jax.vmap(chain))(jax.random.split(jax.random.key(seed), CHAINS))
+        values = np.asarray(drawn)
+        halves = jnp.asarray(values[:, : samples // 2 * 2].reshape(2 * CHAINS, samples // 2, -1))
+        # of one parameter they have no axis
+        r_hat = np.atleast_1d(blackjax.diagnostics.potential_scale_reduction(halves))
+        effective = np.atleast_1d(blackjax.diagnostics.effective_sample_size(halves))
+    return PosteriorChains(values, r_hat, effective, int(diverging.sum()), seed)

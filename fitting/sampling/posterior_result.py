@@ -23,8 +23,9 @@ class PosteriorChains:
 
     Attributes:
         samples: of shape (chains, draws, p), after warming up.
-        r_hat: ratio of the spread of split chains to that within them, 1 if converged.
-        effective_samples: number of independent samples worth as much.
+        r_hat: ratio of the spread of split chains to that within them, 1 if converged; NaN of a Gaussian.
+        effective_samples: number of independent samples worth as much; of a Gaussian what 120 draws are worth once they
+            are weighted to chi2 itself.
         divergences: transitions that lost the energy.
         seed: of the sampler.
     """
@@ -48,6 +49,7 @@ class Posterior(Result):
         converged: whether to trust it; `reasons` say why not.
         reasons: a sentence each.
         chains: the samples and their diagnostics.
+        method: "nuts", the no-U-turn sampler, or "gaussian" around the fit where impacts last.
     """
 
     mean: dict[str, float]
@@ -56,12 +58,13 @@ class Posterior(Result):
     converged: bool
     reasons: list[str]
     chains: PosteriorChains
+    method: str
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the single samples as plain lists, numbers and strings."""
         chains, draws, _ = self.chains.samples.shape
         return {
-            "method": "nuts",
+            "method": self.method,
             "converged": self.converged,
             "reasons": self.reasons,
             "parameters": {
@@ -82,12 +85,27 @@ class Posterior(Result):
             },
         }
 
+    def to_arviz(self) -> Any:
+        """Return the samples as ArviZ's data, for its pictures and summaries.
 
-def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...]) -> Posterior:
+        Raises:
+            ModuleNotFoundError: if ArviZ is not installed.
+        """
+        try:
+            import arviz  # noqa: PLC0415
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError("ArviZ is not installed: pip install arviz", name="arviz") from error
+        columns = np.moveaxis(self.chains.samples, -1, 0)
+        groups: dict[str, Any] = {"posterior": dict(zip(self.mean, columns, strict=True))}
+        # from 1.0 on it takes the groups as one mapping
+        return arviz.from_dict(**groups) if arviz.__version__.startswith("0.") else arviz.from_dict(groups)
+
+
+def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...], method: str) -> Posterior:
     """Return means and intervals of samples, and whether the chains agree."""
     flat = chains.samples.reshape(-1, len(names))
     low, high = np.quantile(flat, [0.025, 0.975], axis=0)
-    reasons = _complaints(chains, names)
+    reasons = _complaints(chains, names) if method == "nuts" else []
     return Posterior(
         mean=dict(zip(names, flat.mean(axis=0).tolist(), strict=True)),
         standard_deviation=dict(zip(names, flat.std(axis=0, ddof=1).tolist(), strict=True)),
@@ -95,6 +113,7 @@ def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...]) -> Post
         converged=not reasons,
         reasons=reasons,
         chains=chains,
+        method=method,
     )
 
 
