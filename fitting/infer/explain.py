@@ -33,6 +33,8 @@ _ROUNDS, _SETTLED = 12, 0.02
 """Rounds of orbits, weights and descent at most, and the change of chi2 at which they have settled."""
 _PROFILE_SETTLED = 1e-2
 """The same for the descent of a profile."""
+_PART, _PARTS = 3.0, 20
+"""Longest part of a profile's way in standard errors, and how many of them at most."""
 _RECOVERIES = 2
 """How often laws around one that lacks measured orbits are looked at."""
 _DECIDED = 3
@@ -81,20 +83,40 @@ class Explained:
         """Of all unknowns, infinite where the readings and priors determine nothing."""
         return covariance_of(self.end.jacobian.T @ self.end.jacobian)
 
-    def beside(self, place: int, value: float) -> Float[np.ndarray, " k"]:
-        """Return the unknowns with one held at a value, the others following to first order."""
-        theta, covariance = self.end.theta.copy(), self.covariance
+    def beside(self, place: int, value: float, begin: Descent | None = None) -> Float[np.ndarray, " k"]:
+        """Return the unknowns with one held at a value, the others following to first order, from the end or another.
+
+        Args:
+            place: of the unknown.
+            value: of it.
+            begin: from where; None: from the minimum.
+        """
+        theta, covariance = (self.end if begin is None else begin).theta.copy(), self.covariance
         if np.isfinite(covariance).all() and covariance[place, place] > 0.0:
             theta = theta + covariance[place] / covariance[place, place] * (value - theta[place])
         theta[place] = value
         return theta
 
     def profile(self, place: int, value: float) -> float:
-        """Return chi2 with one unknown held at a value, the others following, weights as they are."""
-        fixed = np.zeros(self.end.theta.size, bool)
+        """Return chi2 with one unknown held at a value, the others following, weights as they are.
+
+        The way there is gone in parts, shorter ones where an orbit is lost; infinite where there is none.
+        """
+        fixed, begin = np.zeros(self.end.theta.size, bool), self.end
         fixed[place] = True
-        theta = self.beside(place, value)
-        return descend(self.model, theta, self.end.orbits, self.weights, settled=_PROFILE_SETTLED, fixed=fixed).chi2
+        longest = _PART * float(np.sqrt(self.covariance[place, place]))
+        for _ in range(_PARTS):
+            left = value - begin.theta[place]
+            part = float(np.clip(left, -longest, longest))
+            theta = self.beside(place, begin.theta[place] + part, begin)
+            end = descend(self.model, theta, begin.orbits, self.weights, settled=_PROFILE_SETTLED, fixed=fixed)
+            if not np.isfinite(end.chi2):
+                longest = 0.5 * abs(part)
+            elif part == left:
+                return end.chi2
+            else:
+                begin = end
+        return np.inf
 
     def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAt:
         """Return rebound speeds and delays at approach speeds in nm/us, with their change by independent unknowns."""

@@ -146,7 +146,7 @@ class Followed:
         """Follow the orbits of the rows that count to the unknowns; arguments as of `descend`."""
         self.model, self.weights, self.soft = model, weights, soft
         self.orbits, self.least = model.follow(theta, begin.x), np.inf
-        self.counts = np.isfinite(begin.x[:, 0]) & weights.used.any(axis=1) & self.orbits.closes
+        self.counts = np.isfinite(begin.x[:, 0]) & weights.used.any(axis=1)
 
     def sum(self, place: Float[np.ndarray, " k"]) -> Sum:
         """Return the sum of squares at unknowns, outliers softened; infinite where an orbit is lost."""
