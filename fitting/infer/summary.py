@@ -230,6 +230,8 @@ def courses_along_rows(explained: Explained, table: AmplitudeTable | SeveralTabl
     fitted beside everything else.
     """
     data, end, weights = explained.model.data, explained.end, explained.weights
+    if not np.isfinite(end.jacobian).all():
+        return {}
     freedom = max(int(weights.used.sum()) - len(explained.model.law.own), 1)
     scale, courses = np.sqrt(max(1.0, end.chi2 / freedom)), {}
     basis, size, _ = np.linalg.svd(
