@@ -208,7 +208,7 @@ MUTATIONS = {
     ),
     "nuisances that help": Mutation(
         "whole {- => +} np.linalg.slogdet",
-        "tests/test_experiment_selection.py::test_four_of_eleven_taken_one_after_another_are_nearly_the_best_choice",
+        "tests/test_experiment_selection.py::test_points_come_in_the_order_of_their_use[matters1]",
     ),
     "period doubling at multiplier +1": Mutation(
         "1.0 {+ => -} trace {+ => -} determinant,", "tests/test_continuation.py::test_period_doubling_is_that_of_eq_8"

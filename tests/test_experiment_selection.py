@@ -40,13 +40,14 @@ def test_a_parabola_is_measured_at_its_ends_and_in_the_middle():
     np.testing.assert_allclose(np.sort(x[chosen]), [-1.0, 0.0, 1.0], atol=1e-12)
 
 
-def test_points_come_in_the_order_of_their_use():
+@pytest.mark.parametrize("matters", [(0, 1), (0,)])
+def test_points_come_in_the_order_of_their_use(matters):
     each = informations(np.random.default_rng(5).normal(size=(30, 2)))
-    prior = np.eye(2)
-    chosen = choose_points(prior, each, 6, np.ones(2, dtype=bool))
+    prior, mask = np.eye(2), np.isin(np.arange(2), matters)
+    chosen = choose_points(prior, each, 6, mask)
     for step in range(5):
         known = prior + each[chosen[:step]].sum(axis=0)
-        gains = [plain_score(known + each[point], np.ones(2, dtype=bool)) for point in chosen[step:]]
+        gains = [plain_score(known + each[point], mask) for point in chosen[step:]]
         assert np.argmax(gains) == 0
 
 

@@ -15,7 +15,7 @@ from tests.mutations import MUTATIONS, before_and_after
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("afm_jax", "fitting")
 AT_ONCE = 2
-TIME_LIMIT_S = 300
+TIME_LIMIT_S = 1200
 UNCHANGED = "unchanged"
 
 

@@ -215,8 +215,16 @@ def _mark_orders(axes: Axes, result: FitResult, *, above: bool) -> None:
                 fontsize=SMALL,
             )
     if not above:
+        # where two orders meet, one name for both
         names = [f"{frequency[int(place)]:.4g}" for place in ticks]
-        axes.set_xticks(ticks, names, rotation=35, ha="right", rotation_mode="anchor")
+        inner = [f"{last}, {first}" for last, first in zip(names[1:-1:2], names[2::2], strict=True)]
+        axes.set_xticks(
+            [ticks[0], *(last + 0.5 for last in ticks[1:-1:2]), ticks[-1]],
+            [names[0], *inner, names[-1]],
+            rotation=35,
+            ha="right",
+            rotation_mode="anchor",
+        )
 
 
 def draw_law(axes: Axes, result: FitResult) -> None:
