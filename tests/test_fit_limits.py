@@ -8,19 +8,22 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-import fitting.forward
+import fitting.predict.instantaneous
 from afm_jax.impact.closure import OrbitPlace
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit
-from fitting.infer.fit import find_fit, summarise
-from fitting.fits.objective import Objective
+from fitting.infer import fit as fitting_fit
+from fitting.infer.fit import model_of
+from fitting.infer.instantaneous import Chi2
 from fitting.infer.result import FitResult
-from fitting.forward import branch_of, impact_of, orbit_problem
-from fitting.models import measurement_of, problem_of
+from fitting.models import task_of
+from fitting.predict.instantaneous import searched
+from fitting.predict.orbit import Local, Row
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
+    chi2_residuals,
     rows,
     simulated,
     standard_errors_of,
@@ -74,11 +77,7 @@ def test_without_adhesion_epsilon_is_an_upper_limit(table):
     assert "reaches the end of its range, 0" in str(epsilon.interval_reason)
     assert any("epsilon is at its bound" in warning for warning in result.warnings)
     assert result.parameters["r"].value == pytest.approx(0.95, abs=1e-6)
-    problem = problem_of(bare, "law")
-    objective = Objective(measurement_of(bare, problem), problem)
-    scipy = least_squares(
-        lambda at: objective.residual(np.array([[at[0], high, at[1]]]))[0], [0.95, 40.0], x_scale=[1e-2, 0.4]
-    )
+    scipy = least_squares(lambda at: chi2_residuals(bare, at[0], high, at[1]), [0.95, 40.0], x_scale=[1e-2, 0.4])
     # the search stops within a thousandth
     assert 2.0 * scipy.cost - result.chi2 == pytest.approx(3.8415, rel=5e-3)
 
@@ -137,28 +136,31 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     amplitude = jnp.array([[100.0, 40.0, 0.0], [60.0, 26.0, 0.0], [60.0, 25.0, 0.0], [61.0, 40.0, 0.0]])
     steady = jnp.array([True, False, True, False])
     made_up = SteadyOrbits(OrbitPlace(jnp.arange(4.0), jnp.zeros(4)), steady, jnp.zeros(4, dtype=bool), amplitude)
-    monkeypatch.setattr(fitting.forward, "steady_orbits", lambda _: made_up)
+    monkeypatch.setattr(fitting.predict.instantaneous, "steady_orbits", lambda _: made_up)
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
-    problem, values = problem_of(table, "law"), jnp.array([0.95, 60.0, 40.0])
-    measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error), problem)
-    row = jax.tree.map(lambda column: column[0], measurement.rows)
-    orbit = orbit_problem(values, impact_of(values, measurement, problem), row, measurement, problem)
-    branch = branch_of(orbit, row, values, problem)
-    assert int(branch.place.coordinate) == slot
-    assert int(branch.orbits) == 2
-    assert bool(branch.exists)
+    one = with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error)
+    model = model_of(one, task_of(one, "law"), {"fixed": {}, "held": ()})
+    data, local = model.data, Local(*model.local(np.array([0.1, 60.0, 0.0]))[0])
+    given = jax.tree.map(jnp.asarray, (local, Row(*(column[0] for column in data.row)), data.read[0], data.error[0]))
+    seen = searched(ImpactLaw(0.95, 60.0), *given, "sample")
+    assert int(seen.coordinate) == slot
+    assert int(seen.orbits) == 2
 
 
 @pytest.mark.slow
 def test_band_and_intervals_hold_another_minimum_that_the_data_hardly_tell(table, monkeypatch: pytest.MonkeyPatch):
-    found = find_fit(table, "law")
-    best = found.objective.problem.values(found.minimum.coordinates)
-    other = best + np.array([-0.02, 10.0, 0.0])[: best.size]
-    alone = summarise(table, replace(found, minimum=replace(found.minimum, ends=best[None], chi2=np.zeros(1))))
-    # as if chi2 said next to nothing
-    monkeypatch.setattr("fitting.infer.fit._HARDLY_TOLD", 1e9)
-    ends = replace(found.minimum, ends=np.stack([best, other]), chi2=np.zeros(2))
-    both = summarise(table, replace(found, minimum=ends))
+    found, alone = fitting_fit.fit_instantaneous, fit(table, "law")
+    best = values_of(alone)
+    other = best + np.array([-0.02, 10.0, 0.0])
+
+    def as_if_chi2_said_next_to_nothing(*arguments, **named):
+        explained, optax, _ = found(*arguments, **named)
+        theta = np.array([1.0 - other[0] ** 2, other[1], explained.end.theta[2]])
+        chi2 = Chi2(explained.model, explained.weights)
+        return explained, optax, chi2.explained(chi2.descended(theta, np.ones(3, bool)))
+
+    monkeypatch.setattr(fitting_fit, "fit_instantaneous", as_if_chi2_said_next_to_nothing)
+    both = fit(table, "law")
     square = (other[0] * both.law.approach_speed_nm_per_us) ** 2 - other[1]
     theirs = np.sqrt(np.where(square > 0.0, square, np.nan))
     assert not np.any(theirs < both.law.rebound_low_nm_per_us)

@@ -29,7 +29,7 @@ STARTS, _POLISHED, _PADDED = 64, 8, 32
 """Starts that are screened and polished; rows are padded to multiples of the last, so that programs have few shapes."""
 _SOFT = 5.0
 """Residual of a reading from which it counts linearly in the screening."""
-_FINE, _STEPS = 1e-10, 60
+_FINE, _STEPS = 1e-16, 60
 """Estimated distance of chi2 to its minimum at the end, and damped steps to it at most."""
 _APART, _HARDLY_WORSE = 5.0, 4.0
 """Errors by which another minimum differs, and the rise of chi2 up to which it may be the true one."""
