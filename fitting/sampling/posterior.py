@@ -208,7 +208,9 @@ def log_density_of(explained: Explained) -> LogDensity:
         distance = max(abs(off) / errors[i], 0.5)
         share = -np.expm1(-distance)
         middle[i], slope[i] = distance + np.log(share), by_unknown / (known.sign * errors[i] * share)
-    covariance = covariance * np.outer(slope, slope)
+    with np.errstate(invalid="ignore"):
+        # what is not determined has no covariance
+        covariance = covariance * np.outer(slope, slope)
     if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance / np.trace(covariance))[0] < 1e-15:
         raise ValueError(f"the data hardly tell {', '.join(model.names)} apart: hold one fixed, or constrain it")
     return LogDensity(explained, parameters, errors, middle, np.linalg.cholesky(covariance))
