@@ -43,7 +43,7 @@ def test_likelihoods_are_those_of_another_programs_amplitudes(believed):
 
 def test_a_right_posterior_is_not_complained_of(believed):
     _, explained, values = believed
-    ranks = calibrate_ranks(explained, unknowns_of(explained, values), sets=100)
+    ranks = calibrate_ranks(explained, unknowns_of(explained, values), sets=300)
     assert ranks.p_value > 0.05
     assert ranks.gaussian_p_value > 0.05
     assert ranks.failed == 0
