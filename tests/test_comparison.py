@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from afm_jax.cli.main import main
 from fitting.infer import comparison
 from fitting.infer.comparison import compare
-from fitting.infer.fit import find_fit, summarise
+from fitting.infer.fit import fit
 from tests.fit_tables import EXAMPLE, table
 from tests.strict_reading import strictly
 
@@ -23,9 +23,8 @@ def compared(table):
 
 @pytest.fixture(scope="module")
 def fitted(table):
-    """Return minimum and summary of the models that stand, as `compare` takes them."""
-    found = {model: find_fit(table, model) for model in MODELS if model != "viscous"}
-    return {model: (one, summarise(table, one)) for model, one in found.items()}
+    """Return the fits of the models that stand, as `compare` takes them."""
+    return {model: fit(table, model) for model in MODELS if model != "viscous"}
 
 
 @pytest.mark.slow
@@ -48,10 +47,10 @@ def test_models_are_compared_by_their_information(compared):
 def test_a_rival_that_fails_is_reported_beside_those_that_stand(table, compared, fitted, monkeypatch):
     """Those that stand are known already, and not fitted again."""
 
-    def find(*_, **__):
+    def fails(*_, **__):
         raise FloatingPointError
 
-    monkeypatch.setattr(comparison, "find_fit", find)
+    monkeypatch.setattr(comparison, "fit", fails)
     found = compare(table, MODELS, known=fitted)
     assert found.failed == {"viscous": "FloatingPointError"}
     assert "The fit of viscous failed: FloatingPointError." in found.verdict
@@ -99,6 +98,7 @@ def test_a_law_without_adhesion_is_a_rival_like_any_other(contact_table_path: Pa
     assert set(found) == {"restitution+delay", "law+delay", "viscous+delay"}
     assert {model for model, row in found.items() if row["valid"]} == {"law+delay", "viscous+delay"}
     # the resolved contact, whose loss grows with speed and which holds slow tips: restitution alone is far off
-    assert found["restitution+delay"]["aic"] > 10.0 * found["viscous+delay"]["aic"]
+    assert found["restitution+delay"]["largest_distance"] > 10.0 * found["viscous+delay"]["largest_distance"]
+    assert answer["comparison"]["rows"][-1]["model"] == "restitution+delay"
     # a model has one chi2
     assert found["restitution+delay"]["chi2"] == answer["chi2"]

@@ -22,6 +22,8 @@ _ROUNDS = 8
 _BEGIN = {"delay_hertz": 0.2, "delay_lead_nm": 5.0, "delay_offset_nm": 0.0}
 _LOSSES = {parameter.name: parameter.reference for parameter in LAW}
 """Parameters of losses, and the value of each without one."""
+_SAME, _SHARED = 1e-8, 1e-3
+"""What is left of a combination of parameters that does nothing, and the part in it from which one is undetermined."""
 
 
 class Closest(NamedTuple):
@@ -139,5 +141,10 @@ def _projected(explained: Explained, own: tuple[str, ...], fixed: Mapping[str, f
 def _solved(
     slope: Float[np.ndarray, "n p"], change: Float[np.ndarray, "n m"], weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "p m"]:
-    """Return how parameters follow changes of a law."""
-    return np.linalg.lstsq(weight[:, None] * slope, weight[:, None] * change, rcond=None)[0]
+    """Return how parameters follow changes of a law; NaN of those that do the same."""
+    columns = weight[:, None] * slope
+    found = np.linalg.lstsq(columns, weight[:, None] * change, rcond=None)[0]
+    unit = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    _, strength, axes = np.linalg.svd(columns / unit, full_matrices=False)
+    found[np.any(np.abs(axes[strength < _SAME]) > _SHARED, axis=0)] = np.nan
+    return found

@@ -96,12 +96,13 @@ def compare(
         free = of_model.get("free")
         model_parameters(model, None if free is None else tuple(free), of_model.get("fixed"))
     whole = tables_of(table)
-    # formulas whose impacts last have one law: that of the first of them
-    formula = next((model for model in models if model.endswith("+delay")), None)
+    # formulas whose impacts last have one law: that of the first with adhesion, which finds any
+    formulas = sorted((m for m in models if m.endswith("+delay")), key=lambda model: "epsilon" not in MODELS[model])
+    formula = formulas[0] if formulas else None
     results: dict[str, FitResult] = {}
     failures: dict[str, Exception] = {}
     for model in dict.fromkeys(models):
-        if model.endswith("+delay") and model != formula:
+        if model.endswith("+delay") and model != formula and model not in (known or {}):
             continue
         try:
             results[model] = _fitted(whole, model, known or {}, options)

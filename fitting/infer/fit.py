@@ -147,7 +147,7 @@ def model_of(table: AmplitudeTable | SeveralTables, task: Task, settings: dict[s
         return Model(data, ContactLaw(problem.own, fixed, held, problem.effects, data.mass_ng), instrument, known)
     own = problem.own
     if problem.lasting and "viscous_loss" not in (*own, *fixed):
-        own = (*own[: own.index("delay_hertz")], "viscous_loss", *own[own.index("delay_hertz") :])
+        own = (*own, "viscous_loss")
     law = FormulaLaw(own, fixed, data.mass_ng, lasting=problem.lasting)
     return Model(data, law, instrument, known)
 
