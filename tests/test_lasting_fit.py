@@ -8,10 +8,12 @@ import pytest
 import afm_jax as afm
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
-from fitting.fits.minimum import model_errors_of, with_inflated_errors
-from fitting.fits.objective import Objective
+from fitting.infer.fit import model_of
 from fitting.infer.result import FitResult
-from fitting.models import measurement_of, problem_of
+from fitting.infer.rows import weights_of
+from fitting.infer.search import orbits_at
+from fitting.infer.unknowns import Model
+from fitting.models import task_of
 from fitting.simulated.experiment import simulate_experiment
 from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment
@@ -46,27 +48,41 @@ def viscous(shared) -> FitResult:
     return fit(shared, model="viscous+delay")
 
 
+def model_for(table: AmplitudeTable, name: str) -> Model:
+    """Return what is unknown of a table by a model."""
+    return model_of(table, task_of(table, name), {"fixed": {}, "held": ()})
+
+
+def at(model: Model, values: dict[str, float]) -> np.ndarray:
+    """Return the unknowns at a law's parameters, the instrument as the table says."""
+    theta = np.zeros(len(model.names))
+    theta[: len(model.law.own)] = [model.law.unknown_of(name, values[name]) for name in model.law.own]
+    return theta
+
+
 def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
-    problem = problem_of(shared, "viscous+delay")
-    stated = Objective(measurement_of(shared, problem), problem)
-    values = {"epsilon": 0.0, "viscous_loss": 0.0, "delay_hertz": 0.2, "delay_lead_nm": 6.0, "delay_offset_nm": 0.5}
-    model_errors = model_errors_of(stated, np.array([values.get(name, 40.0) for name in problem.names]))
-    assert np.all(np.isfinite(model_errors.model_error))
+    model = model_for(shared, "viscous+delay")
+    values = {"epsilon": 1e-12, "viscous_loss": 0.0, "delay_hertz": 0.2, "delay_lead_nm": 6.0, "delay_offset_nm": 0.5}
+    theta = at(model, values)
+    weights = weights_of(model, theta, orbits_at(model, theta).orbits, np.zeros(shared.rows, bool))
+    assert np.all(np.isfinite(weights.model_error))
+    assert np.all(np.isfinite(weights.whitening))
 
 
 @pytest.mark.long
 def test_the_papers_contact_predicts_the_tables_of_two_programs(shared):
     for table in (shared, read_table(EXAMPLE)):
-        problem = problem_of(table, "contact")
-        values = np.array([(PAPER | {"quality_factor": 40.0})[name] for name in problem.names])
-        stated = Objective(measurement_of(table, problem), problem)
-        objective = with_inflated_errors(stated, model_errors_of(stated, values))
-        used = np.all(np.asarray(objective.measurement.rows.measured)[: table.rows], axis=1)
+        model = model_for(table, "contact")
+        theta = at(model, PAPER)
+        found = orbits_at(model, theta)
+        weights = weights_of(model, theta, found.orbits, np.zeros(table.rows, bool))
+        used = weights.used[:, :2].all(axis=1)
         assert np.sum(~used) <= 3
-        square = objective.amplitude_residuals(values)[: table.rows] ** 2
-        count = 2.0 * used.sum()
-        # chi2 of as many amplitudes has this width; 1 % of noise, nothing fitted
-        assert abs(square[used].sum() - count) < 4.0 * np.sqrt(2.0 * count)
+        off = np.where(weights.used, found.orbits.readings - model.data.read, 0.0)
+        square = np.sum(np.einsum("nij,nj->ni", weights.whitening, off) ** 2)
+        count = float(weights.used.sum())
+        # chi2 of as many readings has this width; 1 % of noise, nothing fitted
+        assert abs(square - count) < 4.0 * np.sqrt(2.0 * count)
 
 
 def test_viscous_law_and_delay_read_the_contact_off_the_shared_table(viscous):
@@ -97,19 +113,18 @@ def test_rows_set_aside_are_named(viscous, shared):
 
 
 def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):
-    problem = problem_of(shared, "viscous+delay")
-    found = np.array([viscous.parameters[name].value for name in problem.names])
-    # more sets than one program takes, each with orbits of its own
-    values = found * np.linspace(0.97, 1.03, 11)[:, None]
-    objective = Objective(measurement_of(shared, problem), problem)
-    searched = objective.at_values(values)
-    followed = objective.following_each(values).at_values(values)
-    np.testing.assert_allclose(followed.residual, searched.residual, rtol=1e-9, atol=1e-9)
-    # from orbits a little away the same are reached where there are any (a row without is a hundred errors off)
-    there = np.abs(objective.at_values(values * 1.003).residual) < 50.0
-    assert there.mean() > 0.99
-    nearby = objective.following_each(values * 1.003).at_values(values)
-    np.testing.assert_allclose(nearby.residual[there], searched.residual[there], rtol=1e-6, atol=1e-6)
+    model = model_for(shared, "viscous+delay")
+    best = at(model, {name: parameter.value for name, parameter in viscous.parameters.items()})
+    for share in np.linspace(-0.03, 0.03, 5):
+        theta = best + np.log1p(share) * (np.arange(best.size) < len(model.law.own))
+        searched = orbits_at(model, theta)
+        # from orbits a little away the same are reached where there are any
+        near = orbits_at(model, theta + 3e-3 * (np.arange(best.size) < len(model.law.own)))
+        followed = model.follow(theta, near.orbits.x)
+        there = searched.exists & near.exists
+        assert there.mean() > 0.98
+        same = np.abs(followed.readings / searched.orbits.readings - 1.0)[there, :2] < 1e-6
+        assert same.mean() > 0.99
 
 
 def test_the_contact_is_read_off_the_shared_table(shared):
