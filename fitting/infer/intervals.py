@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from afm_jax.units import TWO_SIDED_95
 from fitting.parameters import Parameter
 
 CHI2_95 = 3.841458820694124
@@ -34,10 +33,9 @@ class Interval:
     kind: str | None = None
 
 
-def linear_interval(parameter: Parameter, value: float, error: float) -> Interval:
-    """Return the interval of a value with a standard error; an end beyond the parameter's range is open."""
-    ends: list[float | None] = [value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error]
-    return _with_open_ends(parameter, ends, [None, None], "linear")
+def linear_interval(parameter: Parameter, low: float, high: float) -> Interval:
+    """Return the interval between two ends; one beyond the parameter's range is open."""
+    return _with_open_ends(parameter, [low, high], [None, None], "linear")
 
 
 class Unknown(NamedTuple):

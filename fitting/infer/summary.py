@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.least_squares import chi2_tail, covariance_of
+from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.infer.closest import Closest, closest_parameters, covariance_of_unknowns, held_at_bound
 from fitting.infer.explain import Explained
@@ -147,16 +148,21 @@ def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
     """Return the 95 % interval of every parameter.
 
     By profile likelihood of instantaneous laws, and of epsilon where that is less than three errors from 0; else
-    linear.
+    linear, in the unknown where that is a contact's.
     """
     model, covariance = fitted.explained.model, covariance_of_unknowns(fitted.explained)
     intervals = []
     for name, value, error in zip(closest.names, closest.values.tolist(), closest.errors.tolist(), strict=True):
-        variance = covariance[model.names.index(name), model.names.index(name)] if name in model.names else np.inf
+        place = model.names.index(name) if name in model.names else None
+        variance = np.inf if place is None else covariance[place, place]
         if not np.isfinite(error):
             intervals.append(Interval(None, None, UNDETERMINED))
         elif is_of_one_table(name) or (model.law.lasting and (name != "epsilon" or variance < _PROFILED**-2)):
-            intervals.append(linear_interval(parameter_called(name), value, error))
+            ends = value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error
+            if place is not None and isinstance(model.law, ContactLaw) and name in model.law.own:
+                here, reach = fitted.explained.end.theta[place], TWO_SIDED_95 * float(np.sqrt(variance))
+                ends = model.law.value_of(name, here - reach), model.law.value_of(name, here + reach)
+            intervals.append(linear_interval(parameter_called(name), *map(float, ends)))
         else:
             intervals.append(_profile_of(fitted, name, float(np.sqrt(variance))))
     return intervals
