@@ -65,7 +65,6 @@ def of_high_orders() -> AmplitudeTable:
     )
 
 
-@pytest.mark.xfail(strict=True, reason="the redrawn fit: every unknown is free at once")
 def test_an_honest_table_of_high_orders_is_valid_and_its_law_in_the_band(contact):
     table = of_high_orders()
     result = fit(measured(table, steady_amplitudes(table, contact), 0.01, 1), "viscous+delay")
