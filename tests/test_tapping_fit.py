@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from afm_jax.apparatus.cantilever import Cantilever
 from fitting.infer.fit import fit
 from fitting.infer.result import FitResult
-from fitting.models import reach_of, rows_of, tip_work
+from fitting.models import reach_of, readings_of, tip_work
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 from tests.tapping_accuracy import (
@@ -30,7 +29,6 @@ from tests.tapping_truths import TappingTruth, as_measured, exact_table, tapping
 
 TABLES = Path(__file__).parent / "tapping_tables"
 """Truths of some of the random contacts of `tests.tapping_accuracy`."""
-TIP = Cantilever(90.0, 200.0, 16.81)
 
 
 def test_work_of_a_free_and_of_a_drawn_tip():
@@ -50,15 +48,15 @@ def test_work_of_a_free_and_of_a_drawn_tip():
         phase_lag_deg=np.array([lag, 178.5, 178.5]),
         phase_lag_error_deg=np.ones(3),
     )
-    rows = rows_of(table)
-    found = tip_work(rows, TIP, "force")[0]
+    found = tip_work(table, 200.0)[0]
     time = np.linspace(0.0, 2.0 * np.pi, 1000, endpoint=False)
     z, f = (np.real(part * np.exp(1j * time)) for part in (height, force))
     v = np.real(1j * height * np.exp(1j * time))
     np.testing.assert_allclose([found.real, found.imag], [2.0 * np.mean(f * z), -2.0 * -np.mean(f * v)], rtol=1e-9)
-    assert reach_of(rows, TIP, "force")[:3].tolist() == [0, 1, 2]
+    assert reach_of(table, 200.0).tolist() == [0, 1, 2]
     without = dataclasses.replace(table, phase_lag_deg=None, phase_lag_error_deg=None)
-    assert (rows.amplitude_nm.shape[1], rows_of(without).amplitude_nm.shape[1]) == (3, 2)
+    assert (readings_of(table)[0].shape[1], readings_of(without)[0].shape[1]) == (3, 2)
+    assert np.isnan(tip_work(without, 200.0)).all()
 
 
 def judge_fits_of(truth: TappingTruth, table: AmplitudeTable) -> None:
