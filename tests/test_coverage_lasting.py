@@ -74,7 +74,7 @@ def experiments(request) -> Experiments:
 
 
 def check(pulls: np.ndarray) -> None:
-    """Demand coverage, mean and width of pulls within four standard deviations of what so many sets scatter by: coverage of 0.922 to 0.978."""
+    """Demand coverage (0.922 to 0.978), mean and width of pulls within four standard deviations of so many sets."""
     sets = len(pulls)
     covered = np.mean(np.abs(pulls) < TWO_SIDED_95, axis=0)
     assert np.all(np.abs(covered - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / sets)), covered
