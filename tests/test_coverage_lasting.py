@@ -1,9 +1,10 @@
-"""A thousand simulated experiments (200 where impacts last), each fitted: 95 % intervals hold the truth.
+"""A thousand simulated experiments a model, each fitted: 95 % intervals hold the truth.
 
 The truth is the fitted model itself: what is proved is the fit and its errors, not the model. Intervals are linear ones
 of all experiments, and of the instantaneous law profile intervals for two hundred of them.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,11 +25,10 @@ from tests.fit_tables import example_amplitudes, rows, simulated
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
-PROFILED = 200
+EXPERIMENTS, PROFILED = 1000, 200
 CONTACT_EXAMPLE = fitting.examples.__path__[0] + "/amplitudes_contact.csv"
 SPEEDS = np.array([30.0, 50.0, 80.0, 120.0, 180.0])
 """Approach speeds in nm/us at which bands are asked whether they hold the law."""
-EXPERIMENTS = {"law": 1000, "viscous+delay": 200, "contact": 50}
 
 
 class Experiments(NamedTuple):
@@ -45,10 +45,11 @@ class Experiments(NamedTuple):
         return np.array([(one.values - true) / np.linalg.norm(one.factor, axis=1) for one in found])
 
     def pulls_of_law(self) -> np.ndarray:
-        """Return distances of rebound speed and delay from the true ones, in their errors, shape (sets, 2, speeds)."""
-        true = self.truth.law_at(SPEEDS).law
+        """Return distances of rebound speed, and of the delay if there is one, from the true ones, in their errors."""
+        kinds = 2 if self.truth.model.law.lasting else 1
+        true = self.truth.law_at(SPEEDS).law[:kinds]
         found = [one.law_at(SPEEDS) for one in self.fits]
-        return np.array([(one.law - true) / np.linalg.norm(one.factor, axis=2) for one in found])
+        return np.array([(one.law[:kinds] - true) / np.linalg.norm(one.factor[:kinds], axis=2) for one in found])
 
 
 def experiment(model: str) -> tuple[Explained, tuple[str, ...]]:
@@ -57,22 +58,25 @@ def experiment(model: str) -> tuple[Explained, tuple[str, ...]]:
         table = simulated(rows(example_amplitudes(), slice(0, None, 3)), ImpactLaw(0.95, 60.0), seed=None)
     else:
         table = read_table(CONTACT_EXAMPLE)
-    result = fit(table, model)
+    # without the adhesion energy, which the table hardly tells from the humidity
+    free = ("relative_humidity", "viscosity_pa_s", "modulus_gpa") if model == "contact" else None
+    result = fit(table, model, free=free)
+    # what is held is known: errors of a tenth and more of ten parameters are not linear
+    result = replace(result, settings=result.settings | {"held": ()})
     return explained_of(result), tuple(result.settings["free"])
 
 
-@pytest.fixture(scope="module", params=list(EXPERIMENTS))
+@pytest.fixture(scope="module", params=["law", "viscous+delay", "contact"])
 def experiments(request) -> Experiments:
     truth, own = experiment(request.param)
-    data = draw_data(truth, EXPERIMENTS[request.param], np.random.default_rng(95))
+    data = draw_data(truth, EXPERIMENTS, np.random.default_rng(95))
     return Experiments(truth, own, fit_data_sets(truth, data))
 
 
 def check(pulls: np.ndarray) -> None:
-    """Demand coverage, mean and width of pulls within four standard deviations of what so many sets scatter by."""
+    """Demand coverage (0.922 to 0.978), mean and width of pulls within four standard deviations of so many sets."""
     sets = len(pulls)
     covered = np.mean(np.abs(pulls) < TWO_SIDED_95, axis=0)
-    # of a thousand sets 0.922 to 0.978
     assert np.all(np.abs(covered - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / sets)), covered
     assert np.abs(pulls.mean(axis=0)).max() < 4.0 / np.sqrt(sets), pulls.mean(axis=0)
     assert np.abs(pulls.std(axis=0) - 1.0).max() < 4.0 / np.sqrt(2 * sets), pulls.std(axis=0)
@@ -84,8 +88,7 @@ def test_linear_intervals_cover_the_truth_and_pulls_have_mean_0_and_width_1(expe
 
 
 def test_bands_cover_the_true_law(experiments):
-    pulls = experiments.pulls_of_law()
-    check(pulls if experiments.truth.model.law.lasting else pulls[:, 0])
+    check(experiments.pulls_of_law())
 
 
 def test_chi2_is_distributed_as_such(experiments):
