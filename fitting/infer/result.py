@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -341,34 +340,6 @@ def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, 
     return law.rebound_speed(speeds), law.collision_delay(speeds)
 
 
-@compiled_quickly(level=0)
-def _tabulated(
-    speeds: Float[Array, " rows"],
-    rebound: Float[Array, " rows"],
-    late: Float[Array, " rows"] | None,
-    capture: Float[Array, ""],
-    delay: CollisionDelay | None,
-    changes: tuple[Float[Array, "m 2 rows"], Float[Array, " m"]] | None,
-) -> TabulatedLaw:
-    known: dict[str, Any] = {"capture_speed_nm_per_us": capture, "delay": delay}
-    if changes is None:
-        return TabulatedLaw(speeds, rebound, late, **known)
-    of_rows, of_capture = changes
-    return TabulatedLaw.with_errors(
-        speeds,
-        rebound,
-        late,
-        rebound_changes=of_rows[:, 0],
-        delay_changes=None if late is None else of_rows[:, 1],
-        capture_changes=of_capture,
-        **known,
-    )
-
-
-_TOGETHER = 8
-"""Unknowns that one call takes, the last ones filled up: one program for laws of however many."""
-
-
 def table_of_law(
     speeds: Float[np.ndarray, " points"],
     rebound: Float[np.ndarray, " points"],
@@ -378,7 +349,7 @@ def table_of_law(
     delay: CollisionDelay | None,
     errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]] | None = None,
 ) -> TabulatedLaw:
-    """Return a law as the table that a scene takes, by one compiled program.
+    """Return a law as the table that a scene takes.
 
     Args:
         speeds: approach speeds in nm/us, four of which at least leave.
@@ -393,17 +364,14 @@ def table_of_law(
     u, w = speeds[leaves], np.minimum(rebound, speeds)[leaves]
     captured = speeds[~leaves][-1] if not leaves.all() else 0.0
     capture = np.clip(capture_speed_nm_per_us, captured, (1.0 - 1e-9) * u[0])
-    known = u, w, None if late is None else late[leaves], capture, None if late is None else delay
+    columns = u, w, None if late is None else late[leaves]
+    known: dict[str, Any] = {"capture_speed_nm_per_us": capture, "delay": None if late is None else delay}
     if errors is None:
-        return _tabulated(*known, None)
+        return TabulatedLaw(*columns, **known)
     of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
-    count, spare = of_capture.size, -of_capture.size % _TOGETHER
-    of_rows = np.ascontiguousarray(np.pad(np.moveaxis(of_rows, 2, 0), ((0, spare), (0, 0), (0, 0))).transpose(0, 2, 1))
-    of_capture = np.pad(of_capture, (0, spare))
-    together = [slice(first, first + _TOGETHER) for first in range(0, count, _TOGETHER)]
-    laws = [_tabulated(*known, (of_rows[some], of_capture[some])) for some in together]
-    deviations = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *(law.deviations for law in laws))
-    return eqx.tree_at(lambda law: law.deviations, laws[0], deviations)
+    by_rebound, by_delay = np.moveaxis(of_rows, (1, 2), (0, 1))
+    changes = {"rebound_changes": by_rebound, "delay_changes": None if late is None else by_delay}
+    return TabulatedLaw.with_errors(*columns, **changes, capture_changes=of_capture, **known)
 
 
 def fewest_unknowns(
