@@ -185,6 +185,9 @@ def test_a_table_of_another_law_is_named():
     alike = fit(tables)
     assert not alike.valid
     assert "part2.csv is off the others" in " ".join(alike.reasons)
+    pulls = [table.pulls["r"] or 0.0 for table in alike.tables]
+    assert pulls[2] < -4.0
+    assert pulls[3] > 4.0
 
 
 @pytest.mark.slow
