@@ -11,8 +11,8 @@ from fitting.examples.make_amplitudes import TRUTH, example_table
 from fitting.report.report import summary
 from tests.fit_tables import (
     amplitudes_and_errors,
-    holds,
     chi2_residuals,
+    holds,
     law,
     rows,
     simulated,
