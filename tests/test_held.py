@@ -1,16 +1,15 @@
-"""What a fit of the contact holds: at which value, how well known, and what that does to the law."""
+"""What a fit of the contact holds: at which value, how well known, and what that does to the fitted ones."""
 
 import numpy as np
 import pytest
-from fitting.fits.discrepancy import HeldEffect, ModelDiscrepancy
-from fitting.fits.step import system_of
 
-from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS
-from fitting.models import Held, Problem, held_of, split_held
-from tests.test_discrepancy import LEFT_OUT, VALUES, rows
+from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS, PAPER
+from fitting import fit
+from fitting.models import Held, held_of, split_held
+from tests.fit_tables import rows
+from tests.impact_tables import drives
 
 OWN = ("relative_humidity", "modulus_gpa")
-__all__ = ["rows"]
 
 
 def test_a_constraint_on_what_is_held_holds_it_there_and_says_how_well():
@@ -44,19 +43,25 @@ def test_contradictions_about_what_is_held_are_refused(fixed, pair, said):
         split_held(OWN, fixed, {"tip_radius_nm": pair})
 
 
-def test_the_error_of_what_is_held_is_one_more_unknown_of_the_law(rows):
-    """Effects that are those of a parameter: the two are told apart by their prior errors alone."""
-    problem = Problem("viscous+delay", tuple(VALUES))
-    place = np.log(np.geomspace(10.0, 300.0, 50))
-    of_epsilon = HeldEffect(Held("tip_radius_nm", 100.0, 30.0, assumed=True), place, np.full(50, -7.0), np.zeros(50))
-    free = np.ones(6, dtype=bool)
-    jacobian = rows.jacobian.copy()
-    jacobian[:-1, 0] = -rows.slopes.by_square.ravel()
-    rows = rows._replace(jacobian=jacobian)
-    other = ModelDiscrepancy(problem, VALUES, LEFT_OUT.speeds, held=(of_epsilon,))
-    alone, held = (system_of(rows, one, free).step() for one in (LEFT_OUT, other))
-    # a standard error of it takes 7 off the squared rebound speed, as 7 of epsilon do, which it makes up for
-    assert held.covariance[0, 0] - alone.covariance[0, 0] == pytest.approx(49.0, rel=1e-4)
-    assert held.values[0] == pytest.approx(alone.values[0], rel=1e-6)
-    unknown = other.columns(np.array([40.0]), np.array([37.0])).unknown
-    np.testing.assert_allclose(unknown[:, 0, -1], [-7.0, 0.0])
+@pytest.mark.slow
+def test_the_error_of_what_is_held_adds_to_that_of_what_does_the_same():
+    """Humidity and temperature act through the Kelvin length alone, which goes as 1/(T ln(1/h))."""
+    free, table = ("relative_humidity",), rows(drives(), slice(0, None, 2))
+    well = {one.name: (PAPER[one.name], 1e-3 * abs(PAPER[one.name])) for one in CONTACT_PARAMETERS}
+    well.pop("relative_humidity")
+    sharp, loose = (
+        fit(table, "contact", free=free, constraints=well | {"temperature_k": (PAPER["temperature_k"], error)})
+        for error in (0.01, 30.0)
+    )
+    assert sharp.valid
+    assert loose.valid
+    (h, error), (_, wider) = (
+        (one.parameters["relative_humidity"].value, one.parameters["relative_humidity"].standard_error or np.nan)
+        for one in (sharp, loose)
+    )
+    of_temperature = h * np.log(1.0 / h) * 30.0 / PAPER["temperature_k"]
+    assert of_temperature > 1.5 * error
+    assert wider == pytest.approx(np.hypot(error, of_temperature), rel=5e-3)
+    # and the law is as well known as it was
+    for column in ("rebound_speed_nm_per_us", "rebound_high_nm_per_us", "delay_low_us"):
+        np.testing.assert_allclose(getattr(loose.law, column), getattr(sharp.law, column), rtol=1e-4, atol=1e-6)

@@ -3,83 +3,90 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from fitting.fits.objective import Objective
-from fitting.fits.several import parts_of, pulls_of
-from fitting.fits.step import StepParameters, StepSystem
 
 import fitting
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.saved import save
 from fitting.experiments.prior import prior_of_fit
 from fitting.infer.fit import fit
 from fitting.infer.result import FitResult, FittedTable
-from fitting.models import Problem, measurement_of
+from fitting.infer.several import Parts, pulls_of
 from fitting.report.report import row_records, summary
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, read_table
 from tests.fit_tables import example_amplitudes, rows, simulated, standard_errors_of, values_of
 from tests.made_fits import made_fit, made_parameter, made_rows, made_table
+from tests.test_driven_orbits import driven
 
 TABLES, READINGS = 5, 24
-SCATTER = np.array([0.6, 0.3])
 
 
-def linear_sets(seed: int, scatter: np.ndarray, own: float = 0.3) -> tuple[StepSystem, np.ndarray, np.ndarray]:
-    """Return tables whose readings are linear in two parameters (both 0) and a nuisance each, with unit noise.
+class Linear(NamedTuple):
+    """Residuals that are linear in two parameters of a law (both 0) and a nuisance of each table, priors last.
 
-    Also which table each row is of, and the places of its parameters.
+    ``table``: which one each residual is of.
     """
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    table: np.ndarray
+
+    def parts(self) -> Parts:
+        """Return the normal equations of every table, and of what is no table's own: nothing."""
+        blocks = [self.table == t for t in range(TABLES + 1)]
+        slopes, left = ([whole[block] for block in blocks] for whole in (self.jacobian, self.residual))
+        return Parts(
+            matrix=np.array([slope.T @ slope for slope in slopes]),
+            vector=np.array([slope.T @ one for slope, one in zip(slopes, left, strict=True)]),
+            square=np.array([one @ one for one in left]),
+            own=np.eye(2 + TABLES, dtype=bool)[2:],
+            law=np.arange(2),
+        )
+
+
+def linear_tables(seed: int, scatter: np.ndarray, own: float = 0.3) -> Linear:
+    """Return tables with unit noise whose laws scatter, and whose nuisances are known to within an error."""
     random, design = np.random.default_rng(seed), np.random.default_rng(1)
-    table = np.repeat(np.arange(TABLES), READINGS // 2)
-    of = np.repeat(table, 2)
-    slope = np.zeros((of.size, 2 + TABLES))
-    slope[:, 0], slope[:, 1] = 1.0, np.repeat(design.uniform(-1.0, 1.0, table.size), 2)
-    slope[np.arange(of.size), 2 + of] = np.tile([0.5, -0.3], table.size)
-    departures = random.normal(size=(TABLES, 2)) * scatter
-    nuisance = own * random.normal(size=TABLES)
-    read = random.normal(size=of.size) + np.sum(slope[:, :2] * departures[of], axis=1) + slope[:, 2:] @ nuisance
-    residual = np.concatenate([-read, np.zeros(table.size + 2 + TABLES)])
-    jacobian = np.concatenate([slope, np.zeros((table.size + 2 + TABLES, 2 + TABLES))])
-    jacobian[-TABLES:, 2:] = np.eye(TABLES) / own
-    place = np.column_stack([np.zeros(TABLES, int), np.ones(TABLES, int), 2 + np.arange(TABLES)])
-    names, values = ("a", "b", *map(str, range(TABLES))), np.zeros(2 + TABLES)
-    ends = np.full((values.size, 2), [-np.inf, np.inf])
-    parameters = StepParameters(names, values, ends, np.ones(values.size, dtype=bool))
-    return StepSystem(residual, jacobian, np.zeros((of.size, 0)), np.eye(of.size), parameters), table, place
+    table = np.repeat(np.arange(TABLES), READINGS)
+    slope = np.zeros((table.size, 2 + TABLES))
+    slope[:, 0], slope[:, 1] = 1.0, np.repeat(design.uniform(-1.0, 1.0, table.size // 2), 2)
+    slope[np.arange(table.size), 2 + table] = np.tile([0.5, -0.3], table.size // 2)
+    truth = random.normal(size=(TABLES, 2)) * scatter
+    read = np.sum(slope[:, :2] * truth[table], axis=1) + slope[:, 2:] @ (own * random.normal(size=TABLES))
+    known = np.eye(2 + TABLES)[2:] / own
+    residual = np.append(-read - random.normal(size=table.size), np.zeros(TABLES))
+    return Linear(residual, np.concatenate([slope, known]), np.append(table, np.arange(TABLES)))
 
 
 def test_pulls_are_those_of_fits_without_the_table():
-    system, table, place = linear_sets(3, SCATTER)
-    found = pulls_of(parts_of(system, table, place, 2))
+    tables = linear_tables(3, np.array([0.6, 0.3]))
 
-    def solved(rows_kept: np.ndarray, columns: np.ndarray):
-        slope = system.jacobian[rows_kept][:, columns]
+    def solved(kept: np.ndarray, columns: np.ndarray):
+        slope = tables.jacobian[kept][:, columns]
         inverse = np.linalg.inv(slope.T @ slope)
-        return -inverse @ slope.T @ system.residual[rows_kept], inverse
+        return -inverse @ slope.T @ tables.residual[kept], inverse
 
-    every = np.arange(len(system.residual))
-    whole, variance = solved(every, np.arange(2 + TABLES))
-    for t, one in enumerate(found):
-        mine = np.concatenate([np.repeat(table, 2) == t, np.zeros(len(table) + 2, bool), np.arange(TABLES) == t])
-        others, wider = solved(every[~mine], np.delete(np.arange(2 + TABLES), 2 + t))
-        moved, spread = (whole[:2] - others[:2]), (wider - np.delete(np.delete(variance, 2 + t, 0), 2 + t, 1))[:2, :2]
+    whole, variance = solved(np.ones(tables.table.size, bool), np.arange(2 + TABLES))
+    for t, one in enumerate(pulls_of(tables.parts())):
+        mine = tables.table == t
+        others, wider = solved(~mine, np.delete(np.arange(2 + TABLES), 2 + t))
+        moved, spread = whole[:2] - others[:2], wider[:2, :2] - variance[:2, :2]
         np.testing.assert_allclose(one.pulls, moved / np.sqrt(np.diag(spread)), rtol=1e-7)
         square = moved @ np.linalg.solve(spread, moved)
         # two degrees of freedom: the probability is an exponential
         assert one.p_value == pytest.approx(np.exp(-0.5 * square), rel=1e-6)
-        left = (system.residual + system.jacobian @ whole)[mine]
+        left = (tables.residual + tables.jacobian @ whole)[mine]
         assert one.chi2 == pytest.approx(left @ left, rel=1e-9)
 
 
 def test_tables_of_one_law_are_seldom_far_from_the_others():
-    improbable = []
-    for seed in range(60):
-        system, table, place = linear_sets(seed, np.zeros(2))
-        improbable += [one.p_value < 0.05 for one in pulls_of(parts_of(system, table, place, 2))]
-    assert np.mean(improbable) == pytest.approx(0.05, abs=0.03)
+    pulls = [one for seed in range(60) for one in pulls_of(linear_tables(seed, np.zeros(2)).parts())]
+    assert np.mean([one.p_value < 0.05 for one in pulls]) == pytest.approx(0.05, abs=0.03)
 
 
 def cut(table: AmplitudeTable, count: int) -> list[AmplitudeTable]:
@@ -178,21 +185,28 @@ def test_a_table_of_another_law_is_named():
     alike = fit(tables)
     assert not alike.valid
     assert "part2.csv is off the others" in " ".join(alike.reasons)
+    pulls = [table.pulls["r"] or 0.0 for table in alike.tables]
+    assert pulls[2] < -4.0
+    assert pulls[3] > 4.0
 
 
 @pytest.mark.slow
 def test_a_driven_sample_and_a_driven_tip_have_one_law():
     sample, tapping = cut(example_amplitudes(), 2)[0], read_table("fitting/examples/tapping_contact.csv")
     tapping = dataclasses.replace(tapping, mass_ng=1.0)
-    # what the same law predicts for the driven tip, and no noise
-    problem = Problem("law", ("r", "epsilon"), drive="force")
-    found = Objective(measurement_of(tapping, problem), problem).at_values(np.array([[0.95, 60.0]])).prediction
-    steady = np.asarray(found.orbits)[0, : tapping.rows] > 0
-    read = np.asarray(found.amplitude_nm)[0, : tapping.rows][steady]
-    driven = rows(tapping, steady, lockin_amplitude_nm=read[:, 1], phase_lag_deg=read[:, 2], source="tip.csv")
-    one, other = fit([sample, driven]), fit([driven, sample])
+    # what the same law does to a tip that a force drives, without noise
+    ratio, free, offset = tapping.drive_frequency_khz / 90.0, tapping.excitation_nm, tapping.offset_nm
+    drives = zip(ratio, free, offset, strict=True)
+    found = [single_impact_orbits(driven("force", ImpactLaw(0.95, 60.0), *drive, 200.0), 1) for drive in drives]
+    steady = np.array([orbits.exists & orbits.admissible & orbits.stable for orbits in found])
+    assert steady.sum(axis=1).max() == 1
+    kinds = ("drive_lockin_amplitude_nm", "phase_lag_deg")
+    amplitude, lag = (np.array([getattr(orbits, kind) for orbits in found])[steady] for kind in kinds)
+    there = steady.any(axis=1)
+    tip = rows(tapping, there, lockin_amplitude_nm=amplitude, phase_lag_deg=lag, source="tip.csv")
+    one, other = fit([sample, tip]), fit([tip, sample])
     assert one.valid
-    assert [table.used for table in one.tables] == [sample.rows, steady.sum()]
+    assert [table.used for table in one.tables] == [sample.rows, tip.rows]
     for name, truth in (("r", 0.95), ("epsilon", 60.0)):
         parameter = one.parameters[name]
         assert abs(parameter.value - truth) < 3.0 * (parameter.standard_error or 0.0)

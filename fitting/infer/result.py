@@ -54,8 +54,8 @@ class FittedParameter:
         unit: the unit, empty for a number.
         standard_error: Wald's, from the Fisher information, and where impacts last with what the model leaves out; None
             where the data do not determine it or at a bound.
-        interval95: profile-likelihood interval, moved and widened by what the model leaves out; an end is None where it
-            is open.
+        interval95: by profile likelihood, or where impacts last linear, what the model leaves out in it; an end is None
+            where it is open.
         interval_reason: why an end is open; None if none is.
         interval_kind: "profile", "linear", or where an end is open "limit"; None without an interval.
         undetermined: the data do not determine it, not even to first order.
@@ -279,7 +279,7 @@ class FitResult(Result):
             out; of a robust fit without outliers.
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
-        aic: chi2 + 2 k, chi2 here of the formula alone: the model discrepancy would make up for what it lacks.
+        aic: chi2 + 2 k; where impacts last no means to choose a model, for chi2 makes up for what a formula lacks.
         valid: converged, explained and determined; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.

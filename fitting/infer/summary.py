@@ -387,17 +387,19 @@ def _compare_tables(explained: Explained, table: AmplitudeTable | SeveralTables)
         if is_of_one_table(name):
             own[table.labels.index(name.partition(" of ")[2]), i] = True
             number[end.residual.size - count + i] = int(np.flatnonzero(own[:, i])[0])
+    places = np.array([i for i, name in enumerate(model.names) if name in law.own])
+    # r falls where its unknown, 1 - r^2, grows
+    sign = np.sign([law.slope_of(model.names[i], float(end.theta[i])) for i in places])
     blocks = [number == t for t in range(tables + 1)]
     matrix = np.array([end.jacobian[block].T @ end.jacobian[block] for block in blocks])
-    return pulls_of(
-        Parts(
-            matrix=matrix,
-            vector=np.array([end.jacobian[block].T @ end.residual[block] for block in blocks]),
-            square=np.array([end.residual[block] @ end.residual[block] for block in blocks]),
-            own=own,
-            law=np.array([i for i, name in enumerate(model.names) if name in law.own]),
-        )
+    parts = Parts(
+        matrix=matrix,
+        vector=np.array([end.jacobian[block].T @ end.residual[block] for block in blocks]),
+        square=np.array([end.residual[block] @ end.residual[block] for block in blocks]),
+        own=own,
+        law=places,
     )
+    return [pull._replace(pulls=sign * pull.pulls) for pull in pulls_of(parts)]
 
 
 def _fitted_tables(evidence: Evidence, pulls: list[Pull], law: tuple[str, ...]) -> tuple[FittedTable, ...]:
