@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fitting.forward import BATCH, linearise
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, simulate, single_impact_orbits
 from afm_jax.impact.map import next_impact
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, State
-from fitting.forward import BATCH, linearise
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES
 from tests.fit_tables import table_of

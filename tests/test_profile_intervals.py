@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq
-
 from fitting.fits.intervals import at_bound, check_minimum, covariance, profile_intervals
 from fitting.fits.objective import Objective
 from fitting.forward import Linearised
+from scipy.optimize import brentq
+
 from fitting.models import Problem
 
 QUANTILE = 1.959963984540054  # 97.5 % of a normal distribution: its square is the 95 % of chi2
