@@ -7,7 +7,7 @@ widen the smooth functions. The covariance of everything, (J^T J)^-1, is where t
 correlations come from.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -70,6 +70,8 @@ class Explained:
     """Hardly a row of a driven tip is left that a law of impacts can be read off."""
     short: float = 0.0
     """Share of the loss by which a smooth function of short range was added for runs of residuals."""
+    stops: dict[int, list[Descent]] = field(default_factory=dict)
+    """Where profiles have been, by the place of what was held: the next one begins at the nearest."""
 
     @property
     def residual(self) -> Float[np.ndarray, "rows 3"]:
@@ -91,7 +93,8 @@ class Explained:
             value: of it.
             begin: from where; None: from the minimum.
         """
-        theta, covariance = (self.end if begin is None else begin).theta.copy(), self.covariance
+        begin = self.end if begin is None else begin
+        theta, covariance = begin.theta.copy(), covariance_of(begin.jacobian.T @ begin.jacobian)
         if np.isfinite(covariance).all() and covariance[place, place] > 0.0:
             theta = theta + covariance[place] / covariance[place, place] * (value - theta[place])
         theta[place] = value
@@ -102,8 +105,9 @@ class Explained:
 
         The way there is gone in parts, shorter ones where an orbit is lost; infinite where there is none.
         """
-        fixed, begin = np.zeros(self.end.theta.size, bool), self.end
+        fixed, stops = np.zeros(self.end.theta.size, bool), self.stops.setdefault(place, [self.end])
         fixed[place] = True
+        begin = min(stops, key=lambda stop: abs(stop.theta[place] - value))
         longest = _PART * float(np.sqrt(self.covariance[place, place]))
         for _ in range(_PARTS):
             left = value - begin.theta[place]
@@ -112,10 +116,11 @@ class Explained:
             end = descend(self.model, theta, begin.orbits, self.weights, settled=_PROFILE_SETTLED, fixed=fixed)
             if not np.isfinite(end.chi2):
                 longest = 0.5 * abs(part)
-            elif part == left:
+                continue
+            stops.append(end)
+            begin = end
+            if part == left:
                 return end.chi2
-            else:
-                begin = end
         return np.inf
 
     def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAt:

@@ -183,6 +183,8 @@ def orbits_of(model: Model, theta: Float[np.ndarray, " k"], seen: Any) -> Orbits
         x=np.where(exists[:, None], x, np.nan),
         closes=exists,
         steady=exists,
+        growing=np.zeros(exists.size, bool),
+        determinant=np.zeros(exists.size),
         readings=seen.readings,
         slopes=np.zeros((exists.size, 3, COUNT)),
         approach=seen.approach,

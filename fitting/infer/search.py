@@ -42,6 +42,10 @@ _LIKELY = 0.2
 """Relative misfit of an amplitude up to which an orbit may be the one that was measured."""
 
 
+_APART, _STEADY = 1e-3, 1e-3
+"""Relative distance of speeds for a slope; how far below 1 a measured orbit's determinant is, about."""
+
+
 class Found(NamedTuple):
     """The orbits of all rows at unknowns: NaN where there is none; and the number of steady ones of each row."""
 
@@ -57,7 +61,7 @@ class Found(NamedTuple):
 def orbits_at(
     model: Model, theta: Float[np.ndarray, " k"], rows: np.ndarray | None = None, *, roughly: bool = False
 ) -> Found:
-    """Return the steady orbit of each row that explains it best.
+    """Return the steady orbit of each row that explains it best, of a row without one that which nearly is steady.
 
     Args:
         model: what is fitted.
@@ -74,7 +78,8 @@ def orbits_at(
     count = free.astype(int)
     wanted = np.flatnonzero(~free) if rows is None else rows[~free[rows]]
     which, orbits = model.candidates(theta, wanted, most=4 if roughly else 14, judge=not roughly)
-    fine = np.asarray(np.isfinite(orbits.readings).all(axis=1) if roughly else orbits.steady)
+    steady = np.asarray(np.isfinite(orbits.readings).all(axis=1) if roughly else orbits.steady)
+    fine = steady | (orbits.growing & ~np.isin(which, which[steady]))
     error = np.maximum(data.error[which], 0.02 * np.abs(data.read[which]))
     with np.errstate(invalid="ignore"):
         misfit = np.where(fine, np.nansum(((orbits.readings - data.read[which]) / error) ** 2, axis=1), np.inf)
@@ -85,7 +90,7 @@ def orbits_at(
         if np.isfinite(misfit[best]):
             for column, candidate in zip(whole, orbits, strict=True):
                 column[row] = candidate[best]
-            count[row] = np.unique(np.round(np.log(orbits.approach[mine[fine[mine]]]), 5)).size
+            count[row] = np.unique(np.round(np.log(orbits.approach[mine[steady[mine]]]), 5)).size
     return Found(whole, count)
 
 
@@ -147,6 +152,22 @@ class Followed:
         self.model, self.weights, self.soft = model, weights, soft
         self.orbits, self.least = model.follow(theta, begin.x), np.inf
         self.counts = np.isfinite(begin.x[:, 0]) & weights.used.any(axis=1)
+        self.speeds = np.where(self.counts & ~model.data.row.free, self.orbits.approach, 100.0)
+        self.determinant = np.where(self.counts, self.orbits.determinant, 0.0) - self._steepness(theta)[0]
+
+    def _steepness(
+        self, place: Float[np.ndarray, " k"]
+    ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows k"]]:
+        """Return d w^2/d u^2 at every row's approach speed, of which the determinant grows, and its derivatives."""
+        law, theta, (slow, fast) = (
+            self.model.law,
+            self.model.of_law(place),
+            np.outer([1.0 - _APART, 1.0 + _APART], self.speeds),
+        )
+        here, there, apart = law.at(theta, slow), law.at(theta, fast), fast**2 - slow**2
+        slope = np.zeros((slow.size, place.size))
+        slope[:, : theta.size] = (there.square_slope - here.square_slope) / apart[:, None]
+        return (there.square - here.square) / apart, slope
 
     def sum(self, place: Float[np.ndarray, " k"]) -> Sum:
         """Return the sum of squares at unknowns, outliers softened; infinite where an orbit is lost."""
@@ -161,10 +182,14 @@ class Followed:
             white_slope = np.einsum("nij,njk->nik", self.weights.whitening, np.nan_to_num(slope))
         size, known = np.sum(white**2, axis=1), strength * (place - mean)
         share = (1.0 + size / self.soft**2) ** -0.25
-        residual = np.concatenate([(share[:, None] * white).ravel(), known])
-        jacobian = np.concatenate([(share[:, None, None] * white_slope).reshape(-1, place.size), np.diag(strength)])
+        steep, steep_slope = self._steepness(place)
+        over = np.where(self.counts, np.maximum(self.determinant + steep - (1.0 - 2.0 * _STEADY), 0.0), 0.0) / _STEADY
+        residual = np.concatenate([(share[:, None] * white).ravel(), over, known])
+        by_row = (share[:, None, None] * white_slope).reshape(-1, place.size)
+        steep_slope = np.where(over[:, None] > 0.0, steep_slope / _STEADY, 0.0)
+        jacobian = np.concatenate([by_row, steep_slope, np.diag(strength)])
         # 2 s^2 (sqrt(1 + x/s^2) - 1), written so that nothing cancels
-        chi2 = float(np.sum(2.0 * size / (1.0 + np.sqrt(1.0 + size / self.soft**2))) + known @ known)
+        chi2 = float(np.sum(2.0 * size / (1.0 + np.sqrt(1.0 + size / self.soft**2))) + known @ known + over @ over)
         if chi2 < self.least:
             self.least, self.orbits = chi2, orbits
         return Sum(chi2, residual, jacobian)
@@ -297,7 +322,7 @@ def screened(model: Model) -> Float[np.ndarray, " k"]:
 
 def lost_rows(data: Data, found: Found) -> Bool[np.ndarray, " rows"]:
     """Say on which rows something was measured that the law has no orbit for."""
-    return data.measured.any(axis=1) & ~found.exists
+    return data.measured.any(axis=1) & (found.number == 0)
 
 
 def recovered(

@@ -341,7 +341,7 @@ def _column(name: str) -> int:
 def no_orbits(count: int) -> Orbits:
     """Return room for the orbits of so many rows."""
     shapes = {"x": (3,), "readings": (READINGS,), "slopes": (READINGS, COUNT)}
-    kinds = {"closes": bool, "steady": bool}
+    kinds = dict.fromkeys(("closes", "steady", "growing"), bool)
     return Orbits(*(np.zeros((count, *shapes.get(name, ())), kinds.get(name, float)) for name in Orbits._fields))
 
 

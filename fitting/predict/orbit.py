@@ -247,6 +247,8 @@ class Orbits(NamedTuple):
         x: coordinate, phase of arrival in rad, delay in us; NaN where there is none.
         closes: there is an orbit.
         steady: it is stable and does not pass through the platform; as `closes` where nobody asked.
+        growing: it would be steady, but disturbances of it grow while they turn round; not where nobody asked.
+        determinant: of the map's Jacobian (eq. 8): above 1 they grow.
         readings: peak, lock-in, phase, as `_shown`.
         slopes: derivatives of the readings by what is local, the orbit moving along.
         approach, rebound: of the free tip, in nm/us.
@@ -257,6 +259,8 @@ class Orbits(NamedTuple):
     x: Float[np.ndarray, "rows 3"]
     closes: Bool[np.ndarray, " rows"]
     steady: Bool[np.ndarray, " rows"]
+    growing: Bool[np.ndarray, " rows"]
+    determinant: Float[np.ndarray, " rows"]
     readings: Float[np.ndarray, "rows 3"]
     slopes: Float[np.ndarray, "rows 3 local"]
     approach: Float[np.ndarray, " rows"]
@@ -343,13 +347,17 @@ def followed(
         along = slopes[:, 3:, 3:] - slopes[:, 3:, :3] @ _solved(gaps, slopes[:, :3, 3:])
         along = np.where(row.free[:, None, None], slopes[:, 3:, 3:], along)
         closes = np.isfinite(along).all(axis=(1, 2)) & (np.abs(found[:, :3]).max(axis=1) < _CLOSED)
+        trace, determinant = _trace_and_determinant(x, gaps, state, row)
         orbits = Orbits(
-            x, closes | row.free, closes | row.free, found[:, 3:], along, *state[:, :2].T, *state[:, 6:8].T,
+            x, closes | row.free, closes | row.free, np.zeros(count, bool), determinant,
+            found[:, 3:], along, *state[:, :2].T, *state[:, 6:8].T,
             fold=np.linalg.det(gaps) / np.prod(np.linalg.norm(gaps, axis=2), axis=1),
         )  # fmt: skip
         if judge:
-            steady = _stable(x, gaps, state, row) & _flies(x, state, local, row)
-            orbits = orbits._replace(steady=(closes & steady) | row.free)
+            there = closes & (np.abs(trace) < np.abs(1.0 + determinant)) & _flies(x, state, local, row)
+            orbits = orbits._replace(
+                steady=(there & (np.abs(determinant) <= 1.0)) | row.free, growing=there & (determinant > 1.0)
+            )
     return orbits
 
 
@@ -362,8 +370,8 @@ def _solved(
     return np.linalg.solve(safe, np.where(sound, right, 0.0))
 
 
-def _stable(x, gaps, state, row: Row) -> Bool[np.ndarray, " rows"]:
-    """Say which orbits are stable (eq. 8), from the gaps' slopes: as `afm_jax.impact.orbits.is_stable`."""
+def _trace_and_determinant(x, gaps, state, row: Row) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """Return both of the map's Jacobian (eq. 8), from the gaps' slopes: as `afm_jax.impact.orbits.is_stable`."""
     approach, pull, amplitude = state[:, 0], state[:, 5], state[:, 8]
     omega = RAD_PER_US_PER_KHZ * row.drive_frequency_khz
     # the delay follows the other two
@@ -372,8 +380,7 @@ def _stable(x, gaps, state, row: Row) -> Bool[np.ndarray, " rows"]:
     late = amplitude[:, None] * map_[:, 0] / approach[:, None]
     slow = -(amplitude * omega)[:, None] * map_[:, 1] - pull[:, None] * late
     trace, determinant = late[:, 1] + slow[:, 0], late[:, 1] * slow[:, 0] - slow[:, 1] * late[:, 0]
-    whole = 1.0 + trace + determinant
-    return (np.abs(2.0 + trace) < np.abs(1.0 + whole)) & (np.abs(whole) <= 1.0)
+    return 2.0 + trace, 1.0 + trace + determinant
 
 
 def _flies(x, state, local, row: Row) -> Bool[np.ndarray, " rows"]:
