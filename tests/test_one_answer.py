@@ -109,7 +109,7 @@ def test_the_fit_predicts_the_orbits_amplitudes(orbits):
     unknowns = [[model.law.unknown_of(*pair) for pair in zip(NAMES, law, strict=True)] for law in laws]
     every = [orbits_at(model, np.append(theta, 0.0)) for theta in unknowns]
     predicted = np.concatenate([found.orbits.readings[:, :2] for found in every])
-    there = np.concatenate([found.exists for found in every])
+    there = np.concatenate([found.number > 0 for found in every])
     np.testing.assert_array_equal(there, orbits.there)
     found = orbits.found
     stable = np.asarray(found.exists & found.admissible & found.stable)

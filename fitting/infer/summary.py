@@ -69,8 +69,9 @@ def convergence_of(explained: Explained, optimiser: str, iterations: int) -> Con
     if not (np.isfinite(jacobian).all() and np.isfinite(residual).all()):
         reason = "the slopes of the residuals are not finite where the search ended"
         return Convergence(False, optimiser, iterations, np.inf, np.inf, reason)  # noqa: FBT003
-    moves = ~held_at_bound(explained)
-    slope, covariance = jacobian.T @ residual, covariance_of(jacobian[:, moves].T @ jacobian[:, moves])
+    slope = jacobian.T @ residual
+    moves = ~held_at_bound(explained) & ~((end.theta <= explained.model.lowest) & (slope > 0.0))
+    covariance = covariance_of(jacobian[:, moves].T @ jacobian[:, moves])
     known = np.isfinite(np.diag(covariance))
     step = np.where(known, np.where(np.isfinite(covariance), covariance, 0.0) @ np.where(known, slope[moves], 0.0), 0.0)
     distance = float(slope[moves] @ step)

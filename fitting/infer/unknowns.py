@@ -226,6 +226,11 @@ class Model:
                 mean[i], strength[i] = self._known_of(name)
         return mean, strength
 
+    @property
+    def lowest(self) -> Float[np.ndarray, " k"]:
+        """Lowest value of every unknown: no impact on a sample at rest gives energy."""
+        return np.array([0.0 if name in ("r", "viscous_loss") else -np.inf for name in self.names])
+
     def _known_of(self, name: str) -> tuple[float, float]:
         """Return what is known of a parameter's unknown: the mean, and one over the standard deviation."""
         law = self.law
