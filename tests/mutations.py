@@ -136,6 +136,10 @@ MUTATIONS = {
         "= of_law {+ => -} by_local",
         f"{FORWARD}test_slopes_of_readings_are_those_of_orbits_that_are_searched_for_anew[sample]",
     ),
+    "unknowns that leave their bound": Mutation(
+        "moves = free & ~(({place => start} <= lowest)",
+        "tests/test_least_squares.py::test_a_search_alone_ends_where_scipys_does_and_none_is_below_its_lowest",
+    ),
     "drag without its width": Mutation(
         "0.5 * values[LOSS_SHAPE] / raised{ * _Q_WIDTH => }",
         f"{LAWS}test_derivatives_of_formulas_are_those_of_differences[smooth]",
@@ -148,8 +152,8 @@ MUTATIONS = {
         "fitted.profile(fitted.explained, place, y){ - end.chi2 => }",
         "tests/test_fit.py::test_profile_interval_ends_are_where_scipy_finds_chi2_risen_by_3_84",
     ),
-    "profile that goes straight": Mutation(
-        "covariance[place, place] * (value {- => +} theta[place])",
+    "profile that does not shorten its way": Mutation(
+        "longest = {0.5 *  => }abs(part)",
         f"{INTERVALS}::test_a_profile_goes_along_a_bent_valley_where_a_straight_step_loses_an_orbit",
     ),
     "capillary twice as wide": Mutation("return self.pull_nn * length, {1.0 => 0.5} / length", FORMULAS),
