@@ -5,10 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import approx_fprime, least_squares
-
-from afm_jax.units import EV_PER_AJ
-from fitting import fit
 from fitting.fits.discrepancy import ModelDiscrepancy, with_runs
 from fitting.fits.law_after import (
     LawAfter,
@@ -19,9 +15,13 @@ from fitting.fits.law_after import (
     root_of,
 )
 from fitting.fits.objective import Objective
-from fitting.infer.result import Loss, WithInterval, energy_lost, interval_of, scaled
 from fitting.fits.step import LinearStep, StepRows, StepSystem, descending_part, longest_run, settled_step, system_of
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
+from scipy.optimize import approx_fprime, least_squares
+
+from afm_jax.units import EV_PER_AJ
+from fitting import fit
+from fitting.infer.result import Loss, WithInterval, energy_lost, interval_of, scaled
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE
 from fitting.report.words import losses_in_words, parting_in_words

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-
-from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS
 from fitting.fits.discrepancy import HeldEffect, ModelDiscrepancy
 from fitting.fits.step import system_of
+
+from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS
 from fitting.models import Held, Problem, held_of, split_held
 from tests.test_discrepancy import LEFT_OUT, VALUES, rows
 

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fitting.fits.objective import Objective
+from fitting.fits.several import parts_of, pulls_of
+from fitting.fits.step import StepParameters, StepSystem
 
 import fitting
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.saved import save
 from fitting.experiments.prior import prior_of_fit
 from fitting.infer.fit import fit
-from fitting.fits.objective import Objective
 from fitting.infer.result import FitResult, FittedTable
-from fitting.fits.several import parts_of, pulls_of
-from fitting.fits.step import StepParameters, StepSystem
 from fitting.models import Problem, measurement_of
 from fitting.report.report import row_records, summary
 from fitting.tables.several import SeveralTables

@@ -414,33 +414,33 @@ class TabulatedLaw(Law):
         check_kind("delay", delay, CollisionDelay | None)
         if delay is not None and late is None:
             raise ValueError("`delay` needs the column `collision_delay_us`, which the table does not have")
-        if capture_speed_nm_per_us is None:
-            capture = _capture_speed(u, w, held)
+        given, numpy = capture_speed_nm_per_us, _numpy_of(u, w, late, capture_speed_nm_per_us, delay)
+        if given is None:
+            capture = _capture_speed(u, w, held, numpy)
         else:
-            check_parameter("capture_speed_nm_per_us", capture_speed_nm_per_us, "not negative")
-            capture = as_parameter(capture_speed_nm_per_us)
+            check_parameter("capture_speed_nm_per_us", given, "not negative")
+            capture = numpy.asarray(as_parameter(given))
             if not any(map(is_traced, (capture, u))) and not held <= float(capture) < float(u[0]):
                 raise ValueError(
                     f"`capture_speed_nm_per_us` must lie below the slowest tip that leaves, {float(u[0]):g} nm/us"
                     + (f", and not below the fastest that is captured, {held:g} nm/us" if held else "")
                     + f", but is {float(capture):g}"
                 )
-        square = (u - capture) * (u + capture)
-        self.capture = capture
-        self.r, self.viscous_loss = _closest_formula(u, w, capture)
-        self.scale_nm_per_us = jnp.sqrt(u[0] * u[-1])
-        place = _place(jnp.sqrt(square), self.scale_nm_per_us)
+        r, viscous_loss = _closest_formula(u, w, capture, numpy)
+        scale = numpy.sqrt(u[0] * u[-1])
+        place = _place(numpy.sqrt((u - capture) * (u + capture)), scale)
         count = min(place.shape[0], MOST_KNOTS)
         # of more rows than knots every so many is one, first and last among them
-        self.knots = place[np.round(np.linspace(0, place.shape[0] - 1, count)).astype(int)]
-        formula = square * _formula(u, capture, self.r, self.viscous_loss)
-        self.loss_spline = _spline_through(place, jnp.log(w * w / formula), self.knots)
-        self.delay_spline = jnp.zeros_like(self.loss_spline)
-        if late is not None:
-            delay = closest_delay(u, w, late) if delay is None else delay
-            self.delay_spline = _spline_through(place, late - delay(u, w), self.knots)
+        knots = place[np.round(np.linspace(0, place.shape[0] - 1, count)).astype(int)]
+        if late is not None and delay is None:
+            delay = closest_delay(u, w, late, numpy)
+        beside = _Beside(knots, scale, r, viscous_loss, delay)
+        loss, late_spline = _splines(u, w, late, capture, beside, numpy)
+        self.capture, self.r, self.viscous_loss = map(jnp.asarray, (capture, r, viscous_loss))
+        self.scale_nm_per_us, self.knots = jnp.asarray(scale), jnp.asarray(knots)
+        self.loss_spline, self.delay_spline = jnp.asarray(loss), jnp.asarray(late_spline)
+        self.slowest_nm_per_us, self.fastest_nm_per_us = jnp.asarray(u[0]), jnp.asarray(u[-1])
         self.delay = delay  # pyright: ignore[reportIncompatibleMethodOverride]
-        self.slowest_nm_per_us, self.fastest_nm_per_us = u[0], u[-1]
         self.mass_ng = None if mass_ng is None else as_parameter(mass_ng)
         self.origin = Origin(origin)
         self.deviations = None
@@ -475,33 +475,35 @@ class TabulatedLaw(Law):
         """
         law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
         u, w, late, captured, _ = _free_rows(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        by_rebound = jnp.asarray(rebound_changes, float)
+        numpy = _numpy_of(u, w, late, rebound_changes, delay_changes, capture_changes, law.capture, law.delay)
+        by_rebound = numpy.asarray(rebound_changes, float)
         if by_rebound.ndim != 2 or by_rebound.shape[1] != captured + len(u):
             raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
-        by_rebound, count = by_rebound[:, captured:], by_rebound.shape[0]
-        late_changes = None if delay_changes is None else jnp.asarray(delay_changes, float)[:, captured:]
-        by_delay = jnp.zeros_like(by_rebound) if late_changes is None else late_changes
-        by_capture = jnp.zeros(count) if capture_changes is None else jnp.asarray(capture_changes, float)
-        known = options.get("capture_speed_nm_per_us")
+        by_rebound, nothing = by_rebound[:, captured:], numpy.zeros((by_rebound.shape[0], 1))
+        by_delay = nothing if delay_changes is None else numpy.asarray(delay_changes, float)[:, captured:]
+        by_capture = nothing[:, 0] if capture_changes is None else numpy.asarray(capture_changes, float)
+        extrapolated = options.get("capture_speed_nm_per_us") is None
+        # the formula beside the table and the splines' knots stay as they are
+        parts = law.knots, law.scale_nm_per_us, law.r, law.viscous_loss
+        beside = _Beside(*(numpy.asarray(part) for part in parts), law.delay)
+        capture = numpy.asarray(law.capture)
 
-        def numbers(w: Array, late: Array | None, capture: Array) -> dict[str, Array]:
-            # the formula beside the table and the splines' knots stay as they are
-            held = capture if known is not None else _capture_speed(u, w, 0.0)
-            square = (u - held) * (u + held)
-            place = _place(jnp.sqrt(square), law.scale_nm_per_us)
-            loss = jnp.log(w * w / (square * _formula(u, held, law.r, law.viscous_loss)))
-            changed = {"capture": held, "loss_spline": _spline_through(place, loss, law.knots)}
-            if late is None or law.delay is None:
-                return changed
-            return changed | {"delay_spline": _spline_through(place, late - law.delay(u, w), law.knots)}
+        def along(by_rebound: Any, by_delay: Any, by_capture: Any) -> dict[str, Any]:
+            ends = []
+            for side in (-_SMALL, _SMALL):
+                rebound, held = w + side * by_rebound, capture + side * by_capture
+                if extrapolated:
+                    held = _capture_speed(u, rebound, 0.0, numpy)
+                delayed = None if late is None else late + side * by_delay
+                ends.append((held, *_splines(u, rebound, delayed, held, beside, numpy)))
+            names = ("capture", "loss_spline", *(("delay_spline",) if late is not None else ()))
+            return {name: (end - start) / (2.0 * _SMALL) for name, start, end in zip(names, *ends, strict=False)}
 
-        def along(w_change: Array, late_change: Array, capture_change: Array) -> dict[str, Array]:
-            if late is None:
-                start, changes = (w, law.capture), (w_change, capture_change)
-                return jax.jvp(lambda w, capture: numbers(w, None, capture), start, changes)[1]
-            return jax.jvp(numbers, (w, late, law.capture), (w_change, late_change, capture_change))[1]
-
-        deviations = jax.jit(jax.vmap(along))(by_rebound, by_delay, by_capture)
+        changes = by_rebound, by_delay, by_capture
+        if numpy is jnp:
+            return _replaced(law, deviations=jax.vmap(along)(*changes))
+        each = [along(*change) for change in zip(*changes, strict=True)]
+        deviations = {name: jnp.asarray([one[name] for one in each]) for name in each[0]}
         return _replaced(law, deviations=deviations)
 
     def for_scene(self) -> "TabulatedLaw":
@@ -657,6 +659,8 @@ def _at_knots(law: TabulatedLaw) -> Speeds:
     return law.beyond_capture(jnp.sqrt(v**2 + law.capture**2), v)
 
 
+_SMALL = 1e-3
+"""Part of an error over which a derivative is taken."""
 _NUMBERS = ("capture", "r", "viscous_loss", "knots", "loss_spline", "delay_spline")
 _SPLINES = ("knots", "loss_spline", "delay_spline")
 
@@ -856,7 +860,18 @@ def _free_rows(approach: Any, rebound: Any, delay: Any) -> _FreeRows:
     if len(u) - captured < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds that leave, but has {len(u) - captured}")
     late = None if late is None else late[captured:]
-    return _FreeRows(u[captured:], w[captured:], late, captured, float(speeds[captured - 1]) if captured else 0.0)
+    free = (None if column is None else _known(column) for column in (u[captured:], w[captured:], late))
+    return _FreeRows(*free, captured, float(speeds[captured - 1]) if captured else 0.0)
+
+
+def _known(column: Any) -> Any:
+    """Return a column as NumPy's where its numbers are known."""
+    return column if is_traced(column) else np.asarray(column)
+
+
+def _numpy_of(*values: Any) -> Any:
+    """Return JAX's NumPy where a value is traced, else NumPy itself: what is computed once is not compiled."""
+    return jnp if any(map(is_traced, jax.tree.leaves(values))) else np
 
 
 def _column(name: str, values: Any, rows: int | None = None) -> Any:
@@ -890,66 +905,70 @@ def _captured_rows(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> in
     return stays.size
 
 
-def _capture_speed(u: Float[Array, " n"], w: Float[Array, " n"], held: float) -> Float[Array, ""]:
+def _capture_speed(u: Any, w: Any, held: float, numpy: Any) -> Any:
     """Return the capture speed in nm/us that a table points to.
 
     That of u_out^2 = a u^2 - c u - b by linear least squares, slow rows counting most; with c = 0 where that is no law.
     No loss but that of capture at the slowest row is the most it can be.
+
+    Args:
+        u: approach speeds in nm/us.
+        w: rebound speeds.
+        held: the fastest approach that is captured, 0 without one.
+        numpy: NumPy or JAX's.
     """
     low = u[0]
-    ratio, one = (w / u) ** 2, jnp.ones_like(u)
+    ratio, one = (w / u) ** 2, numpy.ones_like(u)
     columns = [one, -low / u, -((low / u) ** 2)]
     weight = low / u
 
-    def fitted(chosen: list[Array]) -> Array:
-        return jnp.linalg.lstsq(jnp.stack(chosen, axis=1) * weight[:, None], ratio * weight)[0]
+    def fitted(chosen: list[Any]) -> Any:
+        return numpy.linalg.lstsq(numpy.stack(chosen, axis=1) * weight[:, None], ratio * weight, rcond=None)[0]
 
     a, c, b = fitted(columns)
     flat_a, flat_b = fitted(columns[::2])
     curved = (a > 0.0) & (b > -_NOTHING) & (c >= 0.0)
-    a, c, b = jnp.where(curved, a, flat_a), jnp.where(curved, c, 0.0), jnp.where(curved, b, flat_b)
+    a, c, b = numpy.where(curved, a, flat_a), numpy.where(curved, c, 0.0), numpy.where(curved, b, flat_b)
     there = (a > 0.0) & (c * c + 4.0 * a * b > 0.0) & (b > -_NOTHING)
-    root = jnp.sqrt(jnp.where(there, c * c + 4.0 * a * jnp.maximum(b, _NOTHING), 1.0))
-    found = low * jnp.where(
-        there & ((c > _NOTHING) | (b > _NOTHING)), (c + root) / (2.0 * jnp.where(there, a, 1.0)), 0.0
+    root = numpy.sqrt(numpy.where(there, c * c + 4.0 * a * numpy.maximum(b, _NOTHING), 1.0))
+    found = low * numpy.where(
+        there & ((c > _NOTHING) | (b > _NOTHING)), (c + root) / (2.0 * numpy.where(there, a, 1.0)), 0.0
     )
-    most = jnp.maximum((u[0] - w[0]) * (u[0] + w[0]), 0.0)
-    most = jnp.where(most > 0.0, jnp.sqrt(jnp.where(most > 0.0, most, 1.0)), 0.0)
-    return jnp.clip(found, held, jnp.maximum(most, held))
+    most = numpy.maximum((u[0] - w[0]) * (u[0] + w[0]), 0.0)
+    most = numpy.where(most > 0.0, numpy.sqrt(numpy.where(most > 0.0, most, 1.0)), 0.0)
+    return numpy.clip(found, held, numpy.maximum(most, held))
 
 
 _NOTHING = 1e-12
 """Share of the squared approach speed below which a loss by adhesion or viscosity is rounding."""
 
 
-def _closest_formula(
-    u: Float[Array, " n"], w: Float[Array, " n"], capture: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _closest_formula(u: Any, w: Any, capture: Any, numpy: Any) -> tuple[Any, Any]:
     """Return r and c of the formula with a capture speed that is closest to a table, in relative squared speeds."""
     square = (u - capture) * (u + capture)
-    columns = jnp.stack([jnp.ones_like(u), -1.0 / (u + capture)], axis=1)
+    columns = numpy.stack([numpy.ones_like(u), -1.0 / (u + capture)], axis=1)
     # relative to the rebound of the table
     weight = square / (w * w)
-    kept, viscous = jnp.linalg.lstsq(columns * weight[:, None], jnp.ones_like(u))[0]
+    kept, viscous = numpy.linalg.lstsq(columns * weight[:, None], numpy.ones_like(u), rcond=None)[0]
     # a loss that grows with the speed alone, and no more than all there is at capture
     good = (viscous > 0.0) & (kept > 0.0) & (viscous < 2.0 * kept * capture)
-    alone = jnp.sum(weight) / jnp.sum(weight**2)
-    return jnp.sqrt(jnp.where(good, kept, alone)), jnp.where(good, viscous, 0.0)
+    alone = numpy.sum(weight) / numpy.sum(weight**2)
+    return numpy.sqrt(numpy.where(good, kept, alone)), numpy.where(good, viscous, 0.0)
 
 
-def _formula(u: Array, capture: Array, r: Array, viscous_loss: Array) -> Array:
+def _formula(u: Any, capture: Any, r: Any, viscous_loss: Any, numpy: Any = jnp) -> Any:
     """Return u_out^2/(u^2 - u_c^2) of a formula with the capture speed u_c: r^2 - c/(u + u_c)."""
     total = u + capture
-    return r**2 - viscous_loss / jnp.where(total > 0.0, total, 1.0)
+    return r**2 - viscous_loss / numpy.where(total > 0.0, total, 1.0)
 
 
-def _place(v: Array, scale: Array) -> Array:
+def _place(v: Any, scale: Any) -> Any:
     """Return the splines' variable v/(v + V), 0 at capture, 1 at infinite speed."""
     return v / (v + scale)
 
 
-def _cubes(knots: Float[Array, " knots"], place: Float[Array, "..."]) -> Float[Array, "... knots"]:
-    return jnp.maximum(place[..., None] - knots, 0.0) ** 3
+def _cubes(knots: Any, place: Any, numpy: Any = jnp) -> Any:
+    return numpy.maximum(place[..., None] - knots, 0.0) ** 3
 
 
 def _spline_of(
@@ -963,40 +982,69 @@ def _spline(spline: Float[Array, "... numbers"], knots: Float[Array, "... knots"
     return _spline_of(spline, knots, place, _cubes(knots, place))
 
 
-def _natural(knots: Float[Array, " knots"]) -> Float[Array, "numbers knots"]:
-    """Return what makes a natural spline's numbers of its values at the knots."""
+def _natural(knots: Any, numpy: Any) -> Any:
+    """Return what makes a natural spline's numbers of its values at the knots, shape (numbers, knots)."""
     count = knots.shape[0]
-    h = jnp.diff(knots)
-    one = jnp.eye(count)
+    h = numpy.diff(knots)
+    one = numpy.eye(count)
     steep = (one[1:] - one[:-1]) / h[:, None]
     # second derivatives, 0 at both ends
-    inner = jnp.diag(2.0 * (h[:-1] + h[1:])) + jnp.diag(h[1:-1], 1) + jnp.diag(h[1:-1], -1)
-    bend = jnp.pad(jnp.linalg.solve(inner, 6.0 * (steep[1:] - steep[:-1])), ((1, 1), (0, 0)))
-    third = jnp.pad(jnp.diff(bend, axis=0) / h[:, None], ((1, 1), (0, 0)))
+    inner = numpy.diag(2.0 * (h[:-1] + h[1:])) + numpy.diag(h[1:-1], 1) + numpy.diag(h[1:-1], -1)
+    bend = numpy.pad(numpy.linalg.solve(inner, 6.0 * (steep[1:] - steep[:-1])), ((1, 1), (0, 0)))
+    third = numpy.pad(numpy.diff(bend, axis=0) / h[:, None], ((1, 1), (0, 0)))
     first = steep[0] - h[0] * bend[1] / 6.0
-    return jnp.concatenate([one[:1], first[None], jnp.diff(third, axis=0) / 6.0])
+    return numpy.concatenate([one[:1], first[None], numpy.diff(third, axis=0) / 6.0])
 
 
-def _spline_through(
-    place: Float[Array, " rows"], values: Float[Array, " rows"], knots: Float[Array, " knots"]
-) -> Float[Array, " numbers"]:
-    """Return the natural spline with knots through values, or of more values than knots the closest one."""
-    numbers = _natural(knots)
-    shapes = jnp.concatenate([jnp.ones_like(place)[:, None], (place - knots[0])[:, None], _cubes(knots, place)], axis=1)
+class _Beside(NamedTuple):
+    """What a table's splines are written beside: knots, scale of the speed, the closest formula and its delay."""
+
+    knots: Any
+    scale: Any
+    r: Any
+    viscous_loss: Any
+    delay: CollisionDelay | None
+
+
+def _splines(u: Any, w: Any, late: Any, capture: Any, beside: _Beside, numpy: Any) -> tuple[Any, Any]:
+    """Return the natural splines of loss and delay through a table's rows, or of more rows than knots the closest ones.
+
+    Args:
+        u: approach speeds in nm/us.
+        w: rebound speeds.
+        late: delays in us; None: instantaneous impacts.
+        capture: the capture speed.
+        beside: what the splines are written beside.
+        numpy: NumPy or JAX's.
+    """
+    knots, scale, r, viscous_loss, delay = beside
+    square = (u - capture) * (u + capture)
+    loss = numpy.log(w * w / (square * _formula(u, capture, r, viscous_loss, numpy)))
+    left = numpy.zeros_like(loss)
+    if late is not None and delay is not None:
+        hertz, lead, offset = (numpy.asarray(getattr(delay, name)) for name in _OF_DELAY)
+        left = late - (hertz * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u)
+    place, numbers = _place(numpy.sqrt(square), scale), _natural(knots, numpy)
+    shapes = [numpy.ones_like(place)[:, None], (place - knots[0])[:, None], _cubes(knots, place, numpy)]
     # by their values at the knots
-    by_values = shapes @ numbers
-    at_knots = jnp.linalg.solve if place.shape == knots.shape else lambda a, b: jnp.linalg.lstsq(a, b)[0]
-    return numbers @ at_knots(by_values, values)
+    by_values, values = numpy.concatenate(shapes, axis=1) @ numbers, numpy.stack([loss, left], axis=1)
+    if place.shape == knots.shape:
+        found = numbers @ numpy.linalg.solve(by_values, values)
+    else:
+        found = numbers @ numpy.linalg.lstsq(by_values, values, rcond=None)[0]
+    return found[:, 0], found[:, 1]
 
 
-def closest_delay(u: Float[Array, " n"], w: Float[Array, " n"], delay: Float[Array, " n"]) -> CollisionDelay:
+def closest_delay(u: Any, w: Any, delay: Any, numpy: Any = jnp) -> CollisionDelay:
     """Return the delay formula closest to a table's delays in us, by linear least squares; speeds in nm/us."""
-    columns = jnp.stack([u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u], axis=1)
-    hertz, lead, offset = jnp.linalg.lstsq(columns, delay)[0]
+    columns = numpy.stack([u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u], axis=1)
+    hertz, lead, offset = numpy.linalg.lstsq(columns, delay, rcond=None)[0]
     # a Hertz time must be one: where the three tell none, alone
     good = hertz > 0.0
-    alone = jnp.maximum(jnp.sum(columns[:, 0] * delay) / jnp.sum(columns[:, 0] ** 2), 0.0)
-    return CollisionDelay(jnp.where(good, hertz, alone), jnp.where(good, lead, 0.0), jnp.where(good, offset, 0.0))
+    alone = numpy.maximum(numpy.sum(columns[:, 0] * delay) / numpy.sum(columns[:, 0] ** 2), 0.0)
+    return CollisionDelay(
+        *(numpy.where(good, one, other) for one, other in ((hertz, alone), (lead, 0.0), (offset, 0.0)))
+    )
 
 
 def impact_law_of(scene: Scene) -> Law:

@@ -183,7 +183,7 @@ def _minimum_with_scale(model: Model, *, scaling: int | None, robust: bool) -> t
 
 
 def explained_of(result: FitResult) -> Explained:
-    """Return the minimum of a fit with all its unknowns, which its result does not keep: by its settings again."""
+    """Return the minimum of a fit with all its unknowns, which its result does not keep: it is searched for again."""
     table, settings = result.table, result.settings
     options: dict[str, Any] = {name: settings[name] for name in ("free", "fixed", "constraints")}
     options["effects"] = settings["effects"] or EFFECTS

@@ -84,14 +84,13 @@ def orbits_at(
     with np.errstate(invalid="ignore"):
         misfit = np.where(fine, np.nansum(((orbits.readings - data.read[which]) / error) ** 2, axis=1), np.inf)
     misfit = np.where(np.isfinite(misfit), misfit, np.inf)
-    for row in np.unique(which):
-        mine = np.flatnonzero(which == row)
-        best = mine[np.argmin(misfit[mine])]
-        if np.isfinite(misfit[best]):
-            for column, candidate in zip(whole, orbits, strict=True):
-                column[row] = candidate[best]
-            count[row] = np.unique(np.round(np.log(orbits.approach[mine[steady[mine]]]), 5)).size
-    return Found(whole, count)
+    order = np.lexsort((misfit, which))
+    best = order[np.unique(which[order], return_index=True)[1]]
+    best = best[np.isfinite(misfit[best])]
+    for column, candidate in zip(whole, orbits, strict=True):
+        column[which[best]] = candidate[best]
+    apart = np.unique(np.stack([which, np.round(np.log(orbits.approach), 5)], axis=1)[steady], axis=0)
+    return Found(whole, count + np.bincount(apart[:, 0].astype(int), minlength=count.size))
 
 
 def soft_cost(data: Data, found: Found, rows: np.ndarray, width: float = _WIDTH) -> float:
