@@ -182,10 +182,11 @@ class Followed:
         size, known = np.sum(white**2, axis=1), strength * (place - mean)
         share = (1.0 + size / self.soft**2) ** -0.25
         steep, steep_slope = self._steepness(place)
-        over = np.where(self.counts, np.maximum(self.determinant + steep - (1.0 - 2.0 * _STEADY), 0.0), 0.0) / _STEADY
+        near = (self.determinant + steep - (1.0 - 3.0 * _STEADY)) / _STEADY
+        over = np.where(self.counts, np.logaddexp(0.0, near), 0.0)
         residual = np.concatenate([(share[:, None] * white).ravel(), over, known])
         by_row = (share[:, None, None] * white_slope).reshape(-1, place.size)
-        steep_slope = np.where(over[:, None] > 0.0, steep_slope / _STEADY, 0.0)
+        steep_slope = steep_slope * (np.where(self.counts, -np.expm1(-over), 0.0) / _STEADY)[:, None]
         jacobian = np.concatenate([by_row, steep_slope, np.diag(strength)])
         # 2 s^2 (sqrt(1 + x/s^2) - 1), written so that nothing cancels
         chi2 = float(np.sum(2.0 * size / (1.0 + np.sqrt(1.0 + size / self.soft**2))) + known @ known + over @ over)
