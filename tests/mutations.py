@@ -136,6 +136,10 @@ MUTATIONS = {
         "= of_law {+ => -} by_local",
         f"{FORWARD}test_slopes_of_readings_are_those_of_orbits_that_are_searched_for_anew[sample]",
     ),
+    "orbits that grow for nothing": Mutation(
+        "residual = np.concatenate([(share[:, None] * white).ravel(), {over => 0.0 * over}, known])",
+        "tests/test_lasting_fit.py::test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient",
+    ),
     "damped steps uphill": Mutation(
         "step[moves] = {- => }np.linalg.solve(normal",
         "tests/test_least_squares.py::test_a_search_alone_ends_where_scipys_does",

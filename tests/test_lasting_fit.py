@@ -10,8 +10,8 @@ from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
 from fitting.infer.fit import model_of
 from fitting.infer.result import FitResult
-from fitting.infer.rows import weights_of
-from fitting.infer.search import orbits_at
+from fitting.infer.rows import plain_weights, weights_of
+from fitting.infer.search import Followed, orbits_at
 from fitting.infer.unknowns import Model, no_orbits
 from fitting.models import task_of
 from fitting.parameters import DELAY_NAMES
@@ -135,6 +135,27 @@ def test_rows_set_aside_are_named(viscous, shared):
     used = np.isfinite(viscous.rows.residual).sum()
     given = sum(parameter.constraint is not None for parameter in viscous.parameters.values())
     assert viscous.degrees_of_freedom == used + given - len(viscous.parameters)
+
+
+def test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient(shared):
+    """A drag that gives: determinants are those of the map's own Jacobian, and chi2's slopes those of differences."""
+    model = model_for(shared, "viscous+delay")
+    delay = {"delay_hertz": 0.2, "delay_lead_nm": 5.0, "delay_offset_nm": 0.0}
+    theta = at(model, delay | {"epsilon": 100.0, "viscous_loss": -10.0})
+    found = orbits_at(model, theta)
+    growing = found.exists & (found.number == 0)
+    assert 5 < growing.sum() < found.exists.sum() - 5
+    np.testing.assert_array_equal(found.orbits.determinant[found.exists] > 1.0, growing[found.exists])
+    weights = plain_weights(model.data, 0.3, np.zeros(shared.rows, bool))
+    rows = Followed(model, theta, found.orbits, weights, np.inf)
+    here = rows.sum(theta)
+    cost = here.residual[3 * shared.rows : 4 * shared.rows]
+    assert cost[growing].min() > 3.0
+    assert cost[found.orbits.determinant < 0.98].max() < 1e-6
+    for i in range(theta.size):
+        step = 1e-5 * np.eye(theta.size)[i]
+        slope = (rows.sum(theta + step).value - rows.sum(theta - step).value) / 2e-5
+        assert 2.0 * here.jacobian[:, i] @ here.residual == pytest.approx(slope, rel=1e-4, abs=1e-3)
 
 
 def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):
