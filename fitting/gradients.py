@@ -20,7 +20,6 @@ from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.infer.fit import model_of
-from fitting.infer.instantaneous import evaluated, orbits_of
 from fitting.infer.search import orbits_at
 from fitting.models import task_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, is_nuisance, model_parameters
@@ -91,12 +90,8 @@ def amplitude_gradients(
     theta = np.zeros(len(whole.names))
     # 0 has no logarithm
     theta[: len(own)] = [law.unknown_of(name, max(values[name], 1e-300)) for name in own]
-    if law.lasting:
-        orbits = orbits_at(whole, theta).orbits
-        slopes = whole.slopes(theta, orbits)
-    else:
-        seen, slopes = evaluated(whole, theta)
-        orbits = orbits_of(whole, theta, seen)
+    orbits = orbits_at(whole, theta).orbits
+    slopes = whole.slopes(theta, orbits)
     exists, hits = np.isfinite(orbits.x[:, 0]), ~whole.data.row.free
     slow, touching = _grazes(orbits.x, orbits.approach, whole.local(theta), whole.data.row, table.drive)
     near_fold = hits & (np.abs(orbits.fold) < NEAR_FOLD)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.infer.explain import Explained
-from fitting.infer.instantaneous import Chi2, evaluated
+from fitting.infer.instantaneous import Chi2
 from fitting.infer.search import Followed, descend
 from fitting.infer.unknowns import _FACTORS
 
@@ -74,7 +74,7 @@ def chi2_of(explained: Explained, theta: Float[np.ndarray, "draws k"]) -> Float[
         rows = Followed(explained.model, explained.end.theta, explained.end.orbits, explained.weights, np.inf)
         return np.array([rows.sum(one).value for one in theta])
     chi2 = Chi2(explained.model, explained.weights)
-    return np.array([np.sum(chi2.at(one, slopes=False)[1] ** 2) for one in theta])
+    return np.array([np.sum(chi2.at(one)[1] ** 2) for one in theta])
 
 
 def readings_of(explained: Explained, theta: Float[np.ndarray, "draws k"]) -> Float[np.ndarray, "draws rows 3"]:
@@ -84,7 +84,8 @@ def readings_of(explained: Explained, theta: Float[np.ndarray, "draws k"]) -> Fl
     if law.lasting:
         found = [model.follow(one, explained.end.orbits.x) for one in theta]
         return np.array([np.where(one.closes[:, None], one.readings, np.nan) for one in found])
-    return np.array([evaluated(model, one, slopes=False)[0].readings for one in theta])
+    chi2 = Chi2(model, explained.weights)
+    return np.array([chi2.at(one)[0].orbits.readings for one in theta])
 
 
 def unknowns_of(explained: Explained, values: Float[np.ndarray, "draws p"]) -> Float[np.ndarray, "draws p"]:

@@ -18,8 +18,8 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting import fit
-from fitting.infer.result import FitResult, FittedParameter, WithInterval
 from fitting.infer.fit import model_of
+from fitting.infer.result import FitResult, FittedParameter, WithInterval
 from fitting.infer.unknowns import Model
 from fitting.models import task_of
 from fitting.tables.table import AmplitudeTable, read_table

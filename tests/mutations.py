@@ -18,7 +18,8 @@ LAW = "tests/test_law.py::test_law_agrees_with_fifty_digits"
 JACOBIAN = "tests/test_jacobian.py::test_written_and_automatic_jacobians_have_twelve_digits[start0-delayed]"
 ORBIT = f"{ORBITS}[damped]"
 DELAYED_ORBIT = f"{ORBITS}[delayed]"
-FORWARD = "tests/test_forward.py"
+FORWARD = "tests/test_forward.py::"
+LAWS = "tests/test_laws_of_fits.py::"
 LASTING = "tests/test_lasting_impact.py::"
 LASTING_ORBITS = "tests/test_lasting_orbits.py::"
 INTERVALS = "tests/test_profile_intervals.py"
@@ -120,12 +121,45 @@ MUTATIONS = {
     "close pairs of roots stepped over": Mutation(
         "bottom * dips.middle {< => >} 0.0", f"{LASTING_ORBITS}test_a_close_pair_is_found"
     ),
-    "misfit as a sum": Mutation("prediction.amplitude_nm {- => +} rows.amplitude_nm", FORWARD),
+    "misfit as a sum": Mutation(
+        "seen.readings {- => +} data.read", f"{FORWARD}test_residuals_are_misfits_in_errors_and_the_constraint"
+    ),
     "constraint of Q without its error": Mutation(
-        "1.0 / np.{asarray => ones_like}(measurement.constraint_error)", FORWARD
+        "numpy.exp({self.error / self.value *  => }unknown)",
+        f"{FORWARD}test_residuals_are_misfits_in_errors_and_the_constraint",
+    ),
+    "outliers softened in the wrong direction": Mutation(
+        "slope = slope {- => +} part[:, :, None]",
+        f"{FORWARD}test_jacobian_of_softened_residuals_is_that_of_differences[0.3]",
+    ),
+    "remainders of corrections turned round": Mutation(
+        "= of_law {+ => -} by_local",
+        f"{FORWARD}test_slopes_of_readings_are_those_of_orbits_that_are_searched_for_anew[sample]",
+    ),
+    "orbits that grow for nothing": Mutation(
+        "residual = np.concatenate([(share[:, None] * white).ravel(), {over => 0.0 * over}, known])",
+        "tests/test_lasting_fit.py::test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient",
+    ),
+    "damped steps uphill": Mutation(
+        "step[moves] = {- => }np.linalg.solve(normal",
+        "tests/test_least_squares.py::test_a_search_alone_ends_where_scipys_does",
+    ),
+    "drag without its width": Mutation(
+        "0.5 * values[LOSS_SHAPE] / raised{ * _Q_WIDTH => }",
+        f"{LAWS}test_derivatives_of_formulas_are_those_of_differences[smooth]",
+    ),
+    "model error that shortens the delay's path twice": Mutation(
+        "- (offset {+ => -} path) / u", f"{LAWS}test_derivatives_of_formulas_are_those_of_differences[smooth]"
     ),
     "intervals of 90 percent": Mutation("CHI2_95 = {3.841458820694124 => 2.705543454095404}", INTERVALS),
-    "rise of chi2 from zero": Mutation("above = value{ - chi2 => }", INTERVALS),
+    "rise of chi2 from zero": Mutation(
+        "fitted.profile(fitted.explained, place, y){ - end.chi2 => }",
+        "tests/test_fit.py::test_profile_interval_ends_are_where_scipy_finds_chi2_risen_by_3_84",
+    ),
+    "profile that does not shorten its way": Mutation(
+        "longest = {0.5 *  => }abs(part)",
+        f"{INTERVALS}::test_a_profile_goes_along_a_bent_valley_where_a_straight_step_loses_an_orbit",
+    ),
     "capillary twice as wide": Mutation("return self.pull_nn * length, {1.0 => 0.5} / length", FORMULAS),
     "structural share without its curvature": Mutation("{(1.0 - kelvin / self.tip_radius_nm) => 1.0}", FORMULAS),
     "core with 8 for 7 in its potential": Mutation("tip_radius_nm / {1260.0 => 1440.0}", FORMULAS),
@@ -223,19 +257,11 @@ MUTATIONS = {
     ),
     "slow impacts' padding of peak and lock-in as if independent": Mutation(
         "{_TOGETHER + _APART * np.array([[1.0, -1.0], [-1.0, 1.0]]) => (_TOGETHER + _APART) * np.eye(2)}",
-        "tests/test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture",
-    ),
-    "slow impacts held back by half": Mutation(
-        "drive_frequency_khz * length / {rebound => (2.0 * rebound)}",
-        "tests/test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture",
-    ),
-    "runs of residuals that the unknowns explain": Mutation(
-        "apart = tried {- => +} basis @ (basis.T @ tried)",
-        "tests/test_discrepancy.py::test_residuals_that_run_together_over_the_speed_are_seen",
+        "tests/test_lasting_fit.py::test_peak_and_lockin_of_slow_rows_share_an_error",
     ),
     "closest formula by half of the distance": Mutation(
         "w**2 - {2.0 *  => }w * rebound",
-        "tests/test_discrepancy.py::test_the_parameters_are_those_of_the_closest_formula_and_as_unsure",
+        f"{LAWS}test_the_closest_formula_is_scipys_and_no_loss_is_negative",
     ),
     "collisions beside capture in few steps": Mutation(
         "_NEAR_CAPTURE = ({-0.02, 0.2 => -0.0, 0.0})",

@@ -15,7 +15,7 @@ from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained, run_of_residuals
 from fitting.infer.fit import explained_of, model_of
 from fitting.infer.law import LawAt, containing
-from fitting.infer.result import Loss, WithInterval, energy_lost, interval_of, scaled
+from fitting.infer.result import EnergyLost, Loss, WithInterval, interval_of, scaled
 from fitting.infer.rows import remainders_of, weights_of
 from fitting.infer.search import Descent, Found, orbits_at
 from fitting.infer.unknowns import no_orbits
@@ -255,13 +255,12 @@ def test_r_and_epsilon_are_said_once_and_are_those_of_the_closest_formula():
 
 
 def test_the_loss_is_said_in_energies_and_delta():
-    # 2 ng (20^2 - 19.9^2)/2 -+ 39: no sample at rest gives energy
-    least = energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj
-    assert least is not None
-    assert least.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
+    # 3.99 -+ 39: no sample at rest gives energy
+    assert interval_of(3.99, 2.0 * 19.9 * 0.5, lowest=0.0).interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
     epsilon = WithInterval(80.0, (76.08, 83.92))
     delta, capture = scaled(epsilon, 0.5 * 2.0), interval_of(9.04, float("nan"))
-    energies = (energy_lost(20.0, 10.0, 0.1, 2.0),)
+    energy = interval_of(300.0, 2.0 * 10.0 * 0.1)
+    energies = (EnergyLost(20.0, energy, scaled(energy, EV_PER_AJ)),)
     loss = Loss(energies, None, delta, scaled(delta, EV_PER_AJ), 4e-3, 24.0, capture)
     said = dict(losses_in_words(made_fit("law", loss=loss)))
     # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side

@@ -2,24 +2,19 @@
 
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-import fitting.predict.instantaneous
-from afm_jax.impact.closure import OrbitPlace
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit
 from fitting.infer import fit as fitting_fit
 from fitting.infer.fit import model_of
 from fitting.infer.instantaneous import Chi2
 from fitting.infer.result import FitResult
+from fitting.infer.search import orbits_at
+from fitting.infer.unknowns import Model, no_orbits
 from fitting.models import task_of
-from fitting.predict.instantaneous import searched
-from fitting.predict.orbit import Local, Row
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
@@ -133,18 +128,15 @@ def test_the_order_of_the_rows_does_not_matter(few, fit_of_few):
 )
 def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, measured, slot):
     """Made-up orbits: without a delay no drive of 140,000 random ones had two stable ones."""
-    amplitude = jnp.array([[100.0, 40.0, 0.0], [60.0, 26.0, 0.0], [60.0, 25.0, 0.0], [61.0, 40.0, 0.0]])
-    steady = jnp.array([True, False, True, False])
-    made_up = SteadyOrbits(OrbitPlace(jnp.arange(4.0), jnp.zeros(4)), steady, jnp.zeros(4, dtype=bool), amplitude)
-    monkeypatch.setattr(fitting.predict.instantaneous, "steady_orbits", lambda _: made_up)
+    steady = np.array([True, False, True, False])
+    readings = np.array([[100.0, 40.0, 0.0], [60.0, 26.0, 0.0], [60.0, 25.0, 0.0], [61.0, 40.0, 0.0]])
+    made_up = no_orbits(4)._replace(steady=steady, readings=readings, approach=np.arange(1.0, 5.0))
+    monkeypatch.setattr(Model, "candidates", lambda *_, **__: (np.zeros(4, int), made_up))
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
     one = with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error)
-    model = model_of(one, task_of(one, "law"), {"fixed": {}, "held": ()})
-    data, local = model.data, Local(*model.local(np.array([0.1, 60.0, 0.0]))[0])
-    given = jax.tree.map(jnp.asarray, (local, Row(*(column[0] for column in data.row)), data.read[0], data.error[0]))
-    seen = searched(ImpactLaw(0.95, 60.0), *given, "sample")
-    assert int(seen.coordinate) == slot
-    assert int(seen.orbits) == 2
+    found = orbits_at(model_of(one, task_of(one, "law"), {"fixed": {}, "held": ()}), np.array([0.1, 60.0, 0.0]))
+    assert found.orbits.approach[0] == 1.0 + slot
+    assert found.number[0] == 2
 
 
 @pytest.mark.slow

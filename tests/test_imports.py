@@ -30,9 +30,9 @@ ROWS = {
     "fitting": (
         ("parameters", "tables"),
         ("instruments", "models", "simulated"),
-        ("forward",),
-        ("gradients", "fits"),
-        ("sampling",),
+        ("predict",),
+        ("infer",),
+        ("gradients", "sampling"),
         ("report",),
         ("traces", "calibration", "inversion", "tapping_curves", "experiments"),
         ("examples",),

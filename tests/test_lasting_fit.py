@@ -10,10 +10,11 @@ from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
 from fitting.infer.fit import model_of
 from fitting.infer.result import FitResult
-from fitting.infer.rows import weights_of
-from fitting.infer.search import orbits_at
-from fitting.infer.unknowns import Model
+from fitting.infer.rows import plain_weights, weights_of
+from fitting.infer.search import Followed, orbits_at
+from fitting.infer.unknowns import Model, no_orbits
 from fitting.models import task_of
+from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import simulate_experiment
 from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment
@@ -69,6 +70,30 @@ def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
     assert np.all(np.isfinite(weights.whitening))
 
 
+def test_peak_and_lockin_of_slow_rows_share_an_error():
+    """Twice its variance on their mean (times root 2), a sixteenth on their difference; the slowest are excluded."""
+    table = read_table(EXAMPLE)
+    model = model_for(table, "viscous+delay")
+    theta = at(model, {"epsilon": 113.6, "viscous_loss": 0.5, **dict.fromkeys(DELAY_NAMES, 0.2)})
+    capture, omega = model.law.capture(theta[:5]), 2e-3 * np.pi * table.drive_frequency_khz
+    u = np.linspace(1.2, 8.0, table.rows) * capture
+    w = np.sqrt(u**2 - 0.5 * u - 100.0)
+    orbits = no_orbits(table.rows)._replace(approach=u, rebound=w)
+    weights = weights_of(model, theta, orbits, np.zeros(table.rows, bool))
+    s = omega * 4.7 / w
+    used = (s < 1.4) & (u > 1.35 * capture)
+    assert 0 < used.sum() < table.rows
+    np.testing.assert_array_equal(weights.used[:, :2], np.stack([used, used], axis=1))
+    lacking = 0.0005 + 0.012 * s**3 + 0.016 * (1.5 * capture / u) ** 6
+    read, error = model.data.read[used, :2], model.data.error[used, :2]
+    white = weights.whitening[used, :2, :2]
+    both = np.linalg.inv(np.swapaxes(white, 1, 2) @ white) - error[:, :, None] ** 2 * np.eye(2)
+    both /= lacking[used, None, None] ** 2 * read[:, :, None] * read[:, None, :]
+    for direction, variance in (([1.0, 1.0], 2.0), ([1.0, -1.0], 1.0 / 16.0)):
+        vector = np.array(direction) / np.sqrt(2.0)
+        np.testing.assert_allclose(both @ vector, np.broadcast_to(variance * vector, both.shape[:2]), atol=1e-6)
+
+
 @pytest.mark.long
 def test_the_papers_contact_predicts_the_tables_of_two_programs(shared):
     for table in (shared, read_table(EXAMPLE)):
@@ -110,6 +135,27 @@ def test_rows_set_aside_are_named(viscous, shared):
     used = np.isfinite(viscous.rows.residual).sum()
     given = sum(parameter.constraint is not None for parameter in viscous.parameters.values())
     assert viscous.degrees_of_freedom == used + given - len(viscous.parameters)
+
+
+def test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient(shared):
+    """A drag that gives: determinants are those of the map's own Jacobian, and chi2's slopes those of differences."""
+    model = model_for(shared, "viscous+delay")
+    delay = {"delay_hertz": 0.2, "delay_lead_nm": 5.0, "delay_offset_nm": 0.0}
+    theta = at(model, delay | {"epsilon": 100.0, "viscous_loss": -10.0})
+    found = orbits_at(model, theta)
+    growing = found.exists & (found.number == 0)
+    assert 5 < growing.sum() < found.exists.sum() - 5
+    np.testing.assert_array_equal(found.orbits.determinant[found.exists] > 1.0, growing[found.exists])
+    weights = plain_weights(model.data, 0.3, np.zeros(shared.rows, bool))
+    rows = Followed(model, theta, found.orbits, weights, np.inf)
+    here = rows.sum(theta)
+    cost = here.residual[3 * shared.rows : 4 * shared.rows]
+    assert cost[growing].min() > 3.0
+    assert cost[found.orbits.determinant < 0.98].max() < 1e-6
+    for i in range(theta.size):
+        step = 1e-5 * np.eye(theta.size)[i]
+        slope = (rows.sum(theta + step).value - rows.sum(theta - step).value) / 2e-5
+        assert 2.0 * here.jacobian[:, i] @ here.residual == pytest.approx(slope, rel=1e-4, abs=1e-3)
 
 
 def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):

@@ -4,11 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.law_table import KNOTS, LawTable
+from fitting.infer.law import closest_loss
 from fitting.infer.rows import NEAREST
 from fitting.models import Held
 from fitting.parameters import DELAY_NAMES
@@ -31,7 +33,7 @@ def unknowns(law: LawModel, values: dict[str, float]) -> np.ndarray:
     return theta
 
 
-def all_of(table: LawTable, coordinates: np.ndarray) -> list[np.ndarray]:
+def all_of(table: LawTable | ImpactLaw, coordinates: np.ndarray) -> list[np.ndarray]:
     """Return approach speeds, rebound speeds and delays of a table."""
     found = jax.jit(jax.vmap(lambda table, at: table.speeds(at), in_axes=(None, 0)))(table, coordinates)
     return [np.asarray(part) for part in (found.approach, found.rebound, found.delay)]
@@ -42,13 +44,12 @@ EVERYWHERE = np.random.default_rng(1).uniform(0.0, KNOTS - 2.0, 60)
 
 
 @pytest.mark.parametrize(("r", "epsilon"), [(0.95, 60.0), (1.0, 122.0), (0.9981, 1e-3), (0.5, 900.0)])
-def test_the_table_of_an_instantaneous_law_is_equation_6(r, epsilon):
-    law = FormulaLaw(("r", "epsilon"), lasting=False)
-    table = law.table(np.array([1.0 - r**2, epsilon]))
-    u, w, delay = all_of(table, EVERYWHERE)
-    assert float(table.capture) == pytest.approx(np.sqrt(epsilon) / r, rel=1e-12)
+def test_an_instantaneous_law_is_equation_6(r, epsilon):
+    law, theta = FormulaLaw(("r", "epsilon"), lasting=False), np.array([1.0 - r**2, epsilon])
+    u, w, delay = all_of(law.table(theta), EVERYWHERE)
+    assert law.capture(theta) == pytest.approx(np.sqrt(epsilon) / r, rel=1e-12)
     # what is left of slow tips is a difference of squares
-    assert np.all(np.abs(w**2 - np.asarray(ImpactLaw(r, epsilon).rebound_speed(u)) ** 2) < 1e-12 * u**2)
+    assert np.all(np.abs(w**2 - (r**2 * u**2 - epsilon)) < 1e-12 * u**2)
     assert not np.any(delay)
 
 
@@ -152,3 +153,17 @@ def test_the_law_of_a_contact_and_its_derivatives_are_those_of_the_contact(conta
     np.testing.assert_allclose(contact.coefficients(theta)[1], slope, rtol=1e-4, atol=1e-6)
     capture = differences(contact.capture, theta, step)
     np.testing.assert_allclose(contact.capture_slope(theta), capture, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("drag", "adhesion"), [(0.5, 113.6), (0.5, -100.0)])
+def test_the_closest_formula_is_scipys_and_no_loss_is_negative(drag, adhesion):
+    u = np.geomspace(25.0, 180.0, 30)
+    rebound, weight = np.sqrt(u**2 - drag * np.sqrt(u**2 + 110.0) - adhesion), 1.0 / (0.1 + 0.01 * u)
+
+    def off(at):
+        return weight * (np.sqrt((at[0] * u) ** 2 - 100.0 * at[1]) - rebound)
+
+    best = least_squares(off, [0.98, 1.0], bounds=([0.0, 0.0], [1.0, 3.0]), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    found = closest_loss(("r", "epsilon"), u, rebound, weight, {}, 8)
+    assert [found["r"], found["epsilon"]] == pytest.approx([best[0], 100.0 * best[1]], rel=1e-6, abs=1e-5)
+    assert (found["epsilon"] == 0.0) == (adhesion < 0.0)

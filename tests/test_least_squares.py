@@ -14,6 +14,7 @@ from afm_jax.least_squares import (
     distance,
     whole_covariance_of,
 )
+from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 
 TIME = np.linspace(0.0, 3.0, 20)
 TRUTHS = np.array([[2.0, 1.3, 0.5], [1.0, 0.4, -0.2], [3.0, 2.0, 0.9], [0.5, 0.7, 1.5]])
@@ -58,6 +59,17 @@ def test_searches_end_where_scipys_do():
         np.testing.assert_array_equal(found[fixed], START[fixed])
     # the third decay is faster than it may be
     assert end.place[2, 1] == HIGHEST[1]
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_a_search_alone_ends_where_scipys_does(truth):
+    def here(place):
+        rest = residual(place, truth)
+        return Sum(float(rest @ rest), rest, slopes(place))
+
+    end = levenberg_marquardt(here, START, settled=1e-16, most=100)
+    scipy = least_squares(residual, START, args=(truth,), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    np.testing.assert_allclose(end.place, scipy.x, rtol=1e-6, atol=1e-6)
 
 
 def test_a_step_takes_what_is_known_as_further_data():

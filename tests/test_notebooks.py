@@ -57,7 +57,8 @@ def test_only_public_names(path):
 
 def test_names_of_rooms_are_found():
     source = (
-        "import afm_jax as afm, afm_jax.impact.map\nfrom fitting.fits import fit\nfrom afm_jax import solve\nafm.motion"
+        "import afm_jax as afm, afm_jax.impact.map\nfrom fitting.infer import fit\nfrom afm_jax import solve\n"
+        "afm.motion"
     )
     assert names_that_are_not_public(source) == [
         "afm_jax.impact.map",

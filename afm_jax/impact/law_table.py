@@ -107,12 +107,6 @@ def coordinate_of(approach_speed: Float[np.ndarray, "..."], capture: float) -> F
     return np.arcsinh(np.sqrt(np.maximum(approach_speed**2 - capture**2, 0.0)) / _SCALE) / _STEP
 
 
-def speed_by_coordinate(coordinate: Float[np.ndarray, "..."], approach: Float[np.ndarray, "..."]):
-    """Return d u/d s in nm/us at coordinates, of approach speeds u in nm/us there."""
-    turn = _STEP * coordinate
-    return _STEP * _SCALE**2 * np.sinh(turn) * np.cosh(turn) / approach
-
-
 def table_of(
     capture: float,
     square: Float[np.ndarray, " knots"],

@@ -12,7 +12,6 @@ from afm_jax.least_squares import covariance_of
 from fitting.experiments.prior import Prior
 from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained
-from fitting.infer.instantaneous import evaluated
 from fitting.infer.rows import Weights, plain_weights, remainders_of, weights_of
 from fitting.infer.search import Descent, Found, orbits_at
 from fitting.infer.unknowns import Data, Model, Quantity
@@ -194,12 +193,8 @@ def _rows_of(
     """Return drives as rows of a fit; ``read`` says which readings are taken."""
     model, theta = model_of(prior, drives, prior.values)
     law: Any = model.law
-    if law.lasting:
-        orbits, count = orbits_at(model, theta)
-        slopes = model.slopes(theta, orbits)
-    else:
-        orbits, slopes = evaluated(model, theta)
-        count = orbits.orbits
+    orbits, count = orbits_at(model, theta)
+    slopes = model.slopes(theta, orbits)
     error = np.concatenate([noise * orbits.readings[:, :2], np.full((len(count), 1), phase_noise_deg)], axis=1)
     expected = np.where(read & (count > 0)[:, None], orbits.readings, np.nan)
     model, out = replace(model, data=replace(model.data, read=expected, error=error)), np.zeros(len(count), bool)
@@ -236,10 +231,7 @@ def candidates_of(
     sure = rows.number == 1
     for values in prior.draws(DRAWS, least=MARGIN)[1:]:
         drawn = model_of(prior, drives, values)
-        if prior.problem.lasting:
-            sure &= orbits_at(*drawn, np.flatnonzero(sure)).number == 1
-        else:
-            sure &= evaluated(*drawn, slopes=False)[0].orbits == 1
+        sure &= orbits_at(*drawn, np.flatnonzero(sure)).number == 1
     kinds, expected = 3 if tapping else 2, rows.orbits.readings
     holds = {
         "measured": same_drives(drives, prior.measured),

@@ -1,110 +1,33 @@
-"""The fit where impacts are instantaneous: chi2 is one JAX function, minimised by Optax from the best of many starts.
+"""The fit where impacts are instantaneous: every orbit is a root of a quartic, and Optax minimises chi2.
 
 Losses are squares of the optimiser's coordinates, so that a law without one of them is an interior minimum like any
 other; damped steps between bounds then go to the last digit. What another start ends at is kept: it may explain the
 readings as well.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.law_table import coordinate_of
 from afm_jax.least_squares import Box, Searches, descended
-from afm_jax.solve.lanes import compiled_quickly, filled
 from fitting.infer.explain import MOST_OUTLIERS, OUTLIER, ROBUST, Explained
 from fitting.infer.optimiser import Minimised, minimised
 from fitting.infer.rows import Weights, plain_weights
-from fitting.infer.search import CENSORED, Descent, Found, starts
+from fitting.infer.search import CENSORED, Descent, Found, orbits_at, starts
 from fitting.infer.unknowns import Model
-from fitting.parameters import LAW
-from fitting.predict.instantaneous import Seen, read_at, searched
-from fitting.predict.orbit import COUNT, Local, Orbits, Row
 
-STARTS, _POLISHED, _PADDED = 64, 8, 32
-"""Starts that are screened and polished; rows are padded to multiples of the last, so that programs have few shapes."""
+STARTS, _POLISHED = 64, 8
+"""Starts that are screened, and polished at most."""
+_AGREE, _SAME = 3, 1e-3
+"""Polished starts that end at the least chi2, to within the second, after which the others are not looked at."""
 _SOFT = 5.0
 """Residual of a reading from which it counts linearly in the screening."""
-_FINE, _STEPS = 1e-16, 60
+_FINE, _STEPS = 1e-12, 60
 """Estimated distance of chi2 to its minimum at the end, and damped steps to it at most."""
 _APART, _HARDLY_WORSE = 5.0, 4.0
 """Errors by which another minimum differs, and the rise of chi2 up to which it may be the true one."""
 _OUTLIER_ROUNDS = 3
-_LAW = tuple(parameter.name for parameter in LAW)
-_INSTRUMENT = 6
-"""Columns of `Local` that are of the instrument."""
-
-
-@compiled_quickly(static_argnames="drive")
-def _seen(
-    law: Float[Array, " 3"], instrument: Float[Array, "rows 6"], row: Row, read: Array, error: Array, drive: str
-) -> Seen:
-    """Return what rows read at r, epsilon and viscous loss."""
-    known = ImpactLaw(*law)
-
-    def one(instrument, row, read, error):
-        return searched(known, _local(instrument), row, read, error, drive)
-
-    return jax.vmap(one)(instrument, row, read, error)
-
-
-@compiled_quickly(static_argnames="drive")
-def _slopes(
-    law: Float[Array, " 3"], instrument: Float[Array, "rows 6"], row: Row, coordinate: Float[Array, " rows"], drive: str
-) -> Float[Array, "rows 3 9"]:
-    """Return the derivatives of the readings by the law and by the instrument of each row."""
-
-    def one(instrument, row, coordinate):
-        def of_both(both):
-            return read_at(coordinate, ImpactLaw(*both[:3]), _local(both[3:]), row, drive)
-
-        return jax.jacfwd(of_both)(jnp.concatenate([law, instrument]))
-
-    return jax.vmap(one)(instrument, row, coordinate)
-
-
-def _local(instrument: Float[Array, " 6"]) -> Local:
-    return Local(*jnp.zeros(COUNT - _INSTRUMENT), *instrument)
-
-
-def evaluated(
-    model: Model, theta: Float[np.ndarray, " k"], *, slopes: bool = True
-) -> tuple[Any, Float[np.ndarray, "rows 3 k"]]:
-    """Return what rows read at unknowns, a `Seen` of arrays of NumPy, and the derivatives by these.
-
-    Args:
-        model: what is fitted.
-        theta: its unknowns.
-        slopes: derivatives are wanted; else they are 0.
-    """
-    data, law = model.data, model.law
-    values, count = law.values(model.of_law(theta)), data.time.size
-    numbers = np.array([values[name] for name in _LAW])
-    instrument = np.stack(model.instrument_columns(theta), axis=1)
-    along, by_local, parts = np.zeros((count, 3, theta.size)), np.zeros((count, 3, COUNT)), []
-    for drive, some in data.groups:
-        rows = filled(some, some.size + -some.size % _PADDED)
-        there = numbers, instrument[rows], data.row.take(rows)
-        error = np.nan_to_num(data.error[rows], nan=1.0)
-        seen: Any = jax.tree.map(np.asarray, _seen(*there, data.read[rows], error, drive))
-        parts.append((some, seen))
-        if not slopes:
-            continue
-        exists = (seen.orbits > 0)[: some.size, None, None]
-        by_both = np.where(exists, np.asarray(_slopes(*there, seen.coordinate, drive))[: some.size], 0.0)
-        for i, name in enumerate(law.own):
-            along[some, :, i] = by_both[:, :, _LAW.index(name)] * law.slope_of(name, theta[i])
-        by_local[some, :, COUNT - _INSTRUMENT :] = by_both[:, :, 3:]
-    whole = jax.tree.map(lambda column: np.zeros((count, *column.shape[1:]), column.dtype), parts[0][1])
-    for some, part in parts:
-        for column, found in zip(whole, part, strict=True):
-            column[some] = found[: some.size]
-    along[:, :, len(law.own) :] = model.slopes_by_instrument(theta, by_local)
-    return whole, along
 
 
 class Chi2(NamedTuple):
@@ -115,12 +38,18 @@ class Chi2(NamedTuple):
     soft: float = np.inf
     """Residual of a row from which it counts linearly."""
 
-    def at(
-        self, theta: Float[np.ndarray, " k"], *, slopes: bool = True
-    ) -> tuple[Any, Float[np.ndarray, " n"], Float[np.ndarray, "n k"]]:
-        """Return what is seen, the residuals and their Jacobian."""
+    def at(self, theta: Float[np.ndarray, " k"]) -> tuple[Found, Float[np.ndarray, " n"], Float[np.ndarray, "n k"]]:
+        """Return the orbits, the residuals and their Jacobian.
+
+        A row without an orbit reads no amplitude, and the phase that is farthest off.
+        """
         (mean, strength), data = self.model.prior, self.model.data
-        seen, along = evaluated(self.model, theta, slopes=slopes)
+        found = orbits_at(self.model, theta)
+        exists, nothing = found.exists[:, None], np.zeros((data.time.size, 3))
+        nothing[:, 2] = data.row.phase_deg + 180.0 / data.row.order
+        seen = found.orbits._replace(readings=np.where(exists, found.orbits.readings, nothing))
+        with np.errstate(all="ignore"):
+            along = np.where(exists[:, :, None], self.model.slopes(theta, seen), 0.0)
         off = np.where(self.weights.used, seen.readings - data.read, 0.0)
         white = np.einsum("nij,nj->ni", self.weights.whitening, off)
         slope = np.einsum("nij,njk->nik", self.weights.whitening, np.nan_to_num(along))
@@ -130,9 +59,10 @@ class Chi2(NamedTuple):
         slope = slope - part[:, :, None] * np.einsum("ni,nik->nk", white, slope)[:, None]
         share = np.sqrt(2.0 / (1.0 + bent))
         white, slope = (share * white).ravel(), (share[:, :, None] * slope).reshape(white.size, -1)
-        unseen = np.where(data.no_orbit & (seen.orbits > 0), CENSORED, 0.0)
+        unseen = np.where(data.no_orbit & (found.number > 0), CENSORED, 0.0)
         residual = np.concatenate([white, unseen, strength * (theta - mean)])
-        return seen, residual, np.concatenate([slope, np.zeros((unseen.size, theta.size)), np.diag(strength)])
+        jacobian = np.concatenate([slope, np.zeros((unseen.size, theta.size)), np.diag(strength)])
+        return Found(seen, found.number), residual, jacobian
 
     def minimised(self, start: Float[np.ndarray, " k"]) -> Minimised:
         """Return where Optax's L-BFGS goes in coordinates whose squares are the losses."""
@@ -167,32 +97,10 @@ class Chi2(NamedTuple):
 
     def explained(self, end: Searches) -> Explained:
         """Return the rows as the law at an end explains them."""
-        model, theta = self.model, end.place[0]
-        seen, residual, jacobian = self.at(theta)
-        orbits = orbits_of(model, theta, seen)
-        descent = Descent(theta, orbits, float(end.chi2[0]), residual, jacobian)
-        return Explained(model, descent, self.weights, Found(orbits, seen.orbits), 0.0, settled=True)
-
-
-def orbits_of(model: Model, theta: Float[np.ndarray, " k"], seen: Any) -> Orbits:
-    """Return the orbits that were seen as those of impacts that last; without slopes."""
-    exists, law = seen.orbits > 0, model.of_law(theta)
-    approach = np.where(np.isfinite(seen.approach), seen.approach, 1.0)
-    x = np.stack([coordinate_of(approach, model.law.capture(law)), seen.phase, np.zeros(exists.size)], axis=1)
-    return Orbits(
-        x=np.where(exists[:, None], x, np.nan),
-        closes=exists,
-        steady=exists,
-        growing=np.zeros(exists.size, bool),
-        determinant=np.zeros(exists.size),
-        readings=seen.readings,
-        slopes=np.zeros((exists.size, 3, COUNT)),
-        approach=seen.approach,
-        rebound=np.sqrt(np.maximum(model.law.at(law, approach).square, 0.0)),
-        pull=np.zeros(exists.size),
-        change=np.zeros(exists.size),
-        fold=np.where(seen.near_fold, 0.0, 1.0),
-    )
+        theta = end.place[0]
+        found, residual, jacobian = self.at(theta)
+        descent = Descent(theta, found.orbits, float(end.chi2[0]), residual, jacobian)
+        return Explained(self.model, descent, self.weights, found, 0.0, settled=True)
 
 
 def profile(explained: Explained, place: int, value: float) -> float:
@@ -214,9 +122,13 @@ def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained,
     chi2 = Chi2(model, plain_weights(model.data, 0.0, out), ROBUST if robust else np.inf)
     points = starts(model, STARTS)
     with np.errstate(all="ignore"):
-        cost = [_softened(chi2.at(point, slopes=False)[1]) for point in points]
-    ends = [chi2.minimised(points[i]) for i in np.argsort(np.nan_to_num(cost, nan=np.inf), kind="stable")[:_POLISHED]]
-    best = min(ends, key=lambda end: end.value)
+        cost = [_softened(chi2.at(point)[1]) for point in points]
+    ends: list[Minimised] = []
+    for i in np.argsort(np.nan_to_num(cost, nan=np.inf), kind="stable")[:_POLISHED]:
+        ends.append(chi2.minimised(points[i]))
+        best = min(ends, key=lambda end: end.value)
+        if sum(end.value < best.value + _SAME for end in ends) >= _AGREE:
+            break
     explained = chi2.explained(chi2.descended(best.place))
     for _ in range(_OUTLIER_ROUNDS if robust else 0):
         with np.errstate(invalid="ignore"):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, Origin, TabulatedLaw
+from afm_jax.impact.law import ImpactLaw, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
 from afm_jax.solve.lanes import compiled_quickly
@@ -214,41 +214,51 @@ class FittedLaw(TabulatedLaw):
     delay_low_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
     delay_high_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
 
-    def __init__(  # noqa: PLR0913
+    def __init__(
         self,
-        speeds: Float[np.ndarray, " points"],
-        rebound: Float[np.ndarray, " points"],
-        late: Float[np.ndarray, " points"],
+        law: AtSpeeds,
+        approach_speeds: Float[np.ndarray, " rows"],
         *,
-        capture_speed_nm_per_us: float,
-        delay: CollisionDelay | None,
+        formula: ImpactLaw | None,
         lasting: bool,
-        errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]],
         mass_ng: float | None,
         origin: str,
     ):
-        """Make the law of its points; arguments as of `table_of_law`.
+        """Make the table of a law, with its linearised 95 % band.
 
-        Errors are NaN where nothing is known of them.
+        Args:
+            law: with its errors, NaN where nothing is known of them.
+            approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
+            formula: of the model's family, whose delay is what the law's is written beside; None: the closest one.
+            lasting: impacts take time.
+            mass_ng: of the tip; None: not known.
+            origin: what the law comes from, in words.
         """
-        table = table_of_law(
-            speeds,
-            rebound,
-            late if lasting else None,
-            capture_speed_nm_per_us=capture_speed_nm_per_us,
-            delay=delay,
-            errors=errors if np.isfinite(errors[0]).all() else None,
-        )
+        speeds, points = points_of_law(law, approach_speeds)
+        leaves = points.law[0] > 0.0
+        u, w = speeds[leaves], np.minimum(points.law[0], speeds)[leaves]
+        captured = speeds[~leaves][-1] if not leaves.all() else 0.0
+        late = points.law[1, leaves] if lasting else None
+        known: dict[str, Any] = {
+            "capture_speed_nm_per_us": np.clip(points.capture, captured, (1.0 - 1e-9) * u[0]),
+            "delay": None if formula is None else formula.delay,
+        }
+        if np.isfinite(points.factor).all():
+            (by_rebound, by_delay), of_capture = fewest_unknowns(points.factor[:, leaves], points.capture_factor)
+            known |= {"rebound_changes": by_rebound.T, "delay_changes": by_delay.T if lasting else None}
+            table = TabulatedLaw.with_errors(u, w, late, capture_changes=of_capture, **known)
+        else:
+            table = TabulatedLaw(u, w, late, **known)
         for part in dataclasses.fields(TabulatedLaw):
             setattr(self, part.name, getattr(table, part.name))
         self.mass_ng, self.origin = None if mass_ng is None else jnp.asarray(mass_ng), Origin(origin)
-        width = TWO_SIDED_95 * np.linalg.norm(errors[0], axis=2)
+        width = TWO_SIDED_95 * np.linalg.norm(points.factor, axis=2)
         self.approach_speed_nm_per_us = speeds
         self.rebound_speed_nm_per_us, self.collision_delay_us = map(np.asarray, _points(table, speeds))
-        self.rebound_low_nm_per_us = np.maximum(self.rebound_speed_nm_per_us - width[:, 0], 0.0)
-        self.rebound_high_nm_per_us = self.rebound_speed_nm_per_us + width[:, 0]
-        self.delay_low_us = self.collision_delay_us - width[:, 1]
-        self.delay_high_us = self.collision_delay_us + width[:, 1]
+        self.rebound_low_nm_per_us = np.maximum(self.rebound_speed_nm_per_us - width[0], 0.0)
+        self.rebound_high_nm_per_us = self.rebound_speed_nm_per_us + width[0]
+        self.delay_low_us = self.collision_delay_us - width[1]
+        self.delay_high_us = self.collision_delay_us + width[1]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the law as fit.json has it: its points with units in their names, and all that makes it again."""
@@ -340,54 +350,20 @@ def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, 
     return law.rebound_speed(speeds), law.collision_delay(speeds)
 
 
-def table_of_law(
-    speeds: Float[np.ndarray, " points"],
-    rebound: Float[np.ndarray, " points"],
-    late: Float[np.ndarray, " points"] | None,
-    *,
-    capture_speed_nm_per_us: float,
-    delay: CollisionDelay | None,
-    errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]] | None = None,
-) -> TabulatedLaw:
-    """Return a law as the table that a scene takes.
-
-    Args:
-        speeds: approach speeds in nm/us, four of which at least leave.
-        rebound: speeds in nm/us, 0 where the tip is captured.
-        late: delays in us; None: impacts are instantaneous.
-        capture_speed_nm_per_us: of the law, kept between the fastest tip that is captured and the slowest that leaves.
-        delay: the formula that the delay is written beside; None: the closest one.
-        errors: changes of rebound speeds and delays, and of the capture speed, with independent unknowns of unit
-            variance; None: nothing is known of them.
-    """
-    leaves = rebound > 0.0
-    u, w = speeds[leaves], np.minimum(rebound, speeds)[leaves]
-    captured = speeds[~leaves][-1] if not leaves.all() else 0.0
-    capture = np.clip(capture_speed_nm_per_us, captured, (1.0 - 1e-9) * u[0])
-    columns = u, w, None if late is None else late[leaves]
-    known: dict[str, Any] = {"capture_speed_nm_per_us": capture, "delay": None if late is None else delay}
-    if errors is None:
-        return TabulatedLaw(*columns, **known)
-    of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
-    by_rebound, by_delay = np.moveaxis(of_rows, (1, 2), (0, 1))
-    changes = {"rebound_changes": by_rebound, "delay_changes": None if late is None else by_delay}
-    return TabulatedLaw.with_errors(*columns, **changes, capture_changes=of_capture, **known)
-
-
 def fewest_unknowns(
-    of_rows: Float[np.ndarray, "points 2 m"], of_capture: Float[np.ndarray, " m"]
-) -> tuple[Float[np.ndarray, "points 2 k"], Float[np.ndarray, " k"]]:
+    of_law: Float[np.ndarray, "2 points m"], of_capture: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "2 points k"], Float[np.ndarray, " k"]]:
     """Return changes with fewer independent unknowns that have the same covariance, to 3 parts in 1000 of every error.
 
     What is not known of the capture speed (NaN) is left out.
     """
-    flat = np.append(of_rows.reshape(-1, of_rows.shape[2]), np.nan_to_num(of_capture)[None], axis=0)
+    flat = np.append(of_law.reshape(-1, of_law.shape[2]), np.nan_to_num(of_capture)[None], axis=0)
     size = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
     left, strength, _ = np.linalg.svd(flat / size, full_matrices=False)
     parts = left * strength
     missing = np.sqrt(np.maximum(np.cumsum((parts**2)[:, ::-1], axis=1)[:, ::-1], 0.0)).max(axis=0)
     kept = (size * parts)[:, : max(int(np.sum(missing > _LEAST_PART)), 1)]
-    return kept[:-1].reshape(*of_rows.shape[:2], -1), kept[-1]
+    return kept[:-1].reshape(*of_law.shape[:2], -1), kept[-1]
 
 
 _LEAST_PART = 3e-3
@@ -411,53 +387,6 @@ def scaled(known: WithInterval, factor: float) -> WithInterval:
 NO_MASS = "the table gives neither mass_ng nor spring_constant_n_per_m"
 
 
-def energy_lost(speed: float, rebound: float, error: float, mass_ng: float | None) -> EnergyLost:
-    """Return the energy that an impact takes; its interval ends at 0, for a sample at rest gives none.
-
-    Args:
-        speed: approach speed in nm/us.
-        rebound: rebound speed.
-        error: standard error of that.
-        mass_ng: of the tip; None: not known.
-    """
-    if mass_ng is None:
-        return EnergyLost(speed, None, None)
-    taken = interval_of(0.5 * mass_ng * (speed**2 - rebound**2), mass_ng * rebound * error, lowest=0.0)
-    return EnergyLost(speed, taken, scaled(taken, EV_PER_AJ))
-
-
-def law_with_band(
-    law: AtSpeeds,
-    approach_speeds: Float[np.ndarray, " rows"],
-    *,
-    lasting: bool,
-    formula: ImpactLaw | None,
-    mass_ng: float | None = None,
-    origin: str = "",
-) -> FittedLaw:
-    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
-
-    Args:
-        law: with its errors.
-        approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
-        lasting: impacts take time.
-        formula: of the model's family, whose delay is the one that the law's is written beside; None: the closest one.
-        mass_ng: of the tip; None: not known.
-        origin: what the law comes from, in words.
-    """
-    speeds, points = points_of_law(law, approach_speeds)
-    return FittedLaw(
-        speeds,
-        *points.law,
-        capture_speed_nm_per_us=points.capture,
-        delay=None if formula is None else formula.delay,
-        lasting=lasting,
-        errors=(np.moveaxis(points.factor, 0, 1), points.capture_factor),
-        mass_ng=mass_ng,
-        origin=origin,
-    )
-
-
 def loss_of(
     law: AtSpeeds,
     measured: tuple[float, float],
@@ -478,11 +407,14 @@ def loss_of(
     # two digits, and within what was measured
     three = np.clip([float(f"{speed:.2g}") for speed in three], *measured)
     points = law(np.resize(three, LAW_POINTS))
-    error = np.linalg.norm(points.factor[0], axis=1)
-    energies = [
-        energy_lost(float(u), float(w), float(e), mass_ng)
-        for u, w, e in zip(three, points.law[0, :3], error[:3], strict=True)
-    ]
+    energies = []
+    for u, w, factor in zip(three.tolist(), points.law[0, :3].tolist(), points.factor[0, :3], strict=True):
+        taken = None
+        if mass_ng is not None:
+            # a sample at rest gives no energy
+            error = mass_ng * w * float(np.linalg.norm(factor))
+            taken = interval_of(0.5 * mass_ng * (u**2 - w**2), error, lowest=0.0)
+        energies.append(EnergyLost(u, taken, None if taken is None else scaled(taken, EV_PER_AJ)))
     delta = None
     if "epsilon" in parameters and mass_ng is not None:
         epsilon = parameters["epsilon"]

@@ -84,14 +84,13 @@ def orbits_at(
     with np.errstate(invalid="ignore"):
         misfit = np.where(fine, np.nansum(((orbits.readings - data.read[which]) / error) ** 2, axis=1), np.inf)
     misfit = np.where(np.isfinite(misfit), misfit, np.inf)
-    for row in np.unique(which):
-        mine = np.flatnonzero(which == row)
-        best = mine[np.argmin(misfit[mine])]
-        if np.isfinite(misfit[best]):
-            for column, candidate in zip(whole, orbits, strict=True):
-                column[row] = candidate[best]
-            count[row] = np.unique(np.round(np.log(orbits.approach[mine[steady[mine]]]), 5)).size
-    return Found(whole, count)
+    order = np.lexsort((misfit, which))
+    best = order[np.unique(which[order], return_index=True)[1]]
+    best = best[np.isfinite(misfit[best])]
+    for column, candidate in zip(whole, orbits, strict=True):
+        column[which[best]] = candidate[best]
+    apart = np.unique(np.stack([which, np.round(np.log(orbits.approach), 5)], axis=1)[steady], axis=0)
+    return Found(whole, count + np.bincount(apart[:, 0].astype(int), minlength=count.size))
 
 
 def soft_cost(data: Data, found: Found, rows: np.ndarray, width: float = _WIDTH) -> float:
@@ -183,10 +182,11 @@ class Followed:
         size, known = np.sum(white**2, axis=1), strength * (place - mean)
         share = (1.0 + size / self.soft**2) ** -0.25
         steep, steep_slope = self._steepness(place)
-        over = np.where(self.counts, np.maximum(self.determinant + steep - (1.0 - 2.0 * _STEADY), 0.0), 0.0) / _STEADY
+        near = (self.determinant + steep - (1.0 - 3.0 * _STEADY)) / _STEADY
+        over = np.where(self.counts, np.logaddexp(0.0, near), 0.0)
         residual = np.concatenate([(share[:, None] * white).ravel(), over, known])
         by_row = (share[:, None, None] * white_slope).reshape(-1, place.size)
-        steep_slope = np.where(over[:, None] > 0.0, steep_slope / _STEADY, 0.0)
+        steep_slope = steep_slope * (np.where(self.counts, -np.expm1(-over), 0.0) / _STEADY)[:, None]
         jacobian = np.concatenate([by_row, steep_slope, np.diag(strength)])
         # 2 s^2 (sqrt(1 + x/s^2) - 1), written so that nothing cancels
         chi2 = float(np.sum(2.0 * size / (1.0 + np.sqrt(1.0 + size / self.soft**2))) + known @ known + over @ over)

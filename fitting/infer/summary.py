@@ -18,10 +18,10 @@ from fitting.infer.law import AtSpeeds, LawAt, containing, speed_range
 from fitting.infer.result import (
     Convergence,
     FitResult,
+    FittedLaw,
     FittedParameter,
     FittedRows,
     FittedTable,
-    law_with_band,
     loss_of,
 )
 from fitting.infer.rows import SIZE_OF_PHASE
@@ -306,7 +306,7 @@ def _result(
         valid=not reasons,
         reasons=reasons,
         warnings=warnings,
-        law=law_with_band(
+        law=FittedLaw(
             at,
             speeds,
             lasting=problem.lasting,

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.contact.parameters import PAPER
+from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.law_table import LawTable
 from fitting.models import Reach, Task, drifts, reach_of, readings_of
 from fitting.parameters import CONTACT_NAMES, PARAMETERS, is_nuisance, name_of_table
@@ -241,8 +242,8 @@ class Model:
         """Return the unknowns of the law."""
         return theta[: len(self.law.names)]
 
-    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
-        """Return the law as a table."""
+    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable | ImpactLaw:
+        """Return the law as orbits are computed from it."""
         return self.law.table(self.of_law(theta))
 
     def _instrument_at(self, theta: Any, numpy: Any = np) -> dict[str, Any]:

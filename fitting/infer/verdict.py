@@ -84,11 +84,6 @@ class Evidence:
     """What a fit of the contact holds, with its errors."""
     short: float = 0.0
     """Share of the loss by which the model discrepancy of short range was added for that."""
-    independent_residual: Float[np.ndarray, "rows k"] | None = None
-    """Residuals without what is common to rows: the most likely remainders of corrections; None: those of
-    the rows."""
-    stuck: tuple[float, float] | None = None
-    """chi2 that no part of the step with the model discrepancy lowers, and what the step takes it to to first order."""
     courses: dict[str, list[str]] = field(default_factory=dict)
     """Which readings of a table follow its rows, whose order nothing says, by the table's label."""
 
@@ -134,8 +129,7 @@ def misfits(evidence: Evidence) -> list[str]:
 
 def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
     """Return in which order of the rows neighbouring residuals are correlated, and how much."""
-    rows, residual = evidence.rows, evidence.independent_residual
-    residual = rows.residual if residual is None else residual
+    rows, residual = evidence.rows, evidence.rows.residual
     known = np.flatnonzero(np.isfinite(residual).any(axis=1) & (rows.orbits > 0))
     speed = rows.approach_speed_nm_per_us[known]
     orders = {"in the table's order": known, "over the approach speed": known[np.argsort(speed, kind="stable")]}
@@ -526,12 +520,6 @@ REASONS: Rules[Evidence] = (
         "extreme; hold some of them fixed.",
     ),
     Rule(_not_explained, "The model does not explain the data: {case}"),
-    Rule(
-        lambda e: e.stuck is not None,
-        "Not converged: to first order the model discrepancy would lower chi2 from {e.stuck[0]:.1f} to "
-        "{e.stuck[1]:.1f}, but computed not even a sixteenth of it does; the amplitudes are far from linear in the "
-        "law, as they are near folds: leave such rows out.",
-    ),
     Rule(
         _torn,
         "The amplitudes contradict what is known beforehand: {case}. "

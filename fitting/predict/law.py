@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.impact.law import BRIDGE_NM
+from afm_jax.impact.law import BRIDGE_NM, ImpactLaw
 from afm_jax.impact.law_table import EXCESS, LawTable, table_of
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE
 
@@ -110,8 +110,8 @@ class LawModel(ABC):
         """Return the capture speed in nm/us."""
 
     @abstractmethod
-    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
-        """Return the table."""
+    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable | ImpactLaw:
+        """Return what orbits are computed from: the table, or where impacts are instantaneous the formula."""
 
     def capture_slope(self, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Return the derivatives of the capture speed by the unknowns: where w^2 vanishes."""
@@ -285,8 +285,11 @@ class FormulaLaw(LawModel):
             low, high = grid[max(leaves - 1, 0)], grid[leaves]
         return float(high)
 
-    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
-        """Return the table."""
+    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable | ImpactLaw:
+        """Return the table, or where impacts are instantaneous the formula."""
+        if not self.lasting:
+            values = self.values(theta)
+            return ImpactLaw(*(np.asarray(values[name]) for name in ("r", "epsilon", "viscous_loss")))
         capture = self.capture(theta)
         found = self.at(theta, np.hypot(capture, EXCESS))
         kept = self.values(theta)["r"] ** 2

@@ -18,10 +18,10 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
-from afm_jax.impact.closure import ClosingSystem, OrbitProblem, closure
+from afm_jax.impact.closure import ClosingSystem, OrbitProblem, closure, coordinates_of_roots
 from afm_jax.impact.lasting_impact import corrected, depth_of_impact, middle_of_contact
-from afm_jax.impact.law import BRIDGE_NM
-from afm_jax.impact.law_table import KNOTS, LawTable, speed_by_coordinate
+from afm_jax.impact.law import BRIDGE_NM, ImpactLaw
+from afm_jax.impact.law_table import KNOTS, LawTable
 from afm_jax.impact.orbits import FlightEnds, lockin, peak_amplitude
 from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -110,8 +110,14 @@ def platform_and_cantilever(local: Local, row: Row, drive: str) -> tuple[Cantile
     return cantilever, Platform(amplitude, row.drive_frequency_khz, row.offset_nm + local.offset_origin_nm)
 
 
-def _law(local: Local, table: LawTable) -> LawTable:
+AnyLaw = LawTable | ImpactLaw
+"""A table where impacts last, a formula without a delay where they do not."""
+
+
+def _law(local: Local, table: AnyLaw) -> AnyLaw:
     """Return the law with the coefficients of one row."""
+    if isinstance(table, ImpactLaw):
+        return table
     return dataclasses.replace(
         table, hertz=local.hertz, lead_nm=local.lead_nm, offset_nm=local.offset_nm, lead_square=local.lead_square
     )
@@ -126,14 +132,20 @@ class _Turn(NamedTuple):
     """u, w, flight's duration, heights and velocities at its ends, surface's rates; see `_State`."""
 
 
-def _turn(x: Float[Array, " 3"], local: Local, row: Row, table: LawTable, drive: str) -> _Turn:
+def _turn(x: Float[Array, " 3"], local: Local, row: Row, table: AnyLaw, drive: str) -> _Turn:
     """Follow an impact and the flight after it."""
     coordinate, phase, delay = x
     (cantilever, platform), law, order = platform_and_cantilever(local, row, drive), _law(local, table), row.order
     omega = platform.angular_frequency
-    free = law.speeds_with(coordinate, local.square, local.late)
-    middle = middle_of_contact(cantilever, platform, phase / omega + 0.5 * delay)
-    speeds = corrected(free, middle, cantilever, law)
+    if isinstance(law, ImpactLaw):
+        instant = law.speeds(coordinate)
+        free = speeds = instant._replace(rebound=jnp.sqrt(instant.rebound**2 + local.square))
+        middle, depth = (jnp.zeros_like(phase), jnp.zeros_like(phase)), 0.0
+    else:
+        free = law.speeds_with(coordinate, local.square, local.late)
+        middle = middle_of_contact(cantilever, platform, phase / omega + 0.5 * delay)
+        speeds = corrected(free, middle, cantilever, law)
+        depth = depth_of_impact(law, speeds.approach, middle, cantilever, omega / order)
     start = phase / omega + delay
     duration = order * platform.period_us - delay
     height, rate = platform.position_and_velocity(start)
@@ -147,8 +159,7 @@ def _turn(x: Float[Array, " 3"], local: Local, row: Row, table: LawTable, drive:
             omega * (speeds.delay - delay),
         ]
     )
-    depth = depth_of_impact(law, speeds.approach, middle, cantilever, omega / order)
-    lock_in = lockin(cantilever, platform, flight, order, delayed=True, indentation=depth)
+    lock_in = lockin(cantilever, platform, flight, order, delayed=law.delayed, indentation=depth)
     readings = shown(jnp.stack([peak_amplitude(cantilever, flight), *lock_in]), local, row, platform, drive)
     pull = cantilever.acceleration(position, velocity) - landing.acceleration
     state = [speeds.approach, free.rebound, duration, *flight[2:4], pull, *middle, platform.amplitude_nm]
@@ -183,14 +194,14 @@ def shown(seen: Float[Array, " 3"], local: Local, row: Row, platform: Platform, 
 
 @compiled_quickly(static_argnames="drive")
 def _evaluated(
-    x: Float[Array, "rows 3"], local: Float[Array, "rows local"], row: Row, table: LawTable, drive: str
-) -> tuple[Float[Array, "rows 6 all"], Float[Array, "rows 6"], Float[Array, "rows 10"]]:
-    """Return gaps and readings with their derivatives by x and by what is local, and the rest of the turns."""
+    x: Float[Array, "rows 3"], local: Float[Array, "rows local"], row: Row, table: AnyLaw, drive: str
+) -> tuple[Float[Array, "rows 7 all"], Float[Array, "rows 7"], Float[Array, "rows 10"]]:
+    """Return gaps, readings and approach speed with derivatives by x and what is local, and the rest of the turns."""
 
     def one(x, local, row):
         def everything(both):
             turn = _turn(both[:3], Local(*both[3:]), row, table, drive)
-            found = jnp.concatenate([turn.gaps, turn.readings])
+            found = jnp.concatenate([turn.gaps, turn.readings, turn.state[:1]])
             return found, (found, turn.state)
 
         return jax.jacfwd(everything, has_aux=True)(jnp.concatenate([x, local]))
@@ -235,6 +246,26 @@ def _scanned(
     return jax.vmap(one)(local, row)
 
 
+@compiled_quickly(static_argnames="drive")
+def _rooted(
+    local: Float[Array, "rows local"], row: Row, law: ImpactLaw, drive: str
+) -> tuple[Float[Array, "rows 4 3"], Bool[Array, "rows 4"]]:
+    """Return x of all orbits of rows whose impacts are instantaneous, the roots of quartics, and which there are."""
+
+    def one(local, row):
+        problem = OrbitProblem(*platform_and_cantilever(Local(*local), row, drive), law, row.order)
+        roots = coordinates_of_roots(problem)
+
+        def at(coordinate):
+            system = closure(coordinate, problem).system
+            return jnp.stack([coordinate, system.phase, 0.0]), system.regular
+
+        x, regular = jax.vmap(at)(roots.coordinate)
+        return x, roots.found & regular
+
+    return jax.vmap(one)(local, row)
+
+
 def _phase(system: ClosingSystem) -> Float[Array, ""]:
     """Return the direction of the phase just after impact, whether or not this is an orbit."""
     return jnp.arctan2(system.sine * system.determinant, system.cosine * system.determinant)
@@ -275,9 +306,9 @@ class Orbits(NamedTuple):
 
 
 def starts_of(
-    local: Float[np.ndarray, "rows local"], row: Row, table: LawTable, drive: str
+    local: Float[np.ndarray, "rows local"], row: Row, table: AnyLaw, drive: str
 ) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 3"]]:
-    """Return where orbits of rows may be: which row, and x.
+    """Return where orbits of rows may be, or where they are if impacts are instantaneous: which row, and x.
 
     Args:
         local: of each row, columns as `Local`; its changes of the law are not looked at.
@@ -287,7 +318,8 @@ def starts_of(
     """
     local = local.copy()
     local[:, :2] = 0.0
-    x, there = _in_blocks(lambda *block: _scanned.outside(*block, table, drive), local, row)
+    search = _scanned if isinstance(table, LawTable) else _rooted
+    x, there = _in_blocks(lambda *block: search.outside(*block, table, drive), local, row)
     which, slot = np.nonzero(there)
     return which, x[which, slot]
 
@@ -307,7 +339,7 @@ def followed(
     x: Float[np.ndarray, "rows 3"],
     local: Float[np.ndarray, "rows local"],
     row: Row,
-    table: LawTable,
+    table: AnyLaw,
     drive: str,
     *,
     most: int = _NEWTON_STEPS,
@@ -316,7 +348,7 @@ def followed(
     """Return the orbits that Newton's method finds from x, with readings and their derivatives.
 
     Args:
-        x: one start for every row.
+        x: one start for every row; of instantaneous impacts the orbit itself.
         local: of each row, columns as `Local`.
         row: the rows; a free tip needs no orbit.
         table: the law.
@@ -325,8 +357,8 @@ def followed(
         judge: say which are steady.
     """
     x, count = x.copy(), len(x)
-    slopes, found, state = np.zeros((count, 6, 3 + COUNT)), np.ones((count, 6)), np.zeros((count, 10))
-    moving = np.arange(count)
+    slopes, found, state = np.zeros((count, 7, 3 + COUNT)), np.ones((count, 7)), np.zeros((count, 10))
+    moving, most = np.arange(count), most if isinstance(table, LawTable) else 1
     with np.errstate(all="ignore"):
         for left in reversed(range(most)):
             some = row.take(moving)
@@ -344,17 +376,19 @@ def followed(
             x[moving] += step[goes]
             x[moving, 0] = np.clip(x[moving, 0], 1e-4, KNOTS - 1.01)
         gaps = slopes[:, :3, :3]
-        along = slopes[:, 3:, 3:] - slopes[:, 3:, :3] @ _solved(gaps, slopes[:, :3, 3:])
-        along = np.where(row.free[:, None, None], slopes[:, 3:, 3:], along)
+        along = slopes[:, 3:6, 3:] - slopes[:, 3:6, :3] @ _solved(gaps, slopes[:, :3, 3:])
+        along = np.where(row.free[:, None, None], slopes[:, 3:6, 3:], along)
         closes = np.isfinite(along).all(axis=(1, 2)) & (np.abs(found[:, :3]).max(axis=1) < _CLOSED)
-        trace, determinant = _trace_and_determinant(x, gaps, state, row)
+        trace, determinant = _trace_and_determinant(slopes[:, 6, 0], gaps, state, row)
         orbits = Orbits(
             x, closes | row.free, closes | row.free, np.zeros(count, bool), determinant,
-            found[:, 3:], along, *state[:, :2].T, *state[:, 6:8].T,
+            found[:, 3:6], along, *state[:, :2].T, *state[:, 6:8].T,
             fold=np.linalg.det(gaps) / np.prod(np.linalg.norm(gaps, axis=2), axis=1),
         )  # fmt: skip
         if judge:
-            there = closes & (np.abs(trace) < np.abs(1.0 + determinant)) & _flies(x, state, local, row)
+            there = closes & (np.abs(trace) < np.abs(1.0 + determinant))
+            some = np.flatnonzero(there)
+            there[some] = _flies(x[some], state[some], local[some], row.take(some))
             orbits = orbits._replace(
                 steady=(there & (np.abs(determinant) <= 1.0)) | row.free, growing=there & (determinant > 1.0)
             )
@@ -370,13 +404,18 @@ def _solved(
     return np.linalg.solve(safe, np.where(sound, right, 0.0))
 
 
-def _trace_and_determinant(x, gaps, state, row: Row) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
-    """Return both of the map's Jacobian (eq. 8), from the gaps' slopes: as `afm_jax.impact.orbits.is_stable`."""
+def _trace_and_determinant(
+    faster, gaps, state, row: Row
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+    """Return both of the map's Jacobian (eq. 8), from the gaps' slopes: as `afm_jax.impact.orbits.is_stable`.
+
+    ``faster``: derivative of the approach speed by the coordinate.
+    """
     approach, pull, amplitude = state[:, 0], state[:, 5], state[:, 8]
     omega = RAD_PER_US_PER_KHZ * row.drive_frequency_khz
     # the delay follows the other two
     map_ = gaps[:, :2, :2] - gaps[:, :2, 2:] * gaps[:, 2:, :2] / gaps[:, 2:, 2:]
-    map_ = map_ / np.stack([speed_by_coordinate(x[:, 0], approach), 1.0 / omega], axis=1)[:, None]
+    map_ = map_ / np.stack([faster, 1.0 / omega], axis=1)[:, None]
     late = amplitude[:, None] * map_[:, 0] / approach[:, None]
     slow = -(amplitude * omega)[:, None] * map_[:, 1] - pull[:, None] * late
     trace, determinant = late[:, 1] + slow[:, 0], late[:, 1] * slow[:, 0] - slow[:, 1] * late[:, 0]

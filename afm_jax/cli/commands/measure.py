@@ -232,8 +232,8 @@ FIT = Command(
         flag("--compare", "Fit the rival models too and say what the table can tell.", into="comparing"),
         flag(
             "--posterior",
-            "Credible intervals, too, by the no-U-turn sampler (extra `nuts`); where impacts last, of a Gaussian around "
-            "the fit.",
+            "Credible intervals, too, by the no-U-turn sampler (extra `nuts`); where impacts last, of a Gaussian "
+            "around the fit.",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the random numbers."),
         click.option(
