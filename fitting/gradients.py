@@ -21,7 +21,8 @@ from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.infer.fit import model_of
 from fitting.infer.instantaneous import evaluated, orbits_of
-from fitting.infer.search import orbits_at
+from fitting.infer.search import Found, orbits_at
+from fitting.infer.unknowns import Model
 from fitting.models import task_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, is_nuisance, model_parameters
 from fitting.predict.orbit import NEAR_FOLD, Local, Row, platform_and_cantilever
@@ -91,12 +92,7 @@ def amplitude_gradients(
     theta = np.zeros(len(whole.names))
     # 0 has no logarithm
     theta[: len(own)] = [law.unknown_of(name, max(values[name], 1e-300)) for name in own]
-    if law.lasting:
-        orbits = orbits_at(whole, theta).orbits
-        slopes = whole.slopes(theta, orbits)
-    else:
-        seen, slopes = evaluated(whole, theta)
-        orbits = orbits_of(whole, theta, seen)
+    (orbits, _), slopes = orbits_and_slopes(whole, theta)
     exists, hits = np.isfinite(orbits.x[:, 0]), ~whole.data.row.free
     slow, touching = _grazes(orbits.x, orbits.approach, whole.local(theta), whole.data.row, table.drive)
     near_fold = hits & (np.abs(orbits.fold) < NEAR_FOLD)
@@ -109,6 +105,15 @@ def amplitude_gradients(
     gradient[[reason is not None for reason in reasons]] = np.nan
     predicted = np.where(exists[:, None], orbits.readings[:, :2], np.nan)
     return AmplitudeGradients(names, predicted, gradient, tuple(reasons))
+
+
+def orbits_and_slopes(model: Model, theta: Float[np.ndarray, " k"]) -> tuple[Found, Float[np.ndarray, "rows 3 k"]]:
+    """Return the orbits of a model's rows at unknowns, and the derivatives of the readings by these."""
+    if model.law.lasting:
+        found = orbits_at(model, theta)
+        return found, model.slopes(theta, found.orbits)
+    seen, slopes = evaluated(model, theta)
+    return Found(orbits_of(model, theta, seen), seen.orbits), slopes
 
 
 def _own_parameters(model: str, values: Mapping[str, float], fixed: Mapping[str, float]) -> tuple[str, ...]:

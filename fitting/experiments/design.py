@@ -237,12 +237,12 @@ def design(  # noqa: PLR0913
     check_parameter("noise", noise, "between 0 and 1")
     check_parameter("largest_nm", largest_nm, "positive", optional=True)
     check_parameter("phase_noise_deg", phase_noise_deg, "positive")
-    errors_of = {"noise": float(noise), "phase_noise_deg": phase_noise_deg}
-    candidates = candidates_of(prior, drives, amplitudes=amplitudes, largest_nm=largest_nm or np.inf, **errors_of)
+    reading: dict[str, Any] = {"noise": noise, "phase_noise_deg": phase_noise_deg, "amplitudes": amplitudes}
+    candidates = candidates_of(prior, drives, largest_nm=largest_nm or np.inf, **reading)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
     matters = np.array([name in interest for name in names])
     chosen = usable[choose_points(prior.information, each[usable], points, matters)]
-    errors = forecast(prior, candidates, chosen, **errors_of)
+    errors = forecast(prior, candidates, chosen, **reading)
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
     reasons, warnings = [], list(prior.notes)
     if not len(chosen):
