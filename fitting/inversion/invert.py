@@ -18,9 +18,9 @@ from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import filled
 from afm_jax.words import bullets, with_error
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
-from fitting.models import readings_of
+from fitting.models import constraints_of, readings_of
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable, TableLike, as_table, check_quality_factor
+from fitting.tables.table import AmplitudeTable, TableLike, as_table
 
 _BLOCK = 64
 """Rows come filled up to a multiple of this, so that one program serves most tables."""
@@ -168,7 +168,6 @@ def invert(table: TableLike) -> Inversion:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
-    check_quality_factor(table)
     require_float64()
     if table.tapping:
         raise TableError(
@@ -184,13 +183,11 @@ def invert(table: TableLike) -> Inversion:
             "use `afm-jax fit`"
         )
     read = np.where(measured, value, 1.0)[chosen], np.where(measured, error, np.inf)[chosen]
+    stated = constraints_of(table, None)
     known = _EXACT | {"quality_factor": table.quality_factor, "free_frequency_khz": table.free_frequency_khz}
-    known |= {name: value for name, (value, _) in table.calibration.items()}
-    errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": table.free_frequency_error_khz}
-    errors |= {name: error for name, (_, error) in table.calibration.items()}
-    errors = {name: error for name, error in errors.items() if error}
+    known |= {name: value for name, (value, _) in stated.items()}
     found = _inverted(table, chosen, *read, known)
-    moved = [_inverted(table, chosen, *read, known | {name: known[name] + e}) for name, e in errors.items()]
+    moved = [_inverted(table, chosen, *read, known | {name: sum(both)}) for name, both in stated.items()]
     good = np.logical_and.reduce([one.converged for one in (found, *moved)])
     rows = chosen[good]
 
@@ -218,7 +215,7 @@ def invert(table: TableLike) -> Inversion:
         collision_delay_us=delay,
         covariance=covariance,
         shared=shared,
-        shared_names=tuple(errors),
+        shared_names=tuple(stated),
         note=tuple(note),
         in_lines=np.isin(np.arange(table.rows), rows[fast]),
         lines=lines,
