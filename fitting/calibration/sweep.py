@@ -24,6 +24,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -49,20 +50,15 @@ DENSITY = "nm/sqrt(Hz)"
 """The unit that makes a sweep a thermal spectrum."""
 
 
+_SIZE: dict[str, Any] = {"kind": "not negative", "meaning": "amplitude", "needed": "amplitude"}
 SWEEP = Form(
     (
         Column("frequency_khz", needed="frequency"),
         Column("frequency_hz", meaning="frequency_khz", needed="frequency", convert=lambda hertz: 1e-3 * hertz),
-        Column("amplitude_nm", kind="not negative", meaning="amplitude", needed="amplitude"),
-        Column("amplitude", kind="not negative", needed="amplitude"),
-        Column("asd_nm_per_sqrt_hz", kind="not negative", meaning="amplitude", needed="amplitude"),
-        Column(
-            "psd_nm2_per_hz",
-            kind="not negative",
-            meaning="amplitude",
-            needed="amplitude",
-            convert=lambda power: np.sqrt(np.maximum(power, 0.0)),
-        ),
+        Column("amplitude_nm", **_SIZE),
+        Column("amplitude", **_SIZE),
+        Column("asd_nm_per_sqrt_hz", **_SIZE),
+        Column("psd_nm2_per_hz", convert=lambda power: np.sqrt(np.maximum(power, 0.0)), **_SIZE),
         Column("phase_deg", kind="number"),
         Column("amplitude_error_nm", meaning="amplitude_error"),
         Column("amplitude_error"),
@@ -165,14 +161,8 @@ class ResonanceSweep(Result):
         return (2.0 * self.frequency_khz - start - end) / max(end - start, 1e-300)
 
     def within(self, low_khz: float, high_khz: float) -> "ResonanceSweep":
-        """Return the points between two frequencies; of a spectrum those that are above zero.
-
-        Raises:
-            TableError: if there are none.
-        """
+        """Return the points between two frequencies; of a spectrum those that are above zero."""
         kept = (self.frequency_khz >= low_khz) & (self.frequency_khz <= high_khz) & (self.amplitude > 0.0)
-        if not kept.any():
-            raise TableError(f"{self.source}: there is no point between {low_khz:g} and {high_khz:g} kHz")
         columns = {name: getattr(self, name) for name in (*_COLUMNS, "lines")}
         return replace(self, **{name: None if column is None else column[kept] for name, column in columns.items()})
 

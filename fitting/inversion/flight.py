@@ -163,7 +163,7 @@ def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
     good = (distance(ends, box) < 1e-6) & (impact[:, :2] > 0.0).all(axis=1)
     good &= np.isfinite(covariance).all(axis=(1, 2))
     # of equally good ones that with the shortest contact
-    response = np.asarray(each.order * each.platform.period_us)
+    response = np.repeat(np.asarray(rows.order * rows.platform.period_us), len(_ANGLES))
     score = np.where(good, ends.chi2 + 1e-3 * (impact[:, 2] / response) ** 2, np.inf).reshape(len(height), -1)
     best = np.argmin(score, axis=1) + len(_ANGLES) * np.arange(len(score))
     return Inverted(impact[best], covariance[best], ends.chi2[best], good[best])

@@ -249,14 +249,15 @@ def _inverted(
     """Return some rows inverted with an instrument; `value` and `error` are what they read."""
     per_nm = np.array([instrument["tip_calibration"], instrument["tip_calibration"], 1.0])
     zero = np.array([0.0, 0.0, instrument["phase_zero_deg"]])
-    amplitude = (instrument["drive_calibration"] * table.excitation_nm)[chosen]
-    offset = (instrument["offset_origin_nm"] + table.offset_nm)[chosen]
-    # every field an array of the rows' shape, for `vmap`
-    platform = Platform(amplitude, table.drive_frequency_khz[chosen], offset, np.zeros(chosen.size))
-    columns = (table.order[chosen].astype(float), (value - zero) / per_nm, error / per_nm)
-    rows = MeasuredRow(platform, *map(jnp.asarray, columns))
     size = -(-chosen.size // _BLOCK) * _BLOCK
-    rows = jax.tree.map(lambda part: filled(jnp.asarray(part), size), rows)
+    amplitude = instrument["drive_calibration"] * table.excitation_nm
+    offset = instrument["offset_origin_nm"] + table.offset_nm
+    drive = (part[chosen] for part in (amplitude, table.drive_frequency_khz, offset, table.order.astype(float)))
+    columns = (*drive, (value - zero) / per_nm, error / per_nm)
+    amplitude, frequency, offset, order, read, spread = (jnp.asarray(filled(column, size)) for column in columns)
+    # every field an array of the rows' shape, for `vmap`
+    platform = Platform(amplitude, frequency, offset, offset_rate_nm_per_us=jnp.zeros(size))
+    rows = MeasuredRow(platform, order, read, spread)
     cantilever = Cantilever(instrument["free_frequency_khz"], instrument["quality_factor"], table.mass_ng)
     return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
 
