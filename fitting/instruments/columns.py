@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from fitting.instruments.recording import UNITS, Recording, Segment, unit_named
+from fitting.instruments.recording import UNITS, Recording, Segment, quantity_of, unit_named
 from fitting.tables.csv_text import NUMBER, TableError
 
 ROLES = {
@@ -59,11 +59,26 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
             raise ValueError(f"there is no column `{column}`; it is one of {', '.join(ROLES)}")
         if column in found:
             raise ValueError(f"the column `{column}` is there twice; approach and retract are {column}=OUT/BACK")
-        if units and UNITS.get(units[0], ("",))[0] not in ROLES[column][0]:
+        if units and quantity_of(units[0]) not in ROLES[column][0]:
             known = ", ".join(unit for unit, (what, _) in UNITS.items() if what in ROLES[column][0])
             raise ValueError(f"`{units[0]}` is no unit of {column}; write one of {known}")
         found[column] = ColumnSource(channel, units[0] if units else "", factors[0] if factors else None)
     return found
+
+
+def checked_unit(unit: str, role: str, channel: str, source: str) -> str:
+    """Return the unit of a channel for a column.
+
+    Raises:
+        TableError: if the column has none such.
+    """
+    if quantity_of(unit) not in ROLES[role][0]:
+        usual = "deg" if role == "phase_lag_deg" else "nm"
+        raise TableError(
+            f"{source}: the channel {channel} has the unit {unit!r}, which is none of {role}; say "
+            f'`columns="{role}={channel}:{usual}"`'
+        )
+    return unit
 
 
 _EIGHT = 8

@@ -53,6 +53,11 @@ def unit_named(text: str) -> str:
     return _SPELLINGS.get(plain, plain)
 
 
+def quantity_of(unit: str) -> str:
+    """Return what a unit measures; empty of one that is not in `UNITS`."""
+    return UNITS.get(unit, ("", 1.0))[0]
+
+
 @dataclass(frozen=True)
 class Known:
     """Something known about a measurement, and where it comes from.

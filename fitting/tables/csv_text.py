@@ -535,7 +535,7 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     return None
 
 
-def _cells(text: str, separator: str) -> list[str]:
+def cells_of(text: str, separator: str) -> list[str]:
     """Return the cells of one line, without the spaces and quotation marks around them."""
     # instruments end their lines with a tab, and put several spaces between columns
     text = text.rstrip(" ").removesuffix("\t") if separator == "\t" else text
@@ -561,7 +561,7 @@ def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns,
     if form.separator == "," and _separator_of(text) != ",":
         message = "the columns are not separated by commas; separate them by commas, decimals by points"
         Faults(faults.source).fail(message, line=line)
-    names, found = _cells(text, form.separator), faults.count
+    names, found = cells_of(text, form.separator), faults.count
     _check_names(names, form, line, faults)
     if not rows[1:] and faults.count == found:
         message = f"there are column names but no rows below them; add a row for each {form.row}"
@@ -587,7 +587,7 @@ def _table_of(rows: NumberedLines, width: int, separator: str, faults: Faults) -
     """Return the cells of rows, numbered, after noting and leaving out those of another number of cells."""
     table = []
     for line, text in rows:
-        cells = _cells(text, separator)
+        cells = cells_of(text, separator)
         if text.count('"') % 2:
             faults.add("a quotation mark is not closed; close or remove it", line=line)
         elif len(cells) != width:
