@@ -32,7 +32,7 @@ from fitting.instruments.columns import (
     turns_of,
 )
 from fitting.instruments.formats import read_recording
-from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, sense_of_phase
+from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, free_lag_deg, sense_of_phase
 from fitting.instruments.recording import (
     ASSUMED_RESONANCE,
     UNITS,
@@ -191,7 +191,7 @@ def read_curves(
     recording = read_recording(path)
     _refuse_others(recording)
     stated = any(segment.branch for segment in recording.segments)
-    recording, wanted = laid_out(recording, wanted)
+    recording = laid_out(recording, wanted)
     known = dict(recording.known)
     known["drive"] = Known(drive, "", "option `drive=...`") if drive else Known("base", "", _ASSUMED_BASE)
     known |= given
@@ -199,11 +199,12 @@ def read_curves(
         # lock-ins are tuned to the resonance before a curve is taken
         free = known["free_frequency_khz"]
         known["drive_frequency_khz"] = Known(free.value, "kHz", ASSUMED_RESONANCE)
-    places = list(dict.fromkeys(segment.curve for segment in recording.segments))
+    numbered: dict[int, list[Segment]] = {}
+    for segment in recording.segments:
+        numbered.setdefault(segment.curve, []).append(segment)
     curves = []
-    for place in places:
-        segments = [segment for segment in recording.segments if segment.curve == place]
-        curve = _joined(recording, segments, wanted, known, len(places))
+    for segments in numbered.values():
+        curve = _joined(recording, segments, wanted, known, len(numbered))
         if curve.amplitude is not None:
             _check_mode(recording)
         said = {role for role, source in wanted.items() if source.factor is not None}
@@ -433,14 +434,14 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
     amplitude = curve.amplitude
     if amplitude is None:
         return curve
-    if curve.amplitude_unit == "V" and "nm_per_volt" in curve.known:
-        scale = float(curve.known["nm_per_volt"].value)
-        amplitude = amplitude * scale
-        curve = replace(curve, amplitude=amplitude, amplitude_unit="nm")
+    scale = curve.known.get("nm_per_volt") if curve.amplitude_unit == "V" else None
+    slope = _mean_slope(_looks(curve)) if of_slope else None
+    if slope is not None:
+        scale = _scale_of_slope(curve, slope, _looks(curve))
+        curve = replace(curve, known=curve.known | {"nm_per_volt": scale})
+    if scale is not None:
+        curve = replace(curve, amplitude=amplitude * float(scale.value), amplitude_unit="nm")
     looks = _looks(curve)
-    slope = _mean_slope(looks)
-    if of_slope and slope is not None:
-        curve, looks = _scaled_by_slope(curve, amplitude, slope, looks)
     free = np.zeros(len(curve.offset_nm), dtype=bool)
     for branch, look in looks.items():
         free[np.flatnonzero(curve.branch == branch)[look.free]] = True
@@ -455,10 +456,12 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
-    looks, amplitude, lag = {}, curve.amplitude, curve.phase_lag_deg
-    for branch in dict.fromkeys(curve.branch.tolist()) if amplitude is not None else ():
+    if curve.amplitude is None:
+        return {}
+    looks, lag = {}, curve.phase_lag_deg
+    for branch in dict.fromkeys(curve.branch.tolist()):
         mask = curve.branch == branch
-        looks[branch] = look_at(curve.offset_nm[mask], amplitude[mask], None if lag is None else lag[mask])
+        looks[branch] = look_at(curve.offset_nm[mask], curve.amplitude[mask], None if lag is None else lag[mask])
     return looks
 
 
@@ -478,13 +481,8 @@ def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))
 
 
-def _scaled_by_slope(
-    curve: MeasuredCurve,
-    amplitude: Float[np.ndarray, " rows"],
-    slope: tuple[float, float],
-    looks: Mapping[str, BranchLook],
-) -> tuple[MeasuredCurve, dict[str, BranchLook]]:
-    """Return the curve with the amplitude scaled such that it falls by 1 nm per nm in contact."""
+def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Mapping[str, BranchLook]) -> Known:
+    """Return the scale with which the amplitude falls by 1 nm per nm in contact."""
     scale, share = 1.0 / abs(slope[0]), slope[1] / abs(slope[0])
     parts = " and ".join(
         f"{look.slope.rows} rows of the {branch} from {look.slope.from_nm:.2f} to {look.slope.to_nm:.2f} nm"
@@ -495,9 +493,7 @@ def _scaled_by_slope(
         f"measured: slope of the steepest settled part ({parts}), taken as 1 nm per nm (a hard sample); unit "
         f"{curve.amplitude_unit}"
     )
-    known = curve.known | {"nm_per_volt": Known(scale, f"nm/{curve.amplitude_unit}", origin, scale * share)}
-    scaled = replace(curve, amplitude=amplitude * scale, amplitude_unit="nm", known=known)
-    return scaled, _looks(scaled)
+    return Known(scale, f"nm/{curve.amplitude_unit}", origin, scale * share)
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
@@ -555,22 +551,18 @@ def _noise(looks: Mapping[str, BranchLook]) -> float:
 
 def _with_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> MeasuredCurve:
     """Return the curve with heights that count from the rest position of the tip, as far as that can be told."""
-    given, level = curve.number("offset_origin_nm"), curve.number("free_amplitude_nm")
-    if given is not None:
-        origin = curve.known["offset_origin_nm"]
-        return replace(
-            curve,
-            offset_nm=curve.offset_nm - given,
-            known=curve.known | {"offset_origin_nm": replace(origin, error=origin.error or _ASSUMED_ORIGIN_NM)},
-        )
+    given, level = curve.known.get("offset_origin_nm"), curve.number("free_amplitude_nm")
     onsets = [look.onset_nm for branch, look in sorted(looks.items()) if look.onset_nm is not None]
-    if not onsets or level is None or curve.amplitude_unit != "nm":
+    if given is not None:
+        origin = replace(given, error=given.error or _ASSUMED_ORIGIN_NM)
+    elif onsets and level is not None and curve.amplitude_unit == "nm":
+        how = "measured: where the amplitude begins to fall the free tip just touches (-free_amplitude_nm)"
+        error = float(np.hypot(_ASSUMED_ORIGIN_NM, np.ptp(onsets)))
+        origin = Known(float(onsets[0] + level), "nm", f"{how}; error assumed", error)
+    else:
         return curve
-    height = float(onsets[0] + level)
-    error = float(np.hypot(_ASSUMED_ORIGIN_NM, np.ptp(onsets)))
-    how = "measured: where the amplitude begins to fall the free tip just touches (-free_amplitude_nm); error assumed"
-    known = curve.known | {"offset_origin_nm": Known(height, "nm", how, error)}
-    return replace(curve, offset_nm=curve.offset_nm - height, known=known)
+    known = curve.known | {"offset_origin_nm": origin}
+    return replace(curve, offset_nm=curve.offset_nm - float(origin.value), known=known)
 
 
 _RADIANS_DEG = 30.0
@@ -586,10 +578,12 @@ def _with_sense_of_phase(curve: MeasuredCurve, looks: Mapping[str, BranchLook], 
     phase, readings = curve.phase_lag_deg, _phase_readings(curve, looks)
     if phase is None:
         return curve
+    # as the curve keeps it, it is a lag
+    sense_known = Known("lag", "", f"option: the file's phase is a {stated}")
+    known = curve.known | ({"phase_sense": sense_known} if stated else {})
     if readings is None or not curve.free.any():
         # frequency and Q, which tell the zero, are not known
-        sign = SENSES.get(stated, 1.0)
-        return replace(curve, phase_lag_deg=sign * phase, known=curve.known | _known_sense(stated))
+        return replace(curve, phase_lag_deg=SENSES.get(stated, 1.0) * phase, known=known)
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
     near = abs(np.rad2deg(abs(level)) - lag) < _RADIANS_DEG < lag
@@ -598,24 +592,16 @@ def _with_sense_of_phase(curve: MeasuredCurve, looks: Mapping[str, BranchLook], 
             f"{printable(curve.source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "
             'degrees: it is in radians; say `columns="phase_lag_deg=CHANNEL:rad"`'
         )
-    of_lever = [
-        0.5 * (changed(1.0 + error).free_lag_deg[0] - changed(1.0 - error).free_lag_deg[0])
-        for changed, error in (
-            (lambda by: readings._replace(frequency_ratio=readings.frequency_ratio * by), readings.frequency_error),
-            (lambda by: readings._replace(quality_factor=readings.quality_factor * by), readings.quality_error),
-        )
-    ]
-    error = float(np.linalg.norm([max(scatter, 0.01), *of_lever]))
+    factors = np.array([1.0 + readings.frequency_error, 1.0 - readings.frequency_error])
+    of_ratio = free_lag_deg(readings.drive, readings.frequency_ratio[0] * factors, readings.quality_factor)
+    factors = np.array([1.0 + readings.quality_error, 1.0 - readings.quality_error])
+    of_quality = free_lag_deg(readings.drive, readings.frequency_ratio[0], readings.quality_factor * factors)
+    error = float(np.linalg.norm([max(scatter, 0.01), *(0.5 * np.ptp([of_ratio, of_quality], axis=1))]))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
     sense = sense_of_phase(readings, stated)
-    known = curve.known | _known_sense(stated) | {"phase_zero_deg": Known(sense.zero_deg, "deg", how, error)}
+    known["phase_zero_deg"] = Known(sense.zero_deg, "deg", how, error)
     notes = (*curve.notes, *sense.notes, *((f"Sign: {sense.reason}.",) if sense.reason else ()))
     return replace(curve, phase_lag_deg=sense.lag_deg(phase), known=known, notes=notes)
-
-
-def _known_sense(stated: str) -> dict[str, Known]:
-    """Return that the phase was stated to be a lag or a lead; as the curve keeps it, it is a lag."""
-    return {"phase_sense": Known("lag", "", f"option: the file's phase is a {stated}")} if stated else {}
 
 
 def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> PhaseReadings | None:

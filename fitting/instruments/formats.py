@@ -21,7 +21,6 @@ from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import MOST_VALUES
 from fitting.instruments.recording import (
     HEADER_KEYS,
-    NATIVE,
     UNITS,
     Known,
     Recording,
@@ -33,7 +32,7 @@ from fitting.instruments.recording import (
     package_for,
     unit_named,
 )
-from fitting.tables.csv_text import DECIMAL_COMMA, NUMBER, TableError, cells_of, read_bytes, split_lines
+from fitting.tables.csv_text import DECIMAL_COMMA, NUMBER, TableError, cells_of, read_bytes, split_lines, text_of
 
 _CURVE = {"approach": "approach", "extend": "approach", "fwd": "approach", "forward": "approach"}
 _CURVE |= {"retract": "retract", "bwd": "retract", "backward": "retract"}
@@ -99,25 +98,10 @@ def holds_curves(head: bytes, path: str) -> bool:
     return _parser_of(head, path) not in {parse_nanosurf, parse_nanonis_text, parse_separated, _refuse_arrays}
 
 
-def text_of(data: bytes, name: str) -> str:
-    """Return the text of a file, UTF-8 or Latin-1, with every line end as a newline.
-
-    Raises:
-        TableError: if it is no text.
-    """
-    data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
-    strange = sum(not (letter.isprintable() or letter.isspace()) for letter in text[:2000])
-    if "\0" in text or strange:
-        line = text[: text.index("\0")].count("\n") + 1 if "\0" in text else 1
-        raise TableError(
-            f"{name}, line {line}: is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, "
-            "Nanonis .dat, Gwyddion .gwy, CSV); export it as CSV"
-        )
-    return text
+_NO_TEXT = (
+    "is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, Nanonis .dat, Gwyddion .gwy, CSV); "
+    "export it as CSV"
+)
 
 
 def _columns(
@@ -143,7 +127,7 @@ _NEASNOM_KEYS = {"Tip Frequency:": ("drive_frequency_khz", "Hz")}
 def parse_neasnom(data: bytes, name: str) -> Recording:
     """Read neaSNOM's text: `# key: [unit] values`, a row of names, rows of numbers; amplitudes in nm, phases in rad."""
     header: dict[str, str] = {}
-    comments, lines = split_lines(text_of(data, name))
+    comments, lines = split_lines(text_of(data, name, _NO_TEXT, latin=True))
     for _, comment in comments:
         key, *cells = [cell.strip() for cell in comment.split("\t") if cell.strip()]
         unit = f" {unit_named(cells.pop(0))}" if cells and cells[0].startswith("[") else ""
@@ -189,13 +173,10 @@ _WSXM_KEYS = {
 def parse_wsxm(data: bytes, name: str) -> Recording:
     """Read WSxM: an image with its header (left aside), then curves, each a text header and pairs of doubles (x, y)."""
     header, place = _wsxm_header(data, 0, name)
-    shape = [number_in(header.get(f"Number of {side}", "0")) for side in ("columns", "rows")]
     if b"FZ curve file" not in data[:place]:
-        kind = header.get("Image Data Type", "double")
         sizes = {"double": 8, "float": 4, "integer": 4, "short": 2}
-        if kind not in sizes or None in shape:
-            raise cut_off(name, f"the image has the data type {kind!r}")
-        place += int(shape[0][0] * shape[1][0]) * sizes[kind]  # type: ignore[index]
+        pixels = int(header.get("Number of columns", "0")) * int(header.get("Number of rows", "0"))
+        place += pixels * sizes[header.get("Image Data Type", "double")]
     segments: list[Segment] = []
     units: dict[str, str] = {}
     announced, own = 0, header
@@ -252,7 +233,9 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     mark = data.find(b"#!")
     if mark < 0:
         raise cut_off(name, "the mark '#!' in front of the data is missing")
-    sections, header = _nid_sections(data[:mark].decode("latin-1"))
+    sections = _nid_sections(data[:mark].decode("latin-1"))
+    # of a name the first
+    header = {key: value for _, keys in reversed(sections) for key, value in keys.items()}
     sets = [keys for title, keys in sections if re.fullmatch(r"DataSet-\d+:\d+", title)]
     sizes = [int(keys["Points"]) * int(keys["Lines"]) * (int(keys["SaveBits"]) // 8) for keys in sets]
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
@@ -287,18 +270,16 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
 
 
-def _nid_sections(text: str) -> tuple[list[tuple[str, dict[str, str]]], dict[str, str]]:
-    """Return the sections in order, each with its keys, and all keys together (the first of a name)."""
+def _nid_sections(text: str) -> list[tuple[str, dict[str, str]]]:
+    """Return the sections in order, each with its keys."""
     sections: list[tuple[str, dict[str, str]]] = []
-    together: dict[str, str] = {}
     for line in text.split("\r\n"):
         if line.startswith("[") and line.endswith("]"):
             sections.append((line[1:-1], {}))
         elif sections and "=" in line:
             key, _, value = line.partition("=")
             sections[-1][1].setdefault(key, value)
-            together.setdefault(key, value)
-    return sections, together
+    return sections
 
 
 def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -315,7 +296,7 @@ def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, 
 
 def parse_nanonis_text(data: bytes, name: str) -> Recording:
     """Read Nanonis text: a header of tab-separated lines, `[DATA]`, names with units in brackets, rows of numbers."""
-    lines = text_of(data, name).split("\n")
+    lines = text_of(data, name, _NO_TEXT, latin=True).split("\n")
     start = next(place for place, line in enumerate(lines) if line.strip() == "[DATA]")
     header = {key: value for key, value, *_ in (line.split("\t") for line in lines[:start] if "\t" in line)}
     rows = [
@@ -366,12 +347,14 @@ def _name_and_unit(text: str) -> tuple[str, str]:
 
 def parse_separated(data: bytes, name: str) -> Recording:
     """Read text separated by tabs, semicolons, commas or blanks, with decimal commas where these do not separate."""
-    comments, rows = split_lines(text_of(data, name))
+    comments, rows = split_lines(text_of(data, name, _NO_TEXT, latin=True))
     if not rows:
         raise TableError(f"{name}: the file holds only comments; add rows of numbers")
     # the last row may be cut off
     separator = _separator_of(rows[len(rows) // 2][1])
-    cells = [(number, cells_of(line, separator)) for number, line in rows]
+    # a tab that ends a row is a blank cell where the first row ends without
+    ending = "\t" if separator == "\t" and not rows[0][1].endswith("\t") else ""
+    cells = [(number, cells_of(line + ending, separator)) for number, line in rows]
     if separator != ",":
         cells = [(line, [_with_point(cell) for cell in row]) for line, row in cells]
     names = cells[0][1]
@@ -393,7 +376,7 @@ def parse_separated(data: bytes, name: str) -> Recording:
     pairs = [re.split(r"\s*[=:]\s*", comment, maxsplit=1) for _, comment in comments]
     settings = {pair[0]: pair[1] for pair in pairs if len(pair) == 2}
     # this package's own table says in which unit a key is by its name
-    keys = {key: (key, NATIVE.get(quantity, "")) for key, quantity in HEADER_KEYS.items() if key != "temperature_k"}
+    keys = {key: (key, unit) for key, unit in HEADER_KEYS.items()}
     segments = _by_branch(cells, titles, {plain: columns[title] for title, plain, _ in named})
     return Recording("separated text", name, segments, units, known_from(settings, keys), settings=settings)
 
@@ -450,13 +433,29 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
         warnings.simplefilter("ignore", RuntimeWarning)
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
-    # of a side's labels the first is its own; behind a text's NUL earlier texts are left over
-    texts = [bytes(label).partition(b"\0")[0] for label in wave["labels"][min(numbers.ndim - 1, 2)][1:]]
-    labels = [_decoded(text) or f"channel {number}" for number, text in enumerate(texts, start=1)]
+    labels = _igor_labels(data, wave["bin_header"], min(numbers.ndim - 1, 2))
     note = bytes(wave["note"]).decode("latin-1").replace("\r", "\n")
     header = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in note.split("\n") if ":" in line)}
     known = known_from(header, _IGOR_KEYS, "note")
     return numbers, labels, header, known | _igor_free(header, known)
+
+
+def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
+    """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
+
+    What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it); a field without NUL
+    goes on in the next one.
+    """
+    sizes = [int(size) for size in header.get("dimLabelsSize", ())]
+    parts = [header.get(f"{part}Size", 0) for part in ("wfm", "formula", "note", "dataEUnits", "dimEUnits")]
+    # behind a header of 64 bytes; version 5 is the only one with labels
+    start = 64 + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
+    labels = [b""]
+    for place in range(start, start + sum(sizes[side : side + 1]), 32):
+        text, end, _ = data[place : place + 32].partition(b"\0")
+        labels[-1] += text
+        labels += [b""] if end else []
+    return [_decoded(label) or f"channel {number}" for number, label in enumerate(labels[1:-1], start=1)]
 
 
 def _decoded(text: bytes) -> str:

@@ -320,7 +320,7 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
         raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
 
 
-_AS_CSV = "save the table as CSV with the encoding UTF-8"
+_AS_CSV = "is not UTF-8 text; save the table as CSV with the encoding UTF-8"
 _A_FIT = "give the fit.json of `afm-jax fit --out`"
 
 
@@ -332,7 +332,7 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
     """
     name = printable(str(path))
     try:
-        found = json.loads(read_text(path, _A_FIT))
+        found = json.loads(read_text(path, f"is not UTF-8 text; {_A_FIT}"))
     except json.JSONDecodeError as error:
         raise TableError(f"{name}, line {error.lineno}: is no JSON; {_A_FIT}") from None
     except RecursionError:
@@ -343,36 +343,42 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
     return found
 
 
-def read_text(path: str | Path, mend: str = _AS_CSV) -> str:
+def read_text(path: str | Path, wrong: str = _AS_CSV) -> str:
     """Return the text of a UTF-8 file, with or without a byte order mark, with every line end as a newline.
 
     Args:
         path: the file.
-        mend: what to do where it is not UTF-8.
+        wrong: what is said where it is not UTF-8, with what to do.
 
     Raises:
         TableError: if there is no such file, it cannot be read or is not UTF-8 text.
     """
-    return text_of(read_bytes(path, "a CSV file"), path, mend)
+    return text_of(read_bytes(path, "a CSV file"), path, wrong)
 
 
-def text_of(data: bytes, path: str | Path, mend: str = _AS_CSV) -> str:
-    """Return the text that the bytes of a file are; see `read_text`.
+def text_of(data: bytes, path: str | Path, wrong: str, *, latin: bool = False) -> str:
+    """Return the text of a file's bytes; see `read_text`.
+
+    Args:
+        data: the bytes.
+        path: the file.
+        wrong: what is said where they are no text, with what to do.
+        latin: whether what is not UTF-8 is taken as Latin-1.
 
     Raises:
-        TableError: if they are not UTF-8 text.
+        TableError: if they are no text.
     """
-    name = printable(str(path))
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     try:
         text = data.decode("utf-8-sig")
         # UTF-16 of plain English is valid UTF-8 with a zero byte in front of every letter.
         start = text.find("\0")
     except UnicodeDecodeError as error:
-        text, start = data[: error.start].decode("utf-8", errors="replace"), error.start
+        text = data.decode("latin-1")
+        start = text.find("\0") if latin else error.start
     if start >= 0:
         line = text.count("\n", 0, start) + 1
-        raise TableError(f"{name}, line {line}: is not UTF-8 text; {mend}")
+        raise TableError(f"{printable(str(path))}, line {line}: {wrong}")
     return text
 
 

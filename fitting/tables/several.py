@@ -62,7 +62,9 @@ class SeveralTables:
         """
         known: dict[tuple[bytes, ...], str] = {}
         for table, label in zip(self.tables, self.labels, strict=True):
-            other = known.setdefault(_readings(table), label)
+            # noise alone makes no two measurements alike
+            columns = [getattr(table, name) for name in _READINGS]
+            other = known.setdefault(tuple(b"" if one is None else one.tobytes() for one in columns), label)
             if other is not label:
                 raise ValueError(f"{label} holds the same readings as {other}; give each table once")
 
@@ -141,12 +143,8 @@ class SeveralTables:
         return np.concatenate([np.zeros(t.rows) if t.no_orbit is None else t.no_orbit for t in self.tables])
 
 
-def _readings(table: AmplitudeTable) -> tuple[bytes, ...]:
-    """Return what tells tables apart: noise alone makes no two measurements alike."""
-    names = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
-    return tuple(b"" if (column := getattr(table, name)) is None else column.tobytes() for name in names)
-
-
+_READINGS = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
+"""What tells tables apart."""
 _SAME_MASS = 0.01
 """Relative difference of masses that is none: they come of spring constants."""
 
