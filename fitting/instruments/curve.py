@@ -44,7 +44,7 @@ from fitting.instruments.recording import (
     refuse_other_modes,
 )
 from fitting.parameters import USUAL_ERRORS
-from fitting.tables.csv_text import TableError
+from fitting.tables.csv_text import TableError, setting_line
 
 FORMAT_VERSION = 1
 OPTIONS = {
@@ -387,16 +387,15 @@ def _runs_away(curve: MeasuredCurve) -> bool:
 
 def _renamed(curve: MeasuredCurve) -> MeasuredCurve:
     """Return a curve with approach and retract exchanged, where its heights fall in the one and rise in the other."""
-    ends = _ends(curve)
-    if any((last >= first) == (name == "approach") for name, (first, last) in ends.items()):
+    if any(_as_named(curve)):
         return curve
     return replace(curve, branch=np.where(curve.branch == "approach", "retract", "approach"))
 
 
-def _ends(curve: MeasuredCurve) -> dict[str, tuple[float, float]]:
-    """Return the first and the last height of every branch."""
+def _as_named(curve: MeasuredCurve) -> list[bool]:
+    """Say of every branch whether its heights rise in an approach, or fall in a retract."""
     heights = {name: curve.offset_nm[curve.branch == name] for name in dict.fromkeys(curve.branch.tolist())}
-    return {name: (float(one[0]), float(one[-1])) for name, one in heights.items()}
+    return [bool(one[-1] >= one[0]) == (name == "approach") for name, one in heights.items()]
 
 
 _TURNED = "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
@@ -609,7 +608,6 @@ def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Ph
     drive, free, quality = (curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz", "quality_factor"))
     if curve.phase_lag_deg is None or curve.amplitude is None or drive is None or free is None or quality is None:
         return None
-
     known = [(key, curve.known[key]) for key in ("free_frequency_khz", "quality_factor")]
     errors = [USUAL_ERRORS[key] if one.error is None else one.error / float(one.value) for key, one in known]
     ones = np.ones(len(curve.offset_nm))
@@ -721,8 +719,7 @@ def _rows(curve: MeasuredCurve) -> Binned:
     if curve.bin_nm is None:
         count = np.ones(len(curve.offset_nm), dtype=int)
         rows = {name: np.full(len(count), error) for name, error in errors.items()}
-        ways = all((last > first) == (name == "approach") for name, (first, last) in _ends(curve).items())
-        in_order = ways and not any(faults_of_order(curve.offset_nm, curve.branch))
+        in_order = all(_as_named(curve)) and not any(faults_of_order(curve.offset_nm, curve.branch))
         return Binned(curve.offset_nm, readings, rows, count, curve.branch, in_order)
     stated = {name: errors[name] for name, one in single.items() if not curve.bin_nm or one.origin.startswith("option")}
     means = binned(curve.offset_nm, readings, curve.branch, curve.free, curve.bin_nm, stated)
@@ -735,22 +732,14 @@ def _rows(curve: MeasuredCurve) -> Binned:
 
 def _setting_lines(curve: MeasuredCurve) -> list[str]:
     """Return the comment lines that a table understands."""
-    lines = []
-    for key in (
-        "free_frequency_khz",
-        "quality_factor",
-        "spring_constant_n_per_m",
-        "offset_origin_nm",
-        "phase_zero_deg",
-    ):
-        known = curve.known.get(key)
-        if known is not None and (known.error or key in _WANTED or key in _NEEDED):
-            value = known.value if key in _WANTED or key in _NEEDED else 0
-            lines.append(f"# {key} = {value!r}" + (f" +- {known.error!r}" if known.error else ""))
+    lever, zeros = ("free_frequency_khz", *_WANTED), ("offset_origin_nm", "phase_zero_deg")
+    known = {key: curve.known[key] for key in (*lever, *zeros) if key in curve.known}
+    lines = [setting_line(key, float(one.value), one.error) for key, one in known.items() if key in lever]
+    lines += [setting_line(key, 0, one.error) for key, one in known.items() if key in zeros and one.error]
     if curve.phase_lag_deg is not None:
         # the zero was set by the free rows: it says nothing of the sign
         lines.append(f"# phase_sense = {'lag' if 'phase_sense' in curve.known else 'either'}")
     scale = curve.known.get("nm_per_volt")
     if scale is not None and scale.error and not isinstance(scale.value, str):
-        lines.append(f"# tip_calibration = 1 +- {scale.error / scale.value!r}")
+        lines.append(setting_line("tip_calibration", 1, scale.error / scale.value))
     return lines

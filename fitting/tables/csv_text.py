@@ -527,6 +527,11 @@ def read_comments(
     return found, tuple(remarks), rows
 
 
+def setting_line(key: str, value: float, error: float | None) -> str:
+    """Return the comment line that makes a setting."""
+    return f"# {key} = {value!r}" + (f" +- {error!r}" if error else "")
+
+
 def fault_in_number(setting: FileSetting, value: float, error: float | None = None) -> str | None:
     """Return what is wrong with a setting's number or its standard error, both in the unit of its key, or None."""
     if not setting.lowest < value < float("inf"):

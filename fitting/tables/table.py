@@ -66,6 +66,7 @@ from fitting.tables.csv_text import (
     read_rows,
     read_text,
     setting_in,
+    setting_line,
 )
 
 LEAST_REPEATS = 4
@@ -674,9 +675,9 @@ def csv_of(table: AmplitudeTable) -> str:
             lines.append("# quality_factor = none")
         # the spring constant says its mass
         elif value is not None and not np.isnan(value) and not (name == "mass_ng" and value == of_spring):
-            lines.append(f"# {name} = {float(value)!r}" + ("" if error is None else f" +- {float(error)!r}"))
+            lines.append(setting_line(name, float(value), error and float(error)))
     known = {name: table.calibration[name] for name in CALIBRATION if name in table.calibration}
-    lines += [f"# {name} = {float(value)!r} +- {float(error)!r}" for name, (value, error) in known.items()]
+    lines += [setting_line(name, float(value), float(error)) for name, (value, error) in known.items()]
     lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
     lines += [f"# phase_sense = {table.phase_sense}"] if table.phase_sense else []
     lines += [f"# {remark}" for remark in table.remarks]
