@@ -734,12 +734,12 @@ def _setting_lines(curve: MeasuredCurve) -> list[str]:
     """Return the comment lines that a table understands."""
     lever, zeros = ("free_frequency_khz", *_WANTED), ("offset_origin_nm", "phase_zero_deg")
     known = {key: curve.known[key] for key in (*lever, *zeros) if key in curve.known}
-    lines = [setting_line(key, float(one.value), one.error) for key, one in known.items() if key in lever]
-    lines += [setting_line(key, 0, one.error) for key, one in known.items() if key in zeros and one.error]
+    lines = [setting_line(key, one.value, one.error) for key, one in known.items() if key in lever]
+    lines += [setting_line(key, "0", one.error) for key, one in known.items() if key in zeros and one.error]
     if curve.phase_lag_deg is not None:
         # the zero was set by the free rows: it says nothing of the sign
         lines.append(f"# phase_sense = {'lag' if 'phase_sense' in curve.known else 'either'}")
     scale = curve.known.get("nm_per_volt")
     if scale is not None and scale.error and not isinstance(scale.value, str):
-        lines.append(setting_line("tip_calibration", 1, scale.error / scale.value))
+        lines.append(setting_line("tip_calibration", "1", scale.error / scale.value))
     return lines

@@ -527,9 +527,9 @@ def read_comments(
     return found, tuple(remarks), rows
 
 
-def setting_line(key: str, value: float, error: float | None) -> str:
+def setting_line(key: str, value: float | str, error: float | None) -> str:
     """Return the comment line that makes a setting."""
-    return f"# {key} = {value!r}" + (f" +- {error!r}" if error else "")
+    return f"# {key} = {value}" + (f" +- {error!r}" if error else "")
 
 
 def fault_in_number(setting: FileSetting, value: float, error: float | None = None) -> str | None:
