@@ -83,16 +83,14 @@ def test_width_of_the_band_is_the_worst_over_the_measured_speeds():
     width = band_width(dataclasses.replace(fit, law=law))
     assert width is not None
     # the fastest row lies between two points of the law, over which the share rises by a hundredth of itself
-    assert width.worst == pytest.approx(0.1, rel=1e-2)
-    assert (width.slowest_nm_per_us, width.fastest_nm_per_us) == (SPEEDS[0], SPEEDS[-1])
-    assert width.worst_at_nm_per_us == SPEEDS[-1]
+    assert width == pytest.approx((SPEEDS[0], SPEEDS[-1], 0.1, SPEEDS[-1]), rel=1e-2)
 
 
 def test_rows_that_were_not_used_do_not_count_as_measured_speeds():
     odd = with_odd_rows()
     width = band_width(odd)
     assert width is not None
-    assert (width.slowest_nm_per_us, width.fastest_nm_per_us) == (40.0, 40.0)
+    assert width[:2] == (40.0, 40.0)
     nothing = dataclasses.replace(odd, rows=dataclasses.replace(odd.rows, used=np.zeros(4, dtype=bool)))
     assert band_width(nothing) is None
     assert all(figure(nothing).axes for figure in (rows_figure, law_figure, speed_figure))

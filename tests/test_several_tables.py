@@ -202,7 +202,7 @@ def test_a_driven_sample_and_a_driven_tip_have_one_law():
     assert steady.sum(axis=1).max() == 1
     kinds = ("drive_lockin_amplitude_nm", "phase_lag_deg")
     amplitude, lag = (np.array([getattr(orbits, kind) for orbits in found])[steady] for kind in kinds)
-    there = steady.any(axis=1)
+    there = np.flatnonzero(steady.any(axis=1))
     tip = rows(tapping, there, lockin_amplitude_nm=amplitude, phase_lag_deg=lag, source="tip.csv")
     one, other = fit([sample, tip]), fit([tip, sample])
     assert one.valid

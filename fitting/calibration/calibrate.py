@@ -16,7 +16,7 @@ from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
-from fitting.calibration.model import ScanFit, chi2_without_resonance, minimum
+from fitting.calibration.model import chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
 from fitting.calibration.sweep import ResonanceSweep, read_sweep, stated_settings
 from fitting.tables.csv_text import TableError
@@ -24,22 +24,10 @@ from fitting.tables.csv_text import TableError
 FORMAT_VERSION = 2
 AIR_K = (296.0, 3.0)
 """Temperature of lever and air where none is given."""
-SCALE_ERROR = (0.05, None)
+SCALE_ERROR = 0.05
 """Relative standard error of the deflection's scale where none is given: force curves repeat it to some per cent."""
-_PEAK = 30.0
-"""Fall of chi2 per unit of chi2/dof that four more parameters practically never bring about by chance."""
-_SYSTEMATIC = 0.5
-"""Correlation of neighbouring residuals beyond which the standard errors mean nothing."""
-_OPEN = 20.0
-"""Variance of a logarithm from which on nothing is determined."""
-_FAST_KHZ = 2e4
-"""The fastest cantilevers resonate at a few MHz."""
-_HALF_WIDTHS = (20.0, 10.0, 5.0, 3.0)
-"""Of a thermal spectrum so much is fitted on both sides of the resonance: as much as the model explains."""
 _LEAST_FREQUENCIES = 6
 """One more than the amplitude has parameters."""
-_LEAST_POINTS = 3
-"""Within the half-width of a scan's resonance."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +36,15 @@ class CalibratedValue:
 
     value: float
     standard_error: float | None
-    interval95: tuple[float | None, float | None]
+    interval95: tuple[float | None, float | None] = (None, None)
     reason: str | None = None
+
+    @property
+    def in_words(self) -> str:
+        """The value with two digits of its error."""
+        if self.standard_error is None:
+            return f"{self.value:.4g}, no calibration"
+        return with_error(self.value, self.standard_error)
 
 
 @public_result(picture="fitting.calibration.picture:calibration_figure")
@@ -70,8 +65,7 @@ class Calibration(Result):
         p_value: probability of a larger chi2 if the model is right; NaN where the errors come from the fit itself.
         residual_autocorrelation: of neighbouring points.
         chi2_without_resonance: of a parabola.
-        left: estimated distance of chi2 to its minimum.
-        fitted: the complex response at every point, or the amplitude, in the sweep's unit.
+        fitted: the response at every point, complex as the phase was measured, or the amplitude, in the sweep's unit.
         sweep: what was fitted; of a spectrum the part around the resonance.
         valid: whether to trust it; `reasons` say why not.
         reasons: what makes the result invalid.
@@ -90,7 +84,6 @@ class Calibration(Result):
     p_value: float
     residual_autocorrelation: float
     chi2_without_resonance: float
-    left: float
     fitted: np.ndarray
     sweep: ResonanceSweep
     valid: bool = False
@@ -103,38 +96,26 @@ class Calibration(Result):
         return next(iter(self.reasons), None)
 
     @property
-    def half_widths(self) -> tuple[float, float]:
-        """How many half-widths f0/2Q the scan reaches below and above the resonance."""
-        half = 0.5 * self.frequency_khz.value / self.quality_factor.value
-        below, above = (self.frequency_khz.value - self.sweep.frequency_khz[[0, -1]]) / half
-        return float(below), -float(above)
-
-    @property
-    def inside(self) -> int:
-        """Points within the half-width."""
-        half = 0.5 * self.frequency_khz.value / self.quality_factor.value
-        return int(np.sum(np.abs(self.sweep.frequency_khz - self.frequency_khz.value) < half))
-
-    @property
     def table_comments(self) -> list[str]:
         """The comment lines that carry the calibration into an amplitude table; none if it is not valid."""
         if not self.valid:
             return []
         # three digits of the error: it enters every amplitude of a table
         places = max(decimals(0.1 * (self.frequency_khz.standard_error or 0.0), unknown=12), 3)
-        lines = [f"# free_frequency_khz = {self.frequency_khz.value:.{places}f}"]
         sure = [one for one in self.spring_constant_n_per_m.values() if one.standard_error is not None]
-        values = {"quality_factor": self.quality_factor, **({"spring_constant_n_per_m": sure[0]} if sure else {})}
-        return lines + [f"# {name} = {with_error(one.value, one.standard_error)}" for name, one in values.items()]
+        return [
+            f"# free_frequency_khz = {self.frequency_khz.value:.{places}f}",
+            f"# quality_factor = {self.quality_factor.in_words}",
+            *(f"# spring_constant_n_per_m = {one.in_words}" for one in sure[:1]),
+        ]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax calibrate`."""
         own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
         values = {name: vars(value) for name, value in own.items() if isinstance(value, CalibratedValue)}
-        springs = {name: vars(value) for name, value in self.spring_constant_n_per_m.items()}
-        more = {"spring_constant_n_per_m": springs, "instrument": self.sweep.instrument}
-        head = {"format": "afm-jax calibrate", "format_version": FORMAT_VERSION}
-        return head | own | values | more | {"table_comments": self.table_comments}
+        values["spring_constant_n_per_m"] = {name: vars(k) for name, k in self.spring_constant_n_per_m.items()}
+        more = {"instrument": self.sweep.instrument, "table_comments": self.table_comments}
+        return {"format": "afm-jax calibrate", "format_version": FORMAT_VERSION} | own | values | more
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of calibration_points.csv: the scan and the fit."""
@@ -142,10 +123,8 @@ class Calibration(Result):
         columns = {"frequency_khz": sweep.frequency_khz, "measured_amplitude": sweep.amplitude}
         columns["fitted_amplitude"] = np.abs(self.fitted)
         if sweep.phase_deg is not None:
-            sign = -1.0 if self.phase_reversed else 1.0
-            fitted = sign * np.angle(self.fitted, deg=True)
             # the turns of the measured phase are kept
-            apart = (fitted - sweep.phase_deg + 180.0) % 360.0 - 180.0
+            apart = np.angle(self.fitted * np.exp(-1j * np.deg2rad(sweep.phase_deg)), deg=True)
             columns |= {"measured_phase_deg": sweep.phase_deg, "fitted_phase_deg": sweep.phase_deg + apart}
         return {"calibration_points.csv": columns}
 
@@ -153,22 +132,18 @@ class Calibration(Result):
         """Return verdict, values, and the lines for an amplitude table."""
         values = {"frequency_khz (kHz)": self.frequency_khz, "quality_factor": self.quality_factor}
         values |= {f"spring constant, {name} (N/m)": one for name, one in self.spring_constant_n_per_m.items()}
-        rows = [{"name": name} | vars(one) for name, one in values.items()]
-        cells: dict[str, Any] = {"of the free cantilever": "name", "value +- standard error": _in_words}
-        fit = f"chi2/dof {self.chi2:.1f}/{self.degrees_of_freedom}, errors: {self.error_origin}"
+        cells: dict[str, Any] = {
+            "of the free cantilever": lambda row: row[0],
+            "value +- standard error": lambda row: row[1].in_words,
+        }
         return [
             f"{'VALID' if self.valid else 'NOT VALID'}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
-            printed_table("", cells, rows),
-            fit,
+            printed_table("", cells, [*values.items()]),
+            f"chi2/dof {self.chi2:.1f}/{self.degrees_of_freedom}, errors: {self.error_origin}",
             *bullets("Reasons:", self.reasons),
             *bullets("Notes:", self.warnings),
             *(["", "For the top of an amplitude table:", *self.table_comments] if self.valid else []),
         ]
-
-
-def _in_words(row: dict[str, Any]) -> str:
-    error = row["standard_error"]
-    return f"{row['value']:.4g}, no calibration" if error is None else with_error(row["value"], error)
 
 
 @checked
@@ -203,9 +178,7 @@ def calibrate(
     sweep = replace(sweep, settings=stated_settings(sweep, settings))
     _check_sweep(sweep)
     found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep)
-    found = replace(found, spring_constant_n_per_m=_springs(found, static=static))
-    reasons, warnings = _why_not_valid(found), (*found.warnings, *_warnings(found))
-    return replace(found, reasons=reasons, warnings=warnings, valid=not reasons)
+    return _judged(replace(found, spring_constant_n_per_m=_springs(found, static=static)))
 
 
 def _check_sweep(sweep: ResonanceSweep) -> None:
@@ -222,66 +195,61 @@ def _check_sweep(sweep: ResonanceSweep) -> None:
 def _fitted(sweep: ResonanceSweep) -> Calibration:
     """Return the fit of a scan or of a part of a spectrum, not yet judged."""
     largest = float(sweep.amplitude.max())
-    known = sweep.averages is not None if sweep.spectrum else sweep.amplitude_error is not None
+    error = np.full(sweep.points, 0.01) if sweep.amplitude_error is None else sweep.amplitude_error / largest
+    stated = sweep.averages if sweep.spectrum else sweep.amplitude_error
     if sweep.spectrum:
-        error = np.full(sweep.points, 1.0 / np.sqrt(sweep.averages or 1.0))
-    elif sweep.amplitude_error is not None:
-        error = np.array(sweep.amplitude_error)
-    else:
-        error = np.full(sweep.points, 0.01 * largest)
+        error = np.full(sweep.points, (sweep.averages or 1.0) ** -0.5)
     fit = minimum(sweep, error)
-    freedom = len(fit.residual) - fit.jacobian.shape[1]
-    chi2 = float(np.sum(fit.residual**2))
+    freedom, chi2 = len(fit.residual) - len(fit.place), float(np.sum(fit.residual**2))
     # without errors they are what makes chi2/dof 1; a scan without noise keeps rounding for an error
-    scale = 1.0 if known else max(chi2 / freedom, 1e-12)
+    scale = max(chi2 / freedom, 1e-12) if stated is None else 1.0
     # the mean of a term of the gamma deviance is a little above 1
     size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages)) if sweep.averages else 1.0
-    together = _autocorrelation(fit, sweep.points)
+    p_value = np.nan if stated is None else chi2_tail(chi2 / size, freedom)
+    together = _autocorrelation(fit.residual.reshape(-1, sweep.points))
     # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
     fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(fit.residual)) < together < 1.0 else 1.0
     covariance = covariance_of(fit.jacobian.T @ fit.jacobian) * scale * fewer
-    p_value = chi2_tail(chi2 / size, freedom) if known else np.nan
-    origin = "averages" if sweep.spectrum else "file"
-    why = "the model does not explain the scan" if p_value < IMPROBABLE else None
+    natural, quality_factor = np.exp(fit.place[:2]).tolist()
+    by_place = np.eye(len(fit.place))
 
-    def stated(value: float, slopes: Float[np.ndarray, " p"]) -> CalibratedValue:
-        """Return a value whose logarithm has these derivatives by the parameters."""
+    def known(value: float, slopes: Float[np.ndarray, " p"]) -> CalibratedValue:
+        """Return a value whose logarithm has these derivatives by the place."""
         used = np.flatnonzero(slopes)
         variance = float(slopes[used] @ covariance[np.ix_(used, used)] @ slopes[used])
-        reason = why if variance < _OPEN else "the scan does not determine it"
-        if reason is not None:
-            return CalibratedValue(value, None, (None, None), reason)
+        # the variance of a logarithm
+        if not variance < 20.0:
+            return CalibratedValue(value, None, reason="the scan does not determine it")
+        if p_value < IMPROBABLE:
+            return CalibratedValue(value, None, reason="the model does not explain the scan")
         return _known_to(value, float(np.sqrt(variance)))
 
-    places = np.eye(fit.jacobian.shape[1])
-    area, slopes = 0.0, places[0] - places[1]
+    mean_square = None
     if sweep.spectrum:
         # the integral of a |L|^2 over all frequencies
-        area = 0.5 * np.pi * 1e3 * fit.frequency_khz / fit.quality_factor * fit.linear[0] * largest**2
-        slopes = slopes + places[2] / fit.linear[0]
+        area = 0.5 * np.pi * 1e3 * natural / quality_factor * fit.place[2] * largest**2
+        mean_square = known(float(area), by_place[0] - by_place[1] + by_place[2] / fit.place[2])
     return Calibration(
-        frequency_khz=stated(fit.frequency_khz, places[0]),
-        quality_factor=stated(fit.quality_factor, places[1]),
-        mean_square_nm2=stated(float(area), slopes) if sweep.spectrum else None,
-        model="power" if sweep.spectrum else "amplitude" if sweep.phase_deg is None else "phase",
-        error_origin=origin if known else "estimated",
+        frequency_khz=known(natural, by_place[0]),
+        quality_factor=known(quality_factor, by_place[1]),
+        mean_square_nm2=mean_square,
+        model=sweep.model,
+        error_origin="estimated" if stated is None else "averages" if sweep.spectrum else "file",
         phase_reversed=fit.reverse,
         chi2=chi2 / scale,
         degrees_of_freedom=freedom,
         p_value=p_value,
         residual_autocorrelation=together,
         chi2_without_resonance=chi2_without_resonance(sweep, error) / scale,
-        left=fit.left / scale,
-        fitted=fit.model * largest,
+        fitted=largest * (np.conj(fit.model) if fit.reverse else fit.model),
         sweep=sweep,
     )
 
 
-def _autocorrelation(fit: ScanFit, points: int) -> float:
+def _autocorrelation(residual: Float[np.ndarray, "kinds points"]) -> float:
     """Return the correlation of residuals of neighbouring points; 0 where there is no misfit but rounding."""
-    blocks = fit.residual.reshape(-1, points)
-    total = float(np.sum(blocks**2))
-    return float(np.sum(blocks[:, 1:] * blocks[:, :-1])) / total if total > 1e-12 * blocks.size else 0.0
+    total = float(np.sum(residual**2))
+    return float(np.sum(residual[:, 1:] * residual[:, :-1])) / total if total > 1e-12 * residual.size else 0.0
 
 
 def _of_spectrum(sweep: ResonanceSweep) -> Calibration:
@@ -297,56 +265,54 @@ def _of_spectrum(sweep: ResonanceSweep) -> Calibration:
     step = float(np.ptp(sweep.frequency_khz)) / (sweep.points - 1)
     low = np.flatnonzero(smooth < 0.5 * (smooth[top] + floor[top]))
     wide = np.min(low[low > top], initial=sweep.points) - np.max(low[low < top], initial=-1)
-    first = (float(sweep.frequency_khz[top]), max(0.5 * float(wide), 3.0) * step)
-    found = _around(sweep, *first, _HALF_WIDTHS[0])
-    for times in _HALF_WIDTHS:
-        centre = min(max(found.frequency_khz.value, sweep.frequency_khz[0]), sweep.frequency_khz[-1])
-        # once more, around the resonance that was found
-        half = max(0.5 * centre / found.quality_factor.value, 3.0 * step)
-        found = _around(sweep, centre, half, times)
-        if not found.p_value < IMPROBABLE:
+    centre, half = sweep.frequency_khz[top], max(0.5 * float(wide), 3.0) * step
+    # a first fit finds the resonance; then as much on both sides of it as the model explains
+    fits: list[Calibration] = []
+    for times in (20.0, 20.0, 10.0, 5.0, 3.0):
+        part = sweep.within(centre - times * half, centre + times * half)
+        _check_sweep(part)
+        fits.append(_fitted(part))
+        if len(fits) > 1 and not fits[-1].p_value < IMPROBABLE:
             break
-    ends = found.sweep.frequency_khz[[0, -1]]
-    note = f"Fitted from {ends[0]:.6g} to {ends[1]:.6g} kHz: what one resonance and white noise explain."
+        centre = np.clip(fits[-1].frequency_khz.value, *sweep.frequency_khz[[0, -1]])
+        half = max(0.5 * centre / fits[-1].quality_factor.value, 3.0 * step)
+    found = fits[-1]
+    low, high = found.sweep.frequency_khz[[0, -1]]
+    note = f"Fitted from {low:.6g} to {high:.6g} kHz: what one resonance and white noise explain."
     return found if found.sweep.points == sweep.points else replace(found, warnings=(note,))
-
-
-def _around(sweep: ResonanceSweep, centre_khz: float, half_khz: float, times: float) -> Calibration:
-    """Return the fit of a spectrum within so many half-widths of a frequency."""
-    part = sweep.within(centre_khz - times * half_khz, centre_khz + times * half_khz)
-    _check_sweep(part)
-    return _fitted(part)
 
 
 def _springs(found: Calibration, *, static: bool) -> dict[str, CalibratedValue]:
     """Return the spring constants that a calibration supports; that by equipartition without error if contradicted."""
-    frequency, quality = found.frequency_khz, found.quality_factor
-    springs, mean = {}, found.mean_square_nm2
+    frequency, quality, mean = found.frequency_khz, found.quality_factor, found.mean_square_nm2
     if quality.standard_error is None or frequency.standard_error is None:
         return {}
-    stated = found.sweep.settings
-    warm = stated.get("temperature_k", AIR_K)
-    if "length_um" in stated:
-        inputs = [(frequency.value, frequency.standard_error), (quality.value, quality.standard_error)]
-        inputs += [stated["length_um"], stated["width_um"], warm]
-        centre = [value for value, _ in inputs]
+    settings, said, springs = found.sweep.settings, found.sweep.instrument.get("spring_constant_n_per_m"), {}
+    warm, warm_error = settings.get("temperature_k", AIR_K)
+    scale_error, _ = settings.get("scale_error", (SCALE_ERROR, None))
+    other = None if said is None else ("the instrument", said, 0.1)
+    if "length_um" in settings:
+        inputs = [(one.value, one.standard_error) for one in (frequency, quality)]
+        inputs += [settings["length_um"], settings["width_um"], (warm, warm_error)]
+        centre = np.array([value for value, _ in inputs])
         value = sader(*centre)
-        moved = [[*centre[:k], one + (error or 0.0), *centre[k + 1 :]] for k, (one, error) in enumerate(inputs)]
-        springs["sader"] = _known_to(value, float(np.sqrt(sum((sader(*one) / value - 1.0) ** 2 for one in moved))))
+        moved = centre + np.diag([error or 0.0 for _, error in inputs])
+        share = float(np.linalg.norm([sader(*place) / value - 1.0 for place in moved]))
+        springs["sader"], other = _known_to(value, share), ("Sader's method", value, share)
     if mean is not None and mean.standard_error is not None:
-        value = equipartition(mean.value, warm[0], static=static)
-        shares = (
-            mean.standard_error / mean.value,
-            (warm[1] or 0.0) / warm[0],
-            2.0 * stated.get("scale_error", SCALE_ERROR)[0],
-        )
-        one, other = _known_to(value, float(np.linalg.norm(shares))), springs.get("sader")
-        said = found.sweep.instrument.get("spring_constant_n_per_m")
+        value = equipartition(mean.value, warm, static=static)
+        shares = (mean.standard_error / mean.value, (warm_error or 0.0) / warm, 2.0 * scale_error)
+        springs["equipartition"] = _known_to(value, float(np.linalg.norm(shares)))
         if other is not None:
-            doubt = _doubt(one, other.value, other.standard_error or 0.0, "Sader's method")
-        else:
-            doubt = None if said is None else _doubt(one, said, 0.1 * said, "the instrument")
-        springs["equipartition"] = one if doubt is None else CalibratedValue(value, None, (None, None), doubt)
+            who, wanted, share = other
+            apart = float(np.log(value / wanted))
+            # neither is better than 5 %
+            if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((*shares, share, 0.05)):
+                doubt = (
+                    f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
+                    f"are {np.exp(-0.5 * apart):.3g} times the true ones"
+                )
+                springs["equipartition"] = CalibratedValue(value, None, reason=doubt)
     return springs
 
 
@@ -356,65 +322,41 @@ def _known_to(value: float, share: float) -> CalibratedValue:
     return CalibratedValue(value, value * share, ends)
 
 
-def _doubt(thermal: CalibratedValue, wanted: float, error: float, who: str) -> str | None:
-    """Return what another spring constant says about the scale of the deflection; None if they agree."""
-    apart = float(np.log(thermal.value / wanted))
-    shares = ((thermal.standard_error or 0.0) / thermal.value, error / wanted, 0.05)
-    if abs(apart) < TWO_SIDED_95 * np.linalg.norm(shares):
-        return None
-    return (
-        f"equipartition gives {thermal.value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm are "
-        f"{np.exp(-0.5 * apart):.3g} times the true ones"
-    )
-
-
-def _why_not_valid(e: Calibration) -> tuple[str, ...]:
-    """Return what makes a calibration invalid: of the faults of its fit the first."""
-    at, near = f"The resonance ({e.frequency_khz.value:.6g} kHz) lies", min(e.half_widths)
-    unknown = e.frequency_khz.reason or e.quality_factor.reason
-    springs = e.spring_constant_n_per_m.values()
-    doubts = [] if any(one.standard_error for one in springs) else [one.reason for one in springs]
-    many = f"chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom"
-    of_fit = (
-        (not e.left < 1e-3, f"Not converged: chi2 lies an estimated {e.left:.2g} above its minimum."),
-        (near < 0.0, f"{at} outside the sweep: sweep around it."),
-        (near < 1.0, f"{at} at the edge of the sweep: sweep at least one half-width (f0/2Q) to both sides."),
-        (
-            e.model != "power" and e.inside < _LEAST_POINTS,
-            f"Only {counted(e.inside, 'point')} within the half-width: sweep in finer steps.",
+def _judged(e: Calibration) -> Calibration:
+    """Return a calibration with what makes it invalid, of the faults of its fit the first, and its warnings."""
+    natural, quality, springs = e.frequency_khz, e.quality_factor, e.spring_constant_n_per_m.values()
+    half, apart = 0.5 * natural.value / quality.value, e.sweep.frequency_khz - natural.value
+    near, count = min(-apart[0], apart[-1]) / half, int(np.sum(np.abs(apart) < half))
+    coarse, unknown = count < 3, natural.reason or quality.reason
+    khz, inside = f"{natural.value:.6g} kHz", f"{counted(count, 'point')} within the half-width"
+    faults = {
+        f"The resonance ({khz}) lies outside the sweep: sweep around it.": near < 0.0,
+        f"The resonance ({khz}) lies at the edge of the sweep: sweep at least one half-width (f0/2Q) to both sides.": (
+            near < 1.0
         ),
-        (
-            e.p_value < IMPROBABLE,
-            f"The model does not explain the sweep: {many}. Another background, a drift, or too small errors?",
-        ),
-        (unknown, f"Not identified: {unknown}."),
-    )
-    reasons = [said for holds, said in of_fit if holds][:1]
-    if e.chi2_without_resonance - e.chi2 < _PEAK * max(e.chi2 / e.degrees_of_freedom, 1e-300):
+        f"Only {inside}: sweep in finer steps.": e.model != "power" and coarse,
+        f"The model does not explain the sweep: chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom. "
+        "Another background, a drift, or too small errors?": e.p_value < IMPROBABLE,
+        f"Not identified: {unknown}.": unknown is not None,
+    }
+    reasons = [said for said, holds in faults.items() if holds][:1]
+    # four more parameters practically never bring such a fall of chi2 about by chance
+    if e.chi2_without_resonance - e.chi2 < 30.0 * max(e.chi2 / e.degrees_of_freedom, 1e-300):
         reasons.insert(0, "No resonance stands out of the sweep: a parabola explains it about as well.")
-    if e.residual_autocorrelation > _SYSTEMATIC:
+    if e.residual_autocorrelation > 0.5:
         reasons.append(
             f"Neighbouring residuals are strongly correlated ({e.residual_autocorrelation:+.2f}): the model misses "
             "something (another background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
         )
-    how = "`length_um=...` and `width_um=...` give k by Sader's method"
-    return (*reasons, *(f"The spring constant is not calibrated: {doubt}; {how}." for doubt in doubts))
-
-
-def _warnings(e: Calibration) -> tuple[str, ...]:
-    """Return what a reader should know besides."""
-    doubts = [one.reason for one in e.spring_constant_n_per_m.values() if one.reason is not None]
-    khz, inside = f"{e.frequency_khz.value:.6g} kHz", counted(e.inside, "point")
-    notes = (
-        (
-            e.frequency_khz.value > _FAST_KHZ,
-            f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.",
-        ),
-        (e.phase_reversed, "The phase rises through the resonance: it was taken with the opposite sign."),
-        (
-            e.model == "power" and e.inside < _LEAST_POINTS,
-            f"{inside} within the half-width: Q is hardly resolved; the area under the line, and k, hold.",
-        ),
-        (doubts, f"The spring constants contradict each other: {'; '.join(doubts)}."),
-    )
-    return tuple(said for holds, said in notes if holds)
+    doubt = next((one.reason for one in springs if one.reason is not None), None)
+    if doubt is not None and len(springs) == 1:
+        how = "`length_um=...` and `width_um=...` give k by Sader's method"
+        reasons.append(f"The spring constant is not calibrated: {doubt}; {how}.")
+    notes = {
+        f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural.value > 2e4,
+        "The phase rises through the resonance: it was taken with the opposite sign.": e.phase_reversed,
+        f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": e.model == "power" and coarse,
+        f"The spring constants contradict each other: {doubt}.": doubt is not None,
+    }
+    warnings = (*e.warnings, *(said for said, holds in notes.items() if holds))
+    return replace(e, valid=not reasons, reasons=tuple(reasons), warnings=warnings)

@@ -46,28 +46,19 @@ from fitting.tables.csv_text import (
     read_text,
 )
 
-HZ_PER_KHZ = 1e3
-
 DENSITY = "nm/sqrt(Hz)"
 """The unit that makes a sweep a thermal spectrum."""
 
 
-def _in_khz(hertz: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:
-    return hertz / HZ_PER_KHZ
-
-
-def _root(power: Float[np.ndarray, " points"]) -> Float[np.ndarray, " points"]:
-    return np.sqrt(np.maximum(power, 0.0))
-
-
+_SIZE: dict[str, Any] = {"kind": "not negative", "meaning": "amplitude", "needed": "amplitude"}
 SWEEP = Form(
     (
         Column("frequency_khz", needed="frequency"),
-        Column("frequency_hz", meaning="frequency_khz", needed="frequency", convert=_in_khz),
-        Column("amplitude_nm", kind="not negative", meaning="amplitude", needed="amplitude"),
-        Column("amplitude", kind="not negative", needed="amplitude"),
-        Column("asd_nm_per_sqrt_hz", kind="not negative", meaning="amplitude", needed="amplitude"),
-        Column("psd_nm2_per_hz", kind="not negative", meaning="amplitude", needed="amplitude", convert=_root),
+        Column("frequency_hz", meaning="frequency_khz", needed="frequency", convert=lambda hertz: 1e-3 * hertz),
+        Column("amplitude_nm", **_SIZE),
+        Column("amplitude", **_SIZE),
+        Column("asd_nm_per_sqrt_hz", **_SIZE),
+        Column("psd_nm2_per_hz", convert=lambda power: np.sqrt(np.maximum(power, 0.0)), **_SIZE),
         Column("phase_deg", kind="number"),
         Column("amplitude_error_nm", meaning="amplitude_error"),
         Column("amplitude_error"),
@@ -88,17 +79,6 @@ _SETTINGS = {
     )
 }
 """What comments of a CSV file say, in place of options of `calibrate`."""
-
-
-def _parse_csv(text: str, faults: Faults) -> dict[str, Any]:
-    """Return what a CSV file says, by the names of `ResonanceSweep`."""
-    table = read_columns(text, SWEEP, _SETTINGS, faults)
-    unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
-    if unit != DENSITY:
-        for key in {"averages", "scale_error"} & set(table.settings):
-            faults.add(f"{key} belongs to a thermal spectrum (asd_nm_per_sqrt_hz or psd_nm2_per_hz); remove the line")
-    found = {"amplitude_unit": unit, "settings": table.settings, "lines": table.lines}
-    return table.columns | found
 
 
 _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error")
@@ -169,15 +149,20 @@ class ResonanceSweep(Result):
         """Whether it is a thermal spectrum."""
         return self.amplitude_unit == DENSITY
 
-    def within(self, low_khz: float, high_khz: float) -> "ResonanceSweep":
-        """Return the points between two frequencies; of a spectrum those that are above zero.
+    @property
+    def model(self) -> str:
+        """What is fitted: a "power" spectrum, the "amplitude", or amplitude and "phase"."""
+        return "power" if self.spectrum else "amplitude" if self.phase_deg is None else "phase"
 
-        Raises:
-            TableError: if there are none.
-        """
+    @property
+    def position(self) -> Float[np.ndarray, " points"]:
+        """Where the points lie: from -1 to 1 over the scan."""
+        start, end = self.frequency_khz[[0, -1]]
+        return (2.0 * self.frequency_khz - start - end) / max(end - start, 1e-300)
+
+    def within(self, low_khz: float, high_khz: float) -> "ResonanceSweep":
+        """Return the points between two frequencies; of a spectrum those that are above zero."""
         kept = (self.frequency_khz >= low_khz) & (self.frequency_khz <= high_khz) & (self.amplitude > 0.0)
-        if not kept.any():
-            raise TableError(f"{self.source}: there is no point between {low_khz:g} and {high_khz:g} kHz")
         columns = {name: getattr(self, name) for name in (*_COLUMNS, "lines")}
         return replace(self, **{name: None if column is None else column[kept] for name, column in columns.items()})
 
@@ -203,9 +188,13 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
             "off amplitude and phase"
         )
     faults = Faults(str(path))
-    found = _parse_csv(read_text(path), faults)
+    table = read_columns(read_text(path), SWEEP, _SETTINGS, faults)
+    unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
+    for key in {"averages", "scale_error"} & set(table.settings if unit != DENSITY else ()):
+        faults.add(f"{key} belongs to a thermal spectrum (asd_nm_per_sqrt_hz or psd_nm2_per_hz); remove the line")
     faults.raise_any()
-    return ResonanceSweep(**found, source=str(path))
+    named = {"amplitude_unit": unit, "settings": table.settings, "lines": table.lines, "source": str(path)}
+    return ResonanceSweep(**table.columns, **named)
 
 
 _NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)

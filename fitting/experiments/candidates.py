@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -12,8 +12,8 @@ from afm_jax.least_squares import covariance_of
 from fitting.experiments.prior import Prior
 from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained
-from fitting.infer.rows import Weights, plain_weights, remainders_of, weights_of
-from fitting.infer.search import Descent, Found, orbits_at
+from fitting.infer.rows import plain_weights, remainders_of, weights_of
+from fitting.infer.search import Descent, orbits_at
 from fitting.infer.unknowns import Data, Model, Quantity
 from fitting.predict.law import SMOOTH, FormulaLaw
 from fitting.predict.orbit import READINGS, Row
@@ -165,44 +165,29 @@ _LEAST = 1e-12
 """Stands for 0 where an unknown is the logarithm of a parameter."""
 
 
-class _Rows(NamedTuple):
-    """Drives as rows of a fit that read what is expected.
-
-    Attributes:
-        model: with these readings.
-        theta: its unknowns at the prior's values.
-        change: derivatives of these values by the unknowns.
-        orbits: of the rows.
-        number: of steady ones.
-        slopes: derivatives of the readings by the unknowns.
-        weights: of the readings.
-    """
-
-    model: Model
-    theta: Float[np.ndarray, " p"]
-    change: Float[np.ndarray, " p"]
-    orbits: Any
-    number: Int[np.ndarray, " rows"]
-    slopes: Float[np.ndarray, "rows 3 p"]
-    weights: Weights
-
-
-def _rows_of(
-    prior: Prior, drives: Drives, noise: float, phase_noise_deg: float, read: Bool[np.ndarray, "... 3"]
-) -> _Rows:
-    """Return drives as rows of a fit; ``read`` says which readings are taken."""
+def _explained(prior: Prior, drives: Drives, noise: float, phase_noise_deg: float, amplitudes: str) -> Explained:
+    """Return drives as rows of a fit that have read what is expected; its Jacobian is by the prior's parameters."""
     model, theta = model_of(prior, drives, prior.values)
+    found = orbits_at(model, theta)
+    slopes = model.slopes(theta, found.orbits)
+    readings, out = found.orbits.readings, np.zeros(len(found.number), bool)
+    tapping = prior.problem.tapping
+    read = [not tapping and amplitudes != "lockin", tapping or amplitudes != "peak", tapping]
+    expected = np.where(read & (found.number > 0)[:, None], readings, np.nan)
+    error = np.concatenate([noise * readings[:, :2], np.full((out.size, 1), phase_noise_deg)], axis=1)
+    model = replace(model, data=replace(model.data, read=expected, error=error))
+    lasting = model.law.lasting
+    weights = weights_of(model, theta, found.orbits, out) if lasting else plain_weights(model.data, 0.0, out)
+    jacobian = (weights.whitening @ (slopes / _by_unknown(model, theta))).reshape(-1, theta.size)
+    return Explained(model, Descent(theta, found.orbits, 0.0, out, jacobian), weights, found, 0.0, settled=True)
+
+
+def _by_unknown(model: Model, theta: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+    """Return the derivatives of the prior's parameters by their unknowns."""
     law: Any = model.law
-    orbits, count = orbits_at(model, theta)
-    slopes = model.slopes(theta, orbits)
-    error = np.concatenate([noise * orbits.readings[:, :2], np.full((len(count), 1), phase_noise_deg)], axis=1)
-    expected = np.where(read & (count > 0)[:, None], orbits.readings, np.nan)
-    model, out = replace(model, data=replace(model.data, read=expected, error=error)), np.zeros(len(count), bool)
-    weights = weights_of(model, theta, orbits, out) if law.lasting else plain_weights(model.data, 0.0, out)
-    step, change = 1e-6, np.ones(len(theta))
-    for i, (name, unknown) in enumerate(zip(law.own, theta.tolist(), strict=False)):
-        change[i] = (law.value_of(name, unknown + step) - law.value_of(name, unknown - step)) / (2.0 * step)
-    return _Rows(model, theta, change, orbits, count, slopes, weights)
+    change = np.ones(theta.size)
+    change[: len(law.own)] = [law.slope_of(name, y) for name, y in zip(law.own, theta.tolist(), strict=False)]
+    return change
 
 
 def candidates_of(
@@ -225,34 +210,33 @@ def candidates_of(
         largest_nm: peak amplitude that the instrument takes; of a cantilever that is driven itself the free one.
         phase_noise_deg: standard error of the lag in degrees.
     """
-    tapping = prior.problem.tapping
-    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak", False])
-    rows = _rows_of(prior, drives, noise, phase_noise_deg, read)
-    sure = rows.number == 1
+    rows = _explained(prior, drives, noise, phase_noise_deg, amplitudes)
+    orbits, number, weights = rows.end.orbits, rows.found.number, rows.weights
+    sure = number == 1
     for values in prior.draws(DRAWS, least=MARGIN)[1:]:
         drawn = model_of(prior, drives, values)
         sure &= orbits_at(*drawn, np.flatnonzero(sure)).number == 1
-    kinds, expected = 3 if tapping else 2, rows.orbits.readings
+    kinds, slope = 3 if prior.problem.tapping else 2, rows.end.jacobian.reshape(len(sure), READINGS, -1)
+    size = drives.amplitude_nm if prior.problem.tapping else orbits.readings[:, 0]
     holds = {
         "measured": same_drives(drives, prior.measured),
-        "no orbit": rows.number == 0,
-        "unsure": ~sure | ~np.isfinite(rows.slopes).all(axis=(1, 2)),
-        "too large": (drives.amplitude_nm if tapping else expected[:, 0]) > largest_nm,
-        "inaccurate": rows.weights.reasons != "",
+        "no orbit": number == 0,
+        "unsure": ~sure | ~np.isfinite(slope).all(axis=(1, 2)),
+        "too large": size > largest_nm,
+        "inaccurate": weights.reasons != "",
     }
     why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), "") for row in range(len(sure)))
     usable = np.array([not reason for reason in why_not])[:, None]
-    whitening = np.where(usable[:, :, None], rows.weights.whitening, 0.0)
+    whitening = np.where(usable[:, :, None], weights.whitening, 0.0)
     # the covariance of what is used is the inverse of W^T W
     variance = np.diagonal(np.linalg.pinv(np.swapaxes(whitening, 1, 2) @ whitening), axis1=1, axis2=2)
-    slope = whitening @ np.where(usable[:, :, None], rows.slopes / rows.change, 0.0)
     return Candidates(
         drives=drives,
         why_not=why_not,
-        amplitude_nm=expected[:, :kinds],
-        error_nm=np.sqrt(np.where(rows.weights.used & usable, variance, np.inf))[:, :kinds],
-        approach_speed_nm_per_us=rows.orbits.approach,
-        slope=slope[:, :kinds],
+        amplitude_nm=orbits.readings[:, :kinds],
+        error_nm=np.sqrt(np.where(weights.used & usable, variance, np.inf))[:, :kinds],
+        approach_speed_nm_per_us=orbits.approach,
+        slope=np.where(usable[:, :, None], slope, 0.0)[:, :kinds],
     )
 
 
@@ -265,7 +249,9 @@ def forecast(
     prior: Prior,
     candidates: Candidates,
     chosen: Int[np.ndarray, " points"],
+    *,
     noise: float,
+    amplitudes: str = "both",
     phase_noise_deg: float = PHASE_NOISE_DEG,
 ) -> Float[np.ndarray, "steps p"]:
     """Return the standard errors that a fit will state, before and after each chosen point.
@@ -278,43 +264,39 @@ def forecast(
         candidates: all drives.
         chosen: numbers of the points.
         noise: standard error of an amplitude relative to it.
+        amplitudes: what is read, as of `candidates_of`.
         phase_noise_deg: standard error of a lag in degrees.
     """
     each = candidates.information[chosen]
-    steps = prior.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
-    errors = standard_errors(steps)
+    errors = standard_errors(prior.information + np.cumsum([np.zeros_like(prior.information), *each], axis=0))
     if prior.problem.lasting and chosen.size:
-        read = np.isfinite(candidates.error_nm[chosen])
-        read = np.pad(read, ((0, 0), (0, READINGS - read.shape[1])))
         drives = Drives(*(column[chosen] for column in candidates.drives))
-        rows = _rows_of(prior, drives, noise, phase_noise_deg, read)
+        rows = _explained(prior, drives, noise, phase_noise_deg, amplitudes)
         errors[1:] = [_stated(prior, rows, count) for count in range(1, len(chosen) + 1)]
     return errors
 
 
-def _stated(prior: Prior, rows: _Rows, count: int) -> Float[np.ndarray, " p"]:
+def _stated(prior: Prior, rows: Explained, count: int) -> Float[np.ndarray, " p"]:
     """Return the standard errors that a fit of the first rows states: with everything unknown that it has."""
-    orbits, law, names = rows.orbits, rows.model.law, prior.problem.names
+    orbits, law, own = rows.end.orbits, rows.model.law, prior.problem.own
     if isinstance(law, FormulaLaw):
         # a fit has drag whatever the formula is; a prior that a fit left is of the formula alone
         drag = not len(prior.measured) and "viscous_loss" not in (*law.own, *law.fixed)
         ends = float(orbits.approach[:count].min()), float(orbits.approach[:count].max())
         law = replace(law, own=(*law.own, "viscous_loss") if drag else law.own).beside(ends, SMOOTH)
-    model = replace(rows.model, law=law, remainders=remainders_of(rows.model, rows.theta, orbits))
-    places, theta = [model.names.index(name) for name in names], np.zeros(len(model.names))
-    theta[places] = rows.theta
+    model = replace(rows.model, law=law, remainders=remainders_of(rows.model, rows.end.theta, orbits))
+    places, theta = [model.names.index(name) for name in prior.problem.names], np.zeros(len(model.names))
+    theta[places], change = rows.end.theta, _by_unknown(rows.model, rows.end.theta)
     of_rows = (rows.weights.whitening @ model.slopes(theta, orbits))[:count].reshape(-1, theta.size)
-    of_prior = np.zeros((len(names), theta.size))
+    of_prior = np.zeros((len(places), theta.size))
     known, axes = np.linalg.eigh(prior.sizes[:, None] * prior.information * prior.sizes)
-    of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / prior.sizes * rows.change
+    of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / prior.sizes * change
     of_law = np.diag(model.prior[1])[: theta.size - len(model.instrument)]
-    jacobian = np.concatenate([of_rows, of_prior, of_law])
-    weights = rows.weights._replace(used=rows.weights.used & (np.arange(len(orbits.x)) < count)[:, None])
-    end = Descent(theta, orbits, 0.0, np.zeros(len(jacobian)), jacobian)
-    fit = Explained(model, end, weights, Found(orbits, rows.number), 0.0, settled=True)
-    errors = np.sqrt(np.diag(fit.covariance))[places] * np.abs(rows.change)
+    end = rows.end._replace(theta=theta, jacobian=np.concatenate([of_rows, of_prior, of_law]))
+    used = rows.weights.used & (np.arange(len(orbits.x)) < count)[:, None]
+    fit = replace(rows, model=model, end=end, weights=rows.weights._replace(used=used))
+    errors = np.sqrt(np.diag(fit.covariance))[places] * np.abs(change)
     if not len(prior.measured):
-        own = prior.problem.own
         stated = closest_parameters(fit, own, prior.fixed).errors[: len(own)]
         # NaN where rows are too few, 0 of a lead that does nothing because no impact loses speed
         errors[: len(own)] = np.where(stated > 0.0, stated, np.inf)

@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.checks import check_parameter, checked, require_float64
+from afm_jax.checks import check_count, check_parameter, checked, require_float64
+from afm_jax.columns import rows_of
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.results import Result, public_result
+from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, known, text_table, with_error
 from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
@@ -38,9 +40,6 @@ _PRINTED = {
     "expected_approach_speed_nm_per_us": ("u_in", ".1f"),
 }
 """Head and format of the columns that are printed."""
-_RIDGE = 1e-9
-"""Information added to every parameter, relative to that of all candidates together, while points are chosen: with it
-the first points, which alone determine nothing, can be compared."""
 
 
 @public_result(picture="fitting.experiments.picture:design_figure", rows="points")
@@ -97,10 +96,8 @@ class Design(Result):
 
     def points(self) -> list[dict[str, Any]]:
         """Return the points as mappings: the drive, what is expected to be read, and the errors once it is."""
-        names, columns = self.prior.problem.names, self.columns
-        errors = [dict(zip(names, map(_finite, row), strict=True)) for row in self.errors[1:].tolist()]
-        rows = zip(*columns.values(), errors, strict=True)
-        return [dict(zip((*columns, "standard_errors"), row, strict=True)) for row in rows]
+        names, errors = self.prior.problem.names, plain(self.errors[1:])
+        return rows_of({**self.columns, "standard_errors": [dict(zip(names, row, strict=True)) for row in errors]})
 
     @property
     def measured_so_far(self) -> dict[str, dict[str, Any]]:
@@ -113,33 +110,31 @@ class Design(Result):
         return self._known_after(-1)
 
     def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
-        entries, columns = {}, (self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist())
-        for parameter, value, error in zip(*columns, strict=True):
-            entry = {"value": value, "unit": parameter.unit, "standard_error": _finite(error)}
-            ends = (
-                max(value - TWO_SIDED_95 * error, parameter.lowest),
-                min(value + TWO_SIDED_95 * error, parameter.highest),
-            )
-            entry["interval95"] = [*ends] if np.isfinite(error) else [None, None]
+        entries = {}
+        for parameter, value, error in zip(
+            self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist(), strict=True
+        ):
+            entry = entries[parameter.name] = {"value": value, "unit": parameter.unit, "standard_error": error}
+            ends = (value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error)
+            entry["interval95"] = np.clip(ends, parameter.lowest, parameter.highest).tolist()
             if not np.isfinite(error):
-                entry["reason"] = "the measurements do not determine it"
-            entries[parameter.name] = entry
+                no_error = {"standard_error": None, "interval95": [None, None]}
+                entry |= no_error | {"reason": "the measurements do not determine it"}
         return entries
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax design`; what is not known is None."""
-        problem, found = self.prior.problem, self.candidates
         names = ("valid", "reasons", "warnings", "noise", "expected", "measured_so_far")
         return {
             "format": "afm-jax design",
             "format_version": FORMAT_VERSION,
-            "drive": problem.drive,
-            "model": problem.model,
+            "drive": self.prior.problem.drive,
+            "model": self.prior.problem.model,
             **{name: getattr(self, name) for name in names},
             "interest": list(self.interest),
             "points": self.points(),
-            "candidates": int(found.usable.sum()),
-            "left_out": found.left_out,
+            "candidates": int(self.candidates.usable.sum()),
+            "left_out": self.candidates.left_out,
             "prior": {"source": self.prior.source, "rows_measured": len(self.prior.measured)},
         }
 
@@ -149,16 +144,13 @@ class Design(Result):
 
     def printed(self) -> list[Any]:
         """Return the verdict, the points, what they will determine, and notes."""
-        prior, columns, usable = self.prior, self.columns, self.candidates.usable
-        title, table = f"{len(self.chosen)} points to measure next for {', '.join(self.interest)}", {}
-        for name, (head, form) in _PRINTED.items():
-            stem, _, unit = name.rpartition("_")
-            errors = columns.get(f"{stem}_error_{unit}")
-            cells = [f"{value:{form}}" for value in columns.get(name, ())]
+        columns, usable, table = self.columns, self.candidates.usable, {}
+        for name in (name for name in _PRINTED if name in columns):
+            (head, form), (stem, _, unit) = _PRINTED[name], name.rpartition("_")
+            table[head] = [f"{value:{form}}" for value in columns[name]]
+            errors = columns.get(f"{stem}_error_{unit}", [])
             if errors:
-                cells = [f"{cell} +- {error:{form}}" for cell, error in zip(cells, errors, strict=True)]
-            if name in columns:
-                table[head] = cells
+                table[head] = [f"{cell} +- {error:{form}}" for cell, error in zip(table[head], errors, strict=True)]
         for name in self.interest[:4]:
             table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in self.points()]
         then = [
@@ -166,8 +158,10 @@ class Design(Result):
             for name, entry in self.expected.items()
         ]
         left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in self.candidates.left_out.items()]
+        verdict, prior = "VALID" if self.valid else "NOT VALID", self.prior
+        title = f"{verdict}: {len(self.chosen)} points to measure next for {', '.join(self.interest)}"
         return [
-            f"{'VALID' if self.valid else 'NOT VALID'}: {title} ({prior.problem.model}, {prior.source})",
+            f"{title} ({prior.problem.model}, {prior.source})",
             *bullets("Reasons:", self.reasons),
             "",
             *text_table([*table], zip(*table.values(), strict=True), words=()),
@@ -176,10 +170,6 @@ class Design(Result):
             *bullets(f"{usable.sum()} of {usable.size} drives can be planned with.", left_out),
             *bullets("Notes:", self.warnings),
         ]
-
-
-def _finite(number: float) -> float | None:
-    return number if np.isfinite(number) else None
 
 
 @checked
@@ -230,33 +220,28 @@ def design(  # noqa: PLR0913
             raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(names)}")
     if not interest or len({*interest}) < len(interest):
         raise ValueError("`interest` must name at least one parameter, and none twice")
-    if points < 1:
-        raise ValueError(f"`points` must be at least 1, but is {points}")
+    check_count("points", points, 1)
     if amplitudes not in AMPLITUDES:
         raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
     check_parameter("noise", noise, "between 0 and 1")
     check_parameter("largest_nm", largest_nm, "positive", optional=True)
     check_parameter("phase_noise_deg", phase_noise_deg, "positive")
-    errors_of = {"noise": float(noise), "phase_noise_deg": phase_noise_deg}
-    candidates = candidates_of(prior, drives, amplitudes=amplitudes, largest_nm=largest_nm or np.inf, **errors_of)
-    usable, each = np.flatnonzero(candidates.usable), candidates.information
+    reading: dict[str, Any] = {"noise": noise, "phase_noise_deg": phase_noise_deg, "amplitudes": amplitudes}
+    candidates = candidates_of(prior, drives, largest_nm=largest_nm or np.inf, **reading)
+    usable = np.flatnonzero(candidates.usable)
     matters = np.array([name in interest for name in names])
-    chosen = usable[choose_points(prior.information, each[usable], points, matters)]
-    errors = forecast(prior, candidates, chosen, **errors_of)
+    chosen = usable[choose_points(prior.information, candidates.information[usable], points, matters)]
+    errors = forecast(prior, candidates, chosen, **reading)
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
-    reasons, warnings = [], list(prior.notes)
-    if not len(chosen):
-        left_out = "; ".join(f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items())
-        reasons.append(f"No drive can be planned with ({left_out}); try others.")
-    elif undetermined:
-        reasons.append(
-            f"The chosen points do not determine {' and '.join(undetermined)}: choose more points, or drives at more "
-            "frequencies, amplitudes, orders or offsets."
-        )
-    if 0 < len(chosen) < points:
-        warnings.append(f"Only {len(chosen)} of the {points} points asked for can be planned with: all are chosen.")
+    left_out = "; ".join(f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items())
+    reasons = {
+        f"No drive can be planned with ({left_out}); try others.": not chosen.size,
+        f"The chosen points do not determine {' and '.join(undetermined)}: choose more points, or drives at more "
+        "frequencies, amplitudes, orders or offsets.": bool(chosen.size and undetermined),
+    }
+    few = f"Only {chosen.size} of the {points} points asked for can be planned with: all are chosen."
     beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
-    warnings += [beyond] if beyond else []
+    notes = (*prior.notes, few if 0 < chosen.size < points else None, beyond)
     return Design(
         prior=prior,
         interest=tuple(interest),
@@ -264,9 +249,9 @@ def design(  # noqa: PLR0913
         candidates=candidates,
         chosen=chosen,
         errors=errors,
-        valid=not reasons,
-        reasons=reasons,
-        warnings=warnings,
+        valid=not any(reasons.values()),
+        reasons=[said for said, holds in reasons.items() if holds],
+        warnings=[note for note in notes if note],
     )
 
 
@@ -283,7 +268,8 @@ def choose_points(
     """
     strength = np.diag(prior + each.sum(axis=0))
     unit = 1.0 / np.sqrt(np.where(strength > 0.0, strength, 1.0))
-    so_far, gains = unit[:, None] * prior * unit + _RIDGE * np.eye(len(unit)), unit[:, None] * each * unit
+    # a little information on every parameter: the first points, which alone determine nothing, can then be compared
+    so_far, gains = unit[:, None] * prior * unit + 1e-9 * np.eye(len(unit)), unit[:, None] * each * unit
     nuisances = np.flatnonzero(~matters)
 
     def score(information: Float[np.ndarray, "n p p"]) -> Float[np.ndarray, " n"]:
@@ -291,9 +277,10 @@ def choose_points(
         whole = np.linalg.slogdet(information)[1]
         return whole - np.linalg.slogdet(information[:, nuisances[:, None], nuisances])[1] if nuisances.size else whole
 
-    left, chosen = list(range(len(each))), []
+    chosen: list[int] = []
     for _ in range(min(points, len(each))):
-        best = left.pop(int(np.argmax(score(so_far + gains[left]))))
-        chosen.append(best)
-        so_far = so_far + gains[best]
+        worth = score(so_far + gains)
+        worth[chosen] = -np.inf
+        chosen.append(int(np.argmax(worth)))
+        so_far = so_far + gains[chosen[-1]]
     return np.array(chosen, dtype=np.int64)

@@ -18,7 +18,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
 from fitting.infer.result import FitResult
 from fitting.models import Problem, check_constraints
-from fitting.parameters import MODELS, NUISANCE_NAMES, PARAMETERS, model_parameters, paper_values
+from fitting.parameters import MODELS, NUISANCE_NAMES, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
 from fitting.tables.csv_text import TableError, beyond, read_fit_json
 
@@ -133,12 +133,11 @@ def prior_of_values(  # noqa: PLR0913
     check_constraints(known, model, own, drive)
     given = {name: value for name, (value, _) in known.items()} | dict(values or {})
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), drive=drive)
-    assumed = [name for name in own if name not in given]
-    notes = []
+    assumed, notes = ", ".join(name for name in own if name not in given), []
     if assumed:
         notes.append(
-            f"Not given, and taken from the paper's contact: {', '.join(assumed)}. The forecast is as good as these "
-            "values; design again from a first fit."
+            f"Not given, and taken from the paper's contact: {assumed}. The forecast is as good as these values; "
+            "design again from a first fit."
         )
     if quality_factor is not None and "quality_factor" not in known:
         notes.append(EXACT_QUALITY_FACTOR)
@@ -206,14 +205,12 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"
     label = payload["tables"][0]["name"] if payload.get("tables") else ""
-    mine = [name for name in payload["parameters"] if name.partition(" of ")[2] in ("", label)]
-    found = {name.partition(" of ")[0]: payload["parameters"][name] for name in mine}
-    if payload["model"] not in MODELS or not {*found} <= {*PARAMETERS}:
-        raise ValueError("a model or a parameter that no fit has")
-    places = [[*payload["parameters"]].index(name) for name in mine]
-    correlations = np.array(payload["correlations"]["matrix"], float)
-    if correlations.shape != 2 * (len(payload["parameters"]),):
-        raise ValueError("not a correlation for each pair of parameters")
+    every = [*payload["parameters"]]
+    places = [i for i, name in enumerate(every) if name.partition(" of ")[2] in ("", label)]
+    found = {every[i].partition(" of ")[0]: payload["parameters"][every[i]] for i in places}
+    matrix = np.array(payload["correlations"]["matrix"], float)
+    if payload["model"] not in MODELS or matrix.shape != (len(every), len(every)):
+        raise ValueError("no model, or not a correlation for each pair of parameters")
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
     driven = [one for one in tables if (one.get("drive") or "sample") == drive]
     columns = "order", "drive_frequency_khz", f"{'free' if problem.tapping else 'drive'}_amplitude_nm", "offset_nm"
@@ -226,7 +223,7 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     return Prior(
         problem=problem,
         values=_checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
-        information=_information(found, correlations[np.ix_(places, places)]),
+        information=_information(found, matrix[np.ix_(places, places)]),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
         mass_ng=table.get("mass_ng"),

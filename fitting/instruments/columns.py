@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from fitting.instruments.recording import UNITS, Recording, Segment, unit_named
+from fitting.instruments.recording import UNITS, Recording, Segment, quantity_of, unit_named
 from fitting.tables.csv_text import NUMBER, TableError
 
 ROLES = {
@@ -59,11 +59,26 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
             raise ValueError(f"there is no column `{column}`; it is one of {', '.join(ROLES)}")
         if column in found:
             raise ValueError(f"the column `{column}` is there twice; approach and retract are {column}=OUT/BACK")
-        if units and UNITS.get(units[0], ("",))[0] not in ROLES[column][0]:
+        if units and quantity_of(units[0]) not in ROLES[column][0]:
             known = ", ".join(unit for unit, (what, _) in UNITS.items() if what in ROLES[column][0])
             raise ValueError(f"`{units[0]}` is no unit of {column}; write one of {known}")
         found[column] = ColumnSource(channel, units[0] if units else "", factors[0] if factors else None)
     return found
+
+
+def checked_unit(unit: str, role: str, channel: str, source: str) -> str:
+    """Return the unit of a channel for a column.
+
+    Raises:
+        TableError: if the column has none such.
+    """
+    if quantity_of(unit) not in ROLES[role][0]:
+        usual = "deg" if role == "phase_lag_deg" else "nm"
+        raise TableError(
+            f"{source}: the channel {channel} has the unit {unit!r}, which is none of {role}; say "
+            f'`columns="{role}={channel}:{usual}"`'
+        )
+    return unit
 
 
 _EIGHT = 8
@@ -71,8 +86,8 @@ _EIGHT = 8
 _EXAMPLE = "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
 
 
-def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> tuple[Recording, dict[str, ColumnSource]]:
-    """Return a recording whose curves are parted into approach and retract, and the column map for it.
+def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Recording:
+    """Return a recording whose curves are parted into approach and retract.
 
     Channels that are named `OUT/BACK` become two segments. A file without a head that repeats their columns (16
     columns where eight are a curve) holds several curves side by side. A segment of no stated branch whose height
@@ -81,36 +96,33 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> tuple[
     Raises:
         TableError: if one of two channels is not there, or some columns have two channels and others one.
     """
-    pairs = {role: _pair(recording, source.channel) for role, source in wanted.items()}
-    if not any(pairs.values()):
-        return _parted(recording, wanted), dict(wanted)
-    single = [f"{role}={wanted[role].channel}" for role, pair in pairs.items() if pair is None]
-    if single:
+    found = {role: _pair(recording, source.channel) for role, source in wanted.items()}
+    pairs = {role: pair for role, pair in found.items() if pair is not None}
+    if not pairs:
+        return _parted(recording, wanted)
+    single = next((role for role in wanted if role not in pairs), None)
+    if single is not None:
         raise TableError(
-            f"{recording.source}: {single[0]} has one channel where other columns have OUT/BACK; write two for each, "
-            f"as {_EXAMPLE}"
+            f"{recording.source}: {single}={wanted[single].channel} has one channel where other columns have OUT/BACK; "
+            f"write two for each, as {_EXAMPLE}"
         )
     names = recording.channels
-    curves = _side_by_side(recording, [name for pair in pairs.values() if pair is not None for name in pair])
     segments = []
     for segment in recording.segments:
-        for step in curves:
+        for step in _side_by_side(recording, [name for pair in pairs.values() for name in pair]):
             for way, branch in enumerate(("approach", "retract")):
                 columns = {
                     wanted[role].channel: segment.channels[names[names.index(pair[way]) + step]]
                     for role, pair in pairs.items()
-                    if pair is not None
                 }
                 segments.append(Segment(len(segments) // 2 + 1, branch, _ended(columns)))
     empty = next((s for s in segments if not np.size(next(iter(s.channels.values())))), None)
     if empty is not None:
         raise TableError(f"{recording.source}, curve {empty.curve}: the {empty.branch} holds no numbers")
-    units = dict(recording.units)
-    for role, pair in pairs.items():
-        units[wanted[role].channel] = recording.units.get(pair[0], "") if pair is not None else ""
-    away = tuple(wanted[role].channel for role, pair in pairs.items() if pair is not None and pair[0] in recording.away)
-    recording = replace(recording, segments=tuple(segments), units=units, away=away)
-    return recording, dict(wanted)
+    of_pair = {wanted[role].channel: pair[0] for role, pair in pairs.items()}
+    units = {**recording.units, **{name: recording.units.get(first, "") for name, first in of_pair.items()}}
+    away = tuple(name for name, first in of_pair.items() if first in recording.away)
+    return replace(recording, segments=tuple(segments), units=units, away=away)
 
 
 def example_of_columns(recording: Recording) -> str:

@@ -22,9 +22,17 @@ from afm_jax.scenefile.tables import printable
 from afm_jax.strict_json import plain
 from fitting.instruments.bins import Binned, binned, faults_of_order, usual_width
 from fitting.instruments.branch import JUMP, BranchLook, look_at
-from fitting.instruments.columns import ROLES, ColumnSource, example_of_columns, laid_out, parse_columns, turns_of
+from fitting.instruments.columns import (
+    ROLES,
+    ColumnSource,
+    checked_unit,
+    example_of_columns,
+    laid_out,
+    parse_columns,
+    turns_of,
+)
 from fitting.instruments.formats import read_recording
-from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, sense_of_phase
+from fitting.instruments.lag import SENSE_OPTION, SENSES, PhaseReadings, free_lag_deg, sense_of_phase
 from fitting.instruments.recording import (
     ASSUMED_RESONANCE,
     UNITS,
@@ -32,10 +40,11 @@ from fitting.instruments.recording import (
     Recording,
     Segment,
     given_numbers,
+    quantity_of,
     refuse_other_modes,
 )
 from fitting.parameters import USUAL_ERRORS
-from fitting.tables.csv_text import TableError
+from fitting.tables.csv_text import TableError, setting_line
 
 FORMAT_VERSION = 1
 OPTIONS = {
@@ -182,7 +191,7 @@ def read_curves(
     recording = read_recording(path)
     _refuse_others(recording)
     stated = any(segment.branch for segment in recording.segments)
-    recording, wanted = laid_out(recording, wanted)
+    recording = laid_out(recording, wanted)
     known = dict(recording.known)
     known["drive"] = Known(drive, "", "option `drive=...`") if drive else Known("base", "", _ASSUMED_BASE)
     known |= given
@@ -190,15 +199,17 @@ def read_curves(
         # lock-ins are tuned to the resonance before a curve is taken
         free = known["free_frequency_khz"]
         known["drive_frequency_khz"] = Known(free.value, "kHz", ASSUMED_RESONANCE)
-    places = list(dict.fromkeys(segment.curve for segment in recording.segments))
+    numbered: dict[int, list[Segment]] = {}
+    for segment in recording.segments:
+        numbered.setdefault(segment.curve, []).append(segment)
     curves = []
-    for place in places:
-        segments = [segment for segment in recording.segments if segment.curve == place]
-        curve = _joined(recording, segments, wanted, known, len(places))
+    for segments in numbered.values():
+        curve = _joined(recording, segments, wanted, known, len(numbered))
         if curve.amplitude is not None:
             _check_mode(recording)
         said = {role for role, source in wanted.items() if source.factor is not None}
-        curve = _turned(curve) if "offset_nm" not in said and _runs_away(curve) else curve
+        if "offset_nm" not in said and _runs_away(curve):
+            curve = replace(curve, offset_nm=-curve.offset_nm, notes=(*curve.notes, _TURNED))
         curve = curve if stated else _renamed(curve)
         sense = phase_sense or ("lag" if "phase_lag_deg" in said else "")
         judged = _judged(curve, of_slope=of_slope, stated_sense=sense)
@@ -217,7 +228,7 @@ _OTHER_CHANNELS = re.compile(
 
 
 def _refuse_others(recording: Recording) -> None:
-    kinds = {UNITS.get(unit, ("",))[0] for unit in recording.units.values()}
+    kinds = set(map(quantity_of, recording.units.values()))
     if {"spectrum", "voltage spectrum"} & kinds:
         raise TableError(f"{recording.source}: holds a thermal spectrum, not a curve; `afm-jax calibrate` fits it")
     if any(name.startswith(("Frequency Shift", "Frequency")) for name in recording.channels):
@@ -248,45 +259,38 @@ def _joined(
 ) -> MeasuredCurve:
     """Return the segments of one curve as one, in the table's quantities."""
     notes = list(recording.remarks)
-    sources = {role: _source(recording, segments[0], role, wanted, notes) for role in ROLES}
-    if sources["offset_nm"] is None:
+    found = {role: _source(recording, segments[0], role, wanted, notes) for role in ROLES}
+    sources = {role: source for role, source in found.items() if source is not None}
+    if "offset_nm" not in sources:
         channels = ", ".join(recording.channels)
         raise TableError(
             f"{recording.source}: no height among the channels {channels}; {example_of_columns(recording)}"
         )
-    taken = {source.channel for source in sources.values() if source is not None}
+    taken = {source.channel for source in sources.values()}
     others = ", ".join(name for name in segments[0].channels if name not in taken)
-    if sources["lockin_amplitude_nm"] is None:
-        is_one = f"; if one of the channels {others} is"
-        told = f'{is_one}: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`' if others else ""
-        notes.append(f"{_NO_AMPLITUDE}{told}.")
-    elif sources["phase_lag_deg"] is None:
-        told = f'; if one of the channels {others} is one: `columns="phase_lag_deg=CHANNEL:UNIT"`' if others else ""
-        notes.append(f"There is no phase, so that the energy of a tap has an upper bound only{told}.")
-    parts: dict[str, list[Any]] = {role: [] for role in ROLES}
+    if "lockin_amplitude_nm" not in sources:
+        ask = f'; if one of the channels {others} is: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`' if others else ""
+        notes.append(f"{_NO_AMPLITUDE}{ask}.")
+    elif "phase_lag_deg" not in sources:
+        ask = f'; if one of the channels {others} is one: `columns="phase_lag_deg=CHANNEL:UNIT"`' if others else ""
+        notes.append(f"There is no phase, so that the energy of a tap has an upper bound only{ask}.")
+    parts = {
+        role: [_converted(recording, segment, source, role) for segment in segments] for role, source in sources.items()
+    }
     branches: list[str] = []
-    for segment in segments:
-        for role, source in sources.items():
-            if source is not None:
-                numbers = segment.channels.get(source.channel)
-                if numbers is None:
-                    where = f"{recording.source}, curve {segment.curve}"
-                    raise TableError(f"{where}: the {segment.branch} has no channel {source.channel}")
-                parts[role].append(_converted(recording, segment, source, role))
-        branches += _branches(segment.branch, parts["offset_nm"][-1])
-        notes += _mixed_note(segment.branch, parts["offset_nm"][-1])
-    lags = parts["phase_lag_deg"]
+    for segment, offset in zip(segments, parts["offset_nm"], strict=True):
+        branches += _branches(segment.branch, offset)
+        notes += _mixed_note(segment.branch, offset)
+    lags = parts.get("phase_lag_deg", [])
     # each was unwrapped from its own first row
     lags[1:] = [lag - 360.0 * np.round((np.median(lag) - np.median(lags[0])) / 360.0) for lag in lags[1:]]
-    columns = {role: np.concatenate(numbers) for role, numbers in parts.items() if numbers}
-    units = {
-        role: UNITS[source.unit][0] for role, source in sources.items() if source is not None and source.unit in UNITS
-    }
+    columns = {role: np.concatenate(numbers) for role, numbers in parts.items()}
     amplitude = columns.get("lockin_amplitude_nm")
     if amplitude is not None and amplitude[np.argmax(np.abs(amplitude))] < 0.0:
         amplitude = -amplitude
         notes.append("Sign: the amplitude is negative (an inverted channel) and was taken with the opposite sign.")
     scales = {"length": "nm", "voltage": "V", "force": "nN"}
+    units = {role: scales.get(quantity_of(source.unit), "") for role, source in sources.items()}
     return MeasuredCurve(
         source=recording.source,
         format=recording.format,
@@ -295,10 +299,10 @@ def _joined(
         branch=np.array(branches),
         offset_nm=columns["offset_nm"],
         amplitude=amplitude,
-        amplitude_unit=scales[units.get("lockin_amplitude_nm", "length")],
+        amplitude_unit=units.get("lockin_amplitude_nm", "nm"),
         phase_lag_deg=columns.get("phase_lag_deg"),
         deflection=columns.get("deflection_nm"),
-        deflection_unit=scales[units.get("deflection_nm", "length")],
+        deflection_unit=units.get("deflection_nm", "nm"),
         free=np.zeros(len(branches), dtype=bool),
         known=dict(known),
         notes=tuple(notes),
@@ -318,61 +322,49 @@ def _source(
         )
     if source is None:
         taken = {other.channel for other in wanted.values()}
-        ranked = [
-            name for pattern in patterns for name in names if re.fullmatch(pattern, name, re.IGNORECASE | re.DOTALL)
-        ]
-        fitting = [
-            n for n in ranked if n not in taken and UNITS.get(recording.units.get(n, ""), ("",))[0] in quantities
-        ]
-        unitless = [n for n in ranked if n not in taken and not recording.units.get(n, "")]
-        if not (fitting or unitless):
+        ranked = [n for pattern in patterns for n in names if re.fullmatch(pattern, n, re.IGNORECASE | re.DOTALL)]
+        units = {n: recording.units.get(n, "") for n in ranked if n not in taken}
+        suited = [n for n, unit in units.items() if quantity_of(unit) in quantities]
+        suited += [n for n, unit in units.items() if not unit]
+        if not suited:
             return None
-        name = (fitting or unitless)[0]
-        away = role == "offset_nm" and name in recording.away
-        source = ColumnSource(name, "", -1.0 if away else 1.0)
+        away = role == "offset_nm" and suited[0] in recording.away
+        source = ColumnSource(suited[0], "", -1.0 if away else 1.0)
         if away:
-            notes.append(f"Sign: {name} grows away from the sample in this format; the offset is its negative.")
-    unit = source.unit or recording.units.get(source.channel, "")
-    if UNITS.get(unit, ("",))[0] not in quantities:
-        unit_of = {"offset_nm": "nm", "lockin_amplitude_nm": "nm", "phase_lag_deg": "deg", "deflection_nm": "nm"}[role]
-        if unit:
-            raise TableError(
-                f"{recording.source}: the channel {source.channel} has the unit {unit!r}, which is none of {role}; say "
-                f'`columns="{role}={source.channel}:{unit_of}"`'
-            )
-        notes.append(f'Unit: {source.channel} has none and is taken in {unit_of}; else `columns="{role}=NAME:UNIT"`.')
-        unit = unit_of
-    return replace(source, unit=unit)
+            notes.append(f"Sign: {suited[0]} grows away from the sample in this format; the offset is its negative.")
+    unit, usual = source.unit or recording.units.get(source.channel, ""), "deg" if role == "phase_lag_deg" else "nm"
+    if not unit:
+        notes.append(f'Unit: {source.channel} has none and is taken in {usual}; else `columns="{role}=NAME:UNIT"`.')
+    return replace(source, unit=checked_unit(unit or usual, role, source.channel, recording.source))
 
 
 def _converted(recording: Recording, segment: Segment, source: ColumnSource, role: str) -> Float[np.ndarray, " rows"]:
-    numbers = segment.channels[source.channel]
+    numbers, where = segment.channels.get(source.channel), f"{recording.source}, curve {segment.curve}"
+    if numbers is None:
+        raise TableError(f"{where}: the {segment.branch} has no channel {source.channel}")
     bad = np.flatnonzero(~np.isfinite(numbers))
     if bad.size:
         raise TableError(
-            f"{recording.source}, curve {segment.curve}, row {bad[0] + 1}, channel {source.channel}: is not a number; "
-            "remove the row, or export the file again"
+            f"{where}, row {bad[0] + 1}, channel {source.channel}: is not a number; remove the row, or export the file "
+            "again"
         )
     with np.errstate(over="ignore"):
         scaled = numbers * (UNITS[source.unit][1] * (source.factor or 1.0))
     if not np.all(np.abs(scaled) < 1e9):
         raise TableError(
-            f"{recording.source}, curve {segment.curve}, channel {source.channel}: numbers beyond 1e9; the file is "
-            f'damaged, or its unit is another one: `columns="{role}={source.channel}:UNIT"`'
+            f"{where}, channel {source.channel}: numbers beyond 1e9; the file is damaged, or its unit is another one: "
+            f'`columns="{role}={source.channel}:UNIT"`'
         )
     return np.rad2deg(np.unwrap(np.deg2rad(scaled))) if role == "phase_lag_deg" else scaled
 
 
 def _branches(branch: str, offset: Float[np.ndarray, " rows"]) -> list[str]:
     """Return the branch of every row: as the file says, else by the heights, towards the sample or away from it."""
-    rows = len(offset)
     if branch:
-        return [branch] * rows
+        return [branch] * len(offset)
     names: list[str] = []
-    ends = [0, *turns_of(offset), rows]
-    for first, last in pairwise(ends):
-        rises = offset[last - 1] >= offset[first]
-        names += ["approach" if rises else "retract"] * (last - first)
+    for first, last in pairwise([0, *turns_of(offset), len(offset)]):
+        names += ["approach" if offset[last - 1] >= offset[first] else "retract"] * (last - first)
     return names
 
 
@@ -393,28 +385,20 @@ def _runs_away(curve: MeasuredCurve) -> bool:
     return far < _AWAY * near and all(look.slope is None for look in _looks(curve).values())
 
 
-def _turned(curve: MeasuredCurve) -> MeasuredCurve:
-    """Return a curve with its heights the other way round."""
-    note = (
-        "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
-    )
-    return replace(curve, offset_nm=-curve.offset_nm, notes=(*curve.notes, note))
-
-
 def _renamed(curve: MeasuredCurve) -> MeasuredCurve:
     """Return a curve with approach and retract exchanged, where its heights fall in the one and rise in the other."""
-    ends = _ends(curve)
-    if any((last >= first) == (name == "approach") for name, (first, last) in ends.items()):
+    if any(_as_named(curve)):
         return curve
     return replace(curve, branch=np.where(curve.branch == "approach", "retract", "approach"))
 
 
-def _ends(curve: MeasuredCurve) -> dict[str, tuple[float, float]]:
-    """Return the first and the last height of every branch."""
+def _as_named(curve: MeasuredCurve) -> list[bool]:
+    """Say of every branch whether its heights rise in an approach, or fall in a retract."""
     heights = {name: curve.offset_nm[curve.branch == name] for name in dict.fromkeys(curve.branch.tolist())}
-    return {name: (float(one[0]), float(one[-1])) for name, one in heights.items()}
+    return [bool(one[-1] >= one[0]) == (name == "approach") for name, one in heights.items()]
 
 
+_TURNED = "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
 _JUMPS = 0.05
 """Median step of the heights, of their range, from which they are no ramp."""
 
@@ -449,21 +433,19 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
     amplitude = curve.amplitude
     if amplitude is None:
         return curve
-    if curve.amplitude_unit == "V" and "nm_per_volt" in curve.known:
-        scale = float(curve.known["nm_per_volt"].value)
-        amplitude = amplitude * scale
-        curve = replace(curve, amplitude=amplitude, amplitude_unit="nm")
+    scale = curve.known.get("nm_per_volt") if curve.amplitude_unit == "V" else None
+    slope = _mean_slope(_looks(curve)) if of_slope else None
+    if slope is not None:
+        scale = _scale_of_slope(curve, slope, _looks(curve))
+        curve = replace(curve, known=curve.known | {"nm_per_volt": scale})
+    if scale is not None:
+        curve = replace(curve, amplitude=amplitude * float(scale.value), amplitude_unit="nm")
     looks = _looks(curve)
-    slope = _mean_slope(looks)
-    if of_slope and slope is not None:
-        curve, looks = _scaled_by_slope(curve, amplitude, slope, looks)
     free = np.zeros(len(curve.offset_nm), dtype=bool)
     for branch, look in looks.items():
         free[np.flatnonzero(curve.branch == branch)[look.free]] = True
     curve = replace(curve, free=free, slope=_mean_slope(looks), reasons=tuple(_reasons(curve, looks)))
-    known = curve.known | _free_amplitude(curve, looks)
-    curve = replace(curve, known=_with_errors(replace(curve, known=known), looks))
-    curve = _with_origin(curve, looks)
+    curve = _with_origin(replace(curve, known=_with_levels(curve, looks)), looks)
     curve = _with_sense_of_phase(curve, looks, stated_sense)
     # in volts the sensitivity comes first
     there = {*curve.known, "free_amplitude_nm" if curve.amplitude_unit == "V" else "nm_per_volt"}
@@ -475,12 +457,11 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
     if curve.amplitude is None:
         return {}
-    masks = {branch: curve.branch == branch for branch in dict.fromkeys(curve.branch.tolist())}
-    lag = curve.phase_lag_deg
-    return {
-        branch: look_at(curve.offset_nm[mask], curve.amplitude[mask], None if lag is None else lag[mask])
-        for branch, mask in masks.items()
-    }
+    looks, lag = {}, curve.phase_lag_deg
+    for branch in dict.fromkeys(curve.branch.tolist()):
+        mask = curve.branch == branch
+        looks[branch] = look_at(curve.offset_nm[mask], curve.amplitude[mask], None if lag is None else lag[mask])
+    return looks
 
 
 _LEAST_ERROR = 1e-9
@@ -499,13 +480,8 @@ def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))
 
 
-def _scaled_by_slope(
-    curve: MeasuredCurve,
-    amplitude: Float[np.ndarray, " rows"],
-    slope: tuple[float, float],
-    looks: Mapping[str, BranchLook],
-) -> tuple[MeasuredCurve, dict[str, BranchLook]]:
-    """Return the curve with the amplitude scaled such that it falls by 1 nm per nm in contact."""
+def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Mapping[str, BranchLook]) -> Known:
+    """Return the scale with which the amplitude falls by 1 nm per nm in contact."""
     scale, share = 1.0 / abs(slope[0]), slope[1] / abs(slope[0])
     parts = " and ".join(
         f"{look.slope.rows} rows of the {branch} from {look.slope.from_nm:.2f} to {look.slope.to_nm:.2f} nm"
@@ -516,9 +492,7 @@ def _scaled_by_slope(
         f"measured: slope of the steepest settled part ({parts}), taken as 1 nm per nm (a hard sample); unit "
         f"{curve.amplitude_unit}"
     )
-    known = curve.known | {"nm_per_volt": Known(scale, f"nm/{curve.amplitude_unit}", origin, scale * share)}
-    scaled = replace(curve, amplitude=amplitude * scale, amplitude_unit="nm", known=known)
-    return scaled, _looks(scaled)
+    return Known(scale, f"nm/{curve.amplitude_unit}", origin, scale * share)
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
@@ -550,55 +524,44 @@ def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]
     return reasons
 
 
-def _free_amplitude(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> dict[str, Known]:
-    if "free_amplitude_nm" in curve.known or curve.amplitude_unit != "nm":
-        return {}
-    if curve.reasons and any(look.jump for look in looks.values()):
-        return {}
-    rows = int(curve.free.sum())
-    level, error = np.mean([look.level for look in looks.values()]), max(look.level_error for look in looks.values())
-    return {"free_amplitude_nm": Known(float(level), "nm", f"measured: median of {rows} free rows", float(error))}
-
-
-def _with_errors(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> dict[str, Known]:
-    """Return what is known with the errors of single rows added, from the scatter of the free ones."""
-    found, free = dict(curve.known), curve.free
-    noise = [look.noise for look in looks.values() if np.isfinite(look.noise) and look.noise > 0.0]
+def _with_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> dict[str, Known]:
+    """Return what is known with the free amplitude and the errors of single rows added, from the free ones."""
+    found = dict(curve.known)
     level = float(np.mean([look.level for look in looks.values()]))
-    if "amplitude_error_nm" not in found and curve.amplitude_unit == "nm":
-        origin = "measured: scatter of the free rows" if noise else "assumed: 1 % of the free amplitude"
-        found["amplitude_error_nm"] = Known(max(noise) if noise else 0.01 * level, "nm", origin)
-    if "phase_error_deg" not in found and curve.phase_lag_deg is not None:
-        scatter = max(
-            (_phase_scatter(curve.phase_lag_deg[free & (curve.branch == branch)]) for branch in looks), default=0.0
-        )
-        origin = "measured: scatter of the free rows" if scatter > 0.0 else "assumed: 1 degree"
-        found["phase_error_deg"] = Known(scatter or 1.0, "deg", origin)
+    if curve.amplitude_unit == "nm":
+        if not any(look.jump for look in looks.values()):
+            how, error = f"measured: median of {curve.free.sum()} free rows", max(v.level_error for v in looks.values())
+            found.setdefault("free_amplitude_nm", Known(level, "nm", how, float(error)))
+        noise = _noise(looks)
+        how = "measured: scatter of the free rows" if noise else "assumed: 1 % of the free amplitude"
+        found.setdefault("amplitude_error_nm", Known(noise or 0.01 * level, "nm", how))
+    if curve.phase_lag_deg is not None:
+        ways = [curve.phase_lag_deg[curve.free & (curve.branch == branch)] for branch in looks]
+        scatter = max(float(np.std(np.diff(way)) / np.sqrt(2.0)) if len(way) > 4 else 0.0 for way in ways)
+        how = "measured: scatter of the free rows" if scatter > 0.0 else "assumed: 1 degree"
+        found.setdefault("phase_error_deg", Known(scatter or 1.0, "deg", how))
     return found
 
 
-def _phase_scatter(phase: Float[np.ndarray, " rows"]) -> float:
-    return float(np.std(np.diff(phase)) / np.sqrt(2.0)) if len(phase) > 4 else 0.0
+def _noise(looks: Mapping[str, BranchLook]) -> float:
+    """Return the scatter of single amplitudes of the free tip, 0 where it is not known."""
+    return max((look.noise for look in looks.values() if look.noise > 0.0), default=0.0)
 
 
 def _with_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> MeasuredCurve:
     """Return the curve with heights that count from the rest position of the tip, as far as that can be told."""
-    given, level = curve.number("offset_origin_nm"), curve.number("free_amplitude_nm")
-    if given is not None:
-        origin = curve.known["offset_origin_nm"]
-        return replace(
-            curve,
-            offset_nm=curve.offset_nm - given,
-            known=curve.known | {"offset_origin_nm": replace(origin, error=origin.error or _ASSUMED_ORIGIN_NM)},
-        )
+    given, level = curve.known.get("offset_origin_nm"), curve.number("free_amplitude_nm")
     onsets = [look.onset_nm for branch, look in sorted(looks.items()) if look.onset_nm is not None]
-    if not onsets or level is None or curve.amplitude_unit != "nm":
+    if given is not None:
+        origin = replace(given, error=given.error or _ASSUMED_ORIGIN_NM)
+    elif onsets and level is not None and curve.amplitude_unit == "nm":
+        how = "measured: where the amplitude begins to fall the free tip just touches (-free_amplitude_nm)"
+        error = float(np.hypot(_ASSUMED_ORIGIN_NM, np.ptp(onsets)))
+        origin = Known(float(onsets[0] + level), "nm", f"{how}; error assumed", error)
+    else:
         return curve
-    height = float(onsets[0] + level)
-    error = float(np.hypot(_ASSUMED_ORIGIN_NM, np.ptp(onsets)))
-    how = "measured: where the amplitude begins to fall the free tip just touches (-free_amplitude_nm); error assumed"
-    known = curve.known | {"offset_origin_nm": Known(height, "nm", how, error)}
-    return replace(curve, offset_nm=curve.offset_nm - height, known=known)
+    known = curve.known | {"offset_origin_nm": origin}
+    return replace(curve, offset_nm=curve.offset_nm - float(origin.value), known=known)
 
 
 _RADIANS_DEG = 30.0
@@ -614,10 +577,12 @@ def _with_sense_of_phase(curve: MeasuredCurve, looks: Mapping[str, BranchLook], 
     phase, readings = curve.phase_lag_deg, _phase_readings(curve, looks)
     if phase is None:
         return curve
+    # as the curve keeps it, it is a lag
+    sense_known = Known("lag", "", f"option: the file's phase is a {stated}")
+    known = curve.known | ({"phase_sense": sense_known} if stated else {})
     if readings is None or not curve.free.any():
         # frequency and Q, which tell the zero, are not known
-        sign = SENSES.get(stated, 1.0)
-        return replace(curve, phase_lag_deg=sign * phase, known=curve.known | _known_sense(stated))
+        return replace(curve, phase_lag_deg=SENSES.get(stated, 1.0) * phase, known=known)
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
     near = abs(np.rad2deg(abs(level)) - lag) < _RADIANS_DEG < lag
@@ -626,24 +591,16 @@ def _with_sense_of_phase(curve: MeasuredCurve, looks: Mapping[str, BranchLook], 
             f"{printable(curve.source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "
             'degrees: it is in radians; say `columns="phase_lag_deg=CHANNEL:rad"`'
         )
-    of_lever = [
-        0.5 * (changed(1.0 + error).free_lag_deg[0] - changed(1.0 - error).free_lag_deg[0])
-        for changed, error in (
-            (lambda by: readings._replace(frequency_ratio=readings.frequency_ratio * by), readings.frequency_error),
-            (lambda by: readings._replace(quality_factor=readings.quality_factor * by), readings.quality_error),
-        )
-    ]
-    error = float(np.linalg.norm([max(scatter, 0.01), *of_lever]))
+    factors = np.array([1.0 + readings.frequency_error, 1.0 - readings.frequency_error])
+    of_ratio = free_lag_deg(readings.drive, readings.frequency_ratio[0] * factors, readings.quality_factor)
+    factors = np.array([1.0 + readings.quality_error, 1.0 - readings.quality_error])
+    of_quality = free_lag_deg(readings.drive, readings.frequency_ratio[0], readings.quality_factor * factors)
+    error = float(np.linalg.norm([max(scatter, 0.01), *(0.5 * np.ptp([of_ratio, of_quality], axis=1))]))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
     sense = sense_of_phase(readings, stated)
-    known = curve.known | _known_sense(stated) | {"phase_zero_deg": Known(sense.zero_deg, "deg", how, error)}
+    known["phase_zero_deg"] = Known(sense.zero_deg, "deg", how, error)
     notes = (*curve.notes, *sense.notes, *((f"Sign: {sense.reason}.",) if sense.reason else ()))
     return replace(curve, phase_lag_deg=sense.lag_deg(phase), known=known, notes=notes)
-
-
-def _known_sense(stated: str) -> dict[str, Known]:
-    """Return that the phase was stated to be a lag or a lead; as the curve keeps it, it is a lag."""
-    return {"phase_sense": Known("lag", "", f"option: the file's phase is a {stated}")} if stated else {}
 
 
 def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> PhaseReadings | None:
@@ -651,23 +608,19 @@ def _phase_readings(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Ph
     drive, free, quality = (curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz", "quality_factor"))
     if curve.phase_lag_deg is None or curve.amplitude is None or drive is None or free is None or quality is None:
         return None
-
-    def relative_error(key: str) -> float:
-        error = curve.known[key].error
-        return USUAL_ERRORS[key] if error is None else error / float(curve.known[key].value)
-
+    known = [(key, curve.known[key]) for key in ("free_frequency_khz", "quality_factor")]
+    errors = [USUAL_ERRORS[key] if one.error is None else one.error / float(one.value) for key, one in known]
     ones = np.ones(len(curve.offset_nm))
     level = float(np.mean([look.level for look in looks.values()]))
-    noise = max((look.noise for look in looks.values() if np.isfinite(look.noise)), default=0.0)
     here = [np.flatnonzero(curve.branch == branch) for branch in looks]
     return PhaseReadings(
         drive=str(curve.known["drive"].value),
         frequency_ratio=drive / free * ones,
-        frequency_error=relative_error("free_frequency_khz"),
+        frequency_error=errors[0],
         quality_factor=quality,
-        quality_error=relative_error("quality_factor"),
+        quality_error=errors[1],
         ratio=curve.amplitude / level,
-        ratio_error=(noise / level or 0.01) * ones,
+        ratio_error=(_noise(looks) / level or 0.01) * ones,
         phase_deg=curve.phase_lag_deg,
         phase_error_deg=float(curve.known["phase_error_deg"].value) * ones,
         free=curve.free,
@@ -747,10 +700,7 @@ def table_text(curve: MeasuredCurve) -> str:
         remarks.append(f"left out: {np.sum(~moving)} rows whose amplitude is not above zero")
     lines += [f"# {remark}" for remark in remarks]
     lines.append(",".join(present))
-    lines += [
-        ",".join(cell if isinstance(cell, str) else repr(cell) for cell in row)
-        for row in zip(*present.values(), strict=True)
-    ]
+    lines += [",".join(map(repr, row)) for row in zip(*present.values(), strict=True)]
     return "\n".join(lines) + "\n"
 
 
@@ -769,8 +719,7 @@ def _rows(curve: MeasuredCurve) -> Binned:
     if curve.bin_nm is None:
         count = np.ones(len(curve.offset_nm), dtype=int)
         rows = {name: np.full(len(count), error) for name, error in errors.items()}
-        ways = all((last > first) == (name == "approach") for name, (first, last) in _ends(curve).items())
-        in_order = ways and not any(faults_of_order(curve.offset_nm, curve.branch))
+        in_order = all(_as_named(curve)) and not any(faults_of_order(curve.offset_nm, curve.branch))
         return Binned(curve.offset_nm, readings, rows, count, curve.branch, in_order)
     stated = {name: errors[name] for name, one in single.items() if not curve.bin_nm or one.origin.startswith("option")}
     means = binned(curve.offset_nm, readings, curve.branch, curve.free, curve.bin_nm, stated)
@@ -783,19 +732,14 @@ def _rows(curve: MeasuredCurve) -> Binned:
 
 def _setting_lines(curve: MeasuredCurve) -> list[str]:
     """Return the comment lines that a table understands."""
-    lines = []
-    for key in ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m"):
-        known = curve.known.get(key)
-        if known is not None:
-            lines.append(f"# {key} = {known.value!r}" + (f" +- {known.error!r}" if known.error else ""))
-    for key in ("offset_origin_nm", "phase_zero_deg"):
-        known = curve.known.get(key)
-        if known is not None and known.error:
-            lines.append(f"# {key} = 0 +- {known.error!r}")
+    lever, zeros = ("free_frequency_khz", *_WANTED), ("offset_origin_nm", "phase_zero_deg")
+    known = {key: curve.known[key] for key in (*lever, *zeros) if key in curve.known}
+    lines = [setting_line(key, one.value, one.error) for key, one in known.items() if key in lever]
+    lines += [setting_line(key, "0", one.error) for key, one in known.items() if key in zeros and one.error]
     if curve.phase_lag_deg is not None:
         # the zero was set by the free rows: it says nothing of the sign
         lines.append(f"# phase_sense = {'lag' if 'phase_sense' in curve.known else 'either'}")
     scale = curve.known.get("nm_per_volt")
     if scale is not None and scale.error and not isinstance(scale.value, str):
-        lines.append(f"# tip_calibration = 1 +- {scale.error / scale.value!r}")
+        lines.append(setting_line("tip_calibration", "1", scale.error / scale.value))
     return lines

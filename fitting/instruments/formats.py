@@ -4,7 +4,6 @@ neaSNOM text, WSxM curves, Nanonis text, NanoSurf .nid and separated text are re
 igor2 and Gwyddion's .gwy by gwyfile (`pip install afm-jax[instruments]`), imported only for such a file.
 """
 
-import csv
 import io
 import logging
 import re
@@ -22,7 +21,6 @@ from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import MOST_VALUES
 from fitting.instruments.recording import (
     HEADER_KEYS,
-    NATIVE,
     UNITS,
     Known,
     Recording,
@@ -34,7 +32,7 @@ from fitting.instruments.recording import (
     package_for,
     unit_named,
 )
-from fitting.tables.csv_text import NUMBER, TableError, read_bytes
+from fitting.tables.csv_text import DECIMAL_COMMA, NUMBER, TableError, cells_of, read_bytes, split_lines, text_of
 
 _CURVE = {"approach": "approach", "extend": "approach", "fwd": "approach", "forward": "approach"}
 _CURVE |= {"retract": "retract", "bwd": "retract", "backward": "retract"}
@@ -59,18 +57,17 @@ def read_recording(path: str | Path) -> Recording:
         recording = parse(data, name)
     if not recording.segments or any(not np.size(v) for s in recording.segments for v in s.channels.values()):
         raise cut_off(name, "holds no rows of numbers")
-    return recording if all(channel.isprintable() for channel in recording.channels) else _spelled(recording)
+    # names that cannot be printed could not be given in options
+    return replace(
+        recording,
+        segments=tuple(replace(segment, channels=_spelled(segment.channels)) for segment in recording.segments),
+        units=_spelled(recording.units),
+        away=tuple(map(printable, recording.away)),
+    )
 
 
-def _spelled(recording: Recording) -> Recording:
-    """Return a recording whose channels have names that can be printed, and so given in options."""
-
-    def keys(named: Mapping[str, Any]) -> dict[str, Any]:
-        return {printable(name): value for name, value in named.items()}
-
-    segments = tuple(replace(segment, channels=keys(segment.channels)) for segment in recording.segments)
-    away = tuple(printable(name) for name in recording.away)
-    return replace(recording, segments=segments, units=keys(recording.units), away=away)
+def _spelled(named: Mapping[str, Any]) -> dict[str, Any]:
+    return {printable(name): value for name, value in named.items()}
 
 
 def _parser_of(data: bytes, path: str) -> Callable[[bytes, str], Recording]:
@@ -101,45 +98,27 @@ def holds_curves(head: bytes, path: str) -> bool:
     return _parser_of(head, path) not in {parse_nanosurf, parse_nanonis_text, parse_separated, _refuse_arrays}
 
 
-def text_of(data: bytes, name: str) -> str:
-    """Return the text of a file, UTF-8 or Latin-1, with every line end as a newline.
-
-    Raises:
-        TableError: if it is no text.
-    """
-    data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
-    strange = sum(not (letter.isprintable() or letter.isspace()) for letter in text[:2000])
-    if "\0" in text or strange:
-        line = text[: text.index("\0")].count("\n") + 1 if "\0" in text else 1
-        raise TableError(
-            f"{name}, line {line}: is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, "
-            "Nanonis .dat, Gwyddion .gwy, CSV); export it as CSV"
-        )
-    return text
+_NO_TEXT = (
+    "is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, Nanonis .dat, Gwyddion .gwy, CSV); "
+    "export it as CSV"
+)
 
 
 def _columns(
-    rows: Sequence[tuple[int, list[str]]], names: list[str], name: str, *, decimal: str = "."
+    rows: Sequence[tuple[int, list[str]]], names: list[str], name: str
 ) -> dict[str, Float[np.ndarray, " rows"]]:
     """Return the columns of rows of cells; NaN where a cell holds no number.
 
     Raises:
-        TableError: if a row has another number of cells than there are names.
+        TableError: if a row has another number of cells than there are names, or there is no row.
     """
+    if not rows:
+        raise TableError(f"{name}: there are column names but no rows of numbers below them")
     for line, cells in rows:
         if len(cells) != len(names):
             raise cut_off(f"{name}, line {line}", f"there are {len(cells)} cells for {len(names)} columns")
-    table = np.full((len(names), len(rows)), np.nan)
-    for row, (_, cells) in enumerate(rows):
-        for place, cell in enumerate(cells):
-            plain = cell if decimal == "." else cell.replace(decimal, ".")
-            if NUMBER.fullmatch(plain):
-                table[place, row] = float(plain)
-    return dict(zip(names, table, strict=True))
+    table = [[float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells] for _, cells in rows]
+    return dict(zip(names, np.array(table).T.copy(), strict=True))
 
 
 _NEASNOM_KEYS = {"Tip Frequency:": ("drive_frequency_khz", "Hz")}
@@ -148,14 +127,12 @@ _NEASNOM_KEYS = {"Tip Frequency:": ("drive_frequency_khz", "Hz")}
 def parse_neasnom(data: bytes, name: str) -> Recording:
     """Read neaSNOM's text: `# key: [unit] values`, a row of names, rows of numbers; amplitudes in nm, phases in rad."""
     header: dict[str, str] = {}
-    lines = [(number, line) for number, line in enumerate(text_of(data, name).split("\n"), start=1) if line.strip()]
-    for _, line in lines:
-        if line.startswith("#"):
-            cells = [cell.strip() for cell in line[1:].split("\t") if cell.strip()]
-            if len(cells) > 1:
-                unit = f" {unit_named(cells[1])}" if cells[1].startswith("[") else ""
-                header[cells[0]] = " ".join(cells[2:] if unit else cells[1:]) + unit
-    rows = [(number, line.rstrip("\t").split("\t")) for number, line in lines if not line.startswith("#")]
+    comments, lines = split_lines(text_of(data, name, _NO_TEXT, latin=True))
+    for _, comment in comments:
+        key, *cells = [cell.strip() for cell in comment.split("\t") if cell.strip()]
+        unit = f" {unit_named(cells.pop(0))}" if cells and cells[0].startswith("[") else ""
+        header[key] = " ".join(cells) + unit
+    rows = [(number, cells_of(line, "\t")) for number, line in lines]
     if len(rows) < 2:
         raise cut_off(name, "there is a header but no rows below it")
     names = rows[0][1]
@@ -196,13 +173,10 @@ _WSXM_KEYS = {
 def parse_wsxm(data: bytes, name: str) -> Recording:
     """Read WSxM: an image with its header (left aside), then curves, each a text header and pairs of doubles (x, y)."""
     header, place = _wsxm_header(data, 0, name)
-    shape = [number_in(header.get(f"Number of {side}", "0")) for side in ("columns", "rows")]
     if b"FZ curve file" not in data[:place]:
-        kind = header.get("Image Data Type", "double")
         sizes = {"double": 8, "float": 4, "integer": 4, "short": 2}
-        if kind not in sizes or None in shape:
-            raise cut_off(name, f"the image has the data type {kind!r}")
-        place += int(shape[0][0] * shape[1][0]) * sizes[kind]  # type: ignore[index]
+        pixels = int(header.get("Number of columns", "0")) * int(header.get("Number of rows", "0"))
+        place += pixels * sizes[header.get("Image Data Type", "double")]
     segments: list[Segment] = []
     units: dict[str, str] = {}
     announced, own = 0, header
@@ -259,7 +233,9 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     mark = data.find(b"#!")
     if mark < 0:
         raise cut_off(name, "the mark '#!' in front of the data is missing")
-    sections, header = _nid_sections(data[:mark].decode("latin-1"))
+    sections = _nid_sections(data[:mark].decode("latin-1"))
+    # of a name the first
+    header = {key: value for _, keys in reversed(sections) for key, value in keys.items()}
     sets = [keys for title, keys in sections if re.fullmatch(r"DataSet-\d+:\d+", title)]
     sizes = [int(keys["Points"]) * int(keys["Lines"]) * (int(keys["SaveBits"]) // 8) for keys in sets]
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
@@ -294,18 +270,16 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
 
 
-def _nid_sections(text: str) -> tuple[list[tuple[str, dict[str, str]]], dict[str, str]]:
-    """Return the sections in order, each with its keys, and all keys together (the first of a name)."""
+def _nid_sections(text: str) -> list[tuple[str, dict[str, str]]]:
+    """Return the sections in order, each with its keys."""
     sections: list[tuple[str, dict[str, str]]] = []
-    together: dict[str, str] = {}
     for line in text.split("\r\n"):
         if line.startswith("[") and line.endswith("]"):
             sections.append((line[1:-1], {}))
         elif sections and "=" in line:
             key, _, value = line.partition("=")
             sections[-1][1].setdefault(key, value)
-            together.setdefault(key, value)
-    return sections, together
+    return sections
 
 
 def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -322,11 +296,12 @@ def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, 
 
 def parse_nanonis_text(data: bytes, name: str) -> Recording:
     """Read Nanonis text: a header of tab-separated lines, `[DATA]`, names with units in brackets, rows of numbers."""
-    lines = [(number, line) for number, line in enumerate(text_of(data, name).split("\n"), start=1)]
-    start = next(place for place, (_, line) in enumerate(lines) if line.strip() == "[DATA]")
-    pairs = [line.partition("\t") for _, line in lines[:start] if "\t" in line]
-    header = {key: value.partition("\t")[0] for key, _, value in pairs}
-    rows = [(number, line.rstrip("\t").split("\t")) for number, line in lines[start + 1 :] if line.strip()]
+    lines = text_of(data, name, _NO_TEXT, latin=True).split("\n")
+    start = next(place for place, line in enumerate(lines) if line.strip() == "[DATA]")
+    header = {key: value for key, value, *_ in (line.split("\t") for line in lines[:start] if "\t" in line)}
+    rows = [
+        (number, cells_of(line, "\t")) for number, line in enumerate(lines, 1) if number > start + 1 and line.strip()
+    ]
     if len(rows) < 2:
         raise cut_off(name, "there is nothing below [DATA]")
     names = rows[0][1]
@@ -371,68 +346,52 @@ def _name_and_unit(text: str) -> tuple[str, str]:
 
 
 def parse_separated(data: bytes, name: str) -> Recording:
-    """Read text separated by tabs, semicolons or commas, with decimal commas where these do not separate."""
-    text = text_of(data, name)
-    lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip(" ,;\t")]
-    comments = [line.lstrip("#").strip() for _, line in lines if line.startswith("#")]
-    rows = [(number, line) for number, line in lines if not line.startswith("#")]
+    """Read text separated by tabs, semicolons, commas or blanks, with decimal commas where these do not separate."""
+    comments, rows = split_lines(text_of(data, name, _NO_TEXT, latin=True))
     if not rows:
         raise TableError(f"{name}: the file holds only comments; add rows of numbers")
-    separator = max("\t;,", key=lambda sign: (rows[0][1].count(sign), rows[-1][1].count(sign)))
-    if separator == "," and (other := _beside_decimal_commas(rows[-1][1])) is not None:
-        separator = other
-    if separator and separator in rows[0][1]:
-        cells = [
-            (number, [cell.strip() for cell in next(csv.reader(io.StringIO(line), delimiter=separator))])
-            for number, line in rows
-        ]
+    # the last row may be cut off
+    separator = _separator_of(rows[len(rows) // 2][1])
+    # a tab that ends a row is a blank cell where the first row ends without
+    ending = "\t" if separator == "\t" and not rows[0][1].endswith("\t") else ""
+    cells = [(number, cells_of(line + ending, separator)) for number, line in rows]
+    if separator != ",":
+        cells = [(line, [_with_point(cell) for cell in row]) for line, row in cells]
+    names = cells[0][1]
+    if len(names) < 2 or (separator == " " and not all(map(NUMBER.fullmatch, names))):
+        raise TableError(
+            f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
+        )
+    units_row = [""] * len(names)
+    if any(map(NUMBER.fullmatch, names)):
+        titles = [str(k + 1) for k in range(len(names))]
     else:
-        cells = [(number, line.split()) for number, line in rows]
-        if len(cells[0][1]) < 2 or not all(NUMBER.fullmatch(cell.replace(",", ".")) for cell in cells[0][1]):
-            raise TableError(
-                f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
-            )
-    decimal = "." if separator == "," else ","
-    titles, units_row, body = _heads(cells, decimal)
-    if not body:
-        raise TableError(f"{name}: there are column names but no rows of numbers below them")
-    columns = _columns(body, titles, name, decimal=decimal)
+        titles = [title or f"column {k + 1}" for k, title in enumerate(names)]
+        cells = cells[1:]
+        if cells and len(cells[0][1]) == len(titles) and not any(map(NUMBER.fullmatch, cells[0][1])):
+            units_row, cells = cells[0][1], cells[1:]
+    columns = _columns(cells, titles, name)
     named = [(title, *_name_and_unit(title)) for title in titles]
     units = {plain: unit or unit_named(units_row[k]) for k, (_, plain, unit) in enumerate(named)}
-    pairs = [re.split(r"\s*[=:]\s*", text, maxsplit=1) for text in comments]
+    pairs = [re.split(r"\s*[=:]\s*", comment, maxsplit=1) for _, comment in comments]
     settings = {pair[0]: pair[1] for pair in pairs if len(pair) == 2}
     # this package's own table says in which unit a key is by its name
-    keys = {key: (key, NATIVE.get(quantity, "")) for key, quantity in HEADER_KEYS.items() if key != "temperature_k"}
-    segments = _by_branch(body, titles, {plain: columns[title] for title, plain, _ in named})
+    keys = {key: (key, unit) for key, unit in HEADER_KEYS.items()}
+    segments = _by_branch(cells, titles, {plain: columns[title] for title, plain, _ in named})
     return Recording("separated text", name, segments, units, known_from(settings, keys), settings=settings)
 
 
-def _beside_decimal_commas(line: str) -> str | None:
-    """Return what separates numbers with decimal commas (tab, semicolon, "" for blanks); None where commas separate."""
-    for sign in ("\t", ";", ""):
-        cells = [cell.strip() for cell in (line.split(sign) if sign else line.split())]
-        numbers = all(NUMBER.fullmatch(cell.replace(",", ".", 1)) for cell in cells if cell)
-        if len(cells) > 1 and numbers and not any("," in (cell[:1], cell[-1:]) for cell in cells):
+def _separator_of(row: str) -> str:
+    """Return what separates numbers: commas only where they are no decimal commas."""
+    for sign in "\t; ":
+        cells = [_with_point(cell) for cell in cells_of(row, sign) if cell]
+        if len(cells) > 1 and all(map(NUMBER.fullmatch, cells)):
             return sign
-    return None
+    return next((sign for sign in "\t;," if sign in row), " ")
 
 
-def _heads(
-    cells: list[tuple[int, list[str]]], decimal: str
-) -> tuple[list[str], list[str], list[tuple[int, list[str]]]]:
-    """Return the names of the columns, their units where a row of them follows, and the other rows."""
-
-    def numeric(row: list[str]) -> bool:
-        return any(NUMBER.fullmatch(cell.replace(decimal, ".") if decimal == "," else cell) for cell in row)
-
-    if numeric(cells[0][1]):
-        width = len(cells[0][1])
-        return [str(k + 1) for k in range(width)], [""] * width, cells
-    titles = [title or f"column {k + 1}" for k, title in enumerate(cells[0][1])]
-    second = cells[1][1] if len(cells) > 1 else []
-    if second and not numeric(second) and len(second) == len(titles):
-        return titles, second, cells[2:]
-    return titles, [""] * len(titles), cells[1:]
+def _with_point(cell: str) -> str:
+    return cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell) else cell
 
 
 def _by_branch(
@@ -455,8 +414,6 @@ _IGOR_KEYS = {
     "InvOLS": ("deflection_nm_per_volt", "m/V"),
     "AmpInvOLS": ("nm_per_volt", "m/V"),
 }
-_IGOR_HEADER = 64
-"""Bytes in front of a wave of version 5, the only one with labels."""
 _IGOR_UNITS = {"amp": "m", "defl": "m", "zsnsr": "m", "raw": "m", "lvdt": "m", "phase": "deg", "phas": "deg"}
 
 
@@ -486,12 +443,13 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
 def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
     """Return the labels along a side of a wave: texts in fields of 32 bytes, that of the side itself first.
 
-    What stands behind a text's NUL in its field is left over from earlier texts; a field without NUL goes on in the
-    next one.
+    What stands behind a text's NUL in its field is left over from earlier texts (igor2 keeps it); a field without NUL
+    goes on in the next one.
     """
     sizes = [int(size) for size in header.get("dimLabelsSize", ())]
     parts = [header.get(f"{part}Size", 0) for part in ("wfm", "formula", "note", "dataEUnits", "dimEUnits")]
-    start = _IGOR_HEADER + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
+    # behind a header of 64 bytes; version 5 is the only one with labels
+    start = 64 + sum(int(np.sum(part)) for part in parts) + sum(sizes[:side])
     labels = [b""]
     for place in range(start, start + sum(sizes[side : side + 1]), 32):
         text, end, _ = data[place : place + 32].partition(b"\0")
@@ -526,12 +484,10 @@ def _igor_points(data: bytes) -> int:
     order = "little" if data[:2] == b"\x05\x00" else "big"
     if data[:2] not in {b"\x05\x00", b"\x00\x05"}:
         return 0
-    points = int.from_bytes(data[76:80], order, signed=True)
-    sides = [int.from_bytes(data[k : k + 4], order, signed=True) for k in range(132, 148, 4)]
-    sizes = [int.from_bytes(data[k : k + 4], order, signed=True) for k in range(4, 56, 4)]
-    if min(points, *sides, *sizes) < 0:
-        return len(data) + 1
-    return max(points, *sides, *sizes)
+    # sizes of the parts, points, points along each side
+    places = (*range(4, 56, 4), 76, *range(132, 148, 4))
+    announced = [int.from_bytes(data[k : k + 4], order, signed=True) for k in places]
+    return max(announced) if min(announced) >= 0 else len(data) + 1
 
 
 def _igor_free(header: dict[str, str], known: dict[str, Known]) -> dict[str, Known]:

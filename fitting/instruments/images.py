@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import LARGEST_BYTES
-from fitting.instruments.columns import ROLES, ColumnSource, parse_columns
+from fitting.instruments.columns import ColumnSource, checked_unit, parse_columns
 from fitting.instruments.formats import NANOSURF_KEYS, gwyddion_objects, igor_wave, is_igor
 from fitting.instruments.recording import (
     UNITS,
@@ -94,10 +94,7 @@ def read_images(
             package that reads it is missing.
     """
     if isinstance(path, tuple):
-        name, images = (
-            "arrays",
-            _Images({"amplitude": (path[0], "nm"), "phase": (path[1], "deg")}),
-        )
+        name, images = "arrays", _Images({"amplitude": (path[0], "nm"), "phase": (path[1], "deg")})
     else:
         name, images = printable(str(path)), _images(path)
     if phase_path is not None:
@@ -152,12 +149,7 @@ def _channel(images: _Images, role: str, source: ColumnSource | None, name: str)
             "phase as two files"
         )
     unit = source.unit or images.channels[source.channel][1] or usual
-    if UNITS.get(unit, ("",))[0] not in ROLES[role][0]:
-        raise TableError(
-            f"{name}: the channel {source.channel} has the unit {unit!r}, which is none of {role}; say "
-            f'`columns="{role}={source.channel}:{usual}"`'
-        )
-    return ColumnSource(source.channel, unit, source.factor)
+    return ColumnSource(source.channel, checked_unit(unit, role, source.channel, name), source.factor)
 
 
 # ---- formats

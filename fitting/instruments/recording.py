@@ -53,6 +53,11 @@ def unit_named(text: str) -> str:
     return _SPELLINGS.get(plain, plain)
 
 
+def quantity_of(unit: str) -> str:
+    """Return what a unit measures; empty of one that is not in `UNITS`."""
+    return UNITS.get(unit, ("", 1.0))[0]
+
+
 @dataclass(frozen=True)
 class Known:
     """Something known about a measurement, and where it comes from.
@@ -128,25 +133,16 @@ def number_in(text: str) -> tuple[float, str] | None:
 
 
 HEADER_KEYS = {
-    "free_frequency_khz": "frequency",
-    "drive_frequency_khz": "frequency",
+    "free_frequency_khz": "kHz",
+    "drive_frequency_khz": "kHz",
     "quality_factor": "",
-    "spring_constant_n_per_m": "stiffness",
-    "free_amplitude_nm": "length",
-    "deflection_nm_per_volt": "sensitivity",
-    "nm_per_volt": "sensitivity",
-    "temperature_k": "temperature",
+    "spring_constant_n_per_m": "N/m",
+    "free_amplitude_nm": "nm",
+    "deflection_nm_per_volt": "nm/V",
+    "nm_per_volt": "nm/V",
     "averages": "",
 }
-"""What headers say that matters here, and what it measures."""
-NATIVE = {
-    "frequency": "kHz",
-    "stiffness": "N/m",
-    "length": "nm",
-    "sensitivity": "nm/V",
-    "temperature": "K",
-}
-"""This package's unit of a quantity."""
+"""What headers say that matters here, and its unit."""
 
 
 def known_from(
@@ -165,9 +161,9 @@ def known_from(
         if said is None or not said[0] > 0.0:
             continue
         quantity, factor = UNITS.get(said[1] or unit, ("", 1.0))
-        if quantity == HEADER_KEYS[key]:
+        if quantity == quantity_of(HEADER_KEYS[key]):
             # twelve digits: a change of unit must not add others
-            found[key] = Known(float(f"{said[0] * factor:.12g}"), NATIVE.get(quantity, ""), f"{where}: {name}")
+            found[key] = Known(float(f"{said[0] * factor:.12g}"), HEADER_KEYS[key], f"{where}: {name}")
     return found
 
 

@@ -23,12 +23,6 @@ from afm_jax.solve.lanes import compiled_quickly
 
 _HALF_SINE = 0.42441318157838753
 """4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
-_ARRIVAL_STEPS = 8
-_ITERATIONS = 30
-_LONGEST_MOVE = 0.3
-_SETTLED = 1e-24
-_ARRIVED = 1e-6
-"""Squared distance to the minimum, in standard errors, at which a search stops, and up to which its end counts."""
 _ANGLES = (-0.45, 0.0, 0.45)
 """Starts of the search: angle of the response in rad beside a half sine's."""
 
@@ -41,14 +35,6 @@ class MeasuredRow(NamedTuple):
     value: Float[Array, " 3"]
     error: Float[Array, " 3"]
     """Infinite where nothing was measured."""
-
-
-class FlightEnd(NamedTuple):
-    """The impact at the ends of a flight, as that of a free tip on a sample at rest: scalars."""
-
-    approach_speed: Float[Array, ""]
-    rebound_speed: Float[Array, ""]
-    delay_us: Float[Array, ""]
 
 
 class Inverted(NamedTuple):
@@ -84,7 +70,7 @@ def flight_of(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantil
         return duration + jnp.clip(move, -0.1 * period, 0.1 * period)
 
     period = row.order * row.platform.period_us
-    found = lax.stop_gradient(lax.fori_loop(0, _ARRIVAL_STEPS, step, period))
+    found = lax.stop_gradient(lax.fori_loop(0, 8, step, period))
     _, _, gap, rate = ends(found)
     # one more step carries the derivative of the root
     duration = found - gap / lax.stop_gradient(rate)
@@ -105,8 +91,8 @@ def readings(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Fl
     return jnp.stack([peak_amplitude(cantilever, flight), amplitude, phase])
 
 
-def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> FlightEnd:
-    """Return the impact between a flight and the next, brought to that of a free tip on a sample at rest.
+def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
+    """Return approach speed, rebound speed and delay between a flight and the next, of a free tip on a sample at rest.
 
     What air, spring and the platform's motion do during a Hertz contact is taken back (`gained_and_longer`): its
     duration is the delay, for want of a law that tells lead and offset apart.
@@ -122,18 +108,9 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> F
         return gained_and_longer(approach, jnp.maximum(tau, 0.0), middle, cantilever)
 
     free_delay = lax.fori_loop(0, 3, lambda _, free_delay: delay - taken_back(free_delay)[1], delay)
-    gained, _ = taken_back(delay)
-    square = jnp.where(rebound > 0.0, rebound**2, 0.0) - gained
-    free_rebound = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
-    return FlightEnd(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
-
-
-def _residual(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
-    apart = readings(flight, row, cantilever) - row.value
-    # the phase is known modulo a drive period
-    turn = 360.0 / row.order
-    apart = apart.at[2].set((apart[2] + 0.5 * turn) % turn - 0.5 * turn)
-    return jnp.where(jnp.isfinite(row.error), apart / row.error, 0.0)
+    square = jnp.where(rebound > 0.0, rebound**2 - taken_back(delay)[0], -1.0)
+    free_rebound = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), jnp.nan)
+    return jnp.stack([approach, free_rebound, free_delay])
 
 
 @compiled_quickly()
@@ -145,7 +122,12 @@ def _evaluate(
 
     def twice(unknowns):
         flight = flight_of(unknowns, row, cantilever)
-        both = jnp.concatenate([_residual(flight, row, cantilever), jnp.stack(impact_of(flight, row, cantilever))])
+        apart = readings(flight, row, cantilever) - row.value
+        # the phase is known modulo a drive period
+        turn = 360.0 / row.order
+        apart = apart.at[2].set((apart[2] + 0.5 * turn) % turn - 0.5 * turn)
+        residual = jnp.where(jnp.isfinite(row.error), apart / row.error, 0.0)
+        both = jnp.concatenate([residual, impact_of(flight, row, cantilever)])
         return both, both
 
     slopes, both = jax.jacfwd(twice, has_aux=True)(unknowns)
@@ -159,12 +141,11 @@ def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
         rows: arrays with a leading axis of rows.
         cantilever: its frequency and Q, exactly known.
     """
-    beside = np.stack([_ANGLES, np.zeros(len(_ANGLES))], axis=1)
     height = np.where(np.isfinite(rows.error[:, 0]), rows.value[:, 0], rows.value[:, 1] / _HALF_SINE)
     # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi
-    middle = np.stack([np.full_like(height, np.pi), np.log(np.asarray(cantilever.angular_frequency) * height)], axis=1)
-    kept = (middle[:, None] + beside).reshape(-1, 2)
-    each = jax.tree.map(lambda part: np.repeat(np.asarray(part), len(beside), axis=0), rows)
+    speed = np.repeat(np.log(np.asarray(cantilever.angular_frequency) * height), len(_ANGLES))
+    kept = np.stack([np.pi + np.tile(_ANGLES, len(height)), speed], axis=1)
+    each = jax.tree.map(lambda part: np.repeat(np.asarray(part), len(_ANGLES), axis=0), rows)
 
     def look(places: Float[np.ndarray, "some 2"], some: Int[np.ndarray, " some"]) -> Searches:
         # all places at once, so that one program serves: what the others have is known already
@@ -173,18 +154,16 @@ def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
         chi2 = np.sum(residual**2, axis=1)
         return Searches(places, residual, slopes, np.where(np.isfinite(chi2), chi2, np.inf))
 
-    box = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros(kept.shape, dtype=bool), _LONGEST_MOVE)
-    ends = descended(look, look(kept.copy(), np.arange(len(kept))), box, settled=_SETTLED, most=_ITERATIONS)
+    box = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros(kept.shape, dtype=bool), longest=0.3)
+    ends = descended(look, look(kept.copy(), np.arange(len(kept))), box, settled=1e-24, most=30)
     impact, slopes = (np.asarray(part)[:, 3:] for part in _evaluate(ends.place, each, cantilever))
-    covariance = (
-        slopes
-        @ whole_covariance_of(np.einsum("snp,snq->spq", ends.jacobian, ends.jacobian))
-        @ np.swapaxes(slopes, 1, 2)
-    )
-    good = (distance(ends, box) < _ARRIVED) & (impact[:, :2] > 0.0).all(axis=1)
+    spread = whole_covariance_of(np.swapaxes(ends.jacobian, 1, 2) @ ends.jacobian)
+    covariance = slopes @ spread @ np.swapaxes(slopes, 1, 2)
+    # a search has arrived if its minimum is within a thousandth of a standard error
+    good = (distance(ends, box) < 1e-6) & (impact[:, :2] > 0.0).all(axis=1)
     good &= np.isfinite(covariance).all(axis=(1, 2))
     # of equally good ones that with the shortest contact
-    response = np.repeat(np.asarray(rows.order * rows.platform.period_us), len(beside))
-    score = np.where(good, ends.chi2 + 1e-3 * (impact[:, 2] / response) ** 2, np.inf).reshape(-1, len(beside))
-    best = np.argmin(score, axis=1) + len(beside) * np.arange(len(score))
+    response = np.repeat(np.asarray(rows.order * rows.platform.period_us), len(_ANGLES))
+    score = np.where(good, ends.chi2 + 1e-3 * (impact[:, 2] / response) ** 2, np.inf).reshape(len(height), -1)
+    best = np.argmin(score, axis=1) + len(_ANGLES) * np.arange(len(score))
     return Inverted(impact[best], covariance[best], ends.chi2[best], good[best])

@@ -1,7 +1,7 @@
 """Direct inversion: amplitude and phase of each row give the speeds of its impact and the collision delay, no law."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -12,14 +12,15 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import printed_table
+from afm_jax.columns import printed_table, rows_of
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import filled
 from afm_jax.words import bullets, with_error
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
+from fitting.models import constraints_of, readings_of
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable, TableLike, as_table, check_quality_factor
+from fitting.tables.table import AmplitudeTable, TableLike, as_table
 
 _BLOCK = 64
 """Rows come filled up to a multiple of this, so that one program serves most tables."""
@@ -27,7 +28,6 @@ _OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _SLOW = 2.5
 """Rows below this multiple of sqrt(epsilon) are left out of the lines: their contact is no short event any more."""
-_PASSES = 6
 POWERS = {"viscous": 1, "restitution": 2}
 """By the law the power n of u_in in u_in^2 - u_out^2 = epsilon + slope u_in^n; slopes are viscous_loss and 1 - r^2."""
 
@@ -111,24 +111,22 @@ class Inversion(Result):
 
     def records(self) -> list[dict[str, Any]]:
         """Return the rows, each with its drive."""
-        (columns,) = self.tables().values()
-        return [dict(zip(columns, cells, strict=True)) for cells in zip(*columns.values(), strict=True)]
+        return rows_of(self.tables()["invert.csv"])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax invert`."""
-        told = {name: getattr(self, name) for name in ("valid", "reasons", "warnings", "preferred", "shared_names")}
-        lines = {name: asdict(line) for name, line in self.lines.items()}
-        return {"format": "afm-jax invert", "format_version": 2} | told | {"rows": self.records(), "lines": lines}
+        names = ("valid", "reasons", "warnings", "preferred", "shared_names")
+        own = {"format": "afm-jax invert", "format_version": 2} | {name: getattr(self, name) for name in names}
+        return own | {"rows": self.records(), "lines": {name: vars(line) for name, line in self.lines.items()}}
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of invert.csv."""
         drive = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
-        names = ("approach_speed", "rebound_speed", "collision_delay")
-        columns: dict[str, Any] = {name: getattr(self.table, name).tolist() for name in drive}
-        for name, unit, error in zip(names, ("nm_per_us", "nm_per_us", "us"), self.errors.T, strict=True):
-            columns |= {f"{name}_{unit}": getattr(self, f"{name}_{unit}").tolist()}
-            columns |= {f"{name}_error_{unit}": error.tolist()}
-        return {"invert.csv": columns | {"in_lines": self.in_lines.tolist(), "note": list(self.note)}}
+        columns: dict[str, Any] = {name: getattr(self.table, name) for name in drive}
+        found = {"approach_speed": "nm_per_us", "rebound_speed": "nm_per_us", "collision_delay": "us"}
+        for (name, unit), error in zip(found.items(), self.errors.T, strict=True):
+            columns |= {f"{name}_{unit}": getattr(self, f"{name}_{unit}"), f"{name}_error_{unit}": error}
+        return {"invert.csv": columns | {"in_lines": self.in_lines, "note": list(self.note)}}
 
     def printed(self) -> list[Any]:
         """Return the verdict, the rows and the lines."""
@@ -170,59 +168,62 @@ def invert(table: TableLike) -> Inversion:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
-    check_quality_factor(table)
     require_float64()
     if table.tapping:
         raise TableError(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "
             "`afm-jax tapping` reads energy and impact speeds off such rows without a law, `afm-jax fit` fits a law"
         )
-    known = np.isfinite(_numbers(table)[1])
-    chosen = np.flatnonzero(known[:, 2] & known[:, :2].any(axis=1))
+    value, error = readings_of(table)
+    measured = np.isfinite(value) & np.isfinite(error)
+    chosen = np.flatnonzero(measured[:, 2:].any(axis=1) & measured[:, :2].any(axis=1))
     if not chosen.size:
         raise TableError(
             f"{table.source}: no row has a phase with an amplitude; add the columns phase_deg and phase_error_deg, or "
             "use `afm-jax fit`"
         )
-    values = {name: value for name, (value, _) in table.calibration.items()}
-    errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": table.free_frequency_error_khz}
-    errors = {name: e for name, e in (errors | {k: e for k, (_, e) in table.calibration.items()}).items() if e}
-    at = _EXACT | {"free_frequency_khz": table.free_frequency_khz, "quality_factor": table.quality_factor} | values
-    found = _at(table, chosen, at)
-    moved = [_at(table, chosen, at | {name: at[name] + error}) for name, error in errors.items()]
-    impact, covariance = np.full((table.rows, 3), np.nan), np.full((table.rows, 3, 3), np.nan)
-    shared = np.full((table.rows, 3, len(moved)), np.nan)
+    read = np.where(measured, value, 1.0)[chosen], np.where(measured, error, np.inf)[chosen]
+    stated = constraints_of(table, None)
+    known = _EXACT | {"quality_factor": table.quality_factor, "free_frequency_khz": table.free_frequency_khz}
+    known |= {name: value for name, (value, _) in stated.items()}
+    found = _inverted(table, chosen, *read, known)
+    moved = [_inverted(table, chosen, *read, known | {name: sum(both)}) for name, both in stated.items()]
     good = np.logical_and.reduce([one.converged for one in (found, *moved)])
     rows = chosen[good]
-    impact[rows], covariance[rows] = found.impact[good], found.covariance[good]
-    for k, other in enumerate(moved):
-        shared[rows, :, k] = (other.impact - found.impact)[good]
+
+    def of_table(part: Float[np.ndarray, "chosen ..."]) -> Float[np.ndarray, "rows ..."]:
+        """Return numbers of the chosen rows as those of all rows, NaN where there are none."""
+        whole = np.full((table.rows, *part.shape[1:]), np.nan)
+        whole[rows] = part[good]
+        return whole
+
+    impact, covariance = of_table(found.impact), of_table(found.covariance)
+    changes = [(one.impact - found.impact)[:, :, None] for one in moved]
+    shared = of_table(np.concatenate([np.zeros((chosen.size, 3, 0)), *changes], axis=2))
+    lines, fast = _lines(impact[rows], covariance[rows], shared[rows])
     note = np.full(table.rows, "no phase with an amplitude: nothing to invert", dtype=object)
     note[chosen] = "no flight between two impacts has this amplitude and phase"
-    note[rows] = ""
-    chi2 = found.chi2[good]
-    for row, apart in zip(rows[chi2 > _OUTLIER], chi2[chi2 > _OUTLIER], strict=True):
-        note[row] = f"amplitudes and phase contradict each other (chi2 {apart:.3g} of one degree of freedom)"
-    lines, fast = _lines(impact[rows], covariance[rows], shared[rows])
-    for row in rows[~fast]:
-        note[row] = note[row] or f"slower than {_SLOW} sqrt(epsilon): left out of the lines"
+    note[rows] = np.where(fast, "", f"slower than {_SLOW} sqrt(epsilon): left out of the lines")
+    for row, chi2 in zip(rows, found.chi2[good], strict=True):
+        if chi2 > _OUTLIER:
+            note[row] = f"amplitudes and phase contradict each other (chi2 {chi2:.3g} of one degree of freedom)"
     u, w, delay = impact.T
+    unsure = table.quality_factor is not None and table.quality_factor_error is None
     result = Inversion(
         approach_speed_nm_per_us=u,
         rebound_speed_nm_per_us=w,
         collision_delay_us=delay,
         covariance=covariance,
         shared=shared,
-        shared_names=tuple(errors),
+        shared_names=tuple(stated),
         note=tuple(note),
         in_lines=np.isin(np.arange(table.rows), rows[fast]),
         lines=lines,
         table=table,
+        warnings=("Q comes without an error: its uncertainty is not in the errors here",) if unsure else (),
     )
     reason = _why_not_valid(result)
-    unsure = table.quality_factor is not None and table.quality_factor_error is None
-    warnings = ("Q comes without an error: its uncertainty is not in the errors here",) if unsure else ()
-    return replace(result, valid=reason is None, reasons=(reason,) if reason else (), warnings=warnings)
+    return replace(result, valid=reason is None, reasons=() if reason is None else (reason,))
 
 
 def _why_not_valid(e: Inversion) -> str | None:
@@ -238,31 +239,25 @@ def _why_not_valid(e: Inversion) -> str | None:
     return None
 
 
-def _numbers(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"]]:
-    """Return peak, lock-in amplitude and phase, and their errors, infinite where nothing was measured."""
-    blank = np.full(table.rows, np.nan)
-    names = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_deg")
-    errors = ("peak_amplitude_error_nm", "lockin_amplitude_error_nm", "phase_error_deg")
-    value, error = (
-        np.stack([blank if getattr(table, name) is None else getattr(table, name) for name in part], axis=1)
-        for part in (names, errors)
-    )
-    there = np.isfinite(value) & np.isfinite(error)
-    return np.where(there, value, 1.0), np.where(there, error, np.inf)
-
-
-def _at(table: AmplitudeTable, chosen: Int[np.ndarray, " chosen"], instrument: Mapping[str, Any]) -> Inverted:
-    """Return some rows inverted with an instrument."""
-    value, error = _numbers(table)
+def _inverted(
+    table: AmplitudeTable,
+    chosen: Int[np.ndarray, " chosen"],
+    value: Float[np.ndarray, "chosen 3"],
+    error: Float[np.ndarray, "chosen 3"],
+    instrument: Mapping[str, Any],
+) -> Inverted:
+    """Return some rows inverted with an instrument; `value` and `error` are what they read."""
     per_nm = np.array([instrument["tip_calibration"], instrument["tip_calibration"], 1.0])
     zero = np.array([0.0, 0.0, instrument["phase_zero_deg"]])
-    fill = filled(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
+    size = -(-chosen.size // _BLOCK) * _BLOCK
     amplitude = instrument["drive_calibration"] * table.excitation_nm
+    offset = instrument["offset_origin_nm"] + table.offset_nm
+    drive = (part[chosen] for part in (amplitude, table.drive_frequency_khz, offset, table.order.astype(float)))
+    columns = (*drive, (value - zero) / per_nm, error / per_nm)
+    amplitude, frequency, offset, order, read, spread = (jnp.asarray(filled(column, size)) for column in columns)
     # every field an array of the rows' shape, for `vmap`
-    drive = (amplitude, table.drive_frequency_khz, instrument["offset_origin_nm"] + table.offset_nm)
-    platform = Platform(*(jnp.asarray(part[fill]) for part in drive), offset_rate_nm_per_us=jnp.zeros(fill.size))
-    readings = (jnp.asarray(part[fill]) for part in ((value - zero) / per_nm, error / per_nm))
-    rows = MeasuredRow(platform, jnp.asarray(table.order[fill], float), *readings)
+    platform = Platform(amplitude, frequency, offset, offset_rate_nm_per_us=jnp.zeros(size))
+    rows = MeasuredRow(platform, order, read, spread)
     cantilever = Cantilever(instrument["free_frequency_khz"], instrument["quality_factor"], table.mass_ng)
     return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
 
@@ -318,6 +313,6 @@ def line(
         return Line(epsilon, epsilon_error, slope, slope_error, chi2, freedom, chi2_tail(chi2, freedom))
 
     found = at(0.0)
-    for _ in range(_PASSES):
+    for _ in range(6):
         found = at(found.slope)
     return found

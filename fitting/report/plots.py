@@ -1,6 +1,5 @@
 """The pictures of a fit: measured and predicted amplitudes, residuals, and the law with its band."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -63,9 +62,19 @@ def law_figure(result: FitResult) -> Figure:
 
 
 def speed_figure(result: FitResult) -> Figure:
-    """Return the figure of the residuals against the approach speed."""
+    """Return the figure of the normalised residuals over the approach speed: what is left of a wrong law shows here."""
     figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
-    draw_residuals_by_speed(figure.subplots(), result)
+    axes, speed = figure.subplots(), result.rows.approach_speed_nm_per_us
+    _draw_expected(axes)
+    for kind in range(result.rows.residual.shape[1]):
+        residual = result.rows.residual[:, kind]
+        if np.isfinite(residual).any():
+            axes.plot(speed, residual, "o", ms=3.5, color=COLOURS[kind], label=_KINDS[kind])
+    if (np.isfinite(speed) & np.isfinite(result.rows.residual).any(axis=1)).any():
+        log_speed_axis(axes)
+        axes.legend(fontsize=SMALL, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
+    axes.set_ylabel("residual (errors)")
+    axes.set_xlabel(_APPROACH)
     return figure
 
 
@@ -142,21 +151,6 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
         _mark_orders(axes, result, above=False)
     axes.set_ylabel("residual (errors)")
     axes.set_xlabel(_HEIGHT if result.table.tapping else _ROW_AXIS)
-
-
-def draw_residuals_by_speed(axes: Axes, result: FitResult) -> None:
-    """Draw the normalised residuals against the approach speed: what is left of a wrong law shows here."""
-    _draw_expected(axes)
-    speed = result.rows.approach_speed_nm_per_us
-    for kind in range(result.rows.residual.shape[1]):
-        residual = result.rows.residual[:, kind]
-        if np.isfinite(residual).any():
-            axes.plot(speed, residual, "o", ms=3.5, color=COLOURS[kind], label=_KINDS[kind])
-    if (np.isfinite(speed) & np.isfinite(result.rows.residual).any(axis=1)).any():
-        log_speed_axis(axes)
-        axes.legend(fontsize=SMALL, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
-    axes.set_ylabel("residual (errors)")
-    axes.set_xlabel(_APPROACH)
 
 
 def log_speed_axis(axes: Axes) -> None:
@@ -248,16 +242,11 @@ def draw_law(axes: Axes, result: FitResult) -> None:
 def draw_losses(axes: Axes, result: FitResult) -> None:
     """Draw the share of its energy that the tip loses, where the laws differ visibly."""
     law = result.law
-    speed = law.approach_speed_nm_per_us
     lost, least, most = (
-        100.0 * (1.0 - (column / speed) ** 2)
+        100.0 * (1.0 - (column / law.approach_speed_nm_per_us) ** 2)
         for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us, law.rebound_low_nm_per_us)
     )
-    axes.fill_between(speed, least, most, color=COLOURS[0], alpha=0.3, lw=0)
-    axes.plot(speed, lost, color=COLOURS[0])
-    _mark_speeds(axes, result)
-    log_speed_axis(axes)
-    axes.set_xlabel(_APPROACH)
+    _draw_with_band(axes, result, lost, least, most)
     axes.set_ylabel("energy lost (%)")
     top = float(np.max(np.where(np.isfinite(most), most, lost)))
     axes.set_ylim(0, min(1.15 * top, 105.0) if top > 0.0 else 1.0)
@@ -265,17 +254,29 @@ def draw_losses(axes: Axes, result: FitResult) -> None:
 
 def draw_delay(axes: Axes, result: FitResult) -> None:
     """Draw the collision delay, which is zero where impacts are instantaneous."""
-    law = result.law
-    speed = law.approach_speed_nm_per_us
+    law, reached = result.law, result.rows.reached_nm_per_us
+    columns = 1e3 * np.stack([law.collision_delay_us, law.delay_low_us, law.delay_high_us])
     axes.axhline(0, color="0.6", ls="--", lw=0.9)
-    axes.fill_between(speed, 1e3 * law.delay_low_us, 1e3 * law.delay_high_us, color=COLOURS[0], alpha=0.3, lw=0)
-    axes.plot(speed, 1e3 * law.collision_delay_us, color=COLOURS[0])
+    _draw_with_band(axes, result, *columns)
+    axes.set_ylabel("collision delay (ns)")
+    # below the measured speeds the delay may fall steeply: the values at these, and 0, decide the height
+    slowest, fastest = np.min(reached, initial=np.inf), np.max(reached, initial=0.0)
+    inside = (law.approach_speed_nm_per_us >= slowest) & (law.approach_speed_nm_per_us <= fastest)
+    values = columns[np.isfinite(columns) & inside]
+    if values.size:
+        low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
+        margin = 0.12 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)
+
+
+def _draw_with_band(axes: Axes, result: FitResult, value: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+    """Draw what a law says over the approach speed, with its band and the speeds of the rows."""
+    speed = result.law.approach_speed_nm_per_us
+    axes.fill_between(speed, low, high, color=COLOURS[0], alpha=0.3, lw=0)
+    axes.plot(speed, value, color=COLOURS[0])
     _mark_speeds(axes, result)
     log_speed_axis(axes)
     axes.set_xlabel(_APPROACH)
-    axes.set_ylabel("collision delay (ns)")
-    # below the measured speeds the delay may fall steeply
-    _frame(axes, result, [1e3 * column for column in (law.collision_delay_us, law.delay_low_us, law.delay_high_us)])
 
 
 def _mark_speeds(axes: Axes, result: FitResult, label: str | None = None) -> None:
@@ -283,17 +284,3 @@ def _mark_speeds(axes: Axes, result: FitResult, label: str | None = None) -> Non
     reached = result.rows.reached_nm_per_us
     edge = axes.get_xaxis_transform()
     axes.plot(reached, np.full_like(reached, 0.02), "|", color="black", ms=6, mew=0.7, transform=edge, label=label)
-
-
-def _frame(axes: Axes, result: FitResult, columns: Sequence[np.ndarray]) -> None:
-    """Let the values at the measured speeds, and 0, decide an axis' height."""
-    law, reached = result.law, result.rows.reached_nm_per_us
-    if not reached.size:
-        return
-    inside = (law.approach_speed_nm_per_us >= reached.min()) & (law.approach_speed_nm_per_us <= reached.max())
-    values = np.concatenate([column[inside] for column in columns])
-    values = values[np.isfinite(values)]
-    if values.size:
-        low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
-        margin = 0.12 * (high - low) or 1.0
-        axes.set_ylim(low - margin, high + margin)

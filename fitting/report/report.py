@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.columns import rows_of
 from afm_jax.saved import saved
 from afm_jax.scenefile.law_files import save_law_csv
-from afm_jax.words import known, percent
+from afm_jax.words import counted, known, percent
 from fitting.infer.comparison import Comparison
-from fitting.infer.result import FitResult, FittedParameter, FittedRows
+from fitting.infer.result import FitResult, FittedParameter
 from fitting.report.files import write_report_files
 from fitting.report.sections import (
     Bullets,
@@ -31,33 +32,11 @@ from fitting.report.words import (
     held_in_words,
     interval_in_words,
     losses_in_words,
-    nuisances_in_words,
     parting_in_words,
-    rows_in_words,
-    tables_in_words,
     value_in_words,
 )
 from fitting.sampling.posterior_result import Posterior
 from fitting.tables.several import SeveralTables
-
-ROW_COLUMNS = (
-    "line",
-    "order",
-    "drive_frequency_khz",
-    "drive_amplitude_nm",
-    "offset_nm",
-    "measured_peak_amplitude_nm",
-    "predicted_peak_amplitude_nm",
-    "peak_residual",
-    "measured_lockin_amplitude_nm",
-    "predicted_lockin_amplitude_nm",
-    "lockin_residual",
-    "approach_speed_nm_per_us",
-    "stable_orbits",
-    "model_error",
-    "used",
-    "set_aside",
-)
 
 
 def summary(result: FitResult, comparison: Comparison | None = None, posterior: Posterior | None = None) -> str:
@@ -70,13 +49,11 @@ def fit_report(result: FitResult, comparison: Comparison | None = None, posterio
     head = ["parameter", "value", "std. error", "95 % interval"]
     cells = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
     parting = parting_in_words(result) if result.valid else ""
-    goodness = [
-        f"  {band_in_words(result)}",
-        *([f"  {parting}"] if parting else []),
-        _goodness_line(result),
-    ]
+    probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
+    chi2 = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}, AIC {result.aic:.1f}"
+    goodness = [f"  {line}" for line in (band_in_words(result), parting, chi2) if line]
     return Report(
-        title=f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
+        title=f"Impact law of {result.table.source} ({counted(result.table.rows, 'row')}), model {result.model}:",
         about=[line for line in (*formulas(result), held_in_words(result)) if line],
         valid=result.valid,
         verdict="VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
@@ -98,21 +75,22 @@ def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
     return [name, value_in_words(parameter), known(parameter.standard_error, ".2g"), tail]
 
 
-def _goodness_line(result: FitResult) -> str:
-    probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
-    goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
-    return f"  {goodness}, AIC {result.aic:.1f}"
-
-
 def _table_sections(result: FitResult) -> list[ReportSection]:
     """Return each of several tables' pull, what it has to itself, and what an impact takes."""
-    parts = []
-    if result.tables:
-        parts += [Table("Tables", *tables_in_words(result)), Text(f"  {PULLS}.")]
-    sections = [ReportSection("Tables", parts)] if parts else []
-    head, rows = nuisances_in_words(result)
-    if rows:
-        sections.append(ReportSection("Nuisances", [Table("Of each table", head, rows, words=(head[1], head[-1]))]))
+    sections, pulls, own = [], [], []
+    law = list(result.tables[0].pulls) if result.tables else []
+    for one in result.tables:
+        cells = [one.name, f"{one.used}/{one.rows}", f"{one.chi2:.1f}/{one.readings}", known(one.pull, ".2f")]
+        pulls.append([*cells, *(known(one.pulls[name], "+.2f") for name in law)])
+        for name, parameter in one.nuisances.items():
+            given = "-" if parameter.constraint is None else "{:g} +- {:g}".format(*parameter.constraint)
+            own.append([one.name, name, value_in_words(parameter), interval_in_words(parameter), given])
+    if pulls:
+        head = ["table", "rows used", "chi2/readings", "pull", *(f"on {name}" for name in law)]
+        sections.append(ReportSection("Tables", [Table("Tables", head, pulls), Text(f"  {PULLS}.")]))
+    if own:
+        head = ["table", "of its own", "value", "95 % interval", "given"]
+        sections.append(ReportSection("Nuisances", [Table("Of each table", head, own, words=(head[1], head[-1]))]))
     losses = losses_in_words(result) if result.valid else []
     if losses:
         head = ["what an impact takes", "95 % interval"]
@@ -121,30 +99,19 @@ def _table_sections(result: FitResult) -> list[ReportSection]:
 
 
 def _compared(comparison: Comparison) -> ReportSection:
-    by_distance = "largest_distance" in comparison.rows[0]
-    rows = [
-        [
-            row["model"],
-            f"{row['chi2']:.1f}/{row['degrees_of_freedom']}",
-            *(
-                [known(row.get("largest_distance"), ".2g"), percent_or_none(row.get("largest_relative_distance"))]
-                if by_distance
-                else [f"{row['aic']:.1f}", f"{row['delta_aic']:.1f}"]
-            ),
-            "yes" if row["valid"] else "no",
-        ]
-        for row in comparison.rows
-    ]
+    by_distance, rows = "largest_distance" in comparison.rows[0], []
+    for row in comparison.rows:
+        cells = [f"{row[name]:.1f}" for name in ("aic", "delta_aic")] if not by_distance else []
+        if by_distance:
+            share = row.get("largest_relative_distance")
+            cells = [known(row.get("largest_distance"), ".2g"), "-" if share is None else percent(share)]
+        chi2 = f"{row['chi2']:.1f}/{row['degrees_of_freedom']}"
+        rows.append([row["model"], chi2, *cells, "yes" if row["valid"] else "no"])
     said, head = "Models, best first:", ["model", "chi2/dof", "AIC", "above the best", "valid"]
     if by_distance:
         said = "Formulas and the law that was found without them, the closest first:"
         head[2:4] = ["at most off (band half-widths)", "of u_out"]
     return ReportSection("Comparison", [Text(said), Table("Models", head, rows), Text(f"  {comparison.verdict}")])
-
-
-def percent_or_none(share: float | None) -> str:
-    """Return a share in per cent, "-" where it is not known."""
-    return "-" if share is None else percent(share)
 
 
 def _sampled(posterior: Posterior) -> ReportSection:
@@ -164,39 +131,34 @@ def _sampled(posterior: Posterior) -> ReportSection:
 
 
 def row_records(result: FitResult) -> list[dict[str, Any]]:
-    """Return a mapping per row of the table: the columns `ROW_COLUMNS`, and those of a phase or of a driven tip."""
+    """Return a mapping per row of the table: what was set, measured and predicted, and whether it was used."""
     table, rows = result.table, result.rows
-    names = ["free_amplitude_nm" if table.tapping and name == "drive_amplitude_nm" else name for name in ROW_COLUMNS]
-    columns = (
-        table.lines,
-        table.order,
-        table.drive_frequency_khz,
-        table.excitation_nm,
-        table.offset_nm,
-        *(column[:, kind] for kind in range(2) for column in (rows.measured_nm, rows.predicted_nm, rows.residual)),
-        rows.approach_speed_nm_per_us,
-        rows.orbits,
-        rows.model_error,
-        rows.used,
-        rows.set_aside,
+    columns: dict[str, Any] = (
+        {"table": np.array(table.labels)[table.number]} if isinstance(table, SeveralTables) else {}
     )
-    more = phase_columns(rows)
-    names += more
-    if isinstance(table, SeveralTables):
-        names, columns = ["table", *names], (np.array(table.labels)[table.number], *columns)
-    cells = zip(*(c.tolist() for c in (*columns, *more.values())), strict=True)
-    return [dict(zip(names, row, strict=True)) for row in cells]
-
-
-def phase_columns(rows: FittedRows) -> dict[str, np.ndarray]:
-    """Return what was measured, predicted and left of the phase, none without one."""
-    if rows.measured_phase_deg is None or rows.predicted_phase_deg is None:
-        return {}
-    return {
-        "measured_phase_deg": rows.measured_phase_deg,
-        "predicted_phase_deg": rows.predicted_phase_deg,
-        "phase_residual": rows.residual[:, 2],
+    columns |= {
+        "line": table.lines,
+        "order": table.order,
+        "drive_frequency_khz": table.drive_frequency_khz,
+        f"{'free' if table.tapping else 'drive'}_amplitude_nm": table.excitation_nm,
+        "offset_nm": table.offset_nm,
     }
+    for kind, name in enumerate(("peak", "lockin")):
+        columns[f"measured_{name}_amplitude_nm"] = rows.measured_nm[:, kind]
+        columns[f"predicted_{name}_amplitude_nm"] = rows.predicted_nm[:, kind]
+        columns[f"{name}_residual"] = rows.residual[:, kind]
+    columns |= {
+        "approach_speed_nm_per_us": rows.approach_speed_nm_per_us,
+        "stable_orbits": rows.orbits,
+        "model_error": rows.model_error,
+        "used": rows.used,
+        "set_aside": rows.set_aside,
+    }
+    if rows.measured_phase_deg is not None:
+        columns["measured_phase_deg"] = rows.measured_phase_deg
+        columns["predicted_phase_deg"] = rows.predicted_phase_deg
+        columns["phase_residual"] = rows.residual[:, 2]
+    return rows_of(columns)
 
 
 def write_report(

@@ -1,10 +1,8 @@
 """A fit in words: how sure the law is, its formula with the digits that count, whether to trust it."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from afm_jax.words import decimals, interval, known, percent, value_alone
+from afm_jax.words import decimals, interval, percent, value_alone
 from fitting.infer.intervals import END_OF_RANGE, UNEXPLAINED
 from fitting.infer.result import FitResult, FittedParameter, WithInterval
 from fitting.infer.verdict import value_at_bound
@@ -12,11 +10,6 @@ from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
 
 _EXACT = 1e-8
 """Relative distance below which two laws are the same."""
-
-
-def rows_in_words(count: int) -> str:
-    """Return '1 row' or '82 rows'."""
-    return f"{count} row" if count == 1 else f"{count} rows"
 
 
 def known_in_words(known: WithInterval, unit: str = "") -> str:
@@ -54,38 +47,10 @@ def losses_in_words(result: FitResult) -> list[list[str]]:
     return [*rows, ["captured below (extrapolated)", known_in_words(loss.capture_speed_nm_per_us, "nm/us")]]
 
 
-def tables_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
-    """Return what there is to say of each of several tables: the names of columns, and a row for each table."""
-    law = list(result.tables[0].pulls) if result.tables else []
-    head = ["table", "rows used", "chi2/readings", "pull", *(f"on {name}" for name in law)]
-    rows = [
-        [
-            one.name,
-            f"{one.used}/{one.rows}",
-            f"{one.chi2:.1f}/{one.readings}",
-            known(one.pull, ".2f"),
-            *(known(one.pulls[name], "+.2f") for name in law),
-        ]
-        for one in result.tables
-    ]
-    return head, rows
-
-
 PULLS = (
     "Pull: how far a table's law is from that of the others, in standard deviations; then by how much it moves each "
     "parameter of the law, in standard deviations of that move"
 )
-
-
-def nuisances_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
-    """Return what each of several tables has to itself: the names of columns, and rows."""
-    head = ["table", "of its own", "value", "95 % interval", "given"]
-    rows = []
-    for one in result.tables:
-        for name, parameter in one.nuisances.items():
-            given = "-" if parameter.constraint is None else "{:g} +- {:g}".format(*parameter.constraint)
-            rows.append([one.name, name, value_in_words(parameter), interval_in_words(parameter), given])
-    return head, rows
 
 
 def formulas(result: FitResult) -> list[str]:
@@ -151,33 +116,19 @@ def value_in_words(parameter: FittedParameter) -> str:
     return value_alone(parameter.value, parameter.standard_error)
 
 
-@dataclass(frozen=True)
-class BandWidth:
-    """The band of the rebound speed over the approach speeds of the rows that were used.
-
-    Attributes:
-        slowest_nm_per_us: the slowest approach of a used row.
-        fastest_nm_per_us: the fastest one.
-        worst: largest half-width of the 95 % band there, relative to the rebound speed; NaN if there is no band.
-        worst_at_nm_per_us: the approach speed it is found at; NaN likewise.
-    """
-
-    slowest_nm_per_us: float
-    fastest_nm_per_us: float
-    worst: float
-    worst_at_nm_per_us: float
-
-
-def band_width(result: FitResult) -> BandWidth | None:
-    """Return the worst relative half-width of the law's band over the measured speeds; None if no row has a speed.
+def band_width(result: FitResult) -> tuple[float, float, float, float] | None:
+    """Return how well the band of a law knows the rebound speed over the speeds of the used rows; None without rows.
 
     The band is known at the law's points; between them it is interpolated, at the slowest and fastest row.
+
+    Returns:
+        Slowest and fastest approach in nm/us; the largest half-width of the 95 % band there, relative to the rebound
+        speed, and the approach speed it is found at: NaN if there is no band.
     """
     reached = result.rows.reached_nm_per_us
     if not reached.size:
         return None
-    slowest, fastest = float(reached.min()), float(reached.max())
-    law = result.law
+    slowest, fastest, law = float(reached.min()), float(reached.max()), result.law
     inside = (law.approach_speed_nm_per_us > slowest) & (law.approach_speed_nm_per_us < fastest)
     speeds = np.concatenate(([slowest], law.approach_speed_nm_per_us[inside], [fastest]))
     rebound, high = (
@@ -187,10 +138,10 @@ def band_width(result: FitResult) -> BandWidth | None:
     # the lower edge is cut at zero, the upper one never
     known = np.isfinite(high) & (rebound > 0.0)
     if not known.any():
-        return BandWidth(slowest, fastest, float("nan"), float("nan"))
+        return slowest, fastest, np.nan, np.nan
     share = (high[known] - rebound[known]) / rebound[known]
     worst = int(np.argmax(share))
-    return BandWidth(slowest, fastest, float(share[worst]), float(speeds[known][worst]))
+    return slowest, fastest, float(share[worst]), float(speeds[known][worst])
 
 
 def band_in_words(result: FitResult) -> str:
@@ -198,12 +149,9 @@ def band_in_words(result: FitResult) -> str:
     width = band_width(result)
     if width is None:
         return "No row reached a steady orbit: the law was measured at no speed."
-    slowest, fastest = f"{width.slowest_nm_per_us:.3g}", f"{width.fastest_nm_per_us:.3g}"
-    where = f"Over the measured approach speeds, {slowest} to {fastest} nm/us,"
-    if not np.isfinite(width.worst):
+    slowest, fastest, worst, at = width
+    where = f"Over the measured approach speeds, {slowest:.3g} to {fastest:.3g} nm/us,"
+    if not np.isfinite(worst):
         cause = "the parameters' errors are not known" if result.valid else "the fit is not valid"
         return f"{where} no band can be given: {cause}."
-    return (
-        f"{where} the rebound speed is known to {percent(width.worst)} or better "
-        f"(95 % band, widest at {width.worst_at_nm_per_us:.3g} nm/us)."
-    )
+    return f"{where} the rebound speed is known to {percent(worst)} or better (95 % band, widest at {at:.3g} nm/us)."

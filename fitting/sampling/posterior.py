@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.infer.closest import closest_parameters, covariance_of_unknowns
@@ -32,11 +32,7 @@ from fitting.predict.orbit import COUNT, Local
 from fitting.sampling.posterior_result import Posterior, PosteriorChains, posterior_of_chains
 from fitting.tables.several import SeveralTables
 
-FEWEST_SAMPLES = 100
 CHAINS = 4
-WARM_UP = 300
-WEIGHED = 120
-"""Draws of a Gaussian that chi2 itself is computed for, at most."""
 
 
 @checked
@@ -64,8 +60,7 @@ def posterior(result: FitResult, *, samples: int = 1000, seed: int = 0) -> Poste
         raise ValueError(  # noqa: TRY004 (a fit of several tables is no wrong type)
             "a posterior is about one table; the intervals of a joint fit are its own"
         )
-    if samples < FEWEST_SAMPLES:
-        raise ValueError(f"`samples` must be at least {FEWEST_SAMPLES}, but is {samples}")
+    check_count("samples", samples, 100)
     lasting = sampled_by_gaussian(result.model)
     if not lasting:
         require_blackjax()
@@ -103,7 +98,7 @@ def _gaussian(explained: Explained, result: FitResult, samples: int, seed: int) 
     drawn = np.random.default_rng(seed).normal(size=(CHAINS, samples, root.shape[1]))
     ends = np.array([(parameter.lowest, parameter.highest) for parameter in map(parameter_called, names)])
     values = np.clip(closest.values + drawn @ closest.factor.T, *ends.T)
-    some = drawn.reshape(-1, root.shape[1])[:WEIGHED]
+    some = drawn.reshape(-1, root.shape[1])[:120]
     rows = Followed(explained.model, end.theta, end.orbits, explained.weights, np.inf)
     chi2 = np.array([rows.sum(end.theta + root @ z).value for z in some])
     raw = -0.5 * (chi2 - np.sum(some**2, axis=1))
@@ -223,7 +218,7 @@ def _nuts(density: LogDensity, samples: int, seed: int) -> PosteriorChains:
     def chain(key):
         start, warm, draw = jax.random.split(key, 3)
         adaptation = blackjax.window_adaptation(blackjax.nuts, log_density, is_mass_matrix_diagonal=False)
-        (state, found), _ = adaptation.run(warm, jax.random.normal(start, (size,)), WARM_UP)
+        (state, found), _ = adaptation.run(warm, jax.random.normal(start, (size,)), 300)
         kernel = blackjax.nuts(log_density, **found)
 
         def step(state, key):

@@ -9,13 +9,6 @@ from jaxtyping import Float
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 
-HIGHEST_R_HAT = 1.02
-"""Samples with a larger ratio between and within chains do not describe one distribution."""
-FEWEST_EFFECTIVE = 100.0
-"""Independent samples that a 95 % interval needs at least."""
-MOST_DIVERGENCES = 0.01
-"""Share of divergent transitions beyond which part of the posterior may be missing."""
-
 
 @dataclass(frozen=True, eq=False)
 class PosteriorChains:
@@ -62,27 +55,19 @@ class Posterior(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the single samples as plain lists, numbers and strings."""
-        chains, draws, _ = self.chains.samples.shape
+        chains, kinds = self.chains, ("mean", "standard_deviation", "interval95")
+        diagnostics = {
+            name: dict(zip(self.mean, plain(getattr(chains, name)), strict=True))
+            for name in ("r_hat", "effective_samples")
+        }
+        count, draws, _ = chains.samples.shape
+        sizes = {"chains": count, "draws": draws, "seed": chains.seed, "divergences": chains.divergences}
         return {
             "method": self.method,
             "converged": self.converged,
             "reasons": self.reasons,
-            "parameters": {
-                name: {
-                    "mean": self.mean[name],
-                    "standard_deviation": self.standard_deviation[name],
-                    "interval95": list(self.interval95[name]),
-                }
-                for name in self.mean
-            },
-            "chains": {
-                "chains": chains,
-                "draws": draws,
-                "seed": self.chains.seed,
-                "divergences": self.chains.divergences,
-                "r_hat": dict(zip(self.mean, plain(self.chains.r_hat), strict=True)),
-                "effective_samples": dict(zip(self.mean, plain(self.chains.effective_samples), strict=True)),
-            },
+            "parameters": {name: {kind: getattr(self, kind)[name] for kind in kinds} for name in self.mean},
+            "chains": sizes | diagnostics,
         }
 
     def to_arviz(self) -> Any:
@@ -118,14 +103,15 @@ def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...], method:
 
 
 def _complaints(chains: PosteriorChains, names: tuple[str, ...]) -> list[str]:
+    """Return why samples are not enough: a 95 % interval needs about a hundred independent ones of one distribution."""
     reasons = []
     for name, r_hat, effective in zip(names, chains.r_hat, chains.effective_samples, strict=True):
-        if not r_hat <= HIGHEST_R_HAT:
-            reasons.append(f"{name}: not converged, R-hat is {r_hat:.3f} (at most {HIGHEST_R_HAT}); draw more samples")
-        elif not effective >= FEWEST_EFFECTIVE:
+        if not r_hat <= 1.02:
+            reasons.append(f"{name}: not converged, R-hat is {r_hat:.3f} (at most 1.02); draw more samples")
+        elif not effective >= 100.0:
             reasons.append(f"{name}: only {effective:.0f} independent samples; draw more")
     transitions = chains.samples.shape[0] * chains.samples.shape[1]
-    if chains.divergences > MOST_DIVERGENCES * transitions:
+    if chains.divergences > 0.01 * transitions:
         reasons.append(
             f"{chains.divergences} of {transitions} transitions diverged: part of the posterior may be missing, such "
             "as the edge where an orbit is lost"

@@ -5,7 +5,7 @@ Every row of the table to be is a motion simulated in time until it repeats, the
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
-from afm_jax.checks import check_count, checked, require_float64
+from afm_jax.checks import check_count, check_parameter, checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
@@ -41,12 +41,6 @@ PIECES = 40
 """Most pieces that a motion may take to settle."""
 _CONTACTS = 260
 """Room for contacts in a piece: motions with more than two a response period are no single-impact orbits."""
-_NOT_PREDICTED = "the law closest to the contact has no stable single-impact orbit there"
-_ROUNDS = 4 * _CONTACTS + 400
-_STABLE = 0.9999
-"""Largest modulus of a multiplier that counts as stable, being known to 1e-4."""
-_TOLERANCE = 1e-6
-"""Of what remains to the steady motion, relative: ten times less than the amplitudes are wanted to."""
 
 
 @public_result()
@@ -61,43 +55,21 @@ class Drives(ResultTuple):
     offset_nm: Float[np.ndarray, " rows"]
 
 
-class SteadyRows(NamedTuple):
-    """What became of the drives."""
-
-    rows: Int[np.ndarray, " steady"]
-    """The numbers of those with a steady (1, N) orbit, ascending."""
-    readings: Float[np.ndarray, "3 steady"]
-    """Of these peak and lock-in amplitude in nm, and the lock-in's phase in [0, 360/N) degrees."""
-    reasons: dict[int, str]
-    """Why the others have none, by number."""
-
-
-class _Verdict(NamedTuple):
-    """What is known of a motion: what is read of it if it is the orbit asked for, from where it goes on, and why."""
-
-    reason: str
-    seen: tuple[float, float, float] | None = None
-    """Peak, lock-in amplitude and phase."""
-    goes_on: State | None = None
-
-
 Report = Callable[[str], None]
-Follow = Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation]
-"""Of starts of shape (3, n), the numbers of their rows, and durations in us: the simulations."""
+Follow = Callable[[np.ndarray, np.ndarray, int], Simulation]
+"""Of starts of shape (3, n), the numbers of their rows, and how many response periods: the simulations."""
+Readings = tuple[float, float, float]
+"""Peak and lock-in amplitude in nm, and the lock-in's phase in [0, 360/N) degrees."""
 
 
 def steady_rows(
-    interaction: Contact | ImpactLaw,
-    cantilever: Cantilever,
-    drives: Drives,
-    *,
-    report: Report,
-) -> SteadyRows:
-    """Return what is observed of every drive once its motion is the (1, N) orbit asked for.
+    interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives, *, report: Report
+) -> tuple[dict[int, Readings], dict[int, str]]:
+    """Return what is observed of the drives whose motion is the (1, N) orbit asked for, and why others have none.
 
-    Every row starts in the middle of the flight of the stable orbit that the law with delay closest to the contact
-    predicts, the fastest if there are several. If it predicts none at all, as on resonance, where the lever turns the
-    tip round, they start as taps that cost nothing.
+    Both by the number of the drive. Every row starts in the middle of the flight of the stable orbit that the law with
+    delay closest to the contact predicts, the fastest if there are several. If it predicts none at all, as on
+    resonance, where the lever turns the tip round, they start as taps that cost nothing.
 
     Args:
         interaction: a contact, or a law with or without a collision delay.
@@ -111,50 +83,45 @@ def steady_rows(
     """
     law = interaction if isinstance(interaction, ImpactLaw) else law_of_contact(interaction, float(cantilever.mass_ng))
     count = len(drives.order)
-    nothing = np.zeros(0, dtype=int), np.zeros((3, 0))
     if law is None:
-        return SteadyRows(*nothing, dict.fromkeys(range(count), "the contact captures tips of every speed"))
+        return {}, dict.fromkeys(range(count), "the contact captures tips of every speed")
     follow = _follower(interaction, cantilever, drives)
     starts, predicted = _starts(law, cantilever, drives)
     if not predicted.any():
         starts, predicted = _starts_on_resonance(drives)
-    reasons = dict.fromkeys(np.flatnonzero(~predicted).tolist(), _NOT_PREDICTED)
+    no_orbit = "the law closest to the contact has no stable single-impact orbit there"
+    reasons = dict.fromkeys(np.flatnonzero(~predicted).tolist(), no_orbit)
     waiting = np.flatnonzero(predicted)
     if not waiting.size:
-        return SteadyRows(*nothing, reasons)
+        return {}, reasons
     report(f"{len(waiting)} of {count} drives have a stable orbit of the closest law; closing in on them")
     orbits = close_periods(
-        lambda starts, rows: ends_in_flight(follow(starts, rows, _responses(drives, rows, 1))),
+        lambda starts, rows: ends_in_flight(follow(starts, rows, 1)),
         starts[:, waiting],
         waiting,
         angular_frequency=float(cantilever.angular_frequency),
     )
-    starts[:, waiting] = np.where(orbits.closed & (orbits.contraction < _STABLE), orbits.starts, starts[:, waiting])
-    steady: dict[int, tuple[float, float, float]] = {}
+    # multipliers are known to 1e-4
+    stable = orbits.closed & (orbits.contraction < 0.9999)
+    starts[:, waiting] = np.where(stable, orbits.starts, starts[:, waiting])
+    steady: dict[int, Readings] = {}
     for piece in range(PIECES):
         if not waiting.size:
             break
         report(f"following {len(waiting)} motions, {RESPONSES} response periods (piece {piece + 1})")
-        found = follow(starts[:, waiting], waiting, _responses(drives, waiting, RESPONSES))
-        left = []
+        found, left = follow(starts[:, waiting], waiting, RESPONSES), []
         for lane, row in enumerate(waiting.tolist()):
-            one = jax.tree.map(lambda part, lane=lane: part[lane], found)
-            verdict = _judged(Scene(cantilever, _platform(drives, row), interaction), one, int(drives.order[row]))
-            reasons[row] = verdict.reason
-            if verdict.seen is not None:
-                steady[row] = verdict.seen
-            elif verdict.goes_on is not None:
-                starts[:, row] = [float(part) for part in verdict.goes_on]
+            motion = jax.tree.map(lambda part, lane=lane: part[lane], found)
+            scene = Scene(cantilever, _platform(drives, row), interaction)
+            reasons[row], seen, goes_on = _judged(scene, motion, int(drives.order[row]))
+            if seen is not None:
+                steady[row] = seen
+                del reasons[row]
+            elif goes_on is not None:
+                starts[:, row] = [float(part) for part in goes_on]
                 left.append(row)
         waiting = np.array(left, dtype=int)
-    rows = np.array(sorted(steady), dtype=int)
-    readings = np.array([steady[row] for row in rows.tolist()]).reshape(-1, 3).T
-    return SteadyRows(rows, readings, {row: reason for row, reason in reasons.items() if row not in steady})
-
-
-def _responses(drives: Drives, rows: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
-    """Return a number of response periods in us."""
-    return count * drives.order[rows] / drives.frequency_khz[rows] * US_PER_MS
+    return dict(sorted(steady.items())), dict(sorted(reasons.items()))
 
 
 def _platform(drives: Drives, rows: int | Int[np.ndarray, " n"]) -> Platform:
@@ -202,30 +169,32 @@ def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: 
     def program(interaction, cantilever, platforms, starts, durations):
         def one(platform, start, duration):
             scene = Scene(cantilever, platform, interaction)
-            return simulate(scene, start, duration, max_contacts=_CONTACTS, max_rounds=_ROUNDS)
+            return simulate(scene, start, duration, max_contacts=_CONTACTS, max_rounds=4 * _CONTACTS + 400)
 
         return jax.vmap(one)(platforms, starts, durations)
 
-    def follow(starts: np.ndarray, rows: np.ndarray, durations: np.ndarray) -> Simulation:
+    def follow(starts: np.ndarray, rows: np.ndarray, periods: int) -> Simulation:
+        durations = periods * drives.order[rows] / drives.frequency_khz[rows] * US_PER_MS
         lanes = (_platform(drives, rows), State(*starts), durations)
         return in_blocks(lambda some: program(interaction, cantilever, *some), lanes, block=BATCH, widths=())
 
     return follow
 
 
-def _judged(scene: Scene, found: Simulation, order: int) -> _Verdict:
-    """Return what is known of a motion of one drive."""
-    outcome = MotionOutcome(int(found.outcome))
+def _judged(scene: Scene, motion: Simulation, order: int) -> tuple[str, Readings | None, State | None]:
+    """Return what a motion of one drive does, its readings if it is the orbit asked for, and from where it goes on."""
+    outcome = MotionOutcome(int(motion.outcome))
     if outcome not in {MotionOutcome.FINISHED, MotionOutcome.HELD}:
-        return _Verdict(outcome.sentence)
-    verdict = settled(scene, found, tolerance=_TOLERANCE)
+        return outcome.sentence, None, None
+    # ten times less than the amplitudes are wanted to
+    verdict = settled(scene, motion, tolerance=1e-6)
     if not verdict.settled:
-        row, goes_on = where_to_go_on(found)
-        return _Verdict(f"not settled: {verdict.reason}", goes_on=state_after(found, row) if goes_on else None)
+        row, goes_on = where_to_go_on(motion)
+        return f"not settled: {verdict.reason}", None, state_after(motion, row) if goes_on else None
     if verdict.stuck or (verdict.contacts, verdict.periods) != (1, order):
-        return _Verdict(verdict.reason)
-    seen = observe(scene, found, verdict=verdict)
-    return _Verdict(verdict.reason, seen=(seen.peak_amplitude_nm, seen.lockin_amplitude_nm, seen.lockin_phase_deg))
+        return verdict.reason, None, None
+    seen = observe(scene, motion, verdict=verdict)
+    return verdict.reason, (seen.peak_amplitude_nm, seen.lockin_amplitude_nm, seen.lockin_phase_deg), None
 
 
 @public_result()
@@ -298,28 +267,25 @@ def simulate_experiment(  # noqa: PLR0913
     if drive == "base":
         height = height_of_free_deflection(drives.amplitude_nm, ratio, cantilever.quality_factor)
         moved = drives._replace(amplitude_nm=np.asarray(height))
-    found = steady_rows(interaction, cantilever, moved, report=report)
-    kept = found.rows
+    steady, reasons = steady_rows(interaction, cantilever, moved, report=report)
     left_out = tuple(
         f"order {drives.order[i]}, {drives.frequency_khz[i]:g} kHz, {drives.amplitude_nm[i]:g} nm, "
         f"offset {drives.offset_nm[i]:g} nm: {reason}"
-        for i, reason in sorted(found.reasons.items())
+        for i, reason in reasons.items()
     )
-    if not kept.size:
+    if not steady:
         raise ValueError(f"no drive has a steady single-impact orbit (the first: {left_out[0]})")
-    peak, lockin, degrees = found.readings
+    kept, (peak, lockin, degrees) = np.array([*steady]), np.array([*steady.values()]).T
     known = cantilever.quality_factor
-    names = ("peak_amplitude", "phase", "drive")
-    if drive != "sample":
+    columns: dict[str, Any] = {f"{'drive' if drive == 'sample' else 'free'}_amplitude_nm": drives.amplitude_nm[kept]}
+    if drive == "sample":
+        columns |= {"peak_amplitude_nm": peak, "peak_amplitude_error_nm": noise * peak}
+    else:
         seen = detected(lockin, degrees, moved.amplitude_nm[kept], ratio[kept], known, base=drive == "base")
         lockin, degrees = (np.asarray(part) for part in seen)
-        names = (None, "phase_lag", "free")
-    columns: dict[str, Any] = {f"{names[2]}_amplitude_nm": drives.amplitude_nm[kept]}
-    if names[0] is not None:
-        columns |= {"peak_amplitude_nm": peak, "peak_amplitude_error_nm": noise * peak}
     if phase_noise_deg is not None:
-        error = np.full(degrees.shape, phase_noise_deg)
-        columns |= {f"{names[1]}_deg": degrees, f"{names[1]}_error_deg": error}
+        phase = "phase" if drive == "sample" else "phase_lag"
+        columns |= {f"{phase}_deg": degrees, f"{phase}_error_deg": np.full(degrees.shape, phase_noise_deg)}
     exact = AmplitudeTable(
         drive=drive,
         order=drives.order[kept],
@@ -392,17 +358,14 @@ def with_noise(exact: AmplitudeTable, draws: Float[np.ndarray, "3 rows"]) -> Amp
         ValueError: if the table has no amplitude of one kind.
     """
     columns = {}
-    for name, error, draw in (
-        ("peak_amplitude_nm", "peak_amplitude_error_nm", draws[0]),
-        ("lockin_amplitude_nm", "lockin_amplitude_error_nm", draws[1]),
-    ):
-        value, spread = getattr(exact, name), getattr(exact, error)
+    for kind, draw in zip(("peak", "lockin"), draws, strict=False):
+        value, spread = (getattr(exact, f"{kind}_amplitude{part}_nm") for part in ("", "_error"))
         if value is None and exact.tapping:
             continue
         if value is None:
-            raise ValueError(f"{exact.source}: the table has no {name}; noise is added to peak and lock-in amplitude")
-        columns[name] = _rounded(value + spread * draw)
-        columns[error] = _rounded(spread)
+            raise ValueError(f"{exact.source}: the table has no {kind}_amplitude_nm; noise is added to both amplitudes")
+        columns[f"{kind}_amplitude_nm"] = _rounded(value + spread * draw)
+        columns[f"{kind}_amplitude_error_nm"] = _rounded(spread)
     phase, error = exact.phase_and_error_deg
     if phase is not None:
         measured = phase + np.asarray(error) * draws[2]
@@ -431,12 +394,11 @@ def _check(drives: Drives, drive: str, noise: float, phase_noise_deg: float | No
     _check_noise(noise, phase_noise_deg)
     if not len(drives.order) or np.any(np.asarray(drives.order) < 1):
         raise ValueError("`drives` must hold at least one drive, and orders of 1 or more")
-    if np.any(np.asarray(drives.frequency_khz) <= 0.0) or np.any(np.asarray(drives.amplitude_nm) <= 0.0):
-        raise ValueError("`drives` must have positive frequencies and amplitudes")
+    check_parameter("drives.frequency_khz", drives.frequency_khz, "positive")
+    check_parameter("drives.amplitude_nm", drives.amplitude_nm, "positive")
 
 
 def _check_noise(noise: float, phase_noise_deg: float | None) -> None:
-    if not 0.0 < noise < 1.0:
-        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+    check_parameter("noise", noise, "between 0 and 1")
     if phase_noise_deg is not None and not 0.0 < phase_noise_deg < 90.0:
         raise ValueError(f"`phase_noise_deg` must be between 0 and 90, but is {phase_noise_deg!r}")

@@ -5,7 +5,6 @@ that was measured. What the columns are a `Form` says; tables of amplitudes, res
 read by the same functions.
 """
 
-import contextlib
 import csv
 import difflib
 import json
@@ -50,7 +49,6 @@ SETTING_NAMES = frozenset(
 NumberedLines = list[tuple[int, str]]
 """Lines of a file, each with its number."""
 Columns = dict[str, Float[np.ndarray, " rows"]]
-Masks = dict[str, Bool[np.ndarray, " rows"]]
 
 
 class TableError(ValueError):
@@ -89,6 +87,20 @@ class Faults:
         if column is not None:
             place += f", column {column}"
         self._first = (line, f"{place}: {message}")
+
+    def add_rows(
+        self, bad: Bool[np.ndarray, " rows"], message: str, lines: Int[np.ndarray, " rows"], column: str | None = None
+    ) -> None:
+        """Note a fault of some rows.
+
+        Args:
+            bad: which rows.
+            message: as for `add`.
+            lines: number of the line of each row.
+            column: as for `add`.
+        """
+        for line in lines[bad].tolist():
+            self.add(message, line=line, column=column)
 
     def fail(self, message: str, *, line: int = 0, column: str | None = None) -> NoReturn:
         """Note a fault, as `add`, with which nothing else can be read.
@@ -142,13 +154,17 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:40] + "...")
 
 
-_MUST = {
-    "number": "must be finite",
-    "not negative": "must be finite and not negative",
-    "positive": "must be finite and above 0",
-    "whole": "must be a positive whole number (1, 2, 3, ...)",
+_KINDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "number": ("must be finite", np.isinf),
+    "not negative": ("must be finite and not negative", lambda v: v < 0.0),
+    "positive": ("must be finite and above 0", lambda v: v <= 0.0),
+    "whole": (
+        "must be a positive whole number (1, 2, 3, ...)",
+        lambda v: (v <= 0.0) | (v > np.floor(v)) | (v >= 2**53),
+    ),
+    "flag": ("", lambda v: (v < 0.0) | ((v > 0.0) & (v != 1.0))),
 }
-"""What the numbers of a kind of column must be; those of a flag are 0 or 1."""
+"""What the numbers of a kind of column must be (those of a flag 0 or 1), and what says which are not; NaN is none."""
 
 
 @dataclass(frozen=True)
@@ -183,6 +199,11 @@ class Column:
     def becomes(self) -> str:
         """What its numbers become."""
         return self.meaning or self.name
+
+    @property
+    def in_unit(self) -> str:
+        """Its unit, in brackets behind its name."""
+        return f" (in {self.unit})" if self.unit else ""
 
 
 @dataclass(frozen=True)
@@ -222,8 +243,8 @@ class Form:
 
     def check_numbers(
         self, name: str, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
-    ) -> Bool[np.ndarray, " rows"]:
-        """Note the impossible numbers of a column, and return which they are.
+    ) -> None:
+        """Note the impossible numbers of a column.
 
         Args:
             name: of the column, or what it becomes.
@@ -232,27 +253,17 @@ class Form:
             faults: where the faults are noted.
         """
         column = next(one for one in self.columns if name in {one.name, one.becomes})
-        positive = column.kind in {"positive", "not negative", "whole"}
+        must, impossible = _KINDS[column.kind]
+        must = must or f"must be 1 ({column.says}) or 0"
         # a whole number only has to survive the way through 64-bit floats
-        far = beyond(values, positive=positive, largest=np.inf if column.kind == "whole" else self.largest)
-        bad = np.isinf(values) | far | (np.isnan(values) & (not self.blanks))
-        match column.kind:
-            case "not negative":
-                bad |= values < 0.0
-            case "positive":
-                bad |= values <= 0.0
-            case "whole":
-                bad |= (values <= 0.0) | (values != np.floor(values)) | (values >= 2**53)
-                bad &= ~np.isnan(values)
-            case "flag":
-                bad |= ~np.isnan(values) & (values != 0.0) & (values != 1.0)
-        must = f"must be 1 ({column.says}) or 0" if column.kind == "flag" else _MUST[column.kind]
+        largest = np.inf if column.kind == "whole" else self.largest
+        far = beyond(values, positive=column.kind not in {"number", "flag"}, largest=largest)
+        bad = np.isinf(values) | far | impossible(values) | (np.isnan(values) & (not self.blanks))
         blank = ", or leave it blank if it was not measured" if column.error is not None else ""
         for row in np.flatnonzero(bad):
             number = repr(float(values[row])).removesuffix(".0")
             wanted = said_beyond(values[row], self.largest) if far[row] else must
             faults.add(f"{wanted}, but is {number}; {self.mend}{blank}", line=int(lines[row]), column=name)
-        return bad
 
 
 @dataclass(frozen=True)
@@ -287,21 +298,6 @@ Settings = Mapping[str, FileSetting]
 """Settings by their key."""
 
 
-@dataclass(frozen=True)
-class Head:
-    """The row of column names of a file.
-
-    Attributes:
-        names: the cells.
-        line: where it stands.
-        present: the columns, and what they become, that are there or that a misspelt name was meant to be.
-    """
-
-    names: list[str]
-    line: int
-    present: set[str]
-
-
 def read_bytes(path: str | Path, wanted: str) -> bytes:
     """Return what a file holds.
 
@@ -324,7 +320,7 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
         raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
 
 
-_AS_CSV = "save the table as CSV with the encoding UTF-8"
+_AS_CSV = "is not UTF-8 text; save the table as CSV with the encoding UTF-8"
 _A_FIT = "give the fit.json of `afm-jax fit --out`"
 
 
@@ -336,7 +332,7 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
     """
     name = printable(str(path))
     try:
-        found = json.loads(read_text(path, _A_FIT))
+        found = json.loads(read_text(path, f"is not UTF-8 text; {_A_FIT}"))
     except json.JSONDecodeError as error:
         raise TableError(f"{name}, line {error.lineno}: is no JSON; {_A_FIT}") from None
     except RecursionError:
@@ -347,36 +343,42 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
     return found
 
 
-def read_text(path: str | Path, mend: str = _AS_CSV) -> str:
+def read_text(path: str | Path, wrong: str = _AS_CSV) -> str:
     """Return the text of a UTF-8 file, with or without a byte order mark, with every line end as a newline.
 
     Args:
         path: the file.
-        mend: what to do where it is not UTF-8.
+        wrong: what is said where it is not UTF-8, with what to do.
 
     Raises:
         TableError: if there is no such file, it cannot be read or is not UTF-8 text.
     """
-    return text_of(read_bytes(path, "a CSV file"), path, mend)
+    return text_of(read_bytes(path, "a CSV file"), path, wrong)
 
 
-def text_of(data: bytes, path: str | Path, mend: str = _AS_CSV) -> str:
-    """Return the text that the bytes of a file are; see `read_text`.
+def text_of(data: bytes, path: str | Path, wrong: str, *, latin: bool = False) -> str:
+    """Return the text of a file's bytes; see `read_text`.
+
+    Args:
+        data: the bytes.
+        path: the file.
+        wrong: what is said where they are no text, with what to do.
+        latin: whether what is not UTF-8 is taken as Latin-1.
 
     Raises:
-        TableError: if they are not UTF-8 text.
+        TableError: if they are no text.
     """
-    name = printable(str(path))
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     try:
         text = data.decode("utf-8-sig")
         # UTF-16 of plain English is valid UTF-8 with a zero byte in front of every letter.
         start = text.find("\0")
     except UnicodeDecodeError as error:
-        text, start = data[: error.start].decode("utf-8", errors="replace"), error.start
+        text = data.decode("latin-1")
+        start = text.find("\0") if latin else error.start
     if start >= 0:
         line = text.count("\n", 0, start) + 1
-        raise TableError(f"{name}, line {line}: is not UTF-8 text; {mend}")
+        raise TableError(f"{printable(str(path))}, line {line}: {wrong}")
     return text
 
 
@@ -397,7 +399,7 @@ class TextTable(NamedTuple):
 
 
 def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> TextTable:
-    """Read a text of comments, a row of column names, and rows of numbers.
+    """Read a text of comments, a row of column names, and rows of numbers, whose form is known.
 
     Args:
         text: all of it.
@@ -406,21 +408,14 @@ def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> T
         faults: where faults are noted; with any, the result is not to be used.
 
     Raises:
-        TableError: at once where there are no rows, or the column names are wrong: the cells cannot be judged then.
+        TableError: as `read_comments` and `read_rows`.
     """
-    comments, rows = split_lines(text)
-    found, _ = settings_in(comments, settings, faults)
-    check_not_empty(comments, rows, faults)
+    found, _, rows = read_comments(text, settings, faults)
     form = form if form.separator else replace(form, separator=_separator_of(rows[0][1]))
-    head, rows = named_rows(rows, form, faults)
-    faults.raise_any()
-    columns, _, lines = parse_rows(rows, head.names, form, faults)
-    numbers = {}
-    for column in form.columns:
-        if column.name in columns:
-            values = columns[column.name]
-            numbers[column.becomes] = values if column.convert is None else column.convert(values)
-    return TextTable(numbers, tuple(columns), lines, found)
+    columns, lines = read_rows(rows, form, faults)
+    used = [column for column in form.columns if column.name in columns]
+    numbers = {one.becomes: one.convert(columns[one.name]) if one.convert else columns[one.name] for one in used}
+    return TextTable(numbers, tuple(column.name for column in used), lines, found)
 
 
 def _separator_of(names: str) -> str:
@@ -453,22 +448,19 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
     return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
 
 
-def _parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults) -> tuple[float, float | None] | None:
-    """Return the value and its error of a comment that makes a setting, or None after noting a fault.
+def _value_of(setting: FileSetting, text: str) -> tuple[float, float | None] | str:
+    """Return the value and its error of a comment that makes a setting, or what is wrong with it.
 
     Of a word it is its place among the choices.
 
     Args:
         setting: from `setting_in`.
         text: the comment without its number sign.
-        line: where it stands.
-        faults: where faults are noted.
     """
     match, key = _KEY_AND_VALUE.fullmatch(text), setting.key
     if match is None or match["key"] != key or match["sign"] is None:
         unit = f" (in {setting.unit})" if setting.unit else ""
-        faults.add(f"{quoted(text)} is no known setting; the key is {key}{unit}, as in '{setting.line}'", line=line)
-        return None
+        return f"{quoted(text)} is no known setting; the key is {key}{unit}, as in '{setting.line}'"
     # Spreadsheets fill every line up with commas.
     cells = [cell.strip() for cell in _PLUS_MINUS.split(match["value"].rstrip(",; \t"))]
     if setting.choices:
@@ -476,46 +468,11 @@ def _parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults
             return float(setting.choices.index(cells[0])), None
         *others, last = setting.choices
         choices = f"{', '.join(others)} or {last}" if others else quoted(last)
-        faults.add(
-            f"{key} must be {choices}, but is {quoted(match['value'].strip())}; write '{setting.line}'", line=line
-        )
-        return None
+        return f"{key} must be {choices}, but is {quoted(match['value'].strip())}; write '{setting.line}'"
     if setting.none and cells == ["none"]:
         return float("inf"), None
     fault = _fault_in_cells(setting, cells)
-    if fault is not None:
-        faults.add(f"{key} {fault}", line=line)
-        return None
-    return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
-
-
-def settings_in(
-    comments: NumberedLines, settings: Settings, faults: Faults
-) -> tuple[dict[str, tuple[float, float | None]], tuple[str, ...]]:
-    """Return value and error of the settings that comments make (NaN where it is at fault), and the other comments.
-
-    Args:
-        comments: line number and text (without the number sign, stripped) of each.
-        settings: those there are.
-        faults: where a misspelt key, a value that is no number and a repeated key are noted.
-    """
-    found: dict[str, tuple[float, float | None]] = {}
-    seen: dict[str, int] = {}
-    remarks = []
-    for line, text in comments:
-        setting = setting_in(text, settings)
-        if setting is None:
-            match = _KEY_AND_VALUE.fullmatch(text)
-            name = "" if match is None else plain_name(match["key"])
-            if name in SETTING_NAMES:
-                faults.add(f"{name} sets nothing in such a file; remove the line", line=line)
-            remarks.append(text)
-        elif setting.key in seen:
-            faults.add(f"{setting.key} was given in line {seen[setting.key]} already; remove one of the two", line=line)
-        else:
-            seen[setting.key] = line
-            found[setting.key] = _parse_setting(setting, text, line=line, faults=faults) or (float("nan"), None)
-    return found, tuple(remarks)
+    return f"{key} {fault}" if fault else (float(cells[0]), float(cells[1]) if len(cells) > 1 else None)
 
 
 def _fault_in_cells(setting: FileSetting, cells: list[str]) -> str | None:
@@ -529,6 +486,50 @@ def _fault_in_cells(setting: FileSetting, cells: list[str]) -> str | None:
     if not least <= len(cells) <= most:
         return f"{'needs its standard error' if len(cells) < least else 'takes no such error'}; write '{setting.line}'"
     return fault_in_number(setting, *map(float, cells))
+
+
+def read_comments(
+    text: str, settings: Settings, faults: Faults
+) -> tuple[dict[str, tuple[float, float | None]], tuple[str, ...], NumberedLines]:
+    """Return value and error of the settings that comments make (NaN where it is at fault), other comments, and rows.
+
+    Args:
+        text: of the whole file.
+        settings: those there are.
+        faults: where a misspelt key, a value that is no number and a repeated key are noted.
+
+    Raises:
+        TableError: where there are no rows: the column names and what stands below.
+    """
+    found: dict[str, tuple[float, float | None]] = {}
+    seen: dict[str, int] = {}
+    remarks = []
+    comments, rows = split_lines(text)
+    for line, comment in comments:
+        setting = setting_in(comment, settings)
+        if setting is None:
+            match = _KEY_AND_VALUE.fullmatch(comment)
+            name = "" if match is None else plain_name(match["key"])
+            if name in SETTING_NAMES:
+                faults.add(f"{name} sets nothing in such a file; remove the line", line=line)
+            remarks.append(comment)
+        elif setting.key in seen:
+            faults.add(f"{setting.key} was given in line {seen[setting.key]} already; remove one of the two", line=line)
+        else:
+            seen[setting.key] = line
+            value = _value_of(setting, comment)
+            if isinstance(value, str):
+                faults.add(value, line=line)
+            found[setting.key] = (float("nan"), None) if isinstance(value, str) else value
+    if not rows:
+        what = "only comments" if comments else "nothing"
+        faults.fail(f"the file holds {what}; add a row of column names and rows of numbers")
+    return found, tuple(remarks), rows
+
+
+def setting_line(key: str, value: float | str, error: float | None) -> str:
+    """Return the comment line that makes a setting."""
+    return f"# {key} = {value}" + (f" +- {error!r}" if error else "")
 
 
 def fault_in_number(setting: FileSetting, value: float, error: float | None = None) -> str | None:
@@ -545,7 +546,7 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     return None
 
 
-def _cells(text: str, separator: str) -> list[str]:
+def cells_of(text: str, separator: str) -> list[str]:
     """Return the cells of one line, without the spaces and quotation marks around them."""
     # instruments end their lines with a tab, and put several spaces between columns
     text = text.rstrip(" ").removesuffix("\t") if separator == "\t" else text
@@ -556,123 +557,132 @@ def _cells(text: str, separator: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def named_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Head, NumberedLines]:
-    """Return the column names of a file and the rows below, after noting every fault of the names.
+def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns, Int[np.ndarray, " rows"]]:
+    """Return the columns that the form has as numbers (NaN where a cell is blank), and the line of each row.
 
     Args:
-        rows: the lines that are no comments, at least one.
+        rows: lines with their numbers, the column names first.
         form: what the file is to be.
-        faults: where faults are noted.
+        faults: where the faults are noted.
 
     Raises:
-        TableError: at once where the columns are not separated by commas: every other message would mislead.
+        TableError: at once where the column names are wrong: the cells below cannot be judged then.
     """
     line, text = rows[0]
     if form.separator == "," and _separator_of(text) != ",":
         message = "the columns are not separated by commas; separate them by commas, decimals by points"
         Faults(faults.source).fail(message, line=line)
-    names, found = _cells(text, form.separator), faults.count
-    present = check_names(names, form, line=line, faults=faults)
+    names, found = cells_of(text, form.separator), faults.count
+    _check_names(names, form, line, faults)
     if not rows[1:] and faults.count == found:
         message = f"there are column names but no rows below them; add a row for each {form.row}"
         faults.add(message, line=line)
-    return Head(names, line, present), rows[1:]
+    if faults.count > found:
+        faults.raise_any()
+    table = _table_of(rows[1:], len(names), form.separator, faults)
+    columns = {}
+    for position, name in enumerate(names):
+        column = form.column(name)
+        if column is not None:
+            columns[name] = numbers = np.full(len(table), np.nan)
+            for row, (line, cells) in enumerate(table):
+                text = cells[position]
+                if NUMBER.fullmatch(text) and not (column.kind == "whole" and set(text) & set(".eE")):
+                    numbers[row] = float(text)
+                elif text or not form.blanks:
+                    faults.add(_unreadable(text, column, form), line=line, column=name)
+    return columns, np.array([line for line, _ in table], dtype=np.int64)
 
 
-def check_not_empty(comments: NumberedLines, rows: NumberedLines, faults: Faults) -> None:
-    """Raise at once where a file has no row at all.
+def _table_of(rows: NumberedLines, width: int, separator: str, faults: Faults) -> list[tuple[int, list[str]]]:
+    """Return the cells of rows, numbered, after noting and leaving out those of another number of cells."""
+    table = []
+    for line, text in rows:
+        cells = cells_of(text, separator)
+        if text.count('"') % 2:
+            faults.add("a quotation mark is not closed; close or remove it", line=line)
+        elif len(cells) != width:
+            hint = "fill the row up" if len(cells) < width else "a decimal comma must be a point"
+            faults.add(f"there are {len(cells)} cells for {width} columns; {hint}", line=line)
+        else:
+            table.append((line, cells))
+    return table
 
-    Raises:
-        TableError: if there is none.
-    """
-    if not rows:
-        what = "only comments" if comments else "nothing"
-        faults.fail(f"the file holds {what}; add a row of column names and rows of numbers")
+
+def _unreadable(text: str, column: Column, form: Form) -> str:
+    """Return what is wrong with a cell that holds no number of its column."""
+    if not text:
+        return f"is blank; every {form.row} needs it: fill it in or remove the row"
+    if DECIMAL_COMMA.fullmatch(text):
+        return f"{quoted(text)} has a decimal comma; write a point"
+    if column.kind == "whole":
+        return f"{quoted(text)} is not a positive whole number; write 1, 2, 3, ..."
+    other = "leave the cell blank" if form.blanks and not column.required else "remove the row"
+    return f"{quoted(text)} is not a number; write it like 90.25 or 9.025e1, or {other}"
 
 
-def check_names(names: list[str], form: Form, *, line: int = 0, faults: Faults) -> set[str]:
-    """Note every fault of column names (or of the names of data sets); return what `Head` calls present."""
+def _check_names(names: list[str], form: Form, line: int, faults: Faults) -> None:
+    """Note every fault of column names."""
     if any(NUMBER.fullmatch(name) for name in names):
-        missing = (
-            f"a row of column names above it: {form.example}" if form.example else "the row of column names above it"
-        )
-        faults.add(f"the first row holds numbers; put {missing}", line=line)
-        return set()
-    first: dict[str, int] = {}
+        row = f"a row of column names above it: {form.example}" if form.example else "the row of column names above it"
+        faults.add(f"the first row holds numbers; put {row}", line=line)
+        return
     present: set[str] = set()
     unknown = []
     for position, name in enumerate(names, start=1):
         column = form.column(name)
         if column is None:
             unknown.append((position, name))
-        elif name in first:
-            faults.add(f"is there twice, as columns {first[name]} and {position}; remove one", line=line, column=name)
+        elif names.index(name) + 1 < position:
+            twice = f"is there twice, as columns {names.index(name) + 1} and {position}; remove one"
+            faults.add(twice, line=line, column=name)
         elif column.becomes in present:
             faults.add("says again what another column says; remove one", line=line, column=name)
         else:
             present |= {column.becomes, name}
-        first.setdefault(name, position)
     # A name that was only misspelt is reported; that its column is then missing is not a second fault.
-    meant = _check_unknown(unknown, form, present, line=line, faults=faults)
-    _check_missing(form, present | meant, line=line, faults=faults)
-    return present | meant
+    present |= _check_unknown(unknown, form, present, line, faults)
+    for what, columns in _missing(form, present).items():
+        message = f"there is no {what} column; add {' or '.join(column.name for column in columns)}"
+        if len(columns) == 1:
+            other = " or rename the one that holds it" if form.open else ""
+            message = f'the column "{columns[0].name}"{columns[0].in_unit} is missing; add it{other}'
+        faults.add(message, line=line)
 
 
 def _check_unknown(
-    unknown: list[tuple[int, str]], form: Form, present: set[str], *, line: int, faults: Faults
+    unknown: list[tuple[int, str]], form: Form, present: set[str], line: int, faults: Faults
 ) -> set[str]:
     """Note names that no column has; return what those were meant to be that are only misspelt."""
     meant: set[str] = set()
-    complete = not _missing(form, present)
+    # where a column is missing an unknown one may be it
+    remove = "" if _missing(form, present) else "remove it, "
     for count, (position, name) in enumerate(unknown):
+        suggestion = form.column(nearest_name(name, form.names) or "") if name and count < _SUGGESTIONS else None
         if name in form.strange:
             faults.add(form.strange[name], line=line, column=name)
+        elif form.open and (suggestion is None or suggestion.becomes in present):
             continue
-        suggestion = form.column(nearest_name(name, form.names) or "") if name and count < _SUGGESTIONS else None
-        if form.open and (suggestion is None or suggestion.becomes in present):
-            continue
-        if not name:
+        elif not name:
             faults.add(f"column {position} has no name; name it or remove its comma", line=line)
-            continue
-        faults.add(_unknown_column(name, suggestion, form, complete=complete), line=line)
-        if suggestion is not None:
+        elif suggestion is None:
+            faults.add(f"unknown column {quoted(name)}; {remove}the columns are {', '.join(form.names)}", line=line)
+        else:
+            faults.add(f"unknown column {quoted(name)}; did you mean {suggestion.name}{suggestion.in_unit}?", line=line)
             meant |= {suggestion.becomes, suggestion.name}
     return meant
-
-
-def _unknown_column(name: str, suggestion: Column | None, form: Form, *, complete: bool) -> str:
-    if suggestion is None:
-        # where a column is missing this may be it
-        advice = "remove it, " if complete else ""
-        return f"unknown column {quoted(name)}; {advice}the columns are {', '.join(form.names)}"
-    return f"unknown column {quoted(name)}; did you mean {suggestion.name}{_in_unit(suggestion)}?"
-
-
-def _check_missing(form: Form, present: set[str], *, line: int, faults: Faults) -> None:
-    for what, columns in _missing(form, present).items():
-        if len(columns) > 1:
-            message = f"there is no {what} column; add {' or '.join(column.name for column in columns)}"
-        else:
-            other = " or rename the one that holds it" if form.open else ""
-            message = f'the column "{columns[0].name}"{_in_unit(columns[0])} is missing; add it{other}'
-        faults.add(message, line=line)
 
 
 def _missing(form: Form, present: set[str]) -> dict[str, list[Column]]:
     """Return the columns of which one would give what is needed and not present."""
     givers: dict[str, list[Column]] = {}
     for column in form.columns:
-        if column.needed:
-            givers.setdefault(column.needed, []).append(column)
+        givers.setdefault(column.needed, []).append(column)
     return {
         what: columns
         for what, columns in givers.items()
-        if not any(present & {column.becomes, column.error} for column in columns)
+        if what and not any(present & {column.becomes, column.error} for column in columns)
     }
-
-
-def _in_unit(column: Column) -> str:
-    return f" (in {column.unit})" if column.unit else ""
 
 
 def plain_name(text: str) -> str:
@@ -703,86 +713,6 @@ def nearest_name(text: str, known: Iterable[str]) -> str | None:
         if name in {candidate, without_unit(candidate)}:
             return candidate
     return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=_SIMILAR)), None)
-
-
-def parse_rows(
-    rows: NumberedLines, names: list[str], form: Form, faults: Faults
-) -> tuple[Columns, Masks, Int[np.ndarray, " rows"]]:
-    """Turn lines of text into columns of numbers, of the names that the form has.
-
-    Args:
-        rows: the lines below the names, numbered.
-        names: of the file's columns, checked before.
-        form: what the file is.
-        faults: where the faults are noted.
-
-    Returns:
-        By name the numbers (NaN where a cell is blank or unreadable) and the mask of the unreadable cells; and the line
-        number of each row.
-    """
-    wanted = {name: column for name in names if (column := form.column(name)) is not None}
-    block = _plain_block(rows, names, wanted, form)
-    if block is not None:
-        lines = np.array([line for line, _ in rows], dtype=np.int64)
-        return block, {name: np.zeros(len(lines), dtype=bool) for name in wanted}, lines
-    lines, table = [], []
-    for line, text in rows:
-        if text.count('"') % 2:
-            faults.add("a quotation mark is not closed; close or remove it", line=line)
-            continue
-        cells = _cells(text, form.separator)
-        if len(cells) == len(names):
-            lines.append(line)
-            table.append(cells)
-        else:
-            hint = "fill the row up" if len(cells) < len(names) else "a decimal comma must be a point"
-            faults.add(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
-    columns, unreadable = {}, {}
-    for name, column in wanted.items():
-        position = names.index(name)
-        texts = [cells[position] for cells in table]
-        columns[name], unreadable[name] = _parse_column(column, texts, lines, form, faults)
-    return columns, unreadable, np.array(lines, dtype=np.int64)
-
-
-def _plain_block(rows: NumberedLines, names: list[str], wanted: Mapping[str, Column], form: Form) -> Columns | None:
-    """Return the wanted columns of a file of nothing but finite numbers at once, None where it holds something else."""
-    sign = form.separator
-    if not rows or sign == " " or any(column.kind == "whole" for column in wanted.values()):
-        return None
-    if any('"' in text or text.count(sign) != len(names) - 1 for _, text in rows):
-        return None
-    positions = [names.index(name) for name in wanted]
-    with contextlib.suppress(ValueError):
-        block = np.loadtxt([text for _, text in rows], delimiter=sign, usecols=positions, ndmin=2, comments=None)
-        if np.all(np.isfinite(block)):
-            return {name: block[:, position].copy() for position, name in enumerate(wanted)}
-    return None
-
-
-def _parse_column(
-    column: Column, texts: list[str], lines: list[int], form: Form, faults: Faults
-) -> tuple[Float[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
-    numbers = np.full(len(texts), np.nan)
-    unreadable = np.zeros(len(texts), dtype=bool)
-    for row, text in enumerate(texts):
-        if NUMBER.fullmatch(text) and not (column.kind == "whole" and set(text) & set(".eE")):
-            numbers[row] = float(text)
-        elif text or not form.blanks:
-            unreadable[row] = True
-            faults.add(_unreadable(text, column, form), line=lines[row], column=column.name)
-    return numbers, unreadable
-
-
-def _unreadable(text: str, column: Column, form: Form) -> str:
-    if not text:
-        return f"is blank; every {form.row} needs it: fill it in or remove the row"
-    if DECIMAL_COMMA.fullmatch(text):
-        return f"{quoted(text)} has a decimal comma; write a point"
-    if column.kind == "whole":
-        return f"{quoted(text)} is not a positive whole number; write 1, 2, 3, ..."
-    other = "leave the cell blank" if form.blanks and not column.required else "remove the row"
-    return f"{quoted(text)} is not a number; write it like 90.25 or 9.025e1, or {other}"
 
 
 def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, faults: Faults) -> Float[np.ndarray, "..."]:

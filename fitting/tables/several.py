@@ -3,7 +3,6 @@
 Where readings were repeated at one drive, their scatter is compared with what their errors say.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,9 +16,7 @@ from fitting.tables.table import (
     AmplitudeTable,
     columns_of,
     drive_numbers,
-    required,
     scatter_about_means,
-    turn_of,
 )
 
 
@@ -41,16 +38,14 @@ class SeveralTables:
             raise ValueError("a joint fit needs at least two tables")
         first, name = self.tables[0], self.labels[0]
         for table, label in zip(self.tables[1:], self.labels[1:], strict=True):
-            if table.mass_ng is None or first.mass_ng is None:
-                if table.mass_ng is not first.mass_ng:
-                    without, having = (label, name) if table.mass_ng is None else (name, label)
-                    raise ValueError(
-                        f"{without} lacks mass_ng (or spring_constant_n_per_m), which {having} gives; add it"
-                    )
-            elif abs(table.mass_ng / first.mass_ng - 1.0) > _SAME_MASS:
+            mass, other = first.mass_ng, table.mass_ng
+            if (mass is None) != (other is None):
+                without, having = (name, label) if mass is None else (label, name)
+                raise ValueError(f"{without} lacks mass_ng (or spring_constant_n_per_m), which {having} gives; add it")
+            if mass is not None and other is not None and abs(other / mass - 1.0) > _SAME_MASS:
                 raise ValueError(
-                    f"mass_ng is {first.mass_ng:g} in {name} and {table.mass_ng:g} in {label}: tips of different "
-                    "mass share no law of impacts; fit each by itself"
+                    f"mass_ng is {mass:g} in {name} and {other:g} in {label}: tips of different mass share no law of "
+                    "impacts; fit each by itself"
                 )
             if (table.quality_factor is None) != (first.quality_factor is None):
                 without, having = (label, name) if table.quality_factor is None else (name, label)
@@ -67,7 +62,9 @@ class SeveralTables:
         """
         known: dict[tuple[bytes, ...], str] = {}
         for table, label in zip(self.tables, self.labels, strict=True):
-            other = known.setdefault(_readings(table), label)
+            # noise alone makes no two measurements alike
+            columns = [getattr(table, name) for name in _READINGS]
+            other = known.setdefault(tuple(b"" if one is None else one.tobytes() for one in columns), label)
             if other is not label:
                 raise ValueError(f"{label} holds the same readings as {other}; give each table once")
 
@@ -118,44 +115,36 @@ class SeveralTables:
     @property
     def lines(self) -> Int[np.ndarray, " rows"]:
         """The line of its file that each row stands in."""
-        return self._joined([table.lines for table in self.tables])
+        return np.concatenate([table.lines for table in self.tables])
 
     @property
     def order(self) -> Int[np.ndarray, " rows"]:
         """Drive periods per impact."""
-        return self._joined([table.order for table in self.tables])
+        return np.concatenate([table.order for table in self.tables])
 
     @property
     def drive_frequency_khz(self) -> Float[np.ndarray, " rows"]:
         """Frequency of the drive."""
-        return self._joined([table.drive_frequency_khz for table in self.tables])
+        return np.concatenate([table.drive_frequency_khz for table in self.tables])
 
     @property
     def excitation_nm(self) -> Float[np.ndarray, " rows"]:
         """Amplitude of the platform, or of the free tip."""
-        return self._joined([table.excitation_nm for table in self.tables])
+        return np.concatenate([table.excitation_nm for table in self.tables])
 
     @property
     def offset_nm(self) -> Float[np.ndarray, " rows"]:
         """Offset of the platform, or height of the sample."""
-        return self._joined([table.offset_nm for table in self.tables])
+        return np.concatenate([table.offset_nm for table in self.tables])
 
     @property
     def no_orbit(self) -> Float[np.ndarray, " rows"]:
         """1 where the tip settled on no single-impact orbit, else 0."""
-        return self._joined([np.zeros(t.rows) if t.no_orbit is None else t.no_orbit for t in self.tables])
-
-    @staticmethod
-    def _joined(columns: Sequence[np.ndarray]) -> np.ndarray:
-        return np.concatenate(columns)
+        return np.concatenate([np.zeros(t.rows) if t.no_orbit is None else t.no_orbit for t in self.tables])
 
 
-def _readings(table: AmplitudeTable) -> tuple[bytes, ...]:
-    """Return what tells tables apart: noise alone makes no two measurements alike."""
-    names = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
-    return tuple(b"" if (column := getattr(table, name)) is None else column.tobytes() for name in names)
-
-
+_READINGS = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
+"""What tells tables apart."""
 _SAME_MASS = 0.01
 """Relative difference of masses that is none: they come of spring constants."""
 
@@ -183,35 +172,22 @@ class RepeatedReadings:
 
 def repeats_of(table: AmplitudeTable | SeveralTables) -> RepeatedReadings | None:
     """Return how the readings of repeated drives scatter; None where no drive was repeated."""
-    found = [one for one in map(_sums, table.tables) if one[0]]
-    if not found:
-        return None
-    drives, rows, freedom, chi2 = (sum(column) for column in zip(*found, strict=True))
+    drives, rows, freedom, chi2 = 0, 0, 0, 0.0
+    for member in table.tables:
+        columns = columns_of(member)
+        count = np.bincount(drive_numbers(columns))
+        drives, rows = drives + int((count > 1).sum()), rows + int(count[count > 1].sum())
+        for column in MEASURED:
+            if column.name in columns:
+                _, more, squares = scatter_about_means(column, columns, columns[str(column.error)])
+                freedom, chi2 = freedom + more, chi2 + squares
     if not freedom:
         return None
     return RepeatedReadings(
-        drives=int(drives),
-        rows=int(rows),
-        chi2=float(chi2),
-        degrees_of_freedom=int(freedom),
+        drives=drives,
+        rows=rows,
+        chi2=chi2,
+        degrees_of_freedom=freedom,
         error_ratio=float(np.sqrt(chi2 / freedom)),
-        p_value=chi2_tail(float(chi2), int(freedom)),
+        p_value=chi2_tail(chi2, freedom),
     )
-
-
-def _sums(table: AmplitudeTable) -> tuple[int, int, int, float]:
-    """Return repeated drives, their rows, the degrees of freedom of their scatter and its chi2."""
-    columns = columns_of(table)
-    drive = drive_numbers(columns, required(columns))
-    count = np.bincount(drive)
-    freedom, chi2 = 0, 0.0
-    for column in MEASURED:
-        if column.name not in columns:
-            continue
-        values, error, turn = columns[column.name], columns[str(column.error)], turn_of(column, columns)
-        there = np.isfinite(values) & (count[drive] > 1)
-        more, sum_of_squares = scatter_about_means(
-            drive[there], values[there], error[there], None if turn is None else turn[there]
-        )
-        freedom, chi2 = freedom + more, chi2 + sum_of_squares
-    return int((count > 1).sum()), int(count[count > 1].sum()), freedom, chi2

@@ -57,20 +57,16 @@ from fitting.tables.csv_text import (
     Faults,
     FileSetting,
     Form,
-    Head,
-    Masks,
     TableError,
-    check_not_empty,
     column_of,
     fault_in_number,
-    named_rows,
-    parse_rows,
     printable,
     quoted,
+    read_comments,
+    read_rows,
     read_text,
     setting_in,
-    settings_in,
-    split_lines,
+    setting_line,
 )
 
 LEAST_REPEATS = 4
@@ -110,22 +106,25 @@ ERROR_OF = {
 _CANTILEVER = ("free_frequency_khz", "quality_factor", "mass_ng", "spring_constant_n_per_m")
 
 
-def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> dict[str, Any]:
+def _header_of(
+    settings: dict[str, tuple[float, float | None]], remarks: tuple[str, ...], faults: Faults
+) -> dict[str, Any]:
     """Return what the comment lines of a table say, by the names of `AmplitudeTable`.
 
-    Args:
-        comments: line number and text (without the number sign, stripped) of each.
-        faults: where the faults are noted; with any, the result is not to be used.
+    Raises:
+        TableError: if it is not known what is driven, and so which columns there must be.
     """
-    settings, remarks = settings_in(comments, SETTINGS, faults)
     if "free_frequency_khz" not in settings:
         example = SETTINGS["free_frequency_khz"].line
         faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
     drive, _ = settings.get("drive", (0.0, None))
+    if np.isnan(drive):
+        faults.raise_any()
+    sense, _ = settings.get("phase_sense", (np.nan, None))
     header: dict[str, Any] = {
-        "drive": "" if np.isnan(drive) else DRIVES[int(drive)],
+        "drive": DRIVES[int(drive)],
         "rows_in_order_of_time": "rows" in settings,
-        "phase_sense": PHASE_SENSES[int(settings["phase_sense"][0])] if "phase_sense" in settings else "",
+        "phase_sense": "" if np.isnan(sense) else PHASE_SENSES[int(sense)],
         "free_frequency_khz": float("nan"),
         "calibration": {key: (settings[key][0], settings[key][1] or 0.0) for key in CALIBRATION if key in settings},
         "remarks": remarks,
@@ -204,96 +203,50 @@ def columns_of(table: "AmplitudeTable") -> dict[str, Any]:
     return {column.name: getattr(table, column.name) for column in _ALL if getattr(table, column.name) is not None}
 
 
-def required(columns: dict[str, Any]) -> tuple[Column, ...]:
+def required(columns: Collection[str]) -> tuple[Column, ...]:
     """Return the columns of which every row needs a number, of those that a table has."""
     return tuple(column for column in _ALL if column.required and column.name in columns)
 
 
-def _check_order(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
-    """Note orders of a cantilever that is driven itself that are not 1: it is read at the drive's frequency."""
-    for row in np.flatnonzero(columns["order"] > 1.0):
-        message = "must be 1 where the cantilever is driven: amplitude and lag are read at the drive's frequency"
-        faults.add(f"{message}; remove the row", line=int(lines[row]), column="order")
-
-
-def check_errors(head: Head, present: Collection[str], faults: Faults) -> None:
-    """Note measured columns without their errors.
-
-    Args:
-        head: the column names.
-        present: names of the columns, with the errors that noise and repeated readings give.
-        faults: where the faults are noted.
-    """
-    for column in MEASURED:
-        if column.name in present and column.error not in present:
-            hint = f"add the column {column.error}"
-            hint += " or give the relative noise (`noise=0.01`)" if column.amplitude else ""
-            hint += f", or repeat readings: {LEAST_REPEATS} repeats tell them"
-            faults.add(f"has no errors; {hint}", line=head.line, column=column.name)
-
-
-def fill_errors(columns: Columns, unreadable: Masks, noise: float | None) -> None:
-    """Set the errors that amplitudes lack to the relative noise times the amplitude.
-
-    Args:
-        columns: the table's columns, changed in place.
-        unreadable: masks of cells whose fault is noted elsewhere, changed in place: errors of impossible amplitudes.
-        noise: relative noise, for example 0.01; None leaves the columns as they are.
-    """
-    if noise is None:
-        return
-    for column in AMPLITUDES:
-        if column.name in columns:
-            values, error = columns[column.name], str(column.error)
-            errors = columns.get(error, np.full(len(values), np.nan))
-            possible = np.isfinite(values) & (values > 0.0)
-            columns[error] = np.where(np.isnan(errors) & possible, noise * values, errors)
-            value_is_bad = ~possible & (~np.isnan(values) | unreadable[column.name])
-            unreadable[error] = unreadable.get(error, np.zeros(len(values), dtype=bool)) | value_is_bad
-
-
-def drive_numbers(columns: dict[str, Any], required: tuple[Column, ...]) -> Int[np.ndarray, " rows"]:
-    """Return the number of the drive that each row is of: the same for rows that repeat each other.
-
-    Args:
-        columns: of the table, by name.
-        required: those of which every row needs a number.
-    """
-    names = [column.name for column in required if column.name in columns]
-    names += ["order"] if "order" in columns else []
-    keys = [np.asarray(columns[name], float) for name in dict.fromkeys(names)]
-    if "retract" in columns:
-        keys.append(np.nan_to_num(columns["retract"]))
+def drive_numbers(columns: Columns) -> Int[np.ndarray, " rows"]:
+    """Return the number of the drive that each row is of: the same for rows that repeat each other."""
+    names = ["order", *(column.name for column in required(columns)), "retract"]
+    keys = [np.nan_to_num(np.asarray(columns[name], float)) for name in dict.fromkeys(names) if name in columns]
     return np.unique(np.stack(keys), axis=1, return_inverse=True)[1].ravel()
 
 
 def scatter_about_means(
-    drive: Int[np.ndarray, " n"],
-    values: Float[np.ndarray, " n"],
-    error: Float[np.ndarray, " n"],
-    turn: Float[np.ndarray, " n"] | None,
-) -> tuple[int, float]:
-    """Return degrees of freedom and chi2 about each drive's weighted mean; angles within half a turn of the first."""
-    if not drive.size:
-        return 0, 0.0
-    _, first, place = np.unique(drive, return_index=True, return_inverse=True)
-    apart = values - values[first][place]
-    if turn is not None:
+    column: Column, columns: Columns, error: Float[np.ndarray, " rows"] | None
+) -> tuple[Bool[np.ndarray, " rows"], int, float]:
+    """Return which rows repeat others, degrees of freedom and chi2 of a measured column about each drive's mean.
+
+    Angles are taken within half a turn of a drive's first.
+
+    Args:
+        column: the measured one.
+        columns: of the table, by name.
+        error: of each reading; None: as large as an amplitude's mean, or one degree.
+    """
+    values, drive = columns[column.name], drive_numbers(columns)
+    known = np.isfinite(values) & ((values > 0.0) | (not column.amplitude))
+    there = known & (np.bincount(drive[known], minlength=drive.max() + 1) > 1)[drive]
+    if not there.any():
+        return there, 0, 0.0
+    _, first, place = np.unique(drive[there], return_index=True, return_inverse=True)
+    apart = values[there] - values[there][first][place]
+    if not column.amplitude:
+        turn = 360.0 / columns.get("order", np.ones(len(values)))[there]
         apart = apart - turn * np.round(apart / turn)
-    weight = error**-2.0
+    if error is None:
+        means = np.bincount(place, values[there]) / np.bincount(place)
+        error = np.ones(len(values))
+        error[there] = means[place] if column.amplitude else 1.0
+    weight = error[there] ** -2.0
     mean = np.bincount(place, weight * apart) / np.bincount(place, weight)
-    return drive.size - first.size, float(np.sum(weight * (apart - mean[place]) ** 2))
+    return there, len(place) - len(first), float(np.sum(weight * (apart - mean[place]) ** 2))
 
 
-def turn_of(column: Column, columns: dict[str, Any]) -> Float[np.ndarray, " rows"] | None:
-    """Return after how many degrees a phase repeats itself; None of an amplitude."""
-    if column.amplitude:
-        return None
-    rows = len(columns[column.name])
-    return 360.0 / np.asarray(columns.get("order", np.ones(rows)), float)
-
-
-def fill_errors_of_repeats(columns: Columns, required: tuple[Column, ...], measured: tuple[Column, ...]) -> list[str]:
+def _fill_errors_of_repeats(columns: Columns) -> list[str]:
     """Add the errors that a table does not give, where repeated readings tell them: one scatter for all its rows.
 
     Amplitudes scatter by a share of them, phases by an angle. Of few readings the scatter is itself uncertain: it is
@@ -301,94 +254,76 @@ def fill_errors_of_repeats(columns: Columns, required: tuple[Column, ...], measu
 
     Args:
         columns: of the table, by name, changed in place.
-        required: those of which every row needs a number.
-        measured: those that need errors.
 
     Returns:
         A remark for each column that errors were added for.
     """
-    lacking = [column for column in measured if column.name in columns and str(column.error) not in columns]
-    readable = all(np.isfinite(columns[one.name]).all() for one in required if one.name in columns)
+    lacking = [column for column in MEASURED if column.name in columns and str(column.error) not in columns]
+    readable = all(np.isfinite(columns[one.name]).all() for one in required(columns))
     if not lacking or not columns[lacking[0].name].size or not readable:
         return []
     from scipy.stats import t as student_t  # noqa: PLC0415 - fits of other tables need no SciPy
 
-    drive, remarks = drive_numbers(columns, required), []
+    remarks = []
     for column in lacking:
         values = columns[column.name]
         known = np.isfinite(values) & ((values > 0.0) | (not column.amplitude))
-        there = known & (np.bincount(drive[known], minlength=drive.max() + 1) > 1)[drive]
-        means = np.bincount(drive[there], values[there], drive.max() + 1)
-        means = means / np.maximum(np.bincount(drive[there], minlength=drive.max() + 1), 1)
-        size, turn = means[drive] if column.amplitude else np.ones(len(values)), turn_of(column, columns)
-        freedom, chi2 = scatter_about_means(
-            drive[there], values[there], size[there], None if turn is None else turn[there]
-        )
+        there, freedom, chi2 = scatter_about_means(column, columns, None)
         if freedom < LEAST_REPEATS or chi2 == 0.0:
             continue
         wider = float(student_t.ppf(0.975, freedom)) / TWO_SIDED_95
         error = wider * float(np.sqrt(chi2 / freedom))
         columns[str(column.error)] = np.where(known, error * (values if column.amplitude else 1.0), np.nan)
         said = f"{100.0 * error:.3g} %" if column.amplitude else f"{error:.3g} degrees"
-        count = f"{int(there.sum())} rows of {len(np.unique(drive[there]))} drives"
+        count = f"{int(there.sum())} rows of {len(np.unique(drive_numbers(columns)[there]))} drives"
         remarks.append(
             f"{ERRORS_OF_REPEATS}{column.name} +- {said} ({count}, widened {wider:.2f} times for their number)"
         )
     return remarks
 
 
-def check_rows(
-    columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults, unreadable: Masks | None = None
-) -> None:
-    """Check the numbers of a table and note every fault.
+def _check_rows(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
+    """Check the numbers of a table.
 
     Args:
         columns: the columns by name, NaN where nothing was measured.
         lines: the number of each row's line, for the messages.
         faults: where the faults are noted.
-        unreadable: masks of cells whose fault has been noted already.
+
+    Raises:
+        TableError: with the first fault: of impossible numbers, else of what must or must not stand together.
     """
-    rows = len(lines)
-    known_bad = {name: np.zeros(rows, dtype=bool) for name in columns} | (unreadable or {})
-    form = TAPPING if "free_amplitude_nm" in columns else TABLE
+    tapping = "free_amplitude_nm" in columns
+    form = TAPPING if tapping else TABLE
     for name in form.names:
         if name in columns:
-            # A cell with an impossible number is not to be blamed a second time for what depends on it.
-            known_bad[name] |= form.check_numbers(name, columns[name], lines, faults)
+            form.check_numbers(name, columns[name], lines, faults)
+    faults.raise_any()
+    blank = {name: np.isnan(values) for name, values in columns.items()}
     for column in required(columns):
-        for row in np.flatnonzero(np.isnan(columns[column.name]) & ~known_bad[column.name]):
-            faults.add("is blank; every row needs it", line=int(lines[row]), column=column.name)
-    blank = {name: np.isnan(values) & ~known_bad[name] for name, values in columns.items()}
-    unseen = columns.get("no_orbit", np.zeros(rows)) == 1.0
-    _check_measured(blank, unseen, lines, faults)
-    if "free_amplitude_nm" in columns and "order" in columns:
-        _check_order(columns, lines, faults)
-
-
-def _check_measured(
-    blank: Masks, unseen: Bool[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
-) -> None:
-    """Note values without error, errors without value, and rows without an amplitude that are not marked `no_orbit`."""
+        faults.add_rows(blank[column.name], "is blank; every row needs it", lines, column.name)
+    if tapping and "order" in columns:
+        message = "must be 1 where the cantilever is driven: amplitude and lag are read at the drive's frequency"
+        faults.add_rows(columns["order"] > 1.0, f"{message}; remove the row", lines, "order")
     for column in MEASURED:
-        if column.name not in blank or column.error not in blank:
-            continue
-        mend = f"fill {column.error} in" + (" or give the relative noise (`noise=0.01`)" if column.amplitude else "")
-        for row in np.flatnonzero(blank[column.error] & ~blank[column.name]):
-            faults.add(f"the value has no error; {mend}", line=int(lines[row]), column=column.name)
-        for row in np.flatnonzero(blank[column.name] & ~blank[column.error]):
+        if column.name in blank and column.error in blank:
+            mend = f"fill {column.error} in" + _OR_NOISE * column.amplitude
+            without, alone = blank[column.error] & ~blank[column.name], blank[column.name] & ~blank[column.error]
+            faults.add_rows(without, f"the value has no error; {mend}", lines, column.name)
             message = f"the error has no value; fill {column.name} in or clear this cell"
-            faults.add(message, line=int(lines[row]), column=column.error)
-    present = [column.name for column in AMPLITUDES if column.name in blank]
-    if present:
-        # An error without its value has been noted already.
-        empty = [blank[name] for column in AMPLITUDES for name in (column.name, column.error) if name in blank]
-        for row in np.flatnonzero(np.all(empty, axis=0) & ~unseen):
-            message = f"the row has no amplitude; fill {' or '.join(present)} in or remove the row"
-            message += ", or set no_orbit to 1 if the tip settled on no orbit there" if "no_orbit" in blank else ""
-            faults.add(message, line=int(lines[row]))
-        for row in np.flatnonzero(~np.all(empty, axis=0) & unseen):
-            message = "the row has an amplitude; clear it or set no_orbit to 0"
-            faults.add(message, line=int(lines[row]), column="no_orbit")
+            faults.add_rows(alone, message, lines, column.error)
+    present = [column for column in AMPLITUDES if column.name in blank]
+    # An error without its value has been noted already.
+    empty = np.all([blank[name] for one in present for name in (one.name, one.error) if name in blank], axis=0)
+    unseen = columns.get("no_orbit", np.zeros(len(lines))) == 1.0
+    message = f"the row has no amplitude; fill {' or '.join(one.name for one in present)} in or remove the row"
+    message += ", or set no_orbit to 1 if the tip settled on no orbit there" if "no_orbit" in blank else ""
+    faults.add_rows(empty & ~unseen, message, lines)
+    faults.add_rows(~empty & unseen, "the row has an amplitude; clear it or set no_orbit to 0", lines, "no_orbit")
+    faults.raise_any()
+
+
+_OR_NOISE = " or give the relative noise (`noise=0.01`)"
 
 
 @public_result()
@@ -485,8 +420,7 @@ class AmplitudeTable(Result):
         _check_pairs(columns, self.form, faults)
         _check_header(self, faults)
         faults.raise_any()
-        check_rows(columns, np.asarray(lines), faults)
-        faults.raise_any()
+        _check_rows(columns, np.asarray(lines), faults)
         if self.mass_ng is None and self.spring_constant_n_per_m is not None:
             mass = effective_mass_ng(self.spring_constant_n_per_m, self.free_frequency_khz)
             object.__setattr__(self, "mass_ng", float(mass))
@@ -523,12 +457,7 @@ class AmplitudeTable(Result):
                 how = f"in `frame.attrs`, or as {name}=... to AmplitudeTable.from_dataframe"
                 faults.add(f"{name} is missing; give it {how if name in own else 'as a column'}")
         faults.raise_any()
-        fill_errors(columns, {name: np.zeros(len(frame), dtype=bool) for name in columns}, noise)
-        repeats = fill_errors_of_repeats(columns, required(columns), MEASURED)
-        known["remarks"] = (*known.get("remarks", ()), *repeats)
-        if "order" in columns:
-            columns["order"] = columns["order"].astype(np.int64)
-        return cls(**columns, **known)
+        return _completed(columns, np.arange(1, len(frame) + 1), known, noise, faults)
 
     @property
     def rows(self) -> int:
@@ -593,28 +522,19 @@ def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], form: Form, fault
 
 def _check_header(table: AmplitudeTable, faults: Faults) -> None:
     for name in _CANTILEVER:
-        value = getattr(table, name)
+        value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
         if value is None or (name == "quality_factor" and np.isnan(value)):
-            continue
-        error = getattr(table, ERROR_OF[name]) if name in ERROR_OF else None
-        fault = fault_in_number(SETTINGS[name], value, error)
-        if fault is not None:
+            if error is not None:
+                faults.add(f"{ERROR_OF[name]} stands without {name}; give both or none")
+        elif fault := fault_in_number(SETTINGS[name], value, error):
             faults.add(f"{name} {fault}")
-    for name, error in ERROR_OF.items():
-        value = getattr(table, name)
-        if (value is None or np.isnan(value)) and getattr(table, error) is not None:
-            faults.add(f"{error} stands without {name}; give both or none")
     if table.spring_constant_n_per_m is not None and table.mass_ng is not None and faults.count == 0:
         wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
         if wrong is not None:
             faults.add(wrong)
     for remark in table.remarks:
-        if (
-            setting_in(remark, SETTINGS) is not None
-            or remark != remark.strip()
-            or not remark
-            or set(remark) & set("\r\n\0")
-        ):
+        plain = remark and remark == remark.strip() and not set(remark) & set("\r\n\0")
+        if not plain or setting_in(remark, SETTINGS) is not None:
             faults.add(f"the remark {quoted(remark)} would not be read back as one; make it one line of free text")
 
 
@@ -679,30 +599,51 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     faults = Faults(source)
     if noise is not None and not 0.0 < noise < 1.0:
         faults.fail(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
-    comments, rows = split_lines(text)
-    check_not_empty(comments, rows, faults)
-    header = parse_comments(comments, faults)
-    found = faults.count
-    form = FORMS.get(header["drive"])
-    if form is None:
-        # which columns there must be is not known
-        faults.raise_any()
-        raise AssertionError
-    head, rows = named_rows(rows, form, faults)
-    if faults.count > found:
-        # With a wrong name the cells below it cannot be judged.
-        faults.raise_any()
-    columns, unreadable, lines = parse_rows(rows, head.names, form, faults)
-    fill_errors(columns, unreadable, noise)
-    repeats = fill_errors_of_repeats(columns, required(columns), MEASURED)
-    check_errors(head, columns, faults)
-    check_rows(columns, lines, faults, unreadable)
-    faults.raise_any()
-    header["remarks"] = (*header["remarks"], *repeats)
-    arrays: dict[str, Any] = dict(columns)
+    settings, remarks, rows = read_comments(text, SETTINGS, faults)
+    header = _header_of(settings, remarks, faults)
+    columns, lines = read_rows(rows, FORMS[header["drive"]], faults)
+    return _completed(columns, lines, header | {"source": source, "lines": lines}, noise, faults, head=rows[0][0])
+
+
+def _completed(
+    columns: Columns,
+    lines: Int[np.ndarray, " rows"],
+    header: dict[str, Any],
+    noise: float | None,
+    faults: Faults,
+    head: int = 0,
+) -> AmplitudeTable:
+    """Return a table of columns, with the errors that noise and repeated readings give.
+
+    Args:
+        columns: by name, NaN where nothing was measured; changed in place.
+        lines: of the rows, for messages.
+        header: the other attributes of the table.
+        noise: relative noise of amplitudes without an error.
+        faults: where faults are noted.
+        head: line of the column names.
+
+    Raises:
+        TableError: as `read_table`.
+    """
+    for column in AMPLITUDES if noise is not None else ():
+        if column.name in columns:
+            values, error = columns[column.name], str(column.error)
+            errors = columns.get(error, np.full(len(values), np.nan))
+            # an impossible amplitude is at fault itself
+            possible = np.isfinite(values) & (values > 0.0)
+            columns[error] = np.where(np.isnan(errors) & possible, (noise or 0.0) * values, errors)
+    repeats = _fill_errors_of_repeats(columns)
+    for column in MEASURED:
+        if column.name in columns and column.error not in columns:
+            hint = f"add the column {column.error}" + _OR_NOISE * column.amplitude
+            hint += f", or repeat readings: {LEAST_REPEATS} repeats tell them"
+            faults.add(f"has no errors; {hint}", line=head, column=column.name)
+    _check_rows(columns, lines, faults)
+    attributes: dict[str, Any] = {**header, **columns, "remarks": (*header.get("remarks", ()), *repeats)}
     if "order" in columns:
-        arrays["order"] = columns["order"].astype(np.int64)
-    return AmplitudeTable(**arrays, **header, source=source, lines=lines)
+        attributes["order"] = columns["order"].astype(np.int64)
+    return AmplitudeTable(**attributes)
 
 
 @checked
@@ -723,23 +664,20 @@ def write_table(table: TableLike, path: str | Path) -> None:
         raise TableError(f"{printable(str(path))}: {error.strerror}; choose another path") from error
 
 
-def _setting_line(name: str, value: float, error: float | None) -> str:
-    return f"# {name} = {float(value)!r}" + ("" if error is None else f" +- {float(error)!r}")
-
-
 def csv_of(table: AmplitudeTable) -> str:
     """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
     spring = table.spring_constant_n_per_m
     of_spring = None if spring is None else effective_mass_ng(spring, table.free_frequency_khz)
     lines = [f"# drive = {table.drive}"] if table.tapping else []
     for name in _CANTILEVER:
-        value, error = getattr(table, name), getattr(table, ERROR_OF[name]) if name in ERROR_OF else None
+        value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
         if name == "quality_factor" and value is None:
             lines.append("# quality_factor = none")
         # the spring constant says its mass
         elif value is not None and not np.isnan(value) and not (name == "mass_ng" and value == of_spring):
-            lines.append(_setting_line(name, value, error))
-    lines += [_setting_line(name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration]
+            lines.append(setting_line(name, float(value), error and float(error)))
+    known = {name: table.calibration[name] for name in CALIBRATION if name in table.calibration}
+    lines += [setting_line(name, float(value), float(error)) for name, (value, error) in known.items()]
     lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
     lines += [f"# phase_sense = {table.phase_sense}"] if table.phase_sense else []
     lines += [f"# {remark}" for remark in table.remarks]

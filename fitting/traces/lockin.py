@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 
 from afm_jax.checks import checked
-from afm_jax.columns import printed_table
+from afm_jax.columns import printed_table, rows_of
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.units import within_turn
 from afm_jax.words import bullets
@@ -108,8 +108,6 @@ class LockinResult(Result):
 
     def printed(self) -> list[Any]:
         """Return the verdict, the amplitudes, and what a reader should know."""
-        (columns,) = self.tables().values()
-        rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
         cells: dict[str, Any] = {
             "drive /": "order:d",
             "amplitude\nnm": "lockin_amplitude_nm",
@@ -119,7 +117,7 @@ class LockinResult(Result):
         verdict = "VALID" if self.valid else "NOT VALID"
         head = f"{verdict}: order {self.order} of {self.drive_frequency_khz:g} kHz, {self.response_periods} periods"
         lines = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
-        return [head, printed_table("", cells, rows), *lines]
+        return [head, printed_table("", cells, rows_of(self.tables()["lockin.csv"])), *lines]
 
 
 @checked
