@@ -257,11 +257,11 @@ MUTATIONS = {
     ),
     "slow impacts' padding of peak and lock-in as if independent": Mutation(
         "{_TOGETHER + _APART * np.array([[1.0, -1.0], [-1.0, 1.0]]) => (_TOGETHER + _APART) * np.eye(2)}",
-        "tests/test_lasting_fit.py::test_peak_and_lockin_of_slow_rows_share_an_error",
+        "tests/test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture",
     ),
     "closest formula by half of the distance": Mutation(
         "w**2 - {2.0 *  => }w * rebound",
-        f"{LAWS}test_the_closest_formula_is_scipys_and_no_loss_is_negative",
+        "tests/test_discrepancy.py::test_the_parameters_are_those_of_the_closest_formula_and_as_unsure",
     ),
     "collisions beside capture in few steps": Mutation(
         "_NEAR_CAPTURE = ({-0.02, 0.2 => -0.0, 0.0})",

@@ -12,9 +12,8 @@ from fitting.infer.fit import model_of
 from fitting.infer.result import FitResult
 from fitting.infer.rows import plain_weights, weights_of
 from fitting.infer.search import Followed, orbits_at
-from fitting.infer.unknowns import Model, no_orbits
+from fitting.infer.unknowns import Model
 from fitting.models import task_of
-from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import simulate_experiment
 from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment
@@ -68,30 +67,6 @@ def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
     weights = weights_of(model, theta, orbits_at(model, theta).orbits, np.zeros(shared.rows, bool))
     assert np.all(np.isfinite(weights.model_error))
     assert np.all(np.isfinite(weights.whitening))
-
-
-def test_peak_and_lockin_of_slow_rows_share_an_error():
-    """Twice its variance on their mean (times root 2), a sixteenth on their difference; the slowest are excluded."""
-    table = read_table(EXAMPLE)
-    model = model_for(table, "viscous+delay")
-    theta = at(model, {"epsilon": 113.6, "viscous_loss": 0.5, **dict.fromkeys(DELAY_NAMES, 0.2)})
-    capture, omega = model.law.capture(theta[:5]), 2e-3 * np.pi * table.drive_frequency_khz
-    u = np.linspace(1.2, 8.0, table.rows) * capture
-    w = np.sqrt(u**2 - 0.5 * u - 100.0)
-    orbits = no_orbits(table.rows)._replace(approach=u, rebound=w)
-    weights = weights_of(model, theta, orbits, np.zeros(table.rows, bool))
-    s = omega * 4.7 / w
-    used = (s < 1.4) & (u > 1.35 * capture)
-    assert 0 < used.sum() < table.rows
-    np.testing.assert_array_equal(weights.used[:, :2], np.stack([used, used], axis=1))
-    lacking = 0.0005 + 0.012 * s**3 + 0.016 * (1.5 * capture / u) ** 6
-    read, error = model.data.read[used, :2], model.data.error[used, :2]
-    white = weights.whitening[used, :2, :2]
-    both = np.linalg.inv(np.swapaxes(white, 1, 2) @ white) - error[:, :, None] ** 2 * np.eye(2)
-    both /= lacking[used, None, None] ** 2 * read[:, :, None] * read[:, None, :]
-    for direction, variance in (([1.0, 1.0], 2.0), ([1.0, -1.0], 1.0 / 16.0)):
-        vector = np.array(direction) / np.sqrt(2.0)
-        np.testing.assert_allclose(both @ vector, np.broadcast_to(variance * vector, both.shape[:2]), atol=1e-6)
 
 
 @pytest.mark.long

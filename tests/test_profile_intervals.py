@@ -1,6 +1,7 @@
 """Intervals of linear and of bent models, where they are known in closed form."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,7 +89,7 @@ class Linear(Chi2):
     design: np.ndarray
     centre: np.ndarray
 
-    def at(self, theta, *, slopes=True):
+    def at(self, theta, *, slopes=True) -> Any:
         """Return residuals and their Jacobian; Q has one of its own."""
         del slopes
         jacobian = np.eye(3)
