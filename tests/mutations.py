@@ -208,7 +208,7 @@ MUTATIONS = {
         "tests/test_scenefile.py::test_reduced_frequency_counts_in_twice_the_free_frequency",
     ),
     "noise that falls with the amplitude": Mutation(
-        "noise {* => /} values", "tests/test_table.py::test_noise_stands_in_for_missing_errors_only"
+        "(noise or 0.0) {* => /} values", "tests/test_table.py::test_noise_stands_in_for_missing_errors_only"
     ),
     "lock-in of a trace with half its height": Mutation(
         "return {2.0 => 1.0} / (length or 1.0)", "tests/test_lockin.py::test_a_bounce_in_closed_form"
@@ -258,6 +258,14 @@ MUTATIONS = {
     "slow impacts' padding of peak and lock-in as if independent": Mutation(
         "{_TOGETHER + _APART * np.array([[1.0, -1.0], [-1.0, 1.0]]) => (_TOGETHER + _APART) * np.eye(2)}",
         "tests/test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture",
+    ),
+    "slow impacts held back by half": Mutation(
+        "drive_frequency_khz * length / {rebound => (2.0 * rebound)}",
+        "tests/test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture",
+    ),
+    "runs of residuals that the unknowns explain": Mutation(
+        "apart = tried {- => +} basis @ (basis.T @ tried)",
+        "tests/test_discrepancy.py::test_residuals_that_run_together_over_the_speed_are_seen",
     ),
     "closest formula by half of the distance": Mutation(
         "w**2 - {2.0 *  => }w * rebound",
