@@ -41,8 +41,9 @@ _DECIDED = 3
 """Round after which rows are no longer excluded or taken in."""
 ROBUST, OUTLIER, MOST_OUTLIERS = 2.0, 4.0, 0.1
 """Residual of a row from which a robust fit counts it linearly, that of an outlier, and their share at most."""
-_RUN_BY_CHANCE, _SHARE_PER_RUN, _LARGEST_SHARE = 2.2, 0.25, 1.0
-"""Standard deviations of a run of residuals that mean nothing, share of the loss for each beyond, and the largest."""
+_RUN_BY_CHANCE, _SHARE_PER_RUN, LARGEST_SHARE = 2.2, 0.25, 1.0
+"""Standard deviations of a run of residuals that mean nothing, share of the loss for each beyond, and the largest: a
+law that needs that much is not believed."""
 _BUMP, _BUMP_STEP, _LEAST_LEFT = 0.2, 0.1, 1e-3
 """Width of the bumps in ln u that runs are looked for with, their distance, and what is left beside the unknowns."""
 
@@ -165,7 +166,7 @@ def fit_lasting(model: Model, *, robust: bool = False) -> tuple[Explained, Expla
         if far.sum() <= max(1.0, MOST_OUTLIERS * whole.weights.used.any(axis=1).sum()):
             out = far
         whole = freed(model, whole.end, out, (SMOOTH,), before=whole.model)
-    share = min(_SHARE_PER_RUN * (whole.run - _RUN_BY_CHANCE), _LARGEST_SHARE)
+    share = min(_SHARE_PER_RUN * (whole.run - _RUN_BY_CHANCE), LARGEST_SHARE)
     if share <= 0.0:
         return whole, whole
     wider = freed(model, whole.end, out, (SMOOTH, of_short_range(share)), before=whole.model)

@@ -23,6 +23,9 @@ from fitting.infer.law import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_fo
 from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
+ENOUGH = 1e-2
+"""Estimated distance of chi2 to its minimum below which a fit counts as converged (one standard error is 1)."""
+
 
 @dataclass(frozen=True)
 class Convergence:

@@ -16,6 +16,7 @@ from fitting.infer.explain import Explained
 from fitting.infer.intervals import UNDETERMINED, UNEXPLAINED, Interval, Unknown, linear_interval, profile_interval
 from fitting.infer.law import AtSpeeds, LawAt, containing, speed_range
 from fitting.infer.result import (
+    ENOUGH,
     Convergence,
     FitResult,
     FittedLaw,
@@ -34,8 +35,6 @@ from fitting.predict.orbit import NEAR_FOLD, READINGS
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
-_ENOUGH = 1e-2
-"""Estimated distance of chi2 to its minimum below which a fit counts as converged (one standard error is 1)."""
 _PROFILED = 3.0
 """Errors from its bound within which epsilon has a profile interval where impacts last."""
 _VANISHING = 1e-3
@@ -76,7 +75,7 @@ def convergence_of(explained: Explained, optimiser: str, iterations: int) -> Con
     distance = float(slope[moves] @ step)
     errors = np.sqrt(np.where(known, np.diag(covariance), 0.0))
     gradient = float(np.max(np.abs(2.0 * slope[moves] * errors), initial=0.0))
-    return Convergence(explained.settled and distance < _ENOUGH, optimiser, iterations, gradient, distance)
+    return Convergence(explained.settled and distance < ENOUGH, optimiser, iterations, gradient, distance)
 
 
 def summary_of(

@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN, chi2_tail
 from afm_jax.outcomes import Rule, Rules, judge
-from fitting.infer.explain import MOST_OUTLIERS, OUTLIER
+from fitting.infer.explain import LARGEST_SHARE, MOST_OUTLIERS, OUTLIER
 from fitting.infer.intervals import UNSETTLED
-from fitting.infer.result import NO_MASS, Convergence, FittedParameter, FittedRows
+from fitting.infer.result import ENOUGH, NO_MASS, Convergence, FittedParameter, FittedRows
 from fitting.infer.rows import OUTLIER_LEFT_OUT, TOO_SLOW
 from fitting.models import Held
 from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, name_of_table, parameter_called
@@ -212,10 +212,11 @@ def _not_converged(evidence: Evidence) -> list[str]:
     convergence = evidence.convergence
     if convergence.converged:
         return []
-    distance = f"chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
     if not np.isfinite(convergence.estimated_distance):
-        distance = "chi2 bends downwards where the search ended, which is no minimum"
-    return [distance]
+        return ["chi2 bends downwards where the search ended, which is no minimum"]
+    if convergence.estimated_distance < ENOUGH:
+        return ["which orbits the rows have, and what they count, does not settle"]
+    return [f"chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"]
 
 
 def _not_explained(evidence: Evidence) -> list[str]:
@@ -498,7 +499,7 @@ MISFITS: Rules[Evidence] = (
     ),
     Rule(_contradicted, "it contradicts what is known beforehand, in standard errors: {case}"),
     Rule(
-        lambda e: [100.0 * e.short] if e.run[1] > _LONGEST_RUN else [],
+        lambda e: [100.0 * e.short] if e.run[1] > _LONGEST_RUN or e.short >= LARGEST_SHARE else [],
         "residuals run together over the approach speed ({e.run[0]:.1f} standard deviations; {e.run[1]:.1f} beside a "
         "model discrepancy of {case:.0f} % of the loss)",
     ),

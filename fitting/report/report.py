@@ -29,6 +29,7 @@ from fitting.report.words import (
     PULLS,
     band_in_words,
     formulas,
+    has_delay,
     held_in_words,
     interval_in_words,
     losses_in_words,
@@ -50,7 +51,9 @@ def fit_report(result: FitResult, comparison: Comparison | None = None, posterio
     cells = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
     parting = parting_in_words(result) if result.valid else ""
     probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
-    chi2 = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}, AIC {result.aic:.1f}"
+    chi2 = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
+    # where impacts last chi2 makes up for what a formula lacks
+    chi2 += "" if has_delay(result) else f", AIC {result.aic:.1f}"
     goodness = [f"  {line}" for line in (band_in_words(result), parting, chi2) if line]
     return Report(
         title=f"Impact law of {result.table.source} ({counted(result.table.rows, 'row')}), model {result.model}:",
