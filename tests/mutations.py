@@ -208,7 +208,7 @@ MUTATIONS = {
         "tests/test_scenefile.py::test_reduced_frequency_counts_in_twice_the_free_frequency",
     ),
     "noise that falls with the amplitude": Mutation(
-        "noise {* => /} values", "tests/test_table.py::test_noise_stands_in_for_missing_errors_only"
+        "(noise or 0.0) {* => /} values", "tests/test_table.py::test_noise_stands_in_for_missing_errors_only"
     ),
     "lock-in of a trace with half its height": Mutation(
         "return {2.0 => 1.0} / (length or 1.0)", "tests/test_lockin.py::test_a_bounce_in_closed_form"
