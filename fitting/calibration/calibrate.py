@@ -65,6 +65,7 @@ class Calibration(Result):
         p_value: probability of a larger chi2 if the model is right; NaN where the errors come from the fit itself.
         residual_autocorrelation: of neighbouring points.
         chi2_without_resonance: of a parabola.
+        left: estimated distance of chi2 to its minimum.
         fitted: the response at every point, complex as the phase was measured, or the amplitude, in the sweep's unit.
         sweep: what was fitted; of a spectrum the part around the resonance.
         valid: whether to trust it; `reasons` say why not.
@@ -84,6 +85,7 @@ class Calibration(Result):
     p_value: float
     residual_autocorrelation: float
     chi2_without_resonance: float
+    left: float
     fitted: np.ndarray
     sweep: ResonanceSweep
     valid: bool = False
@@ -209,7 +211,9 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
     together = _autocorrelation(fit.residual.reshape(-1, sweep.points))
     # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
     fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(fit.residual)) < together < 1.0 else 1.0
-    covariance = covariance_of(fit.jacobian.T @ fit.jacobian) * scale * fewer
+    covariance, slope = covariance_of(fit.jacobian.T @ fit.jacobian), fit.jacobian.T @ fit.residual
+    left = float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope)
+    covariance = covariance * scale * fewer
     natural, quality_factor = np.exp(fit.place[:2]).tolist()
     by_place = np.eye(len(fit.place))
 
@@ -241,6 +245,7 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
         p_value=p_value,
         residual_autocorrelation=together,
         chi2_without_resonance=chi2_without_resonance(sweep, error) / scale,
+        left=left / scale,
         fitted=largest * (np.conj(fit.model) if fit.reverse else fit.model),
         sweep=sweep,
     )
@@ -337,6 +342,7 @@ def _judged(e: Calibration) -> Calibration:
         f"Only {inside}: sweep in finer steps.": e.model != "power" and coarse,
         f"The model does not explain the sweep: chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom. "
         "Another background, a drift, or too small errors?": e.p_value < IMPROBABLE,
+        f"Not converged: chi2 lies an estimated {e.left:.2g} above its minimum.": not e.left < 1e-3,
         f"Not identified: {unknown}.": unknown is not None,
     }
     reasons = [said for said, holds in faults.items() if holds][:1]

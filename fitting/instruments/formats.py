@@ -174,9 +174,11 @@ def parse_wsxm(data: bytes, name: str) -> Recording:
     """Read WSxM: an image with its header (left aside), then curves, each a text header and pairs of doubles (x, y)."""
     header, place = _wsxm_header(data, 0, name)
     if b"FZ curve file" not in data[:place]:
-        sizes = {"double": 8, "float": 4, "integer": 4, "short": 2}
-        pixels = int(header.get("Number of columns", "0")) * int(header.get("Number of rows", "0"))
-        place += pixels * sizes[header.get("Image Data Type", "double")]
+        kind, *sides = (header.get(key, "0") for key in ("Image Data Type", "Number of columns", "Number of rows"))
+        sizes = {"0": 8, "double": 8, "float": 4, "integer": 4, "short": 2}
+        if kind not in sizes or not all(side.isdecimal() for side in sides):
+            raise cut_off(name, f"the image has the data type {kind!r} and {' x '.join(sides)} points")
+        place += int(sides[0]) * int(sides[1]) * sizes[kind]
     segments: list[Segment] = []
     units: dict[str, str] = {}
     announced, own = 0, header
