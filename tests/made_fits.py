@@ -7,6 +7,7 @@ import numpy as np
 
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.units import TWO_SIDED_95
+from fitting.infer.law import LawAt
 from fitting.infer.result import Convergence, FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, PARAMETERS
 from fitting.tables.table import AmplitudeTable
@@ -77,15 +78,17 @@ def made_parameter(name: str, value: float, **changes: Any) -> FittedParameter:
 
 def made_law(values: dict[str, float], *, width: float, lasting: bool) -> FittedLaw:
     """Return the law of the parameters from 0.8 times the slowest to 1.2 times the fastest row."""
-    u = np.geomspace(0.8 * SPEEDS[0], 1.2 * SPEEDS[-1], 121)
     law = ImpactLaw(values.get("r", 1.0), values.get("epsilon", 0.0), values.get("viscous_loss", 0.0))
     hertz, lead, offset = (values.get(name, 0.1) for name in DELAY_NAMES)
-    w = np.asarray(law.rebound_speed(u))
-    late = np.asarray(CollisionDelay(hertz, lead, offset)(u, w)) if lasting else np.zeros_like(u)
-    errors = width / TWO_SIDED_95 * np.stack([w, np.abs(late)], axis=1)[:, :, None], np.zeros(1)
-    capture = float(law.capture_speed_nm_per_us)
-    rest: dict[str, Any] = {"delay": None, "lasting": lasting, "mass_ng": 1.0, "origin": "made"}
-    return FittedLaw(u, w, late, capture_speed_nm_per_us=capture, errors=errors, **rest)
+    late = CollisionDelay(hertz, lead, offset)
+
+    def at(u: np.ndarray) -> LawAt:
+        w = np.asarray(law.rebound_speed(u))
+        both = np.stack([w, np.asarray(late(u, w)) if lasting else np.zeros_like(u)])
+        errors = width / TWO_SIDED_95 * np.abs(both)[:, :, None]
+        return LawAt(both, errors, float(law.capture_speed_nm_per_us), np.zeros(1))
+
+    return FittedLaw(at, SPEEDS, formula=None, lasting=lasting, mass_ng=1.0, origin="made")
 
 
 def made_table(rows: int = 4, **changes: Any) -> AmplitudeTable:

@@ -259,6 +259,14 @@ MUTATIONS = {
         "{_TOGETHER + _APART * np.array([[1.0, -1.0], [-1.0, 1.0]]) => (_TOGETHER + _APART) * np.eye(2)}",
         "tests/test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture",
     ),
+    "slow impacts held back by half": Mutation(
+        "drive_frequency_khz * length / {rebound => (2.0 * rebound)}",
+        "tests/test_discrepancy.py::test_peak_and_lockin_of_a_slow_row_share_the_error_of_the_picture",
+    ),
+    "runs of residuals that the unknowns explain": Mutation(
+        "apart = tried {- => +} basis @ (basis.T @ tried)",
+        "tests/test_discrepancy.py::test_residuals_that_run_together_over_the_speed_are_seen",
+    ),
     "closest formula by half of the distance": Mutation(
         "w**2 - {2.0 *  => }w * rebound",
         "tests/test_discrepancy.py::test_the_parameters_are_those_of_the_closest_formula_and_as_unsure",

@@ -48,7 +48,8 @@ SETTING_NAMES = frozenset(
 
 NumberedLines = list[tuple[int, str]]
 """Lines of a file, each with its number."""
-Columns = dict[str, Float[np.ndarray, " rows"]]
+Columns = dict[str, Shaped[np.ndarray, " rows"]]
+"""Columns by name: numbers, of orders whole ones."""
 
 
 class TableError(ValueError):
