@@ -112,19 +112,20 @@ def test_rows_set_aside_are_named(viscous, shared):
     assert viscous.degrees_of_freedom == used + given - len(viscous.parameters)
 
 
-def test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient(shared):
+def test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient():
     """A drag that gives: determinants are those of the map's own Jacobian, and chi2's slopes those of differences."""
-    model = model_for(shared, "viscous+delay")
+    table = read_table(EXAMPLE)
+    model = model_for(table, "viscous+delay")
     delay = {"delay_hertz": 0.2, "delay_lead_nm": 5.0, "delay_offset_nm": 0.0}
     theta = at(model, delay | {"epsilon": 100.0, "viscous_loss": -10.0})
     found = orbits_at(model, theta)
     growing = found.exists & (found.number == 0)
     assert 5 < growing.sum() < found.exists.sum() - 5
     np.testing.assert_array_equal(found.orbits.determinant[found.exists] > 1.0, growing[found.exists])
-    weights = plain_weights(model.data, 0.3, np.zeros(shared.rows, bool))
+    weights = plain_weights(model.data, 0.3, np.zeros(table.rows, bool))
     rows = Followed(model, theta, found.orbits, weights, np.inf)
     here = rows.sum(theta)
-    cost = here.residual[3 * shared.rows : 4 * shared.rows]
+    cost = here.residual[3 * table.rows : 4 * table.rows]
     assert cost[growing].min() > 3.0
     assert cost[found.orbits.determinant < 0.98].max() < 1e-6
     for i in range(theta.size):
