@@ -7,7 +7,7 @@ import numpy as np
 
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.units import TWO_SIDED_95
-from fitting.infer.law import LawAt
+from fitting.infer.law import LawWithErrors
 from fitting.infer.result import Convergence, FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, PARAMETERS
 from fitting.tables.table import AmplitudeTable
@@ -82,11 +82,11 @@ def made_law(values: dict[str, float], *, width: float, lasting: bool) -> Fitted
     hertz, lead, offset = (values.get(name, 0.1) for name in DELAY_NAMES)
     late = CollisionDelay(hertz, lead, offset)
 
-    def at(u: np.ndarray) -> LawAt:
+    def at(u: np.ndarray) -> LawWithErrors:
         w = np.asarray(law.rebound_speed(u))
         both = np.stack([w, np.asarray(late(u, w)) if lasting else np.zeros_like(u)])
         errors = width / TWO_SIDED_95 * np.abs(both)[:, :, None]
-        return LawAt(both, errors, float(law.capture_speed_nm_per_us), np.zeros(1))
+        return LawWithErrors(both, errors, float(law.capture_speed_nm_per_us), np.zeros(1))
 
     return FittedLaw(at, SPEEDS, formula=None, lasting=lasting, mass_ng=1.0, origin="made")
 

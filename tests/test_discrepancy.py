@@ -14,7 +14,7 @@ from fitting import fit
 from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained, run_of_residuals
 from fitting.infer.fit import explained_of, model_of
-from fitting.infer.law import LawAt, containing
+from fitting.infer.law import LawWithErrors, containing
 from fitting.infer.result import EnergyLost, Loss, WithInterval, interval_of, scaled
 from fitting.infer.rows import remainders_of, weights_of
 from fitting.infer.search import Descent, Found, orbits_at
@@ -173,8 +173,8 @@ def test_residuals_that_run_together_over_the_speed_are_seen(explained):
 
 def test_a_band_holds_that_of_another_law_too():
     factor = np.array([[[0.3, 0.4], [0.0, 1.0]], [[0.1, 0.0], [0.2, 0.0]]])
-    one = LawAt(np.array([[10.0, 20.0], [0.1, 0.2]]), factor, 5.0, np.array([0.1, 0.0]))
-    other = LawAt(one.law + np.array([[0.5, -3.0], [0.0, 0.01]]), 2.0 * factor, 5.5, np.array([0.0, 0.2]))
+    one = LawWithErrors(np.array([[10.0, 20.0], [0.1, 0.2]]), factor, 5.0, np.array([0.1, 0.0]))
+    other = LawWithErrors(one.law + np.array([[0.5, -3.0], [0.0, 0.01]]), 2.0 * factor, 5.5, np.array([0.0, 0.2]))
     both = containing(one, other)
     for law in (one, other):
         own, mine = (np.linalg.norm(x.factor, axis=2) * TWO_SIDED_95 for x in (law, both))

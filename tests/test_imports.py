@@ -105,7 +105,7 @@ def test_files_import_each_other_in_no_circle():
 def test_a_call_needs_few_files():
     # four of them because the path of a scene may be given instead, five because results are written into files
     contacts = {"afm_jax.contact.collide": 33, "afm_jax.motion.simulate": 39}
-    for module, most in {**contacts, "afm_jax.studies.effects": 57, "fitting.infer.fit": 63}.items():
+    for module, most in {**contacts, "afm_jax.studies.effects": 57, "fitting.infer.fit": 69}.items():
         files, ahead = {module}, [module]
         while ahead:
             further = needs()[ahead.pop()] - files

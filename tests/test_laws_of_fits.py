@@ -13,7 +13,7 @@ from fitting.infer.law import closest_loss
 from fitting.infer.rows import NEAREST
 from fitting.models import Held
 from fitting.parameters import DELAY_NAMES
-from fitting.predict.contact import ContactLaw
+from fitting.predict.contact import ContactLawModel
 from fitting.predict.law import SMOOTH, FormulaLaw, LawModel, of_short_range
 
 LASTING = {
@@ -120,9 +120,11 @@ def test_parameters_and_unknowns_are_each_others_inverse(law):
 
 
 @pytest.fixture(scope="module")
-def contact() -> ContactLaw:
+def contact() -> ContactLawModel:
     held = (Held("tip_radius_nm", 10.0, 3.0, assumed=True),)
-    return ContactLaw(("relative_humidity", "viscosity_pa_s", "modulus_gpa"), {"adhesion_energy_j_per_m2": 0.28}, held)
+    return ContactLawModel(
+        ("relative_humidity", "viscosity_pa_s", "modulus_gpa"), {"adhesion_energy_j_per_m2": 0.28}, held
+    )
 
 
 CONTACT = {"relative_humidity": 0.45, "viscosity_pa_s": 1.2e-3, "modulus_gpa": 80.0}

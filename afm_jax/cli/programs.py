@@ -1,8 +1,8 @@
 """Traced programs beside JAX's compilation cache, which finds what it has compiled only after tracing anew.
 
-Commands name the few that gain (processor seconds of a warm call, with and without: fit by viscous+delay 5.3 and 11.9,
-collide 2.1 and 3.3; a simulation gains too little). `jax.export` writes them, its own serialisation; pickle would run
-any code that a file names. A file is found by all that a trace depends on: sources, versions, configuration,
+Commands name the few that gain (processor seconds of a warm call of collide, with and without: 2.1 and 3.3; a
+simulation gains too little). `jax.export` writes them, its own serialisation; pickle would run any code that a file
+names. A file is found by all that a trace depends on: sources, versions, configuration,
 devices, shapes and structure. Results are modules and tuples of arrays; other arguments have a `repr` that says all.
 """
 

@@ -36,6 +36,7 @@ def levenberg_marquardt(
     most: int,
     longest: Float[np.ndarray, " k"] | float = np.inf,
     fixed: Bool[np.ndarray, " k"] | None = None,
+    lowest: Float[np.ndarray, " k"] | float = -np.inf,
 ) -> Lowest:
     """Return a minimum.
 
@@ -46,10 +47,13 @@ def levenberg_marquardt(
         most: steps that are taken, at most.
         longest: by how much each unknown may change in a step; longer steps are shortened as a whole.
         fixed: unknowns that stay; None: none.
+        lowest: value of each unknown: one that is there stays while the sum falls beyond.
     """
-    moves = np.ones(start.size, bool) if fixed is None else ~fixed
-    place, here, damping, count = start, evaluate(start), _FIRST, 0
+    free = np.ones(start.size, bool) if fixed is None else ~fixed
+    place = np.where(free, np.maximum(start, lowest), start)
+    here, damping, count = evaluate(place), _FIRST, 0
     for _ in range(most):
+        moves = free & ~((place <= lowest) & (here.jacobian.T @ here.residual > 0.0))
         gradient = here.jacobian[:, moves].T @ here.residual
         normal = here.jacobian[:, moves].T @ here.jacobian[:, moves]
         unit = np.sqrt(np.diag(normal)) + 1e-30
@@ -62,6 +66,7 @@ def levenberg_marquardt(
             if promised < 1e-2 * settled:
                 return Lowest(place, here, count)
             step *= min(1.0, float(np.min(longest / np.maximum(np.abs(step), 1e-300))))
+            step = np.where(moves, np.maximum(step, lowest - place), 0.0)
             there, count = evaluate(place + step), count + 1
             if not there.value < here.value:
                 damping = max(_MORE * damping, 1e-4)

@@ -148,9 +148,9 @@ def model_of(prior: Prior, drives: Drives, values: Float[np.ndarray, " p"]) -> t
     blank = np.full((count, READINGS), np.nan)
     data = Data(row, blank, np.ones_like(blank), never, zero, zero.astype(int), (problem.drive,), *lever)
     if problem.model == "contact":
-        from fitting.predict.contact import ContactLaw  # noqa: PLC0415  # for contacts alone
+        from fitting.predict.contact import ContactLawModel  # noqa: PLC0415  # for contacts alone
 
-        law = ContactLaw(problem.own, prior.fixed, (), problem.effects, mass)
+        law = ContactLawModel(problem.own, prior.fixed, (), problem.effects, mass)
     else:
         law = FormulaLaw(problem.own, prior.fixed, mass, lasting=problem.lasting)
     theta = np.zeros(len(values))

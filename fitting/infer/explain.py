@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import covariance_of
-from fitting.infer.law import LawAt, root_of
+from fitting.infer.law import LawWithErrors, root_of
 from fitting.infer.rows import Weights, few_left, remainders_of, weights_of
 from fitting.infer.search import (
     CENSORED,
@@ -124,7 +124,7 @@ class Explained:
                 return end.chi2
         return np.inf
 
-    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAt:
+    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawWithErrors:
         """Return rebound speeds and delays at approach speeds in nm/us, with their change by independent unknowns."""
         law, count = self.model.law, len(self.model.law.names)
         theta = self.model.of_law(self.end.theta)
@@ -141,7 +141,7 @@ class Explained:
         root = root_of(self.covariance)[:count]
         capture = law.capture(theta)
         factor = np.stack([by_rebound, by_delay]) @ root
-        return LawAt(
+        return LawWithErrors(
             np.where(leaves, np.stack([w, late]), 0.0),
             np.where(leaves[:, None], factor, 0.0),
             capture,

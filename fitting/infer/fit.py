@@ -141,10 +141,10 @@ def model_of(table: AmplitudeTable | SeveralTables, task: Task, settings: dict[s
     known = {name: pair for name, pair in task.known.items() if not is_nuisance(name)}
     instrument = quantities_of(data, task, table.labels)
     if problem.model == "contact":
-        from fitting.predict.contact import ContactLaw  # noqa: PLC0415  # for contacts alone
+        from fitting.predict.contact import ContactLawModel  # noqa: PLC0415  # for contacts alone
 
         held = tuple(one for one in settings["held"] if one.error > 0.0)
-        return Model(data, ContactLaw(problem.own, fixed, held, problem.effects, data.mass_ng), instrument, known)
+        return Model(data, ContactLawModel(problem.own, fixed, held, problem.effects, data.mass_ng), instrument, known)
     own = problem.own
     if problem.lasting and "viscous_loss" not in (*own, *fixed):
         own = (*own, "viscous_loss")

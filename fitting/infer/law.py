@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from afm_jax.units import TWO_SIDED_95
 
 
-class LawAt(NamedTuple):
+class LawWithErrors(NamedTuple):
     """Rebound speeds in nm/us and delays in us, capture speed, and how they change with unknowns of unit variance."""
 
     law: Float[np.ndarray, "2 n"]
@@ -17,13 +17,13 @@ class LawAt(NamedTuple):
     capture: float
     capture_factor: Float[np.ndarray, " m"]
 
-    def without_errors(self) -> "LawAt":
+    def without_errors(self) -> "LawWithErrors":
         """Return the law with nothing known of its errors: NaN."""
         nothing = np.full_like(self.factor, np.nan), np.full_like(self.capture_factor, np.nan)
         return self._replace(factor=nothing[0], capture_factor=nothing[1])
 
 
-AtSpeeds = Callable[[Float[np.ndarray, " n"]], LawAt]
+AtSpeeds = Callable[[Float[np.ndarray, " n"]], LawWithErrors]
 """A law with its errors, of approach speeds in nm/us."""
 
 
@@ -32,7 +32,7 @@ LAW_POINTS, _FEWEST_POINTS = 121, 4
 
 def points_of_law(
     law: AtSpeeds, approach_speeds: Float[np.ndarray, " rows"]
-) -> tuple[Float[np.ndarray, " points"], LawAt]:
+) -> tuple[Float[np.ndarray, " points"], LawWithErrors]:
     """Return a law from 0.8 times the slowest to 1.2 times the fastest approach in nm/us, and beyond its capture.
 
     Args:
@@ -55,7 +55,7 @@ def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, flo
     return (float(known.min()), float(known.max())) if known.size else (1.25, 250.0 / 3.0)
 
 
-def containing(one: LawAt, other: LawAt) -> LawAt:
+def containing(one: LawWithErrors, other: LawWithErrors) -> LawWithErrors:
     """Return a law with errors so large that its 95 % band holds that of another law too."""
 
     def widened(value, factor, far, spread):

@@ -139,7 +139,8 @@ def descend(
     """
     rows = Followed(model, theta, begin, weights, soft)
     longest = np.array([1.0 if name in ("epsilon", "delay_hertz") else np.inf for name in model.names])
-    end = levenberg_marquardt(rows.sum, theta, settled=settled, most=_STEPS, longest=longest, fixed=fixed)
+    limits = {"longest": longest, "fixed": fixed, "lowest": model.lowest}
+    end = levenberg_marquardt(rows.sum, theta, settled=settled, most=_STEPS, **limits)
     return rows.descent(end.place, end.sum, end.steps)
 
 

@@ -14,7 +14,7 @@ from afm_jax.version import version_of
 from fitting.infer.closest import Closest, closest_parameters, covariance_of_unknowns, held_at_bound
 from fitting.infer.explain import Explained
 from fitting.infer.intervals import UNDETERMINED, UNEXPLAINED, Interval, Unknown, linear_interval, profile_interval
-from fitting.infer.law import AtSpeeds, LawAt, containing, speed_range
+from fitting.infer.law import AtSpeeds, LawWithErrors, containing, speed_range
 from fitting.infer.result import (
     ENOUGH,
     Convergence,
@@ -29,14 +29,23 @@ from fitting.infer.rows import SIZE_OF_PHASE
 from fitting.infer.several import Parts, Pull, pulls_of
 from fitting.infer.verdict import Evidence, judge_fit, misfits
 from fitting.models import Task, readings_of
-from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES, is_of_one_table, name_of_table, parameter_called
-from fitting.predict.contact import ContactLaw
+from fitting.parameters import (
+    CONTACT_NAMES,
+    DELAY_NAMES,
+    NUISANCE_NAMES,
+    is_of_one_table,
+    name_of_table,
+    parameter_called,
+)
+from fitting.predict.law import FormulaLaw
 from fitting.predict.orbit import NEAR_FOLD, READINGS
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
 _PROFILED = 3.0
 """Errors from its bound within which epsilon has a profile interval where impacts last."""
+_VAGUE = 2.0
+"""Error of the logarithm of a contact's parameter from which its interval is a profile's."""
 _VANISHING = 1e-3
 """Part of epsilon that is none, where its logarithm is the unknown."""
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
@@ -68,8 +77,9 @@ def convergence_of(explained: Explained, optimiser: str, iterations: int) -> Con
     if not (np.isfinite(jacobian).all() and np.isfinite(residual).all()):
         reason = "the slopes of the residuals are not finite where the search ended"
         return Convergence(False, optimiser, iterations, np.inf, np.inf, reason)  # noqa: FBT003
-    moves = ~held_at_bound(explained)
-    slope, covariance = jacobian.T @ residual, covariance_of(jacobian[:, moves].T @ jacobian[:, moves])
+    slope = jacobian.T @ residual
+    moves = ~held_at_bound(explained) & ~((end.theta <= explained.model.lowest) & (slope > 0.0))
+    covariance = covariance_of(jacobian[:, moves].T @ jacobian[:, moves])
     known = np.isfinite(np.diag(covariance))
     step = np.where(known, np.where(np.isfinite(covariance), covariance, 0.0) @ np.where(known, slope[moves], 0.0), 0.0)
     distance = float(slope[moves] @ step)
@@ -146,19 +156,22 @@ def _known_parameters(
 def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
     """Return the 95 % interval of every parameter.
 
-    By profile likelihood of instantaneous laws, and of epsilon where that is less than three errors from 0; else
-    linear, in the unknown where that is a contact's.
+    By profile likelihood of instantaneous laws, of epsilon where that is less than three errors from 0, and of a
+    contact's parameter that is known to no factor of seven; else linear, in the unknown where that is a contact's.
     """
     model, covariance = fitted.explained.model, covariance_of_unknowns(fitted.explained)
-    intervals = []
+    formula, intervals = isinstance(model.law, FormulaLaw), []
+    # the error of a logarithm from which on an end may be far away
+    positive = [name for name in model.law.own if not parameter_called(name).width]
+    bounded = {"epsilon": 1.0 / _PROFILED} if formula else dict.fromkeys(positive, _VAGUE)
     for name, value, error in zip(closest.names, closest.values.tolist(), closest.errors.tolist(), strict=True):
         place = model.names.index(name) if name in model.names else None
         variance = np.inf if place is None else covariance[place, place]
         if not np.isfinite(error):
             intervals.append(Interval(None, None, UNDETERMINED))
-        elif is_of_one_table(name) or (model.law.lasting and (name != "epsilon" or variance < _PROFILED**-2)):
+        elif is_of_one_table(name) or (model.law.lasting and (name not in bounded or variance < bounded[name] ** 2)):
             ends = value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error
-            if place is not None and isinstance(model.law, ContactLaw) and name in model.law.own:
+            if place is not None and not formula and name in model.law.own:
                 here, reach = fitted.explained.end.theta[place], TWO_SIDED_95 * float(np.sqrt(variance))
                 ends = model.law.value_of(name, here - reach), model.law.value_of(name, here + reach)
             intervals.append(linear_interval(parameter_called(name), *map(float, ends)))
@@ -277,7 +290,7 @@ def _result(
     """Return the result of a fit whose errors are known, or are not: the law and its loss with bands, the verdict."""
     explained, table, problem, rows = fitted.explained, evidence.table, task.problem, evidence.rows
 
-    def law_at(speeds: Float[np.ndarray, " n"]) -> LawAt:
+    def law_at(speeds: Float[np.ndarray, " n"]) -> LawWithErrors:
         law = explained.law_at(speeds)
         if fitted.other is not None:
             law = containing(law, fitted.other.law_at(speeds))
@@ -338,15 +351,17 @@ def _parameters(
     parameters = {}
     for i, (name, interval) in enumerate(zip(closest.names, intervals, strict=True)):
         error = float(errors[i])
+        # of a contact's parameter that may be 0 for all the data say, the other end is a limit
+        vanishes = closest.vanishes[i] or (name in CONTACT_NAMES and interval.low is None and interval.high is not None)
         parameters[name] = FittedParameter(
             value=float(closest.values[i]),
             unit=parameter_called(name).unit,
-            standard_error=error if not closest.vanishes[i] and np.isfinite(error) else None,
+            standard_error=error if not vanishes and np.isfinite(error) else None,
             interval95=(interval.low, interval.high),
             interval_reason=interval.reason,
             interval_kind=interval.kind,
             undetermined=not np.isfinite(closest.errors[i]),
-            at_bound=closest.vanishes[i],
+            at_bound=vanishes,
             constraint=task.known.get(name),
         )
     return parameters
@@ -354,11 +369,9 @@ def _parameters(
 
 def _untabulated(explained: Explained, rows: FittedRows) -> tuple[int, ...]:
     """Return the rows whose impacts the table of a contact does not hold to its accuracy."""
-    law = explained.model.law
-    if not isinstance(law, ContactLaw):
-        return ()
+    law, theta = explained.model.law, explained.model.of_law(explained.end.theta)
     speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
-    return tuple(np.flatnonzero(law.misses_accuracy(explained.model.of_law(explained.end.theta), speeds)).tolist())
+    return tuple(np.flatnonzero(law.misses_accuracy(theta, speeds)).tolist())
 
 
 def _contact_share(explained: Explained) -> float:

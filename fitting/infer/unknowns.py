@@ -227,6 +227,11 @@ class Model:
                 mean[i], strength[i] = self._known_of(name)
         return mean, strength
 
+    @property
+    def lowest(self) -> Float[np.ndarray, " k"]:
+        """Lowest value of every unknown: no impact on a sample at rest gives energy."""
+        return np.array([0.0 if name == "viscous_loss" else -np.inf for name in self.names])
+
     def _known_of(self, name: str) -> tuple[float, float]:
         """Return what is known of a parameter's unknown: the mean, and one over the standard deviation."""
         law = self.law
@@ -342,7 +347,7 @@ def _column(name: str) -> int:
 def no_orbits(count: int) -> Orbits:
     """Return room for the orbits of so many rows."""
     shapes = {"x": (3,), "readings": (READINGS,), "slopes": (READINGS, COUNT)}
-    kinds = dict.fromkeys(("closes", "steady", "growing"), bool)
+    kinds: dict[str, type] = dict.fromkeys(("closes", "steady", "growing"), bool)
     return Orbits(*(np.zeros((count, *shapes.get(name, ())), kinds.get(name, float)) for name in Orbits._fields))
 
 

@@ -28,7 +28,7 @@ _SPEEDS = 160
 
 
 @dataclass(frozen=True, eq=False)
-class ContactLaw(LawModel):
+class ContactLawModel(LawModel):
     """The law of a contact.
 
     Attributes:

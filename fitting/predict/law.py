@@ -1,7 +1,7 @@
 """The law of a fit as a function of its unknowns: rebound speed and delay over the approach speed, with derivatives.
 
-A formula times a smooth function (`FormulaLaw`), or a contact (`ContactLaw`, in `fitting.predict.contact`): both give
-w^2 and the delay without its leads, T, at any speed, and the table that orbits are computed from.
+A formula times a smooth function (`FormulaLaw`), or a contact (`ContactLawModel`, in `fitting.predict.contact`): both
+give w^2 and the delay without its leads, T, at any speed, and the table that orbits are computed from.
 
     w^2 = u^2 - [(1 - r^2) u^2 + c sqrt(u^2 + q) + epsilon] exp(L(ln u))
     T = a u^(-1/5) - d/u - P(ln u)/u,    tau = T - b (1/w - 1/u) + f (1/w^2 - 1/u^2)
@@ -18,7 +18,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from afm_jax.impact.law import BRIDGE_NM, ImpactLaw
 from afm_jax.impact.law_table import EXCESS, LawTable, table_of
@@ -112,6 +112,13 @@ class LawModel(ABC):
     @abstractmethod
     def table(self, theta: Float[np.ndarray, " k"]) -> LawTable | ImpactLaw:
         """Return what orbits are computed from: the table, or where impacts are instantaneous the formula."""
+
+    def misses_accuracy(
+        self, theta: Float[np.ndarray, " k"], approach: Float[np.ndarray, " rows"]
+    ) -> Bool[np.ndarray, " rows"]:
+        """Say at which approach speeds in nm/us a law that is computed misses its accuracy."""
+        del theta
+        return np.zeros(approach.shape, bool)
 
     def capture_slope(self, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Return the derivatives of the capture speed by the unknowns: where w^2 vanishes."""
