@@ -82,7 +82,7 @@ def test_neither_compiled_nor_traced_programs_of_a_folder_that_others_may_write_
     folder = Path(start(XDG_CACHE_HOME=str(tmp_path))[1])
     (folder / "traced").mkdir()
     (folder / "traced").chmod(0o777)
-    code = "import sys\nsys.argv = ['afm-jax', 'collide', 'none.toml', '--verbose']\nfrom afm_jax.__main__ import run\nrun()"
+    code = "import sys\nsys.argv = ['afm-jax', 'collide', '-', '--verbose']\nfrom afm_jax.__main__ import run\nrun()"
     _, said = outputs(code, with_cache_in(tmp_path), (2,))
     assert f"traced programs are not kept: {folder}/traced: others may write to the folder" in said
     (tmp_path / "afm-jax").chmod(0o777)

@@ -69,6 +69,7 @@ def test_without_adhesion_epsilon_is_an_upper_limit(table):
     assert epsilon.standard_error is None
     low, high = epsilon.interval95
     assert low is None
+    assert high is not None
     assert "reaches the end of its range, 0" in str(epsilon.interval_reason)
     assert any("epsilon is at its bound" in warning for warning in result.warnings)
     assert result.parameters["r"].value == pytest.approx(0.95, abs=1e-6)

@@ -1,5 +1,7 @@
 """The law of a fit as a function of its unknowns: its table against `ImpactLaw`, derivatives against differences."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +57,8 @@ def test_an_instantaneous_law_is_equation_6(r, epsilon):
 def test_the_table_of_a_law_with_drag_and_delay_is_the_formula():
     law = FormulaLaw(tuple(LASTING))
     u, w, delay = all_of(law.table(unknowns(law, LASTING)), EVERYWHERE)
-    late = CollisionDelay(*(LASTING[name] for name in DELAY_NAMES))
+    hertz, lead, offset = (LASTING[name] for name in DELAY_NAMES)
+    late = CollisionDelay(hertz, lead, offset)
     formula = ImpactLaw(LASTING["r"], LASTING["epsilon"], LASTING["viscous_loss"], late)
     rebound = np.asarray(formula.rebound_speed(u))
     np.testing.assert_allclose(w, rebound, rtol=1e-6)
@@ -134,7 +137,8 @@ CONTACT = {"relative_humidity": 0.45, "viscosity_pa_s": 1.2e-3, "modulus_gpa": 8
 def test_the_law_of_a_contact_and_its_derivatives_are_those_of_the_contact(contact):
     theta = np.append([contact.unknown_of(name, CONTACT[name]) for name in contact.own], 0.1)
     radius = 10.0 + 3.0 * 0.1
-    impact = tabulated(Contact.paper(**CONTACT, adhesion_energy_j_per_m2=0.28, tip_radius_nm=radius), jnp.asarray(1.0))
+    numbers: dict[str, Any] = CONTACT | {"adhesion_energy_j_per_m2": 0.28, "tip_radius_nm": radius}
+    impact = tabulated(Contact.paper(**numbers), jnp.asarray(1.0))
     table = contact.table(theta)
     u, w, delay = all_of(table, np.random.default_rng(2).uniform(2.0, 70.0, 40))
     exact = jax.jit(jax.vmap(impact.speeds))(jnp.asarray(u))

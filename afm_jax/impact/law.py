@@ -484,8 +484,9 @@ class TabulatedLaw(Law):
         by_capture = nothing[:, 0] if capture_changes is None else numpy.asarray(capture_changes, float)
         extrapolated = options.get("capture_speed_nm_per_us") is None
         # the formula beside the table and the splines' knots stay as they are
-        parts = law.knots, law.scale_nm_per_us, law.r, law.viscous_loss
-        beside = _Beside(*(numpy.asarray(part) for part in parts), law.delay)
+        numbers = law.knots, law.scale_nm_per_us, law.r, law.viscous_loss
+        knots, scale, r, viscous_loss = map(numpy.asarray, numbers)
+        beside = _Beside(knots, scale, r, viscous_loss, law.delay)
         capture = numpy.asarray(law.capture)
 
         def along(by_rebound: Any, by_delay: Any, by_capture: Any) -> dict[str, Any]:
@@ -860,13 +861,13 @@ def _free_rows(approach: Any, rebound: Any, delay: Any) -> _FreeRows:
     if len(u) - captured < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds that leave, but has {len(u) - captured}")
     late = None if late is None else late[captured:]
-    free = (None if column is None else _known(column) for column in (u[captured:], w[captured:], late))
-    return _FreeRows(*free, captured, float(speeds[captured - 1]) if captured else 0.0)
+    held = float(speeds[captured - 1]) if captured else 0.0
+    return _FreeRows(_known(u[captured:]), _known(w[captured:]), _known(late), captured, held)
 
 
 def _known(column: Any) -> Any:
     """Return a column as NumPy's where its numbers are known."""
-    return column if is_traced(column) else np.asarray(column)
+    return column if column is None or is_traced(column) else np.asarray(column)
 
 
 def _numpy_of(*values: Any) -> Any:

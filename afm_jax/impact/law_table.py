@@ -78,7 +78,8 @@ class LawTable(Impact):
     @property
     def hertz_contact(self) -> HertzContact:
         """The Hertz contact on which platform, spring and air act while the impact lasts."""
-        return HertzContact(self.hertz, self.lead_nm, 0.5 * self.offset_nm, self.length_nm)
+        numbers = self.hertz, self.lead_nm, 0.5 * self.offset_nm, self.length_nm
+        return HertzContact(*map(jnp.asarray, numbers))
 
     def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
         """Return approach and rebound speed in nm/us and the delay in us at a coordinate."""
@@ -93,7 +94,7 @@ class LawTable(Impact):
         to_right = x * x * (3.0 - 2.0 * x)
         ends = jnp.stack([1.0 - to_right, x * (1.0 - x) ** 2, to_right, -x * x * (1.0 - x)])
 
-        def spline(numbers: Float[Array, "2 knots"]) -> Float[Array, ""]:
+        def spline(numbers: Float[AnyArray, "2 knots"]) -> Float[Array, ""]:
             value, slope = numbers
             return ends[0] * value[left] + ends[1] * slope[left] + ends[2] * value[left + 1] + ends[3] * slope[left + 1]
 

@@ -19,8 +19,8 @@ from fitting.infer.unknowns import Model
 
 STARTS, _POLISHED = 64, 8
 """Starts that are screened, and polished at most."""
-_AGREE, _SAME = 3, 1e-3
-"""Polished starts that end at the least chi2, to within the second, after which the others are not looked at."""
+_BY_OPTAX, _SAME = 3, 1e-3
+"""Of these by Optax, the others by damped steps, and by Optax where one of those ends at a lower chi2."""
 _SOFT = 5.0
 """Residual of a reading from which it counts linearly in the screening."""
 _FINE, _STEPS = 1e-12, 60
@@ -123,12 +123,14 @@ def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained,
     points = starts(model, STARTS)
     with np.errstate(all="ignore"):
         cost = [_softened(chi2.at(point)[1]) for point in points]
-    ends: list[Minimised] = []
-    for i in np.argsort(np.nan_to_num(cost, nan=np.inf), kind="stable")[:_POLISHED]:
-        ends.append(chi2.minimised(points[i]))
-        best = min(ends, key=lambda end: end.value)
-        if sum(end.value < best.value + _SAME for end in ends) >= _AGREE:
-            break
+    order = np.argsort(np.nan_to_num(cost, nan=np.inf), kind="stable")[:_POLISHED]
+    ends = [chi2.minimised(points[i]) for i in order[:_BY_OPTAX]]
+    others = [chi2.descended(points[i]) for i in order[_BY_OPTAX:]]
+    elsewhere = [(float(end.chi2[0]), end.place[0]) for end in others]
+    least, place = min(elsewhere, key=lambda end: end[0], default=(np.inf, points[0]))
+    best = min(ends, key=lambda end: end.value)
+    if least < best.value - _SAME:
+        best = chi2.minimised(place)
     explained = chi2.explained(chi2.descended(best.place))
     for _ in range(_OUTLIER_ROUNDS if robust else 0):
         with np.errstate(invalid="ignore"):
@@ -139,10 +141,12 @@ def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained,
             break
         chi2, out = Chi2(model, plain_weights(model.data, 0.0, far)), far
         explained = chi2.explained(chi2.descended(explained.end.theta))
-    return explained, best, _other_minimum(chi2, explained, ends)
+    return explained, best, _other_minimum(chi2, explained, [(end.value, end.place) for end in ends] + elsewhere)
 
 
-def _other_minimum(chi2: Chi2, explained: Explained, ends: list[Minimised]) -> Explained | None:
+def _other_minimum(
+    chi2: Chi2, explained: Explained, ends: list[tuple[float, Float[np.ndarray, " k"]]]
+) -> Explained | None:
     """Return another minimum that the data hardly tell from the best one, None if there is none."""
     errors = np.sqrt(np.diag(explained.covariance))
     errors = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
@@ -150,9 +154,9 @@ def _other_minimum(chi2: Chi2, explained: Explained, ends: list[Minimised]) -> E
     def apart(theta: Float[np.ndarray, " k"]) -> bool:
         return bool(np.max(np.abs(theta - explained.end.theta) / errors) > _APART)
 
-    for end in sorted(ends, key=lambda end: end.value):
-        if apart(end.place):
-            there = chi2.explained(chi2.descended(end.place))
+    for _, place in sorted(ends, key=lambda end: end[0]):
+        if apart(place):
+            there = chi2.explained(chi2.descended(place))
             hardly_worse = there.end.chi2 < explained.end.chi2 + _HARDLY_WORSE
             return there if hardly_worse and apart(there.end.theta) else None
     return None

@@ -296,7 +296,7 @@ class FormulaLaw(LawModel):
         """Return the table, or where impacts are instantaneous the formula."""
         if not self.lasting:
             values = self.values(theta)
-            return ImpactLaw(*(np.asarray(values[name]) for name in ("r", "epsilon", "viscous_loss")))
+            return ImpactLaw(values["r"], values["epsilon"], values["viscous_loss"])
         capture = self.capture(theta)
         found = self.at(theta, np.hypot(capture, EXCESS))
         kept = self.values(theta)["r"] ** 2
