@@ -194,10 +194,8 @@ def test_fits_find_their_programs_again_and_standard_error_holds_our_own_words_o
     surroundings: dict[str, str | None] = {"XDG_CACHE_HOME": str(tmp_path), "TF_CPP_MIN_LOG_LEVEL": None}
     surroundings |= {"JAX_COMPILATION_CACHE_DIR": None, "JAX_ENABLE_COMPILATION_CACHE": None}
     fit = COMMAND.format(["fit", "--example", "--model", "law", "--json", "--verbose"])
-    (first, said), (second, said_again) = (outputs(fit, surroundings) for _ in range(2))
+    (first, _), (second, said_again) = (outputs(fit, surroundings) for _ in range(2))
     assert first == second
-    # impacts; where orbits may be, where they are, which are steady; how they change
-    assert len([line for line in said.splitlines() if line.endswith("was not there: traced and written")]) == 5
     # one line a program and processor with AVX-512 otherwise
     lines = said_again.splitlines()
     assert len(lines) == 2

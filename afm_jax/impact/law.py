@@ -371,6 +371,7 @@ class TabulatedLaw(Law):
             with corrections.
         mass_ng: the mass of the tip that the table is of; None: not known.
         origin: what the table comes from, in words; it changes nothing.
+        most_knots: knots of its splines: tables of more rows are smoothed by least squares.
 
     Raises:
         ValueError: if there are fewer than four rows that rebound, speeds do not increase, a rebound is faster than its
@@ -397,7 +398,7 @@ class TabulatedLaw(Law):
     delay: CollisionDelay | None = None
     deviations: dict[str, Float[Array, "deviations ..."]] | None = None
 
-    def __init__(
+    def __init__(  # noqa: PLR0913
         self,
         approach_speed_nm_per_us: ArrayLike | Sequence[float],
         rebound_speed_nm_per_us: ArrayLike | Sequence[float],
@@ -407,6 +408,7 @@ class TabulatedLaw(Law):
         delay: CollisionDelay | None = None,
         mass_ng: ArrayLike | None = None,
         origin: str = "",
+        most_knots: int = MOST_KNOTS,
     ):
         """Make a law of columns: see the class."""
         u, w, late, _, held = _free_rows(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
@@ -429,7 +431,7 @@ class TabulatedLaw(Law):
         r, viscous_loss = _closest_formula(u, w, capture, numpy)
         scale = numpy.sqrt(u[0] * u[-1])
         place = _place(numpy.sqrt((u - capture) * (u + capture)), scale)
-        count = min(place.shape[0], MOST_KNOTS)
+        count = min(place.shape[0], most_knots)
         # of more rows than knots every so many is one, first and last among them
         knots = place[np.round(np.linspace(0, place.shape[0] - 1, count)).astype(int)]
         if late is not None and delay is None:
@@ -724,6 +726,7 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
         delay=delay,
         mass_ng=told.get("mass_ng"),
         origin=str(told.get("origin", "")),
+        most_knots=len(numbers["knots"]) if isinstance(numbers, Mapping) else MOST_KNOTS,
     )
     if not isinstance(numbers, Mapping):
         return law

@@ -26,8 +26,9 @@ from fitting.infer.search import (
     orbits_at,
     recovered,
 )
-from fitting.infer.unknowns import Model
+from fitting.infer.unknowns import REMAINDERS, Model
 from fitting.predict.law import SMOOTH, FormulaLaw, Process, of_short_range
+from fitting.predict.orbit import Orbits
 
 _ROUNDS, _SETTLED = 12, 0.02
 """Rounds of orbits, weights and descent at most, and the change of chi2 at which they have settled."""
@@ -85,6 +86,14 @@ class Explained:
     def covariance(self) -> Float[np.ndarray, "k k"]:
         """Of all unknowns, infinite where the readings and priors determine nothing."""
         return covariance_of(self.end.jacobian.T @ self.end.jacobian)
+
+    def by_law_alone(self) -> Orbits:
+        """Return the rows' orbits without the remainders of corrections: those of a scene with the law."""
+        model, first = self.model, len(self.model.law.names)
+        if model.remainders is None:
+            return self.end.orbits
+        theta = np.delete(self.end.theta, np.arange(first, first + REMAINDERS))
+        return replace(model, remainders=None).follow(theta, self.end.orbits.x)
 
     def beside(self, place: int, value: float, begin: Descent | None = None) -> Float[np.ndarray, " k"]:
         """Return the unknowns with one held at a value, the others following to first order, from the end or another.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.impact.law import ImpactLaw, Origin, TabulatedLaw
+from afm_jax.impact.law import CollisionDelay, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
 from afm_jax.solve.lanes import compiled_quickly
@@ -193,6 +193,10 @@ class Loss:
     capture_speed_nm_per_us: WithInterval
 
 
+_KNOTS = 60
+"""Of the law's splines: orbits of a scene with the law are the fit's predictions to 1e-8; with 24 knots to 4e-4."""
+
+
 class FittedLaw(TabulatedLaw):
     """The impact law that a fit found, with its discrepancy: a law for scenes, and its points with a 95 % band.
 
@@ -222,8 +226,7 @@ class FittedLaw(TabulatedLaw):
         law: AtSpeeds,
         approach_speeds: Float[np.ndarray, " rows"],
         *,
-        formula: ImpactLaw | None,
-        lasting: bool,
+        delay: CollisionDelay | None,
         mass_ng: float | None,
         origin: str,
     ):
@@ -232,8 +235,7 @@ class FittedLaw(TabulatedLaw):
         Args:
             law: with its errors, NaN where nothing is known of them.
             approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
-            formula: of the model's family, whose delay is what the law's is written beside; None: the closest one.
-            lasting: impacts take time.
+            delay: what the law's own is written beside; None: impacts are instantaneous.
             mass_ng: of the tip; None: not known.
             origin: what the law comes from, in words.
         """
@@ -241,14 +243,15 @@ class FittedLaw(TabulatedLaw):
         leaves = points.law[0] > 0.0
         u, w = speeds[leaves], np.minimum(points.law[0], speeds)[leaves]
         captured = speeds[~leaves][-1] if not leaves.all() else 0.0
-        late = points.law[1, leaves] if lasting else None
+        late = None if delay is None else points.law[1, leaves]
         known: dict[str, Any] = {
             "capture_speed_nm_per_us": np.clip(points.capture, captured, (1.0 - 1e-9) * u[0]),
-            "delay": None if formula is None else formula.delay,
+            "delay": delay,
+            "most_knots": _KNOTS,
         }
         if np.isfinite(points.factor).all():
             (by_rebound, by_delay), of_capture = fewest_unknowns(points.factor[:, leaves], points.capture_factor)
-            known |= {"rebound_changes": by_rebound.T, "delay_changes": by_delay.T if lasting else None}
+            known |= {"rebound_changes": by_rebound.T, "delay_changes": None if delay is None else by_delay.T}
             table = TabulatedLaw.with_errors(u, w, late, capture_changes=of_capture, **known)
         else:
             table = TabulatedLaw(u, w, late, **known)

@@ -1,13 +1,13 @@
 """What a fit amounts to: the law with its band, parameters and intervals, rows, and the verdict."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import CollisionDelay
 from afm_jax.least_squares import chi2_tail, covariance_of
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
@@ -31,7 +31,6 @@ from fitting.infer.verdict import Evidence, judge_fit, misfits
 from fitting.models import Task, readings_of
 from fitting.parameters import (
     CONTACT_NAMES,
-    DELAY_NAMES,
     NUISANCE_NAMES,
     is_of_one_table,
     name_of_table,
@@ -210,8 +209,8 @@ def _rows_of(explained: Explained, table: AmplitudeTable | SeveralTables) -> Fit
     size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(exists), 1), SIZE_OF_PHASE)], axis=1)
     error = np.where(counted, np.hypot(data.error, weights.model_error[:, None] * size), np.nan)
     # an instantaneous law without an orbit predicts no amplitude; one that lasts is asked for the others alone
-    predicted = np.where(exists[:, None], orbits.readings, np.nan)
-    compared = predicted if explained.model.law.lasting else orbits.readings
+    compared = np.where(exists[:, None] | (not explained.model.law.lasting), orbits.readings, np.nan)
+    predicted = np.where(exists[:, None], explained.by_law_alone().readings, np.nan)
     phases = {}
     if kinds == READINGS:
         phases = {
@@ -227,7 +226,7 @@ def _rows_of(explained: Explained, table: AmplitudeTable | SeveralTables) -> Fit
         model_error=weights.model_error,
         used=counted.any(axis=1),
         set_aside=(reasons != "").astype(bool),
-        approach_speed_nm_per_us=np.where(exists & ~data.row.free, orbits.approach, np.nan),
+        approach_speed_nm_per_us=np.where(exists & ~data.row.free, explained.by_law_alone().approach, np.nan),
         orbits=number,
         near_fold=exists & (np.abs(orbits.fold) < NEAR_FOLD) & ~data.row.free,
         reasons=tuple(reasons.tolist()),
@@ -304,6 +303,7 @@ def _result(
     if np.isfinite(speeds).any():
         loss = loss_of(at, speed_range(speeds), table.mass_ng, evidence.parameters, formula)
     reasons, warnings = judge_fit(evidence)
+    coefficients, _ = explained.model.law.coefficients(explained.model.of_law(explained.end.theta))
     common = [i for i, name in enumerate(closest.names) if not is_of_one_table(name)]
     return FitResult(
         model=problem.model,
@@ -321,8 +321,7 @@ def _result(
         law=FittedLaw(
             at,
             speeds,
-            lasting=problem.lasting,
-            formula=None if formula is None else _formula_of(values, lasting=problem.lasting),
+            delay=CollisionDelay(*coefficients[:3]) if problem.lasting else None,
             mass_ng=table.mass_ng,
             origin=f"{problem.model} fitted to {table.source}",
         ),
@@ -334,14 +333,6 @@ def _result(
         versions={name: version_of(name) for name in _PACKAGES},
         tables=_fitted_tables(evidence, pulls, problem.own),
     )
-
-
-def _formula_of(values: Mapping[str, float], *, lasting: bool) -> ImpactLaw:
-    """Return the impact law of a formula's parameters."""
-    hertz, lead, offset = (float(values.get(name, 0.0)) for name in DELAY_NAMES)
-    delay = CollisionDelay(hertz, lead, offset) if lasting else None
-    r, epsilon, loss = (float(values.get(*one)) for one in (("r", 1.0), ("epsilon", 0.0), ("viscous_loss", 0.0)))
-    return ImpactLaw(r, epsilon, loss, delay)
 
 
 def _parameters(

@@ -284,7 +284,8 @@ class Orbits(NamedTuple):
         slopes: derivatives of the readings by what is local, the orbit moving along.
         approach, rebound: of the free tip, in nm/us.
         pull, change: acceleration at mid contact in nm/us^2 and its derivative by time.
-        fold: determinant of the gaps' slopes over the product of their norms, 0 at a fold.
+        fold: determinant of the gaps' slopes over the product of their norms, 0 at a fold; of instantaneous impacts the
+            slope of the closing condition.
     """
 
     x: Float[np.ndarray, "rows 3"]
@@ -385,6 +386,8 @@ def followed(
             found[:, 3:6], along, *state[:, :2].T, *state[:, 6:8].T,
             fold=np.linalg.det(gaps) / np.prod(np.linalg.norm(gaps, axis=2), axis=1),
         )  # fmt: skip
+        if isinstance(table, ImpactLaw):
+            orbits = orbits._replace(fold=_slope_of_closing(x, gaps, state, local))
         if judge:
             there = closes & (np.abs(trace) < np.abs(1.0 + determinant))
             some = np.flatnonzero(there)
@@ -420,6 +423,14 @@ def _trace_and_determinant(
     slow = -(amplitude * omega)[:, None] * map_[:, 1] - pull[:, None] * late
     trace, determinant = late[:, 1] + slow[:, 0], late[:, 1] * slow[:, 0] - slow[:, 1] * late[:, 0]
     return 2.0 + trace, 1.0 + trace + determinant
+
+
+def _slope_of_closing(x, gaps, state, local) -> Float[np.ndarray, " rows"]:
+    """Return the slope of the closing condition per relative change of the coordinate, as `closure.near_fold`."""
+    frequency = RAD_PER_US_PER_KHZ * local[:, 6]
+    decay = 0.5 * frequency / local[:, 7]
+    kept, turn = np.exp(-decay * state[:, 2]), np.sqrt(frequency**2 - decay**2) * state[:, 2]
+    return x[:, 0] * np.linalg.det(gaps[:, :2, :2]) / (1.0 - 2.0 * kept * np.cos(turn) + kept**2)
 
 
 def _flies(x, state, local, row: Row) -> Bool[np.ndarray, " rows"]:

@@ -91,7 +91,7 @@ def models_figure(compared: Comparison) -> Figure:
         )
         axes.fill_between(speed, low, high, color="0.85", lw=0, label="95 % band of the law")
         for name in (row["model"] for row in compared.rows):
-            axes.plot(speed, 100.0 * (compared.rebounds[name] / reference - 1.0), label=name)
+            axes.plot(speed, 100.0 * (compared.rebounds.get(name, reference) / reference - 1.0), label=name)
     log_speed_axis(axes)
     axes.set_xlabel(_APPROACH)
     axes.set_ylabel("rebound speed: deviation from\nthe law of the fit (%)")
