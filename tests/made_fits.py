@@ -88,7 +88,7 @@ def made_law(values: dict[str, float], *, width: float, lasting: bool) -> Fitted
         errors = width / TWO_SIDED_95 * np.abs(both)[:, :, None]
         return LawWithErrors(both, errors, float(law.capture_speed_nm_per_us), np.zeros(1))
 
-    return FittedLaw(at, SPEEDS, delay=law.delay if lasting else None, mass_ng=1.0, origin="made")
+    return FittedLaw(at, SPEEDS, delay=late if lasting else None, mass_ng=1.0, origin="made")
 
 
 def made_table(rows: int = 4, **changes: Any) -> AmplitudeTable:

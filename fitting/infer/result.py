@@ -193,10 +193,6 @@ class Loss:
     capture_speed_nm_per_us: WithInterval
 
 
-_KNOTS = 60
-"""Of the law's splines: orbits of a scene with the law are the fit's predictions to 1e-8; with 24 knots to 4e-4."""
-
-
 class FittedLaw(TabulatedLaw):
     """The impact law that a fit found, with its discrepancy: a law for scenes, and its points with a 95 % band.
 
@@ -247,7 +243,8 @@ class FittedLaw(TabulatedLaw):
         known: dict[str, Any] = {
             "capture_speed_nm_per_us": np.clip(points.capture, captured, (1.0 - 1e-9) * u[0]),
             "delay": delay,
-            "most_knots": _KNOTS,
+            # with a knot a point, orbits of a scene with the law are the fit's predictions to 1e-6; with 24 to 4e-4
+            "most_knots": LAW_POINTS,
         }
         if np.isfinite(points.factor).all():
             (by_rebound, by_delay), of_capture = fewest_unknowns(points.factor[:, leaves], points.capture_factor)
