@@ -16,7 +16,7 @@ from fitting.infer.rows import plain_weights, remainders_of, weights_of
 from fitting.infer.search import Descent, orbits_at
 from fitting.infer.unknowns import Data, Model, Quantity
 from fitting.predict.law import SMOOTH, FormulaLaw
-from fitting.predict.orbit import READINGS, Row
+from fitting.predict.orbit import NEAR_FOLD, READINGS, Row
 from fitting.simulated.experiment import Drives, check_drive
 
 MOST = 20_000
@@ -91,7 +91,7 @@ def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.nda
 LEFT_OUT = {
     "measured": "already measured",
     "no orbit": "no steady single-impact orbit",
-    "unsure": "several steady orbits, or none, for some of the values that the prior allows",
+    "unsure": "several steady orbits, or none, or one near its end, for some of the values that the prior allows",
     "too large": "amplitudes above what the instrument takes",
     "inaccurate": "impacts too slow, or under too strong a pull, for the model: a fit excludes such rows",
 }
@@ -212,10 +212,11 @@ def candidates_of(
     """
     rows = _explained(prior, drives, noise, phase_noise_deg, amplitudes)
     orbits, number, weights = rows.end.orbits, rows.found.number, rows.weights
-    sure = number == 1
+    sure = (number == 1) & (np.abs(orbits.fold) > NEAR_FOLD)
     for values in prior.draws(DRAWS, least=MARGIN)[1:]:
         drawn = model_of(prior, drives, values)
-        sure &= orbits_at(*drawn, np.flatnonzero(sure)).number == 1
+        found = orbits_at(*drawn, np.flatnonzero(sure))
+        sure &= (found.number == 1) & (np.abs(found.orbits.fold) > NEAR_FOLD)
     kinds, slope = 3 if prior.problem.tapping else 2, rows.end.jacobian.reshape(len(sure), READINGS, -1)
     size = drives.amplitude_nm if prior.problem.tapping else orbits.readings[:, 0]
     holds = {
