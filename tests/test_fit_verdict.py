@@ -65,7 +65,7 @@ RUN = "residuals run together over the approach speed (5.0"
         ("law+delay", {"run": (5.0, 2.0), "short": 0.7}, RUN, "nowhere"),
         ("law+delay", {"run": (5.0, 4.0), "short": 0.7}, RUN, "reasons"),
         # as of a lever that is wrongly stated as undamped: a law can take up the air's loss, but not smoothly
-        ("law+delay", {"run": (13.0, 2.0), "short": 1.0}, "a model discrepancy of 100 % of the loss", "reasons"),
+        ("law+delay", {"run": (13.0, 2.0), "short": 1.0}, "(13.0 standard deviations; 2.0 beside", "reasons"),
         ("law", {"table": {"lockin_amplitude_nm": np.full(4, 0.02)}}, "micrometres for nanometres", "warnings"),
     ],
 )
