@@ -22,6 +22,7 @@ from afm_jax.dynamics.contact_orbits import contact_orbits as contact_orbits
 from afm_jax.dynamics.continuation import continue_orbits as continue_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum as lyapunov_spectrum
 from afm_jax.dynamics.impact_orbits import many_impact_orbits as many_impact_orbits
+from afm_jax.impact.dimensionless import dimensionless_scene as dimensionless_scene
 from afm_jax.impact.jacobian import map_jacobian as map_jacobian
 from afm_jax.impact.law import CollisionDelay as CollisionDelay
 from afm_jax.impact.law import ImpactLaw as ImpactLaw

@@ -187,8 +187,8 @@ ORBITS = Command(
     whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase and lag
     at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and orbits.png. Exit
     code 3 if none is admissible. With --impacts every impact is listed, the hardest first. A contact's orbits are
-    listed like this, too: its impacts begin where the bridge forms and end, with phase and velocity, where it breaks (a
-    dry one's where its forces begin). All are found with a law only: of a contact the search may miss some.
+    listed like this, too: an impact lasts from the formation of the bridge to its rupture (of a dry contact: while its
+    forces act); phase and velocity are those at rupture. The search may miss orbits of a contact, never of a law.
     """,
     options=(
         SCENE,
