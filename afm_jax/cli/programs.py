@@ -9,7 +9,6 @@ devices, shapes and structure. Results are modules and tuples of arrays; other a
 import hashlib
 import json
 import sys
-import threading
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
@@ -52,19 +51,12 @@ class _Keeping:
         if any(isinstance(leaf, core.Tracer) for leaf in arrays):
             return self.jitted(*arguments, **named)
         if call not in self.programs:
-            with _ONE_TRACE:
-                program, _ = self._trace(call, arrays, of_arrays)
-                # at once: a jitted function would compile again where an argument comes from another program
-                like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
-                lowered = jax.jit(program.call).lower(*like)
+            program, _ = self._trace(call, arrays, of_arrays)
+            # at once: a jitted function would compile again where an argument comes from another program
+            like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
+            lowered = jax.jit(program.call).lower(*like)
             self.programs[call] = lowered.compile(getattr(self.jitted, "options", None))
         return jax.tree.unflatten(self.traced[call][1], self.programs[call](arrays))
-
-    def shapes(self, *arguments: Any, **named: Any) -> Any:
-        """Return the result of a call with shapes and types in place of arrays; nothing is compiled."""
-        with _ONE_TRACE:
-            program, result = self._trace(*self._call(arguments, named))
-        return jax.tree.unflatten(result, [jax.ShapeDtypeStruct(of.shape, of.dtype) for of in program.out_avals])
 
     def _call(self, arguments: Any, named: Any) -> tuple[Any, list[Any], Callable[[list[Any]], Any]]:
         """Return what names a call's program, its arrays, and the function of these."""
@@ -83,10 +75,6 @@ class _Keeping:
             path = self.folder / f"{self.jitted.__name__}-{_digest(call)}.program"
             self.traced[call] = _traced(path, of_arrays, arrays, self.tell)
         return self.traced[call]
-
-
-_ONE_TRACE = threading.Lock()
-"""Traces need the interpreter: one after the other, so that the first is compiled while the next one is traced."""
 
 
 def _digest(call: Any) -> str:

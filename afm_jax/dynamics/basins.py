@@ -25,7 +25,7 @@ from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, 
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, settled_below, verdicts_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.lanes import LANES, Report, compiling, in_blocks
+from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.units import within_turn
 
 _SAMPLE = 2048
@@ -217,9 +217,7 @@ def basins_of_attraction(
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
     else:
-        targets, some = finder.targets(), jax.tree.map(lambda part: part[:_PART], starts)
-        with compiling(lambda: finder.towards(targets, some, impacts=0)):
-            finder.look_around(high, low)
+        finder.look_around(high, low)
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
     order = [number for number in np.argsort(-count, kind="stable") if count[number]]

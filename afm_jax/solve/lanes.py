@@ -7,9 +7,8 @@ A batch costs what its hardest lane costs where all lanes take the same steps. S
 need more are gathered into small blocks of their own, where no others wait for them.
 """
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, update_wrapper
 from typing import Any, NamedTuple
@@ -100,30 +99,6 @@ def in_blocks(
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
 
 
-@contextmanager
-def compiling(*works: Callable[[], object], first: Sequence[Callable[[], object]] = ()) -> Iterator[None]:
-    """Do works on other cores until the block ends and drop their results: the programs that they compile stay.
-
-    Compiling takes a core for seconds. Where a computation needs two programs one after the other, the second one is
-    compiled while the first one is.
-
-    Args:
-        works: begun in this order, as many at once as there are cores and one more, which traces.
-        first: done before these and before the block begins.
-    """
-
-    def in_usual_precision(work: Callable[[], object]) -> None:
-        with jax.enable_x64(True):  # noqa: FBT003
-            work()
-
-    with ThreadPoolExecutor(available_cores() + 1) as pool:
-        before = [pool.submit(in_usual_precision, work) for work in first]
-        for work in works:
-            pool.submit(in_usual_precision, work)
-        wait(before)
-        yield
-
-
 @dataclass(eq=False)
 class QuicklyCompiled:
     """A function that is compiled with `quick_options`; inside of another program it is compiled as that one is.
@@ -162,10 +137,6 @@ class QuicklyCompiled:
         # inside a program everything is traced, also what is made of known numbers
         traced = is_traced(jnp.asarray(0.0)) or any(map(is_traced, jax.tree.leaves((arguments, named))))
         return (self.inside if traced else self.outside)(*arguments, **named)
-
-    def shapes(self, *arguments: Any, **named: Any) -> Any:
-        """Return the result of a call with shapes and types in place of arrays; nothing is compiled."""
-        return self.outside.eval_shape(*arguments, **named)
 
 
 def compiled_quickly(
