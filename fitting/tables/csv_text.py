@@ -462,8 +462,7 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     if not setting.lowest <= value <= LARGEST:
         return f"must lie between {setting.lowest:g} and {LARGEST:g}, but is {value!r}; correct it"
     if error is not None and not 1.0 / FARTHEST <= error <= LARGEST:
-        wanted = f"it must lie between {1.0 / FARTHEST:g} and {LARGEST:g}, or be left out"
-        return f"has the error {error!r}; {wanted}"
+        return f"has the error {error!r}; it must lie between {1.0 / FARTHEST:g} and {LARGEST:g}, or be left out"
     return None
 
 
@@ -559,7 +558,7 @@ def check_names(names: list[str], form: Form, faults: Faults, *, line: int = 0) 
         elif column.becomes in present:
             faults.add("says again what another column says; remove one", line=line, column=name)
         else:
-            present |= {column.becomes, name}
+            present.add(column.becomes)
     _check_unknown(unknown[:_SUGGESTIONS], form, present, line, faults)
     # a column that is missing may be one that is misspelt
     for what in dict.fromkeys(column.needed for column in form.columns) if not faults.found else ():
