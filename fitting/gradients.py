@@ -1,7 +1,7 @@
 """Derivatives of predicted amplitudes by a model's parameters, and where they do not exist.
 
 By the implicit function theorem an orbit moves smoothly with the parameters, except at a fold, where it meets another
-one and ends, and where the tip grazes the platform, at the impact or on the way. There, and where there is no steady
+one and ends, and where the tip grazes the platform on the way. There, and where there is no steady
 orbit, the derivatives of amplitudes are NaN and a sentence says why.
 """
 
@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.infer.fit import model_of
@@ -28,7 +27,6 @@ from fitting.tables.table import TableLike, as_table
 
 NO_ORBIT = "there is no steady single-impact orbit at these values"
 AT_A_FOLD = "the orbit is close to a fold, where it ends and no derivative exists"
-SLOW_GRAZE = "the impact grazes the platform: its approach is slower than a thousandth of the platform's speed"
 GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change makes another impact there"
 
 
@@ -93,9 +91,9 @@ def amplitude_gradients(
     orbits = orbits_at(whole, theta).orbits
     slopes = whole.slopes(theta, orbits)
     exists, hits = np.isfinite(orbits.x[:, 0]), ~whole.data.row.free
-    slow, touching = _grazes(orbits.x, orbits.approach, whole.local(theta), whole.data.row, table.drive)
+    touching = _touches(orbits.x, orbits.approach, whole.local(theta), whole.data.row, table.drive)
     near_fold = hits & (np.abs(orbits.fold) < NEAR_FOLD)
-    faults = {NO_ORBIT: ~exists, AT_A_FOLD: near_fold, SLOW_GRAZE: hits & slow, GRAZE_ON_THE_WAY: hits & touching}
+    faults = {NO_ORBIT: ~exists, AT_A_FOLD: near_fold, GRAZE_ON_THE_WAY: hits & touching}
     reasons = [next((reason for reason, rows in faults.items() if rows[i]), None) for i in range(table.rows)]
     names = (*own, *(name for name in NUISANCE_NAMES if name in values))
     slope_of_value = [law.slope_of(name, y) for name, y in zip(own, theta, strict=False)]
@@ -135,10 +133,10 @@ _TOUCHING = 1e-3
 
 
 @compiled_quickly(static_argnames="drive")
-def _grazes(
+def _touches(
     x: Float[Array, "rows 3"], approach: Float[Array, " rows"], local: Float[Array, "rows local"], row: Row, drive: str
-) -> tuple[Bool[Array, " rows"], Bool[Array, " rows"]]:
-    """Say of rows whether the impact is a graze, and whether the flight before it touches the platform on the way."""
+) -> Bool[Array, " rows"]:
+    """Say of rows whether the flight before the impact touches the platform on the way."""
 
     def one(x, approach, local, row):
         cantilever, platform = platform_and_cantilever(Local(*local), row, drive)
@@ -153,7 +151,6 @@ def _grazes(
         dip = (here <= before) & (here <= after) & (bend > 0.0)
         # the parabola through three neighbours: between two looks the flight may come closer
         lowest = here - (after - before) ** 2 / (8.0 * jnp.where(dip, bend, 1.0))
-        slow = approach < NEAR_GRAZING * platform.top_speed_nm_per_us
-        return slow, jnp.any(dip & (lowest < _TOUCHING * platform.amplitude_nm))
+        return jnp.any(dip & (lowest < _TOUCHING * platform.amplitude_nm))
 
     return jax.vmap(one)(x, approach, local, row)

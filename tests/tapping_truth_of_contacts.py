@@ -57,8 +57,8 @@ def _simulate(path: Path, viscosity: float, ratio: float) -> None:
     from fitting.examples.make_tapping import TIP_RADIUS_NM, steady_curve  # noqa: PLC0415
 
     contact = Contact.paper(tip_radius_nm=TIP_RADIUS_NM, viscosity_pa_s=viscosity * PAPER["viscosity_pa_s"])
-    rows = steady_curve(HEIGHTS_NM, ratio, contact)
-    columns = np.column_stack([HEIGHTS_NM, np.array(rows)])
+    curve = steady_curve(HEIGHTS_NM, ratio, contact)
+    columns = np.column_stack([HEIGHTS_NM, curve.amplitude_nm, curve.phase_lag_deg, curve.dissipated_in_contact_aj])
     np.savetxt(path, columns, delimiter=",", fmt="%.9g", header="height_nm,amplitude_nm,lag_deg,energy_aj", comments="")
 
 

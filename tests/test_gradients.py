@@ -20,9 +20,7 @@ from fitting.gradients import (
     AT_A_FOLD,
     GRAZE_ON_THE_WAY,
     NO_ORBIT,
-    _grazes,
 )
-from fitting.predict.orbit import Row
 from fitting.tables.table import AmplitudeTable
 from tests import fit_tables
 from tests.reference_examples import scene
@@ -181,16 +179,6 @@ def lowest_gap_on_the_way(row: tuple[int, float, float, float], r: float) -> flo
     gap = height(start + times) - platform(k, start + times, np)[0]
     inside = (gap[1:-1] < gap[:-2]) & (gap[1:-1] < gap[2:])
     return float(gap[1:-1][inside].min())
-
-
-def test_an_impact_of_a_ten_thousandth_of_the_drives_speed_is_a_graze():
-    """Looked at directly: orbits with such an impact are unstable, no table leads there."""
-    top_speed = Platform(4.0, 181.8, 0.0).top_speed_nm_per_us
-    local = np.array([*np.zeros(6), 90.0, 40.0, 1.0, 0.0, 1.0, 0.0])
-    columns: Any = *np.tile([[1.0], [181.8], [4.0], [0.0], [0.0]], 2), np.zeros(2, bool)
-    row, approach = Row(*columns), np.array([1e-4, 1e-2]) * top_speed
-    slow, _ = _grazes(np.zeros((2, 3)), approach, np.tile(local, (2, 1)), row, "sample")
-    np.testing.assert_array_equal(slow, [True, False])
 
 
 @pytest.mark.parametrize(

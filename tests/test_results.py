@@ -233,7 +233,7 @@ def test_a_table_of_pandas_is_an_amplitude_table_and_back():
     assert noisy.peak_amplitude_error_nm == pytest.approx(0.01 * table.peak_amplitude_nm, rel=1e-15)
     with pytest.raises(fitting.TableError, match=r"free_frequency_khz is missing; give it in `frame.attrs`"):
         fitting.fit(bare)
-    with pytest.raises(fitting.TableError, match="there is no column 'peak'"):
+    with pytest.raises(fitting.TableError, match="unknown column 'peak'"):
         fitting.AmplitudeTable.from_dataframe(frame.rename(columns={"peak_amplitude_nm": "peak"}))
 
 

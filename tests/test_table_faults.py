@@ -56,12 +56,15 @@ def test_noise_is_a_fraction(tmp_path: Path):
     [
         ({"offset_nm": np.array([0.0, np.nan])}, ", row 2, column offset_nm: is blank; every row needs it"),
         ({"peak_amplitude_error_nm": None}, ": peak_amplitude_nm and peak_amplitude_error_nm come together; "),
-        ({"peak_amplitude_nm": None, "peak_amplitude_error_nm": None}, ": there is no amplitude; give peak_amplitude"),
+        (
+            {"peak_amplitude_nm": None, "peak_amplitude_error_nm": None},
+            ": there is no amplitude column; add ",
+        ),
         ({"quality_factor_error": 2.0}, ": quality_factor_error stands without quality_factor; give both or none"),
         ({"no_orbit": np.array([0.0, 1.0])}, ", row 2, column no_orbit: the row has an amplitude; clear it or "),
         ({"remarks": ("a\nb",)}, r": the remark 'a\nb' would not be read back as one; make it one line"),
         ({"remarks": ("mass_ng = 2",)}, ": the remark 'mass_ng = 2' would not be read back as one; make it one line"),
-        ({"source": "a\nb", "quality_factor": 0.4}, ": quality_factor must be finite and above 0.5, but is 0.4; "),
+        ({"source": "a\nb", "quality_factor": 0.4}, ": quality_factor must lie between 0.5 and 1e+09, but is 0.4; "),
     ],
 )
 def test_a_table_in_memory_keeps_the_same_rules(change: dict[str, Any], message: str):

@@ -24,47 +24,36 @@ from afm_jax.impact.orbits import single_impact_orbits
 from fitting.tables.table import AmplitudeTable, write_table
 
 TRUTH = {"r": 0.95, "epsilon": 60.0}
-FREE_FREQUENCY_KHZ = 90.0
-QUALITY_FACTOR = 40.0
-QUALITY_FACTOR_ERROR = 0.4
-NOISE = 0.01
-SEED = 1997
-ORDERS = (1, 2, 3)
-PHASE_ERROR_DEG = 0.1
-REDUCED_DETUNINGS = (0.97, 0.985, 0.995, 1.0, 1.01, 1.02)
-DRIVES_NM = (1.5, 2.5, 4.0, 6.0, 10.0)
-OFFSETS_NM = (-1.0, 0.0, 1.0)
 EXAMPLE = Path(__file__).with_name("amplitudes_law.csv")
 
 
 def example_table() -> AmplitudeTable:
     """Return the bundled table, made anew."""
-    jobs = np.array(list(product(ORDERS, REDUCED_DETUNINGS, DRIVES_NM)))
-    offsets = np.array(OFFSETS_NM)[np.arange(len(jobs)) % len(OFFSETS_NM)]
+    jobs = np.array(list(product((1, 2, 3), (0.97, 0.985, 0.995, 1.0, 1.01, 1.02), (1.5, 2.5, 4.0, 6.0, 10.0))))
+    offsets = np.arange(len(jobs)) % 3 - 1.0
     order, drive = jobs[:, 0].astype(int), jobs[:, 2]
-    frequency = np.round(2.0 * FREE_FREQUENCY_KHZ * order * jobs[:, 1], 4)
+    frequency = np.round(180.0 * order * jobs[:, 1], 4)
     peak, lockin, phase = (np.asarray(a) for a in _seen(*map(jnp.asarray, (order, frequency, drive, offsets))))
     kept = np.isfinite(peak)
-    noise = np.random.default_rng(SEED).normal(size=(3, len(jobs)))
-    truth = f"r {TRUTH['r']}, epsilon {TRUTH['epsilon']} nm^2/us^2, Q {QUALITY_FACTOR}, no delay"
+    noise = np.random.default_rng(1997).normal(size=(3, len(jobs)))
     return AmplitudeTable(
         order=order[kept],
         drive_frequency_khz=frequency[kept],
         drive_amplitude_nm=drive[kept],
         offset_nm=offsets[kept],
-        free_frequency_khz=FREE_FREQUENCY_KHZ,
-        quality_factor=QUALITY_FACTOR,
-        quality_factor_error=QUALITY_FACTOR_ERROR,
+        free_frequency_khz=90.0,
+        quality_factor=40.0,
+        quality_factor_error=0.4,
         mass_ng=1.0,
-        peak_amplitude_nm=_rounded(peak * (1.0 + NOISE * noise[0]))[kept],
-        peak_amplitude_error_nm=_rounded(peak * NOISE)[kept],
-        lockin_amplitude_nm=_rounded(lockin * (1.0 + NOISE * noise[1]))[kept],
-        lockin_amplitude_error_nm=_rounded(lockin * NOISE)[kept],
-        phase_deg=np.round((phase + PHASE_ERROR_DEG * noise[2]) % (360.0 / order), 3)[kept],
-        phase_error_deg=np.full(kept.sum(), PHASE_ERROR_DEG),
+        peak_amplitude_nm=_rounded(peak * (1.0 + 0.01 * noise[0]))[kept],
+        peak_amplitude_error_nm=_rounded(peak * 0.01)[kept],
+        lockin_amplitude_nm=_rounded(lockin * (1.0 + 0.01 * noise[1]))[kept],
+        lockin_amplitude_error_nm=_rounded(lockin * 0.01)[kept],
+        phase_deg=np.round((phase + 0.1 * noise[2]) % (360.0 / order), 3)[kept],
+        phase_error_deg=np.full(kept.sum(), 0.1),
         remarks=(
             "simulated single-impact orbits of the impact law u_out^2 = r^2 u_in^2 - epsilon",
-            f"truth: {truth}; noise 1 % and {PHASE_ERROR_DEG} degrees, seed {SEED}",
+            "truth: r 0.95, epsilon 60.0 nm^2/us^2, Q 40.0, no delay; noise 1 % and 0.1 degrees, seed 1997",
             "made by python -m fitting.examples.make_amplitudes",
         ),
     )
@@ -75,7 +64,7 @@ def example_table() -> AmplitudeTable:
 def _seen(order, frequency_khz, drive_nm, offset_nm):
     """Return peak, lock-in amplitude and phase of the one steady orbit; NaN where there is none or more than one."""
     platform = Platform(drive_nm, frequency_khz, offset_nm)
-    scene = Scene(Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR), platform, ImpactLaw(TRUTH["r"], TRUTH["epsilon"]))
+    scene = Scene(Cantilever(90.0, 40.0), platform, ImpactLaw(TRUTH["r"], TRUTH["epsilon"]))
     orbits = single_impact_orbits(scene, order)
     steady = orbits.stable & orbits.admissible
     slot = jnp.argmax(steady)
@@ -91,5 +80,4 @@ def _rounded(values: np.ndarray) -> np.ndarray:
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
-    write_table(example_table(), target)
+    write_table(example_table(), sys.argv[1] if len(sys.argv) > 1 else EXAMPLE)

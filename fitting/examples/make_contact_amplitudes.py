@@ -19,27 +19,20 @@ from afm_jax.contact.contact import Contact
 from fitting.simulated.experiment import Drives, SimulatedExperiment, drives_of, simulate_experiment
 from fitting.tables.table import write_table
 
-FREE_FREQUENCY_KHZ = 90.0
-QUALITY_FACTOR = 40.0
-QUALITY_FACTOR_ERROR = 0.5
-NOISE = 0.01
-PHASE_NOISE_DEG = 0.1
-SEED = 1997
 ORDERS = (1, 2, 3, 4)
-REDUCED_DETUNINGS = (0.97, 0.985, 1.0, 1.01, 1.02)
 DRIVES_NM = (2.0, 4.0, 8.0)
 OFFSETS_NM = (-1.0, 0.0, 1.0)
 EXAMPLE = Path(__file__).with_name("amplitudes_contact.csv")
 
 
-def example_drives(free_frequency_khz: float = FREE_FREQUENCY_KHZ) -> Drives:
+def example_drives(free_frequency_khz: float = 90.0) -> Drives:
     """Return the drives of the bundled table.
 
     Args:
         free_frequency_khz: of the cantilever; the drive frequencies go with it.
     """
     rows = []
-    for number, (order, detuning, amplitude) in enumerate(product(ORDERS, REDUCED_DETUNINGS, DRIVES_NM)):
+    for number, (order, detuning, amplitude) in enumerate(product(ORDERS, (0.97, 0.985, 1.0, 1.01, 1.02), DRIVES_NM)):
         # the offset also moves on from one detuning to the next, so that it does not go with the drive
         offset = OFFSETS_NM[(number + number // len(DRIVES_NM)) % len(OFFSETS_NM)]
         rows.append((order, round(2.0 * free_frequency_khz * order * detuning, 4), amplitude, offset))
@@ -50,26 +43,20 @@ def example_experiment() -> SimulatedExperiment:
     """Return the bundled table, made anew, with its noise-free amplitudes."""
     return simulate_experiment(
         Contact.paper(),
-        Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR),
+        Cantilever(90.0, 40.0),
         example_drives(),
-        noise=NOISE,
-        phase_noise_deg=PHASE_NOISE_DEG,
-        seed=SEED,
-        quality_factor_error=QUALITY_FACTOR_ERROR,
+        noise=0.01,
+        phase_noise_deg=0.1,
+        seed=1997,
+        quality_factor_error=0.5,
         remarks=(
             "simulated single-impact orbits of the paper's contact (liquid bridge and solid junction), 1 ng",
-            f"truth: Q {QUALITY_FACTOR}; noise 1 % and {PHASE_NOISE_DEG} degrees, seed {SEED}",
+            "truth: Q 40.0; noise 1 % and 0.1 degrees, seed 1997",
             "made by python -m fitting.examples.make_contact_amplitudes",
         ),
     )
 
 
-def main() -> None:
-    """Write the table."""
-    jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
-    write_table(example_experiment().table, target)
-
-
 if __name__ == "__main__":
-    main()
+    jax.config.update("jax_enable_x64", True)  # noqa: FBT003
+    write_table(example_experiment().table, sys.argv[1] if len(sys.argv) > 1 else EXAMPLE)

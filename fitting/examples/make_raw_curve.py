@@ -141,13 +141,5 @@ def raw_curve(
     )
 
 
-def main() -> None:
-    """Write the example."""
-    target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
-    made = raw_curve()
-    write_whole(target, made.text)
-    print(f"wrote {made.height_nm.shape[1]} rows to {target}; a tap takes at most {made.energy_aj.max():.2f} aJ")
-
-
 if __name__ == "__main__":
-    main()
+    write_whole(sys.argv[1] if len(sys.argv) > 1 else EXAMPLE, raw_curve().text)

@@ -8,7 +8,6 @@ and 0.2 degrees, the instrument known as an instrument is. Run from the reposito
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -18,36 +17,25 @@ from afm_jax.contact.contact import Contact
 from fitting.simulated.experiment import drives_of, simulate_experiment
 from fitting.tables.table import write_table
 
-CONTACT: dict[str, Any] = {
-    "tip_radius_nm": 20.0,
-    "relative_humidity": 0.55,
-    "adhesion_energy_j_per_m2": 0.35,
-    "viscosity_pa_s": 0.8e-3,
-    "modulus_gpa": 120.0,
-}
-KNOWN: dict[str, Any] = {
-    "free_frequency_error_khz": 0.01,
-    "quality_factor_error": 2.0,
-    "calibration": {"tip_calibration": (1.0, 0.02), "offset_origin_nm": (0.0, 1.0), "phase_zero_deg": (0.0, 0.5)},
-}
-
-
-def main() -> None:
-    """Simulate the curves and write the table beside this file."""
+if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    heights = np.linspace(0.9, 0.12, 12)
-    rows = [(1, 92.7, free, -free * height) for free in (80.0, 40.0) for height in heights]
+    drives = [(1, 92.7, free, -free * height) for free in (80.0, 40.0) for height in np.linspace(0.9, 0.12, 12)]
     made = simulate_experiment(
-        Contact.paper(**CONTACT),
+        Contact.paper(
+            tip_radius_nm=20.0,
+            relative_humidity=0.55,
+            adhesion_energy_j_per_m2=0.35,
+            viscosity_pa_s=0.8e-3,
+            modulus_gpa=120.0,
+        ),
         Cantilever(90.0, 200.0, 16.81),
-        drives_of(rows),
+        drives_of(drives),
         drive="force",
         noise=0.003,
         phase_noise_deg=0.2,
         seed=1,
+        quality_factor_error=2.0,
     )
-    write_table(replace(made.table, **KNOWN), Path(__file__).parent / "tapping_contact.csv")
-
-
-if __name__ == "__main__":
-    main()
+    known = {"tip_calibration": (1.0, 0.02), "offset_origin_nm": (0.0, 1.0), "phase_zero_deg": (0.0, 0.5)}
+    table = replace(made.table, free_frequency_error_khz=0.01, calibration=known)
+    write_table(table, Path(__file__).with_name("tapping_contact.csv"))

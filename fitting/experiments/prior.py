@@ -20,7 +20,7 @@ from fitting.infer.result import FitResult
 from fitting.models import Problem, check_constraints
 from fitting.parameters import MODELS, NUISANCE_NAMES, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
-from fitting.tables.csv_text import TableError, beyond, read_fit_json
+from fitting.tables.csv_text import FARTHEST, TableError, read_fit_json
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
@@ -239,7 +239,8 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
 def _information(found: Mapping[str, Any], matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     """Return the Fisher information of a fit: of what it determined, and the constraints on what it did not."""
     error = np.array([entry["standard_error"] for entry in found.values()], dtype=float)
-    if np.any(beyond(error, positive=True)):
+    sizes = np.abs(error[np.isfinite(error) & (error != 0.0)])
+    if np.any((sizes > FARTHEST) | (sizes < 1.0 / FARTHEST)):
         raise ValueError("an error beyond what can be computed with")
     known = np.isfinite(error) & np.isfinite(np.diag(matrix)) & (error > 0.0)
     inner = matrix[np.ix_(known, known)]

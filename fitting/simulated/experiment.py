@@ -1,6 +1,7 @@
 """Synthetic measurements: the amplitude table that an instrument would give of a full scene.
 
-Every row of the table to be is a motion simulated in time until it repeats, then observed.
+Every row of the table to be is a periodic motion of the full scene: Newton's method finds where a response period that
+is simulated in time ends as it began.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,25 +23,21 @@ from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome
-from afm_jax.motion.follow import state_after, where_to_go_on
-from afm_jax.motion.observe import observe
+from afm_jax.motion.observe import MotionWindow
 from afm_jax.motion.periodic import close_periods, ends_in_flight
-from afm_jax.motion.record import MotionOutcome, Simulation, State
-from afm_jax.motion.settle import settled
+from afm_jax.motion.record import Simulation, State
 from afm_jax.motion.simulate import simulate
+from afm_jax.motion.trajectory import dense_path
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.lanes import in_blocks
+from afm_jax.units import within_turn
 from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
 BATCH = 16
 """Rows simulated side by side: one program serves all tables, and its last row keeps few others waiting."""
-RESPONSES = 100
-"""Response periods of one piece; a row that has not settled goes on for another."""
-PIECES = 40
-"""Most pieces that a motion may take to settle."""
-_CONTACTS = 260
-"""Room for contacts in a piece: motions with more than two a response period are no single-impact orbits."""
+_CONTACTS = 8
+"""Room for contacts in a response period: motions with more than one are no single-impact orbits."""
 
 
 @public_result()
@@ -55,15 +52,14 @@ class Drives(ResultTuple):
     offset_nm: Float[np.ndarray, " rows"]
 
 
-Report = Callable[[str], None]
-Follow = Callable[[np.ndarray, np.ndarray, int], Simulation]
-"""Of starts of shape (3, n), the numbers of their rows, and how many response periods: the simulations."""
+Follow = Callable[[np.ndarray, np.ndarray], Simulation]
+"""Of starts of shape (3, n) and the numbers of their rows: the simulations, a response period each."""
 Readings = tuple[float, float, float]
 """Peak and lock-in amplitude in nm, and the lock-in's phase in [0, 360/N) degrees."""
 
 
 def steady_rows(
-    interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives, *, report: Report
+    interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives
 ) -> tuple[dict[int, Readings], dict[int, str]]:
     """Return what is observed of the drives whose motion is the (1, N) orbit asked for, and why others have none.
 
@@ -75,16 +71,14 @@ def steady_rows(
         interaction: a contact, or a law with or without a collision delay.
         cantilever: the cantilever.
         drives: what is driven.
-        report: told how far it is.
 
     Raises:
         ValueError: if the contact has no junction.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     law = interaction if isinstance(interaction, ImpactLaw) else law_of_contact(interaction, float(cantilever.mass_ng))
-    count = len(drives.order)
     if law is None:
-        return {}, dict.fromkeys(range(count), "the contact captures tips of every speed")
+        return {}, dict.fromkeys(range(len(drives.order)), "the contact captures tips of every speed")
     follow = _follower(interaction, cantilever, drives)
     starts, predicted = _starts(law, cantilever, drives)
     if not predicted.any():
@@ -94,34 +88,24 @@ def steady_rows(
     waiting = np.flatnonzero(predicted)
     if not waiting.size:
         return {}, reasons
-    report(f"{len(waiting)} of {count} drives have a stable orbit of the closest law; closing in on them")
     orbits = close_periods(
-        lambda starts, rows: ends_in_flight(follow(starts, rows, 1)),
+        lambda starts, rows: ends_in_flight(follow(starts, rows)),
         starts[:, waiting],
         waiting,
         angular_frequency=float(cantilever.angular_frequency),
     )
     # multipliers are known to 1e-4
     stable = orbits.closed & (orbits.contraction < 0.9999)
-    starts[:, waiting] = np.where(stable, orbits.starts, starts[:, waiting])
+    motions = follow(np.where(stable, orbits.starts, starts[:, waiting]), waiting)
     steady: dict[int, Readings] = {}
-    for piece in range(PIECES):
-        if not waiting.size:
-            break
-        report(f"following {len(waiting)} motions, {RESPONSES} response periods (piece {piece + 1})")
-        found, left = follow(starts[:, waiting], waiting, RESPONSES), []
-        for lane, row in enumerate(waiting.tolist()):
-            motion = jax.tree.map(lambda part, lane=lane: part[lane], found)
-            scene = Scene(cantilever, _platform(drives, row), interaction)
-            reasons[row], seen, goes_on = _judged(scene, motion, int(drives.order[row]))
-            if seen is not None:
-                steady[row] = seen
-                del reasons[row]
-            elif goes_on is not None:
-                starts[:, row] = [float(part) for part in goes_on]
-                left.append(row)
-        waiting = np.array(left, dtype=int)
-    return dict(sorted(steady.items())), dict(sorted(reasons.items()))
+    for lane, row in enumerate(waiting.tolist()):
+        if not stable[lane] or motions.count[lane] != 1:
+            reasons[row] = "no stable orbit of one contact in a response period lies near the closest law's"
+            continue
+        motion = jax.tree.map(lambda part, lane=lane: part[lane], motions)
+        scene = Scene(cantilever, _platform(drives, row), interaction)
+        steady[row] = _readings(scene, motion, float(orbits.starts[0, lane]), int(drives.order[row]))
+    return steady, dict(sorted(reasons.items()))
 
 
 def _platform(drives: Drives, rows: int | Int[np.ndarray, " n"]) -> Platform:
@@ -173,28 +157,21 @@ def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: 
 
         return jax.vmap(one)(platforms, starts, durations)
 
-    def follow(starts: np.ndarray, rows: np.ndarray, periods: int) -> Simulation:
-        durations = periods * drives.order[rows] / drives.frequency_khz[rows] * US_PER_MS
+    def follow(starts: np.ndarray, rows: np.ndarray) -> Simulation:
+        durations = drives.order[rows] / drives.frequency_khz[rows] * US_PER_MS
         lanes = (_platform(drives, rows), State(*starts), durations)
         return in_blocks(lambda some: program(interaction, cantilever, *some), lanes, block=BATCH, widths=())
 
     return follow
 
 
-def _judged(scene: Scene, motion: Simulation, order: int) -> tuple[str, Readings | None, State | None]:
-    """Return what a motion of one drive does, its readings if it is the orbit asked for, and from where it goes on."""
-    outcome = MotionOutcome(int(motion.outcome))
-    if outcome not in {MotionOutcome.FINISHED, MotionOutcome.HELD}:
-        return outcome.sentence, None, None
-    # ten times less than the amplitudes are wanted to
-    verdict = settled(scene, motion, tolerance=1e-6)
-    if not verdict.settled:
-        row, goes_on = where_to_go_on(motion)
-        return f"not settled: {verdict.reason}", None, state_after(motion, row) if goes_on else None
-    if verdict.stuck or (verdict.contacts, verdict.periods) != (1, order):
-        return verdict.reason, None, None
-    seen = observe(scene, motion, verdict=verdict)
-    return verdict.reason, (seen.peak_amplitude_nm, seen.lockin_amplitude_nm, seen.lockin_phase_deg), None
+def _readings(scene: Scene, motion: Simulation, begin_us: float, order: int) -> Readings:
+    """Return what is read of one response period."""
+    end_us = begin_us + order * scene.platform.period_us
+    window = MotionWindow(dense_path(scene, motion, begin_us, float(end_us)), begin_us, float(end_us))
+    value = window.height.lockin(float(scene.platform.angular_frequency) / order)
+    degrees = within_turn(np.degrees(np.angle(value)), 360.0 / order)
+    return window.height.largest, float(abs(value)), float(degrees)
 
 
 @public_result()
@@ -231,11 +208,10 @@ def simulate_experiment(  # noqa: PLR0913
     seed: int = 0,
     quality_factor_error: float | None = None,
     remarks: tuple[str, ...] = (),
-    report: Report = lambda _: None,
 ) -> SimulatedExperiment:
     """Return the amplitudes that an experiment on a scene would read, with noise.
 
-    Every drive is simulated in time until it repeats to 1e-6, and observed over one response period.
+    Every drive is simulated in time over one response period, begun where it repeats to 1e-9, and observed over that.
 
     Args:
         interaction: a contact, or a law with or without a collision delay.
@@ -249,7 +225,6 @@ def simulate_experiment(  # noqa: PLR0913
         seed: of the noise.
         quality_factor_error: uncertainty of Q that the table states; None: none.
         remarks: comments for the table.
-        report: told how far it is.
 
     Returns:
         The table with and without noise, and what was left out.
@@ -267,7 +242,7 @@ def simulate_experiment(  # noqa: PLR0913
     if drive == "base":
         height = height_of_free_deflection(drives.amplitude_nm, ratio, cantilever.quality_factor)
         moved = drives._replace(amplitude_nm=np.asarray(height))
-    steady, reasons = steady_rows(interaction, cantilever, moved, report=report)
+    steady, reasons = steady_rows(interaction, cantilever, moved)
     left_out = tuple(
         f"order {drives.order[i]}, {drives.frequency_khz[i]:g} kHz, {drives.amplitude_nm[i]:g} nm, "
         f"offset {drives.offset_nm[i]:g} nm: {reason}"
@@ -353,19 +328,12 @@ def with_noise(exact: AmplitudeTable, draws: Float[np.ndarray, "3 rows"]) -> Amp
     Args:
         exact: noise-free amplitudes with their errors.
         draws: of peak, lock-in amplitude and phase.
-
-    Raises:
-        ValueError: if the table has no amplitude of one kind.
     """
     columns = {}
-    for kind, draw in zip(("peak", "lockin"), draws, strict=False):
-        value, spread = (getattr(exact, f"{kind}_amplitude{part}_nm") for part in ("", "_error"))
-        if value is None and exact.tapping:
-            continue
-        if value is None:
-            raise ValueError(f"{exact.source}: the table has no {kind}_amplitude_nm; noise is added to both amplitudes")
-        columns[f"{kind}_amplitude_nm"] = _rounded(value + spread * draw)
-        columns[f"{kind}_amplitude_error_nm"] = _rounded(spread)
+    for name, draw in zip(("peak_amplitude", "lockin_amplitude"), draws, strict=False):
+        value, spread = getattr(exact, f"{name}_nm"), getattr(exact, f"{name}_error_nm")
+        if value is not None:
+            columns |= {f"{name}_nm": _rounded(value + spread * draw), f"{name}_error_nm": _rounded(spread)}
     phase, error = exact.phase_and_error_deg
     if phase is not None:
         measured = phase + np.asarray(error) * draws[2]

@@ -10,9 +10,9 @@ import difflib
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, NoReturn
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -27,12 +27,7 @@ DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
 # A colon makes a key only in front of a number: "Measured: Tuesday" is a remark.
 _KEY_AND_VALUE = re.compile(r"\s*(?P<key>[^=:]+?)\s*(?:(?P<sign>=)|:(?=\s*[-+.\d]))(?P<value>.*)", re.DOTALL)
 _PLUS_MINUS = re.compile(r"\+-|\+/-|±")
-_SHORT_NAMES = {
-    "q": "quality_factor",
-    "q_factor": "quality_factor",
-    "f0": "free_frequency_khz",
-    "f_0": "free_frequency_khz",
-}
+_SHORT_NAMES = {"q": "quality_factor", "q_factor": "quality_factor", "f0": "free_frequency_khz"}
 """What people call a key, too far from its name for a comparison of letters."""
 _SUGGESTIONS = 20
 """How many unknown column names are compared with the known ones; it takes some milliseconds each."""
@@ -58,18 +53,17 @@ class TableError(ValueError):
 
 @dataclass
 class Faults:
-    """Keeps the fault that comes first in the file and counts the others.
+    """Faults of a table, of which the one that comes first in the file is reported and the others are counted.
 
     Attributes:
         source: the table's name, as it begins every message.
         place: what a row's number is called, "line" for a file and "row" for a table in memory.
-        count: how many faults were noted.
+        found: lines and messages.
     """
 
     source: str
     place: str = "line"
-    count: int = field(default=0, init=False)
-    _first: tuple[int, str] | None = field(default=None, init=False)
+    found: list[tuple[int, str]] = field(default_factory=list, init=False)
 
     def add(self, message: str, *, line: int = 0, column: str | None = None) -> None:
         """Note a fault.
@@ -79,15 +73,9 @@ class Faults:
             line: number of the line (or row) it is in; 0 stands for the table as a whole and comes first.
             column: name of the column it is in.
         """
-        self.count += 1
-        if self._first is not None and self._first[0] <= line:
-            return
-        place = printable(self.source)
-        if line:
-            place += f", {self.place} {line}"
-        if column is not None:
-            place += f", column {column}"
-        self._first = (line, f"{place}: {message}")
+        place = f", {self.place} {line}" if line else ""
+        place += "" if column is None else f", column {column}"
+        self.found.append((line, f"{printable(self.source)}{place}: {message}"))
 
     def add_rows(
         self, bad: Bool[np.ndarray, " rows"], message: str, lines: Int[np.ndarray, " rows"], column: str | None = None
@@ -103,28 +91,16 @@ class Faults:
         for line in lines[bad].tolist():
             self.add(message, line=line, column=column)
 
-    def fail(self, message: str, *, line: int = 0, column: str | None = None) -> NoReturn:
-        """Note a fault, as `add`, with which nothing else can be read.
-
-        Raises:
-            TableError: with the first fault and the number of the others.
-        """
-        self.add(message, line=line, column=column)
-        self.raise_any()
-        raise AssertionError
-
     def raise_any(self) -> None:
         """Raise the first fault, if there is one.
 
         Raises:
             TableError: with the first fault and the number of the others.
         """
-        if self._first is None:
-            return
-        message = self._first[1]
-        if self.count > 1:
-            message += f" (and {self.count - 1} more fault{'s' if self.count > 2 else ''})"
-        raise TableError(message)
+        if self.found:
+            _, message = min(self.found, key=lambda fault: fault[0])
+            more = len(self.found) - 1
+            raise TableError(message + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else ""))
 
 
 LARGEST = 1e9
@@ -133,39 +109,9 @@ FARTHEST = 1e30
 """Size of a number in any unit, and the inverse of one that must be above 0: the powers of others are no numbers."""
 
 
-def beyond(values: Any, *, positive: bool, largest: float = FARTHEST) -> Any:
-    """Say which numbers are too large, or too small for ones that must be above 0, to compute with.
-
-    Args:
-        values: a number or an array; what is none, or infinite, is not meant.
-        positive: whether they must be above 0.
-        largest: size of the largest that is not too large.
-    """
-    small = (values > 0.0) & (values < 1.0 / FARTHEST) if positive else False
-    return np.isfinite(values) & ((np.abs(values) > largest) | small)
-
-
-def said_beyond(value: float, largest: float = FARTHEST) -> str:
-    """Return what a number that is `beyond` must be instead."""
-    return f"must be at most {largest:g} in size" if abs(value) > largest else f"must be at least {1.0 / FARTHEST:g}"
-
-
 def quoted(text: str) -> str:
     """Return a piece of the file for a message: in quotation marks, escaped, and cut after 40 characters."""
     return repr(text if len(text) <= 40 else text[:40] + "...")
-
-
-_KINDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "number": ("must be finite", np.isinf),
-    "not negative": ("must be finite and not negative", lambda v: v < 0.0),
-    "positive": ("must be finite and above 0", lambda v: v <= 0.0),
-    "whole": (
-        "must be a positive whole number (1, 2, 3, ...)",
-        lambda v: (v <= 0.0) | (v > np.floor(v)) | (v >= 2**53),
-    ),
-    "flag": ("", lambda v: (v < 0.0) | ((v > 0.0) & (v != 1.0))),
-}
-"""What the numbers of a kind of column must be (those of a flag 0 or 1), and what says which are not; NaN is none."""
 
 
 @dataclass(frozen=True)
@@ -174,37 +120,29 @@ class Column:
 
     Attributes:
         name: its name in the file.
-        unit: its unit in words of a message; empty for a plain number, or where the name says enough.
-        kind: what its numbers must be: "number" (any finite one), "not negative", "positive", "whole" or "flag" (0, 1).
+        kind: what its numbers must be: "number" (any finite one), "not negative", "positive", "whole" (1, 2, 3, ...) or
+            "flag" (0, 1).
         meaning: what its numbers become; empty: the name. Columns of one meaning are aliases, of which a file has one.
         needed: what it gives, in a word, if every file needs a column that gives it; else empty.
         required: whether every row needs it.
         error: the name of the column that holds its standard errors, for a measured column.
         amplitude: whether it is a measured amplitude: each row needs one, and a relative noise applies to it.
-        says: of a flag: what 1 says.
         convert: makes the unit of the meaning of its numbers; None: they have it.
     """
 
     name: str
-    unit: str = ""
     kind: Literal["number", "not negative", "positive", "whole", "flag"] = "positive"
     meaning: str = ""
     needed: str = ""
     required: bool = False
     error: str | None = None
     amplitude: bool = False
-    says: str = ""
     convert: Callable[[Float[np.ndarray, " rows"]], Float[np.ndarray, " rows"]] | None = None
 
     @property
     def becomes(self) -> str:
         """What its numbers become."""
         return self.meaning or self.name
-
-    @property
-    def in_unit(self) -> str:
-        """Its unit, in brackets behind its name."""
-        return f" (in {self.unit})" if self.unit else ""
 
 
 @dataclass(frozen=True)
@@ -216,9 +154,7 @@ class Form:
         row: what a row is measured at: a drive, a point, a sample.
         open: whether columns of other names are left alone, not refused.
         blanks: whether cells may be blank (NaN); else every cell is needed.
-        example: a row of column names to show, where the row above the numbers is the whole head.
         separator: what stands between cells; empty: commas, tabs, semicolons or spaces, as the row of names has them.
-        mend: what to do with a number that is impossible.
         largest: size of any number.
         strange: columns that other files have, and what to do about them.
     """
@@ -227,9 +163,7 @@ class Form:
     row: str
     open: bool = False
     blanks: bool = False
-    example: str = ""
     separator: str = ","
-    mend: str = "correct it or remove the row"
     largest: float = FARTHEST
     strange: Mapping[str, str] = field(default_factory=dict)
 
@@ -254,17 +188,23 @@ class Form:
             faults: where the faults are noted.
         """
         column = next(one for one in self.columns if name in {one.name, one.becomes})
-        must, impossible = _KINDS[column.kind]
-        must = must or f"must be 1 ({column.says}) or 0"
-        # a whole number only has to survive the way through 64-bit floats
-        largest = np.inf if column.kind == "whole" else self.largest
-        far = beyond(values, positive=column.kind not in {"number", "flag"}, largest=largest)
-        bad = np.isinf(values) | far | impossible(values) | (np.isnan(values) & (not self.blanks))
-        blank = ", or leave it blank if it was not measured" if column.error is not None else ""
-        for row in np.flatnonzero(bad):
+        lowest, highest = {
+            "number": (-self.largest, self.largest),
+            "not negative": (1.0 / FARTHEST, self.largest),
+            "positive": (1.0 / FARTHEST, self.largest),
+            # a whole number only has to survive the way through 64-bit floats
+            "whole": (1.0, 2.0**53 - 1.0),
+            "flag": (0.0, 1.0),
+        }[column.kind]
+        good = (values >= lowest) & (values <= highest)
+        words = {"whole": "be a positive whole number (1, 2, 3, ...)", "flag": "be 0 or 1"}
+        if column.kind in words:
+            good &= values == np.floor(values)
+        good |= (column.kind == "not negative") & (values == 0.0)
+        must = words.get(column.kind, f"lie between {lowest:g} and {highest:g}")
+        for row in np.flatnonzero(~(good | (np.isnan(values) & self.blanks))):
             number = repr(float(values[row])).removesuffix(".0")
-            wanted = said_beyond(values[row], self.largest) if far[row] else must
-            faults.add(f"{wanted}, but is {number}; {self.mend}{blank}", line=int(lines[row]), column=name)
+            faults.add(f"must {must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
 
 
 @dataclass(frozen=True)
@@ -275,16 +215,16 @@ class FileSetting:
         key: its name.
         example: how its value may be written, for messages.
         unit: its unit in words of a message, where the name might be taken for another one.
-        lowest: what it must lie above.
+        lowest: how small it may be.
         error: whether a standard error stands behind it: "never", "maybe" or "always".
         choices: of a word in place of a number: which there are.
-        none: whether the word "none" may stand in place of the number, which then is infinite.
+        none: whether the word "none" may stand in place of the number, which then is None.
     """
 
     key: str
     example: str = "1"
     unit: str = ""
-    lowest: float = 0.0
+    lowest: float = 1.0 / FARTHEST
     error: Literal["never", "maybe", "always"] = "never"
     choices: tuple[str, ...] = ()
     none: bool = False
@@ -321,7 +261,6 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
         raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
 
 
-_AS_CSV = "is not UTF-8 text; save the table as CSV with the encoding UTF-8"
 _A_FIT = "give the fit.json of `afm-jax fit --out`"
 
 
@@ -331,29 +270,24 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
     Raises:
         TableError: if the file cannot be read or is no fit.
     """
-    name = printable(str(path))
     try:
-        found = json.loads(read_text(path, f"is not UTF-8 text; {_A_FIT}"))
-    except json.JSONDecodeError as error:
-        raise TableError(f"{name}, line {error.lineno}: is no JSON; {_A_FIT}") from None
-    except RecursionError:
-        raise TableError(f"{name}: has too many brackets within each other; {_A_FIT}") from None
+        found = json.loads(text_of(read_bytes(path, "a fit.json"), path, f"is not UTF-8 text; {_A_FIT}"))
+    except (json.JSONDecodeError, RecursionError) as error:
+        place = f"{printable(str(path))}, line {getattr(error, 'lineno', 1)}"
+        raise TableError(f"{place}: is no JSON; {_A_FIT}") from None
     wrong = why_no_fit(found)
     if wrong is not None:
-        raise TableError(f"{name}: {wrong}")
+        raise TableError(f"{printable(str(path))}: {wrong}")
     return found
 
 
-def read_text(path: str | Path, wrong: str = _AS_CSV) -> str:
+def read_text(path: str | Path) -> str:
     """Return the text of a UTF-8 file, with or without a byte order mark, with every line end as a newline.
-
-    Args:
-        path: the file.
-        wrong: what is said where it is not UTF-8, with what to do.
 
     Raises:
         TableError: if there is no such file, it cannot be read or is not UTF-8 text.
     """
+    wrong = "is not UTF-8 text; save the table as CSV with the encoding UTF-8"
     return text_of(read_bytes(path, "a CSV file"), path, wrong)
 
 
@@ -412,16 +346,10 @@ def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> T
         TableError: as `read_comments` and `read_rows`.
     """
     found, _, rows = read_comments(text, settings, faults)
-    form = form if form.separator else replace(form, separator=_separator_of(rows[0][1]))
     columns, lines = read_rows(rows, form, faults)
     used = [column for column in form.columns if column.name in columns]
     numbers = {one.becomes: one.convert(columns[one.name]) if one.convert else columns[one.name] for one in used}
     return TextTable(numbers, tuple(column.name for column in used), lines, found)
-
-
-def _separator_of(names: str) -> str:
-    """Return what separates a row of names."""
-    return next((sign for sign in ",\t; " if sign in names.strip()), ",")
 
 
 def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
@@ -449,50 +377,47 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
     return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
 
 
-def _value_of(setting: FileSetting, text: str) -> tuple[float, float | None] | str:
-    """Return the value and its error of a comment that makes a setting, or what is wrong with it.
-
-    Of a word it is its place among the choices.
+def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
+    """Return the value and its error of a comment that makes a setting; of a word the word.
 
     Args:
         setting: from `setting_in`.
         text: the comment without its number sign.
+
+    Raises:
+        ValueError: with what is wrong.
     """
     match, key = _KEY_AND_VALUE.fullmatch(text), setting.key
     if match is None or match["key"] != key or match["sign"] is None:
         unit = f" (in {setting.unit})" if setting.unit else ""
-        return f"{quoted(text)} is no known setting; the key is {key}{unit}, as in '{setting.line}'"
+        raise ValueError(f"{quoted(text)} is no known setting; the key is {key}{unit}, as in '{setting.line}'")
     # Spreadsheets fill every line up with commas.
-    cells = [cell.strip() for cell in _PLUS_MINUS.split(match["value"].rstrip(",; \t"))]
+    value = match["value"].rstrip(",; \t").strip()
+    if value in setting.choices:
+        return value, None
     if setting.choices:
-        if cells in [[choice] for choice in setting.choices]:
-            return float(setting.choices.index(cells[0])), None
-        *others, last = setting.choices
-        choices = f"{', '.join(others)} or {last}" if others else quoted(last)
-        return f"{key} must be {choices}, but is {quoted(match['value'].strip())}; write '{setting.line}'"
-    if setting.none and cells == ["none"]:
-        return float("inf"), None
-    fault = _fault_in_cells(setting, cells)
-    return f"{key} {fault}" if fault else (float(cells[0]), float(cells[1]) if len(cells) > 1 else None)
-
-
-def _fault_in_cells(setting: FileSetting, cells: list[str]) -> str | None:
-    """Return what is wrong with the value (and its error) of a setting, or None."""
+        raise ValueError(f"{key} must be {' or '.join(setting.choices)}, but is {quoted(value)}")
+    if setting.none and value == "none":
+        return None, None
+    cells = [cell.strip() for cell in _PLUS_MINUS.split(value)]
     for cell in cells:
-        if DECIMAL_COMMA.fullmatch(cell):
-            return f"is {quoted(cell)}; write the decimal comma as a point"
         if not NUMBER.fullmatch(cell):
-            return f"has {quoted(cell)} where a number must stand; write '{setting.line}', without the unit"
-    least, most = {"never": (1, 1), "maybe": (1, 2), "always": (2, 2)}[setting.error]
-    if not least <= len(cells) <= most:
-        return f"{'needs its standard error' if len(cells) < least else 'takes no such error'}; write '{setting.line}'"
-    return fault_in_number(setting, *map(float, cells))
+            mend = f"write '{setting.line}', with a decimal point and without the unit"
+            raise ValueError(f"{key} has {quoted(cell)} where a number must stand; {mend}")
+    if len(cells) not in {"never": (1,), "maybe": (1, 2), "always": (2,)}[setting.error]:
+        wrong = "needs its standard error" if len(cells) < 2 else "takes no such error"
+        raise ValueError(f"{key} {wrong}; write '{setting.line}'")
+    number, error = float(cells[0]), float(cells[1]) if len(cells) > 1 else None
+    fault = fault_in_number(setting, number, error)
+    if fault is not None:
+        raise ValueError(f"{key} {fault}")
+    return number, error
 
 
 def read_comments(
     text: str, settings: Settings, faults: Faults
-) -> tuple[dict[str, tuple[float, float | None]], tuple[str, ...], NumberedLines]:
-    """Return value and error of the settings that comments make (NaN where it is at fault), other comments, and rows.
+) -> tuple[dict[str, tuple[Any, float | None]], tuple[str, ...], NumberedLines]:
+    """Return value and error of the settings that comments make, other comments, and rows.
 
     Args:
         text: of the whole file.
@@ -500,10 +425,9 @@ def read_comments(
         faults: where a misspelt key, a value that is no number and a repeated key are noted.
 
     Raises:
-        TableError: where there are no rows: the column names and what stands below.
+        TableError: if something is wrong, or there are no rows: the column names and what stands below.
     """
-    found: dict[str, tuple[float, float | None]] = {}
-    seen: dict[str, int] = {}
+    found: dict[str, tuple[Any, float | None]] = {}
     remarks = []
     comments, rows = split_lines(text)
     for line, comment in comments:
@@ -514,17 +438,17 @@ def read_comments(
             if name in SETTING_NAMES:
                 faults.add(f"{name} sets nothing in such a file; remove the line", line=line)
             remarks.append(comment)
-        elif setting.key in seen:
-            faults.add(f"{setting.key} was given in line {seen[setting.key]} already; remove one of the two", line=line)
+        elif setting.key in found:
+            faults.add(f"{setting.key} was given already; remove one of the two", line=line)
         else:
-            seen[setting.key] = line
-            value = _value_of(setting, comment)
-            if isinstance(value, str):
-                faults.add(value, line=line)
-            found[setting.key] = (float("nan"), None) if isinstance(value, str) else value
+            try:
+                found[setting.key] = _value_of(setting, comment)
+            except ValueError as error:
+                faults.add(str(error), line=line)
     if not rows:
         what = "only comments" if comments else "nothing"
-        faults.fail(f"the file holds {what}; add a row of column names and rows of numbers")
+        faults.add(f"the file holds {what}; add a row of column names and rows of numbers")
+    faults.raise_any()
     return found, tuple(remarks), rows
 
 
@@ -535,15 +459,10 @@ def setting_line(key: str, value: float | str, error: float | None) -> str:
 
 def fault_in_number(setting: FileSetting, value: float, error: float | None = None) -> str | None:
     """Return what is wrong with a setting's number or its standard error, both in the unit of its key, or None."""
-    if not setting.lowest < value < float("inf"):
-        above = "" if setting.lowest == float("-inf") else f" and above {setting.lowest:g}"
-        return f"must be finite{above}, but is {value!r}; correct it"
-    if beyond(value, positive=setting.lowest >= 0.0, largest=LARGEST):
-        return f"{said_beyond(value, LARGEST)}, but is {value!r}; correct it"
-    if error is not None and not 0.0 < error < float("inf"):
-        return f"has the error {error!r}; it must be finite and above 0, or left out"
-    if error is not None and beyond(error, positive=True, largest=LARGEST):
-        return f"has the error {error!r}; it {said_beyond(error, LARGEST)}, or left out"
+    if not setting.lowest <= value <= LARGEST:
+        return f"must lie between {setting.lowest:g} and {LARGEST:g}, but is {value!r}; correct it"
+    if error is not None and not 1.0 / FARTHEST <= error <= LARGEST:
+        return f"has the error {error!r}; it must lie between {1.0 / FARTHEST:g} and {LARGEST:g}, or be left out"
     return None
 
 
@@ -570,28 +489,27 @@ def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns,
         TableError: at once where the column names are wrong: the cells below cannot be judged then.
     """
     line, text = rows[0]
-    if form.separator == "," and _separator_of(text) != ",":
-        message = "the columns are not separated by commas; separate them by commas, decimals by points"
-        Faults(faults.source).fail(message, line=line)
-    names, found = cells_of(text, form.separator), faults.count
-    _check_names(names, form, line, faults)
-    if not rows[1:] and faults.count == found:
-        message = f"there are column names but no rows below them; add a row for each {form.row}"
-        faults.add(message, line=line)
-    if faults.count > found:
+    looks = next((sign for sign in ",\t; " if sign in text.strip()), ",")
+    separator = form.separator or looks
+    if looks != separator:
+        faults.add("the columns are not separated by commas; separate them by commas, decimals by points", line=line)
         faults.raise_any()
-    table = _table_of(rows[1:], len(names), form.separator, faults)
+    names = cells_of(text, separator)
+    check_names(names, form, faults, line=line)
+    if not rows[1:]:
+        faults.add(f"there are column names but no rows below them; add a row for each {form.row}", line=line)
+    faults.raise_any()
+    table = _table_of(rows[1:], len(names), separator, faults)
     columns = {}
     for position, name in enumerate(names):
-        column = form.column(name)
-        if column is not None:
+        if form.column(name) is not None:
             columns[name] = numbers = np.full(len(table), np.nan)
             for row, (line, cells) in enumerate(table):
                 text = cells[position]
-                if NUMBER.fullmatch(text) and not (column.kind == "whole" and set(text) & set(".eE")):
+                if NUMBER.fullmatch(text):
                     numbers[row] = float(text)
                 elif text or not form.blanks:
-                    faults.add(_unreadable(text, column, form), line=line, column=name)
+                    faults.add(_unreadable(text, form.row), line=line, column=name)
     return columns, np.array([line for line, _ in table], dtype=np.int64)
 
 
@@ -610,80 +528,58 @@ def _table_of(rows: NumberedLines, width: int, separator: str, faults: Faults) -
     return table
 
 
-def _unreadable(text: str, column: Column, form: Form) -> str:
-    """Return what is wrong with a cell that holds no number of its column."""
+def _unreadable(text: str, row: str) -> str:
+    """Return what is wrong with a cell of a row that holds no number."""
     if not text:
-        return f"is blank; every {form.row} needs it: fill it in or remove the row"
+        return f"is blank; every {row} needs it: fill it in or remove the row"
     if DECIMAL_COMMA.fullmatch(text):
         return f"{quoted(text)} has a decimal comma; write a point"
-    if column.kind == "whole":
-        return f"{quoted(text)} is not a positive whole number; write 1, 2, 3, ..."
-    other = "leave the cell blank" if form.blanks and not column.required else "remove the row"
-    return f"{quoted(text)} is not a number; write it like 90.25 or 9.025e1, or {other}"
+    return f"{quoted(text)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
 
 
-def _check_names(names: list[str], form: Form, line: int, faults: Faults) -> None:
-    """Note every fault of column names."""
+def check_names(names: list[str], form: Form, faults: Faults, *, line: int = 0) -> None:
+    """Note every fault of column names.
+
+    Args:
+        names: of the columns, from left to right.
+        form: what the table is to be.
+        faults: where the faults are noted.
+        line: where the names stand; 0: in memory.
+    """
     if any(NUMBER.fullmatch(name) for name in names):
-        row = f"a row of column names above it: {form.example}" if form.example else "the row of column names above it"
-        faults.add(f"the first row holds numbers; put {row}", line=line)
+        faults.add("the first row holds numbers; put the row of column names above it", line=line)
         return
     present: set[str] = set()
     unknown = []
-    for position, name in enumerate(names, start=1):
+    for name in names:
         column = form.column(name)
         if column is None:
-            unknown.append((position, name))
-        elif names.index(name) + 1 < position:
-            twice = f"is there twice, as columns {names.index(name) + 1} and {position}; remove one"
-            faults.add(twice, line=line, column=name)
+            unknown.append(name)
         elif column.becomes in present:
             faults.add("says again what another column says; remove one", line=line, column=name)
         else:
-            present |= {column.becomes, name}
-    # A name that was only misspelt is reported; that its column is then missing is not a second fault.
-    present |= _check_unknown(unknown, form, present, line, faults)
-    for what, columns in _missing(form, present).items():
-        message = f"there is no {what} column; add {' or '.join(column.name for column in columns)}"
-        if len(columns) == 1:
-            other = " or rename the one that holds it" if form.open else ""
-            message = f'the column "{columns[0].name}"{columns[0].in_unit} is missing; add it{other}'
-        faults.add(message, line=line)
+            present.add(column.becomes)
+    _check_unknown(unknown[:_SUGGESTIONS], form, present, line, faults)
+    # a column that is missing may be one that is misspelt
+    for what in dict.fromkeys(column.needed for column in form.columns) if not faults.found else ():
+        columns = [column for column in form.columns if column.needed == what]
+        if what and not any(column.becomes in present for column in columns):
+            faults.add(f"there is no {what} column; add {' or '.join(column.name for column in columns)}", line=line)
 
 
-def _check_unknown(
-    unknown: list[tuple[int, str]], form: Form, present: set[str], line: int, faults: Faults
-) -> set[str]:
-    """Note names that no column has; return what those were meant to be that are only misspelt."""
-    meant: set[str] = set()
-    # where a column is missing an unknown one may be it
-    remove = "" if _missing(form, present) else "remove it, "
-    for count, (position, name) in enumerate(unknown):
-        suggestion = form.column(nearest_name(name, form.names) or "") if name and count < _SUGGESTIONS else None
+def _check_unknown(unknown: list[str], form: Form, present: set[str], line: int, faults: Faults) -> None:
+    """Note names that no column has, and what each was meant to be."""
+    for name in unknown:
+        meant = form.column(nearest_name(name, form.names) or "")
         if name in form.strange:
             faults.add(form.strange[name], line=line, column=name)
-        elif form.open and (suggestion is None or suggestion.becomes in present):
+        elif form.open and (meant is None or meant.becomes in present):
             continue
-        elif not name:
-            faults.add(f"column {position} has no name; name it or remove its comma", line=line)
-        elif suggestion is None:
-            faults.add(f"unknown column {quoted(name)}; {remove}the columns are {', '.join(form.names)}", line=line)
+        elif meant is None:
+            known = ", ".join(form.names)
+            faults.add(f"unknown column {quoted(name)}; remove or rename it, the columns are {known}", line=line)
         else:
-            faults.add(f"unknown column {quoted(name)}; did you mean {suggestion.name}{suggestion.in_unit}?", line=line)
-            meant |= {suggestion.becomes, suggestion.name}
-    return meant
-
-
-def _missing(form: Form, present: set[str]) -> dict[str, list[Column]]:
-    """Return the columns of which one would give what is needed and not present."""
-    givers: dict[str, list[Column]] = {}
-    for column in form.columns:
-        givers.setdefault(column.needed, []).append(column)
-    return {
-        what: columns
-        for what, columns in givers.items()
-        if what and not any(present & {column.becomes, column.error} for column in columns)
-    }
+            faults.add(f"unknown column {quoted(name)}; did you mean {meant.name}?", line=line)
 
 
 def plain_name(text: str) -> str:
@@ -691,13 +587,7 @@ def plain_name(text: str) -> str:
     return "_".join(re.findall(r"\w+", text.lower().replace("_", " ")))
 
 
-def without_unit(name: str) -> str:
-    """Return a name without its last word, where that may be a unit: one of five letters at most."""
-    stem, _, unit = name.rpartition("_")
-    return stem if stem and len(unit) <= 5 else name
-
-
-_SIMILAR = 0.75
+_SIMILAR = 0.7
 """Similarity (0 to 1, as difflib counts it) that a misspelling must reach."""
 
 
@@ -708,12 +598,7 @@ def nearest_name(text: str, known: Iterable[str]) -> str | None:
         text: the name as it stands in the file.
         known: the right names; their unit is the last word.
     """
-    known = list(known)
-    name = plain_name(text)
-    for candidate in known:
-        if name in {candidate, without_unit(candidate)}:
-            return candidate
-    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=_SIMILAR)), None)
+    return next(iter(difflib.get_close_matches(plain_name(text), list(known), n=1, cutoff=_SIMILAR)), None)
 
 
 def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, faults: Faults) -> Float[np.ndarray, "..."]:

@@ -6,6 +6,7 @@ Where readings were repeated at one drive, their scatter is compared with what t
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Shaped
@@ -38,20 +39,15 @@ class SeveralTables:
             raise ValueError("a joint fit needs at least two tables")
         first, name = self.tables[0], self.labels[0]
         for table, label in zip(self.tables[1:], self.labels[1:], strict=True):
+            for known in ("mass_ng", "quality_factor"):
+                if (getattr(first, known) is None) != (getattr(table, known) is None):
+                    without, having = (name, label) if getattr(first, known) is None else (label, name)
+                    raise ValueError(f"{without} gives no {known}, but {having} does; correct one of them")
             mass, other = first.mass_ng, table.mass_ng
-            if (mass is None) != (other is None):
-                without, having = (name, label) if mass is None else (label, name)
-                raise ValueError(f"{without} lacks mass_ng (or spring_constant_n_per_m), which {having} gives; add it")
             if mass is not None and other is not None and abs(other / mass - 1.0) > _SAME_MASS:
                 raise ValueError(
                     f"mass_ng is {mass:g} in {name} and {other:g} in {label}: tips of different mass share no law of "
                     "impacts; fit each by itself"
-                )
-            if (table.quality_factor is None) != (first.quality_factor is None):
-                without, having = (label, name) if table.quality_factor is None else (name, label)
-                raise ValueError(
-                    f"{without} says that there is no air damping (quality_factor = none), {having} gives a quality "
-                    "factor; correct one of them"
                 )
 
     def check_different(self) -> None:
@@ -112,30 +108,11 @@ class SeveralTables:
         """Effective mass of the tip; None: not known."""
         return self.tables[0].mass_ng
 
-    @property
-    def lines(self) -> Int[np.ndarray, " rows"]:
-        """The line of its file that each row stands in."""
-        return np.concatenate([table.lines for table in self.tables])
-
-    @property
-    def order(self) -> Int[np.ndarray, " rows"]:
-        """Drive periods per impact."""
-        return np.concatenate([table.order for table in self.tables])
-
-    @property
-    def drive_frequency_khz(self) -> Float[np.ndarray, " rows"]:
-        """Frequency of the drive."""
-        return np.concatenate([table.drive_frequency_khz for table in self.tables])
-
-    @property
-    def excitation_nm(self) -> Float[np.ndarray, " rows"]:
-        """Amplitude of the platform, or of the free tip."""
-        return np.concatenate([table.excitation_nm for table in self.tables])
-
-    @property
-    def offset_nm(self) -> Float[np.ndarray, " rows"]:
-        """Offset of the platform, or height of the sample."""
-        return np.concatenate([table.offset_nm for table in self.tables])
+    def __getattr__(self, name: str) -> Any:
+        """Return what each table has a number a row of, for all rows: frequency, amplitude and offset of the drive."""
+        if name not in _STACKED:
+            raise AttributeError(name)
+        return np.concatenate([getattr(table, name) for table in self.tables])
 
     @property
     def no_orbit(self) -> Float[np.ndarray, " rows"]:
@@ -143,6 +120,7 @@ class SeveralTables:
         return np.concatenate([np.zeros(t.rows) if t.no_orbit is None else t.no_orbit for t in self.tables])
 
 
+_STACKED = ("lines", "order", "drive_frequency_khz", "excitation_nm", "offset_nm")
 _READINGS = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
 """What tells tables apart."""
 _SAME_MASS = 0.01

@@ -37,6 +37,7 @@ phase_sense = lag`` says that ``phase_lag_deg`` is a lag for sure, ``lead`` that
 that its sign is not known and its zero that of the free tip; without that line the curve decides where it can.
 """
 
+import math
 import os
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
@@ -44,7 +45,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Real, Shaped
 
 from afm_jax.checks import check_kind, checked
 from afm_jax.results import Result, public_result
@@ -58,6 +59,7 @@ from fitting.tables.csv_text import (
     FileSetting,
     Form,
     TableError,
+    check_names,
     column_of,
     fault_in_number,
     printable,
@@ -73,8 +75,8 @@ LEAST_REPEATS = 4
 """Readings beyond the first of each drive from which on their scatter gives errors."""
 ERRORS_OF_REPEATS = "errors from repeated readings: "
 """How the remark begins that says so."""
-# An overdamped cantilever does not vibrate.
-LOWEST_QUALITY_FACTOR = 0.5
+# Above one half: an overdamped cantilever does not vibrate.
+LOWEST_QUALITY_FACTOR = math.nextafter(0.5, 1.0)
 SETTINGS = {
     setting.key: setting
     for setting in (
@@ -87,8 +89,8 @@ SETTINGS = {
         FileSetting("spring_constant_n_per_m", "5.4 (or 5.4 +- 0.5)", unit="N/m", error="maybe"),
         FileSetting("tip_calibration", "1 +- 0.02", error="always"),
         FileSetting("drive_calibration", "1 +- 0.02", error="always"),
-        FileSetting("offset_origin_nm", "0 +- 0.3", lowest=float("-inf"), error="always"),
-        FileSetting("phase_zero_deg", "0 +- 0.2", unit="degrees", lowest=float("-inf"), error="always"),
+        FileSetting("offset_origin_nm", "0 +- 0.3", lowest=-LARGEST, error="always"),
+        FileSetting("phase_zero_deg", "0 +- 0.2", unit="degrees", lowest=-LARGEST, error="always"),
     )
 }
 DRIVES = SETTINGS["drive"].choices
@@ -106,106 +108,60 @@ ERROR_OF = {
 _CANTILEVER = ("free_frequency_khz", "quality_factor", "mass_ng", "spring_constant_n_per_m")
 
 
-def _header_of(
-    settings: dict[str, tuple[float, float | None]], remarks: tuple[str, ...], faults: Faults
-) -> dict[str, Any]:
-    """Return what the comment lines of a table say, by the names of `AmplitudeTable`.
+_COLUMNS = (
+    Column("order", needed="order", required=True, kind="whole"),
+    Column("drive_frequency_khz", needed="drive frequency", required=True),
+    Column("drive_amplitude_nm", needed="drive amplitude", required=True),
+    Column("free_amplitude_nm", needed="free amplitude", required=True),
+    Column("offset_nm", needed="offset", required=True, kind="number"),
+    Column("peak_amplitude_nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
+    Column("peak_amplitude_error_nm"),
+    Column("lockin_amplitude_nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
+    Column("lockin_amplitude_error_nm"),
+    Column("phase_deg", error="phase_error_deg", kind="number"),
+    Column("phase_error_deg"),
+    Column("phase_lag_deg", error="phase_lag_error_deg", kind="number"),
+    Column("phase_lag_error_deg"),
+    Column("retract", kind="flag"),
+    Column("no_orbit", kind="flag"),
+)
 
-    Raises:
-        TableError: if it is not known what is driven, and so which columns there must be.
+
+def _form(others: tuple[str, ...], strange: str, optional: str = "") -> Form:
+    """Return the form of tables that have all columns but those of the other form.
+
+    Args:
+        others: the columns of the other form.
+        strange: what to say of them.
+        optional: a column that may be left out.
     """
-    if "free_frequency_khz" not in settings:
-        example = SETTINGS["free_frequency_khz"].line
-        faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
-    drive, _ = settings.get("drive", (0.0, None))
-    if np.isnan(drive):
-        faults.raise_any()
-    sense, _ = settings.get("phase_sense", (np.nan, None))
-    header: dict[str, Any] = {
-        "drive": DRIVES[int(drive)],
-        "rows_in_order_of_time": "rows" in settings,
-        "phase_sense": "" if np.isnan(sense) else PHASE_SENSES[int(sense)],
-        "free_frequency_khz": float("nan"),
-        "calibration": {key: (settings[key][0], settings[key][1] or 0.0) for key in CALIBRATION if key in settings},
-        "remarks": remarks,
-    }
-    for name in _CANTILEVER:
-        if name in settings:
-            value, error = settings[name]
-            header[name] = None if np.isinf(value) else value
-            header |= {ERROR_OF[name]: error} if name in ERROR_OF else {}
-    return header
-
-
-_ORDER = Column("order", needed="order", required=True, kind="whole")
-_FREQUENCY = Column("drive_frequency_khz", "kHz", needed="drive frequency", required=True)
-_OFFSET = Column("offset_nm", "nm", needed="offset", required=True, kind="number")
-_LOCKIN = (
-    Column("lockin_amplitude_nm", "nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
-    Column("lockin_amplitude_error_nm", "nm"),
-)
-_NO_ORBIT = Column("no_orbit", kind="flag", says="no steady orbit was seen")
-_SAMPLE = (
-    _ORDER,
-    _FREQUENCY,
-    Column("drive_amplitude_nm", "nm", needed="drive amplitude", required=True),
-    _OFFSET,
-    Column("peak_amplitude_nm", "nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
-    Column("peak_amplitude_error_nm", "nm"),
-    *_LOCKIN,
-    Column("phase_deg", "degrees", error="phase_error_deg", kind="number"),
-    Column("phase_error_deg", "degrees"),
-    _NO_ORBIT,
-)
-_TAPPING = (
-    replace(_ORDER, needed=""),
-    _FREQUENCY,
-    Column("free_amplitude_nm", "nm", needed="free amplitude", required=True),
-    _OFFSET,
-    *_LOCKIN,
-    Column("phase_lag_deg", "degrees", error="phase_lag_error_deg", kind="number"),
-    Column("phase_lag_error_deg", "degrees"),
-    Column("retract", kind="flag", says="the sample moves away"),
-    _NO_ORBIT,
-)
-
-
-def _form(columns: tuple[Column, ...], strange: str) -> Form:
-    """Return the form of tables of some columns, and what to say of those of the other form."""
-    names = {column.name for column in columns}
-    return Form(
-        columns,
-        "drive",
-        blanks=True,
-        largest=LARGEST,
-        strange={column.name: strange for column in (*_SAMPLE, *_TAPPING) if column.name not in names},
-    )
+    columns = [replace(one, needed="") if one.name == optional else one for one in _COLUMNS if one.name not in others]
+    return Form(tuple(columns), "drive", blanks=True, largest=LARGEST, strange=dict.fromkeys(others, strange))
 
 
 TABLE = _form(
-    _SAMPLE,
+    ("free_amplitude_nm", "phase_lag_deg", "phase_lag_error_deg", "retract"),
     "belongs to a cantilever that is driven itself; add the line '# drive = force' or '# drive = base' above the names",
 )
 TAPPING = _form(
-    _TAPPING,
-    "belongs to a sample that is driven; with '# drive = force' or '# drive = base' the columns are "
-    + ", ".join(column.name for column in _TAPPING),
+    ("drive_amplitude_nm", "peak_amplitude_nm", "peak_amplitude_error_nm", "phase_deg", "phase_error_deg"),
+    "belongs to a sample that is driven; where the cantilever is driven the columns are free_amplitude_nm, "
+    "lockin_amplitude_nm and phase_lag_deg instead",
+    optional="order",
 )
 FORMS = {drive: TABLE if drive == "sample" else TAPPING for drive in DRIVES}
 """The columns of a table by what is driven."""
-_ALL = tuple({column.name: column for column in (*_SAMPLE, *_TAPPING)}.values())
-MEASURED = tuple(column for column in _ALL if column.error is not None)
-AMPLITUDES = tuple(column for column in _ALL if column.amplitude)
+MEASURED = tuple(column for column in _COLUMNS if column.error is not None)
 
 
 def columns_of(table: "AmplitudeTable") -> dict[str, Any]:
     """Return the columns that a table has, by name."""
-    return {column.name: getattr(table, column.name) for column in _ALL if getattr(table, column.name) is not None}
+    return {column.name: getattr(table, column.name) for column in _COLUMNS if getattr(table, column.name) is not None}
 
 
 def required(columns: Collection[str]) -> tuple[Column, ...]:
     """Return the columns of which every row needs a number, of those that a table has."""
-    return tuple(column for column in _ALL if column.required and column.name in columns)
+    return tuple(column for column in _COLUMNS if column.required and column.name in columns)
 
 
 def drive_numbers(columns: Columns) -> Int[np.ndarray, " rows"]:
@@ -282,42 +238,39 @@ def _fill_errors_of_repeats(columns: Columns) -> list[str]:
     return remarks
 
 
-def _check_rows(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
+def _check_rows(columns: Columns, form: Form, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
     """Check the numbers of a table.
 
     Args:
         columns: the columns by name, NaN where nothing was measured.
+        form: what the table is to be.
         lines: the number of each row's line, for the messages.
         faults: where the faults are noted.
 
     Raises:
         TableError: with the first fault: of impossible numbers, else of what must or must not stand together.
     """
-    tapping = "free_amplitude_nm" in columns
-    form = TAPPING if tapping else TABLE
-    for name in form.names:
-        if name in columns:
-            form.check_numbers(name, columns[name], lines, faults)
+    for name in columns:
+        form.check_numbers(name, columns[name], lines, faults)
     faults.raise_any()
     blank = {name: np.isnan(values) for name, values in columns.items()}
     for column in required(columns):
         faults.add_rows(blank[column.name], "is blank; every row needs it", lines, column.name)
-    if tapping and "order" in columns:
+    if form is TAPPING:
         message = "must be 1 where the cantilever is driven: amplitude and lag are read at the drive's frequency"
         faults.add_rows(columns["order"] > 1.0, f"{message}; remove the row", lines, "order")
-    for column in MEASURED:
-        if column.name in blank and column.error in blank:
-            mend = f"fill {column.error} in" + _OR_NOISE * column.amplitude
-            without, alone = blank[column.error] & ~blank[column.name], blank[column.name] & ~blank[column.error]
-            faults.add_rows(without, f"the value has no error; {mend}", lines, column.name)
-            message = f"the error has no value; fill {column.name} in or clear this cell"
-            faults.add_rows(alone, message, lines, column.error)
-    present = [column for column in AMPLITUDES if column.name in blank]
-    # An error without its value has been noted already.
-    empty = np.all([blank[name] for one in present for name in (one.name, one.error) if name in blank], axis=0)
-    unseen = columns.get("no_orbit", np.zeros(len(lines))) == 1.0
-    message = f"the row has no amplitude; fill {' or '.join(one.name for one in present)} in or remove the row"
-    message += ", or set no_orbit to 1 if the tip settled on no orbit there" if "no_orbit" in blank else ""
+    present = [column for column in MEASURED if column.name in columns]
+    for column in present:
+        value, error = blank[column.name], blank[str(column.error)]
+        mend = f"fill {column.error} in" + _OR_NOISE * column.amplitude
+        faults.add_rows(error & ~value, f"the value has no error; {mend}", lines, column.name)
+        faults.add_rows(value & ~error, "the error has no value; fill it in or clear this cell", lines, column.error)
+    amplitudes = [column.name for column in present if column.amplitude]
+    empty, unseen = np.all([blank[name] for name in amplitudes], axis=0), np.zeros(len(lines), bool)
+    message = f"the row has no amplitude; fill {' or '.join(amplitudes)} in or remove the row"
+    if "no_orbit" in columns:
+        unseen = columns["no_orbit"] == 1.0
+        message += ", or set no_orbit to 1 if the tip settled on no orbit there"
     faults.add_rows(empty & ~unseen, message, lines)
     faults.add_rows(~empty & unseen, "the row has an amplitude; clear it or set no_orbit to 0", lines, "no_orbit")
     faults.raise_any()
@@ -377,7 +330,7 @@ class AmplitudeTable(Result):
     free_frequency_khz: float
     free_frequency_error_khz: float | None = None
     drive: str = "sample"
-    order: Int[np.ndarray, " orders"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    order: Real[np.ndarray, " orders"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     drive_amplitude_nm: Float[np.ndarray, " rows"] | None = None
     free_amplitude_nm: Float[np.ndarray, " rows"] | None = None
     peak_amplitude_nm: Float[np.ndarray, " rows"] | None = None
@@ -407,25 +360,27 @@ class AmplitudeTable(Result):
         rows = np.size(self.drive_frequency_khz)
         own = len(self.lines) == rows
         faults = Faults(self.source, place="line" if own else "row")
-        if self.drive not in FORMS:
-            faults.add(f"drive must be one of {', '.join(FORMS)}, but is {self.drive!r}")
-            faults.raise_any()
-        if self.phase_sense not in {"", *PHASE_SENSES}:
-            faults.add(f"phase_sense must be one of {', '.join(PHASE_SENSES)}, but is {self.phase_sense!r}")
+        for name, choices in (("drive", DRIVES), ("phase_sense", ("", *PHASE_SENSES))):
+            if getattr(self, name) not in choices:
+                faults.add(f"{name} must be one of {', '.join(filter(None, choices))}, but is {getattr(self, name)!r}")
+        faults.raise_any()
         columns = columns_of(self)
-        if self.drive != "sample" and np.size(self.order) == 0:
+        if self.tapping and np.size(self.order) == 0:
             columns["order"] = np.ones(rows)
-        lines = self.lines if own else np.arange(1, rows + 1)
+        lines = np.array(self.lines if own else np.arange(1, rows + 1), dtype=np.int64)
+        check_names(list(columns), self.form, faults)
         columns = {name: column_of(name, values, rows, faults) for name, values in columns.items()}
-        _check_pairs(columns, self.form, faults)
+        for column in MEASURED:
+            if (column.name in columns) != (column.error in columns):
+                faults.add(f"{column.name} and {column.error} come together; give both or none")
         _check_header(self, faults)
         faults.raise_any()
-        _check_rows(columns, np.asarray(lines), faults)
+        _check_rows(columns, self.form, lines, faults)
         if self.mass_ng is None and self.spring_constant_n_per_m is not None:
             mass = effective_mass_ng(self.spring_constant_n_per_m, self.free_frequency_khz)
             object.__setattr__(self, "mass_ng", float(mass))
         columns["order"] = columns["order"].astype(np.int64)
-        for name, values in (columns | {"lines": np.array(lines, dtype=np.int64)}).items():
+        for name, values in (columns | {"lines": lines}).items():
             values.setflags(write=False)
             object.__setattr__(self, name, values)
 
@@ -441,23 +396,17 @@ class AmplitudeTable(Result):
         Raises:
             TableError: if a value is impossible, a column is not known or missing.
         """
-        faults = Faults(str(header.get("source", "data frame")), place="row")
-        names = {column.name for column in _ALL}
-        own = {field.name for field in fields(cls)} - {*names, "lines"}
+        own = {field.name for field in fields(cls)}
         known: dict[str, Any] = {"source": "data frame"}
         known |= {name: value for name, value in frame.attrs.items() if name in own} | header
-        form = FORMS.get(known.get("drive", "sample"), TABLE)
-        columns: dict[str, Any] = {name: np.asarray(frame[name], np.float64) for name in form.names if name in frame}
-        for name in frame.columns:
-            if name not in (*form.names, "lines"):
-                faults.add(f"there is no column {name!r}; leave it out, or choose from {', '.join(form.names)}")
-        needed = (column.name for column in form.columns if column.required and column.needed)
-        for name in ("free_frequency_khz", *needed):
-            if name not in known and name not in columns:
-                how = f"in `frame.attrs`, or as {name}=... to AmplitudeTable.from_dataframe"
-                faults.add(f"{name} is missing; give it {how if name in own else 'as a column'}")
+        names = [name for name in frame.columns if name != "lines"]
+        faults = Faults(str(known["source"]), place="row")
+        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), faults)
+        if "free_frequency_khz" not in known:
+            how = "as free_frequency_khz=... to AmplitudeTable.from_dataframe"
+            faults.add(f"free_frequency_khz is missing; give it in `frame.attrs`, or {how}")
         faults.raise_any()
-        return _completed(columns, np.arange(1, len(frame) + 1), known, noise, faults)
+        return _completed({name: np.asarray(frame[name], np.float64) for name in names}, known, noise, faults)
 
     @property
     def rows(self) -> int:
@@ -504,22 +453,6 @@ class AmplitudeTable(Result):
         return self.phase_deg, self.phase_error_deg
 
 
-def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], form: Form, faults: Faults) -> None:
-    """Note columns of the other form, missing ones, values or errors without the other, and no amplitudes at all."""
-    for name in columns:
-        if name in form.strange:
-            faults.add(form.strange[name], column=name)
-    for column in form.columns:
-        if column.required and column.name not in columns:
-            faults.add("is missing; give it", column=column.name)
-    for column in MEASURED:
-        if (column.name in columns) != (column.error in columns):
-            faults.add(f"{column.name} and {column.error} come together; give both or none")
-    amplitudes = [column.name for column in form.columns if column.amplitude]
-    if not any(name in columns for name in amplitudes):
-        faults.add(f"there is no amplitude; give {' or '.join(amplitudes)}")
-
-
 def _check_header(table: AmplitudeTable, faults: Faults) -> None:
     for name in _CANTILEVER:
         value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
@@ -528,7 +461,7 @@ def _check_header(table: AmplitudeTable, faults: Faults) -> None:
                 faults.add(f"{ERROR_OF[name]} stands without {name}; give both or none")
         elif fault := fault_in_number(SETTINGS[name], value, error):
             faults.add(f"{name} {fault}")
-    if table.spring_constant_n_per_m is not None and table.mass_ng is not None and faults.count == 0:
+    if table.spring_constant_n_per_m is not None and table.mass_ng is not None and not faults.found:
         wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
         if wrong is not None:
             faults.add(wrong)
@@ -598,26 +531,31 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     """
     faults = Faults(source)
     if noise is not None and not 0.0 < noise < 1.0:
-        faults.fail(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+        faults.add(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
     settings, remarks, rows = read_comments(text, SETTINGS, faults)
-    header = _header_of(settings, remarks, faults)
-    columns, lines = read_rows(rows, FORMS[header["drive"]], faults)
-    return _completed(columns, lines, header | {"source": source, "lines": lines}, noise, faults, head=rows[0][0])
+    if "free_frequency_khz" not in settings:
+        example = SETTINGS["free_frequency_khz"].line
+        faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
+    header: dict[str, Any] = {
+        "rows_in_order_of_time": "rows" in settings,
+        "calibration": {key: settings[key] for key in CALIBRATION if key in settings},
+    }
+    for name in ("drive", "phase_sense", *_CANTILEVER):
+        if name in settings:
+            header[name], error = settings[name]
+            header |= {ERROR_OF[name]: error} if name in ERROR_OF else {}
+    columns, lines = read_rows(rows, FORMS[header.get("drive", "sample")], faults)
+    header |= {"source": source, "lines": lines, "remarks": remarks}
+    return _completed(columns, header, noise, faults, head=rows[0][0])
 
 
 def _completed(
-    columns: Columns,
-    lines: Int[np.ndarray, " rows"],
-    header: dict[str, Any],
-    noise: float | None,
-    faults: Faults,
-    head: int = 0,
+    columns: Columns, header: dict[str, Any], noise: float | None, faults: Faults, head: int = 0
 ) -> AmplitudeTable:
     """Return a table of columns, with the errors that noise and repeated readings give.
 
     Args:
         columns: by name, NaN where nothing was measured; changed in place.
-        lines: of the rows, for messages.
         header: the other attributes of the table.
         noise: relative noise of amplitudes without an error.
         faults: where faults are noted.
@@ -626,23 +564,20 @@ def _completed(
     Raises:
         TableError: as `read_table`.
     """
-    for column in AMPLITUDES if noise is not None else ():
-        if column.name in columns:
+    faults.raise_any()
+    for column in MEASURED if noise is not None else ():
+        if column.amplitude and column.name in columns:
             values, error = columns[column.name], str(column.error)
             errors = columns.get(error, np.full(len(values), np.nan))
-            # an impossible amplitude is at fault itself
-            possible = np.isfinite(values) & (values > 0.0)
-            columns[error] = np.where(np.isnan(errors) & possible, (noise or 0.0) * values, errors)
+            columns[error] = np.where(np.isnan(errors), (noise or 0.0) * values, errors)
     repeats = _fill_errors_of_repeats(columns)
     for column in MEASURED:
         if column.name in columns and column.error not in columns:
             hint = f"add the column {column.error}" + _OR_NOISE * column.amplitude
             hint += f", or repeat readings: {LEAST_REPEATS} repeats tell them"
             faults.add(f"has no errors; {hint}", line=head, column=column.name)
-    _check_rows(columns, lines, faults)
+    faults.raise_any()
     attributes: dict[str, Any] = {**header, **columns, "remarks": (*header.get("remarks", ()), *repeats)}
-    if "order" in columns:
-        attributes["order"] = columns["order"].astype(np.int64)
     return AmplitudeTable(**attributes)
 
 
@@ -666,15 +601,12 @@ def write_table(table: TableLike, path: str | Path) -> None:
 
 def csv_of(table: AmplitudeTable) -> str:
     """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
-    spring = table.spring_constant_n_per_m
-    of_spring = None if spring is None else effective_mass_ng(spring, table.free_frequency_khz)
     lines = [f"# drive = {table.drive}"] if table.tapping else []
     for name in _CANTILEVER:
         value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
         if name == "quality_factor" and value is None:
             lines.append("# quality_factor = none")
-        # the spring constant says its mass
-        elif value is not None and not np.isnan(value) and not (name == "mass_ng" and value == of_spring):
+        elif value is not None and not np.isnan(value):
             lines.append(setting_line(name, float(value), error and float(error)))
     known = {name: table.calibration[name] for name in CALIBRATION if name in table.calibration}
     lines += [setting_line(name, float(value), float(error)) for name, (value, error) in known.items()]

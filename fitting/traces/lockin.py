@@ -293,17 +293,15 @@ def _why_not_periodic(found: LockinResult) -> str | None:
 
 TRACE = Form(
     (
-        Column("time_us", "us", kind="number", needed="time"),
+        Column("time_us", kind="number", needed="time"),
         Column("time_ms", kind="number", meaning="time_us", needed="time", convert=lambda ms: 1e3 * ms),
         Column("time_s", kind="number", meaning="time_us", needed="time", convert=lambda s: 1e6 * s),
-        Column("deflection_nm", "nm", kind="number", needed="deflection"),
+        Column("deflection_nm", kind="number", needed="deflection"),
         Column("position_nm", kind="number", meaning="deflection_nm", needed="deflection"),
     ),
     "sample",
     open=True,
-    example="time_us,deflection_nm",
     separator="",
-    mend="cut the trace there or repair it",
 )
 SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180", unit="kHz")}
 
