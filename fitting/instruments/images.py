@@ -19,7 +19,7 @@ from jaxtyping import Float
 from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import LARGEST_BYTES
 from fitting.instruments.columns import ColumnSource, checked_unit, parse_columns
-from fitting.instruments.formats import NANOSURF_KEYS, gwyddion_objects, igor_wave, is_igor
+from fitting.instruments.formats import gwyddion_objects, igor_wave, is_igor
 from fitting.instruments.recording import (
     UNITS,
     Known,
@@ -251,4 +251,4 @@ def _of_fields(fields: Iterable[_Field], name: str) -> _Images:
         sides = sides or (float(size[0]), float(size[1]))
     if not channels:
         raise TableError(f"{name}: holds no image; a curve is for `afm-jax tapping`")
-    return _Images(channels, settings, known_from(settings, NANOSURF_KEYS), sides)
+    return _Images(channels, settings, known_from(settings), sides)

@@ -132,38 +132,37 @@ def number_in(text: str) -> tuple[float, str] | None:
     return float(match[0]), unit_named(match.string[match.end() :])
 
 
-HEADER_KEYS = {
-    "free_frequency_khz": "kHz",
-    "drive_frequency_khz": "kHz",
-    "quality_factor": "",
-    "spring_constant_n_per_m": "N/m",
-    "free_amplitude_nm": "nm",
-    "deflection_nm_per_volt": "nm/V",
-    "nm_per_volt": "nm/V",
-    "averages": "",
+_DRIVE = "Oscillation Control>Center Frequency (Hz)|Conversion Offset 00|Tip Frequency|Vibration freq."
+_HEADER = {
+    "free_frequency_khz": ("kHz", "Hz", "f_res (Hz)|f0 (Hz)|Resonance frequency|Frequency:|ThermalFrequency"),
+    "drive_frequency_khz": ("kHz", "Hz", f"{_DRIVE}|Excitation frequency|DriveFrequency"),
+    "quality_factor": ("", "", "Q|Quality factor (Q)|Q Factor:|ThermalQ"),
+    "spring_constant_n_per_m": ("N/m", "N/m", "Force constant|Spring Constant:|SpringConstant"),
+    "free_amplitude_nm": ("nm", "", ""),
+    "deflection_nm_per_volt": ("nm/V", "m/V", "InvOLS"),
+    "nm_per_volt": ("nm/V", "m/V", "AmpInvOLS"),
+    "averages": ("", "", "Averages"),
 }
-"""What headers say that matters here, and its unit."""
+"""What headers say that matters here: its unit, the one where a text holds none, and its names in all formats; by its
+own name it stands in its own unit."""
 
 
-def known_from(
-    header: Mapping[str, str], keys: Mapping[str, tuple[str, str]], where: str = "header"
-) -> dict[str, Known]:
+def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Known]:
     """Return what the lines of a header say of the measurement, in this package's units.
 
     Args:
         header: texts by the names that the file gives them.
-        keys: for names in the file the key of `HEADER_KEYS` and the unit where the text holds none.
         where: what the place is called: "header" or "note".
     """
     found = {}
-    for name, (key, unit) in keys.items():
-        said = number_in(header.get(name, ""))
-        if said is None or not said[0] > 0.0:
-            continue
-        quantity, factor = UNITS.get(said[1] or unit, ("", 1.0))
-        if quantity == quantity_of(HEADER_KEYS[key]):
-            # twelve digits: a change of unit must not add others
-            found[key] = Known(float(f"{said[0] * factor:.12g}"), HEADER_KEYS[key], f"{where}: {name}")
+    for key, (own_unit, usual, names) in _HEADER.items():
+        for name in (key, *names.split("|")):
+            said = number_in(header.get(name, ""))
+            if said is not None and said[0] > 0.0:
+                quantity, factor = UNITS.get(said[1] or (own_unit if name == key else usual), ("", 1.0))
+                if quantity == quantity_of(own_unit):
+                    # twelve digits: a change of unit must not add others
+                    found[key] = Known(float(f"{said[0] * factor:.12g}"), own_unit, f"{where}: {name}")
     return found
 
 
