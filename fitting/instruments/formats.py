@@ -1,7 +1,7 @@
 """One parser for each format of file that instruments write; which one a file is its content says, not its name.
 
-Text (neaSNOM, Nanonis, separated), WSxM curves and NanoSurf .nid are read here; Asylum's .ibw by the package igor2 and
-Gwyddion's .gwy by gwyfile (`pip install afm-jax[instruments]`), imported only for such a file.
+Text (neaSNOM, Nanonis, separated), WSxM curves and NanoSurf .nid are read here; Asylum's .ibw by the package igor2
+(`pip install afm-jax[instruments]`), imported only for such a file.
 """
 
 import io
@@ -58,8 +58,9 @@ def read_recording(path: str | Path) -> Recording:
     data = read_bytes(path, "one file")
     if not data.strip():
         raise TableError(f"{name}: the file is empty; copy it again from the instrument")
-    if data.startswith(b"\x93NUMPY") or (data.startswith(b"PK") and b".npy" in data[:4096]):
-        raise TableError(f"{name}: holds NumPy's arrays, no curve; energies of images: afm-jax tapping-map")
+    if data.startswith((b"\x93NUMPY", b"GWYP")) or (data.startswith(b"PK") and b".npy" in data[:4096]):
+        what = "arrays of NumPy or data of Gwyddion, no curve as text; export a graph as text"
+        raise TableError(f"{name}: holds {what}; energies of images: afm-jax tapping-map")
     parse = parse_igor if is_igor(data, str(path)) else parse_text
     parse = next((parser for mark, parser in MARKS.items() if data.startswith(mark)), parse)
     with damaged_as_one_line(name):
@@ -88,7 +89,7 @@ def parse_text(data: bytes, name: str) -> Recording:
     Nanonis writes `[DATA]`, and names with "[bwd]" for the way back. neaSNOM's comments are `key: [unit] values`; its
     columns carry no units.
     """
-    wrong = "is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, Nanonis .dat, Gwyddion .gwy, "
+    wrong = "is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, Nanonis .dat, "
     comments, rows = split_lines(text_of(data, name, f"{wrong}CSV); export it as CSV", latin=True))
     start = next((number for number, line in rows if line.strip() == "[DATA]"), 0)
     head = [line for number, line in rows if number < start] or [comment for _, comment in comments]
@@ -226,9 +227,14 @@ def _wsxm_header(data: bytes, start: int, name: str) -> tuple[dict[str, str], in
     end = data.find(_WSXM_END, start)
     if end < 0:
         raise cut_off(name, f"no '[Header end]' behind byte {start}")
-    lines = data[start:end].decode("latin-1").split("\r\n")
-    pairs = [line.partition(":") for line in lines if ":" in line]
-    return {key.strip(): value.strip() for key, _, value in pairs}, end + len(_WSXM_END)
+    return _settings(data[start:end], ":"), end + len(_WSXM_END)
+
+
+def _settings(head: bytes, sign: str) -> dict[str, str]:
+    """Return what lines of keys and values say, which a sign parts."""
+    lines = re.split("[\r\n]+", head.decode("latin-1"))
+    pairs = [line.partition(sign) for line in lines if sign in line]
+    return {key.strip(): value.strip() for key, _, value in pairs}
 
 
 def parse_nanosurf(data: bytes, name: str) -> Recording:
@@ -236,53 +242,37 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     mark = data.find(b"#!")
     if mark < 0:
         raise cut_off(name, "the mark '#!' in front of the data is missing")
-    sections = _nid_sections(data[:mark].decode("latin-1"))
+    found = re.split(rb"(?m)^\[(.*)\]\r?$", data[:mark])
+    sections = [(title, _settings(head, "=")) for title, head in zip(found[1::2], found[2::2], strict=True)]
     # of a name the first
     header = {key: value for _, keys in reversed(sections) for key, value in keys.items()}
-    sets = [keys for title, keys in sections if re.fullmatch(r"DataSet-\d+:\d+", title)]
+    sets = [keys for title, keys in sections if re.fullmatch(rb"DataSet-\d+:\d+", title)]
     sizes = [int(keys["Points"]) * int(keys["Lines"]) * (int(keys["SaveBits"]) // 8) for keys in sets]
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
         raise cut_off(name, f"the header announces {sum(sizes)} bytes of data, {len(data) - mark - 2} are there")
-    starts = mark + 2 + np.cumsum([0, *sizes])
     branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": "", "Spectrum Fit": ""}
     parts: dict[tuple[int, str], dict[str, Any]] = {}
     units: dict[str, str] = {}
-    for keys, (start, end) in zip(sets, pairwise(starts.tolist()), strict=True):
+    ends = mark + 2 + np.cumsum(sizes)
+    for keys, size, end in zip(sets, sizes, ends.tolist(), strict=True):
         frame = keys.get("Frame", "")
         if frame in branches:
             ending = " (vendor's fit)" if frame == "Spectrum Fit" else ""
-            axis, channel = keys["Dim0Name"], keys["Dim2Name"] + ending
+            axis, channel = printable(keys["Dim0Name"]), printable(keys["Dim2Name"] + ending)
             units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
-            for line, (at, numbers) in enumerate(_nid_lines(keys, data[start:end])):
-                channels = parts.setdefault((line + 1, branches[frame]), {})
-                channels.setdefault(axis, at)
-                channels[channel] = numbers
+            for line, (at, numbers) in enumerate(_nid_lines(keys, data[end - size : end]), start=1):
+                parts.setdefault((line, branches[frame]), {axis: at})[channel] = numbers
     if not parts:
         frames = ", ".join(dict.fromkeys(keys.get("Frame", "?") for keys in sets)) or "none"
-        raise TableError(
-            f"{name}: holds no curve and no spectrum, but {frames}; export the spectroscopy data; energies of images: "
-            "afm-jax tapping-map"
-        )
+        mend = "export the spectroscopy data; energies of images: afm-jax tapping-map"
+        raise TableError(f"{name}: holds no curve and no spectrum, but {frames}; {mend}")
     known = known_from(header)
     warm = number_in(header.get("Cantilever temperature", ""))
     if warm is not None and -100.0 < warm[0] < 500.0:
-        known["temperature_k"] = Known(
-            warm[0] + 273.15, "K", "header: Cantilever temperature, taken in degrees Celsius"
-        )
+        origin = "header: Cantilever temperature, taken in degrees Celsius"
+        known["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
     return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
-
-
-def _nid_sections(text: str) -> list[tuple[str, dict[str, str]]]:
-    """Return the sections in order, each with its keys."""
-    sections: list[tuple[str, dict[str, str]]] = []
-    for line in text.split("\r\n"):
-        if line.startswith("[") and line.endswith("]"):
-            sections.append((line[1:-1], {}))
-        elif sections and "=" in line:
-            key, _, value = line.partition("=")
-            sections[-1][1].setdefault(key, value)
-    return sections
 
 
 def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -297,7 +287,7 @@ def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, 
         yield low + width * np.arange(used) / max(used - 1, 1), numbers[:used].copy()
 
 
-# ---- Igor and Gwyddion
+# ---- Igor
 
 
 _IGOR_UNITS = {"amp": "m", "defl": "m", "zsnsr": "m", "raw": "m", "lvdt": "m", "phase": "deg", "phas": "deg"}
@@ -320,8 +310,7 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
     labels = _igor_labels(data, wave["bin_header"], min(numbers.ndim - 1, 2))
-    note = bytes(wave["note"]).decode("latin-1").replace("\r", "\n")
-    header = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in note.split("\n") if ":" in line)}
+    header = _settings(bytes(wave["note"]), ":")
     known = known_from(header, "note")
     phase, said = (number_in(header.get(f"FreeAir{what}", "")) for what in ("Phase", "Amplitude"))
     if phase is not None:
@@ -382,43 +371,5 @@ def parse_igor(data: bytes, name: str) -> Recording:
     )
 
 
-def gwyddion_objects(data: bytes, name: str) -> Mapping[str, Any]:
-    """Return the components of a Gwyddion file.
-
-    Raises:
-        TableError: if the package that reads it is missing; the line names the extra.
-    """
-    package = package_for("gwyfile.objects", "instruments", f"{name}: .gwy files")
-    return package.GwyObject.frombuffer(data[len(b"GWYP") :])
-
-
-def parse_gwyddion(data: bytes, name: str) -> Recording:
-    """Read the graphs of a Gwyddion file: every curve is a channel over the height, which is the channel Z."""
-    content = gwyddion_objects(data, name)
-    graphs = [value for key, value in sorted(content.items()) if "/graph/graph/" in key and "curves" in value]
-    if not graphs:
-        if any(key.endswith("/data") for key in content):
-            raise TableError(f"{name}: holds images; their energies: afm-jax tapping-map")
-        raise TableError(f"{name}: holds no graph; copy the curve into a graph in Gwyddion and save again")
-    units: dict[str, str] = {}
-    parts: list[dict[str, Any]] = []
-    for graph in graphs:
-        sides = {side: unit_named(str(graph.get(f"{side}_unit", {}).get("unitstr", ""))) for side in "xy"}
-        for curve in graph["curves"]:
-            label = str(curve.get("description") or graph.get("title") or "curve")
-            at, numbers = (np.array(curve[side], dtype=float) for side in ("xdata", "ydata"))
-            if at.shape != numbers.shape:
-                raise cut_off(name, f"the curve {label!r} has {at.size} heights for {numbers.size} numbers")
-            units |= {"Z": sides["x"], label: sides["y"]}
-            same = (part for part in parts if np.array_equal(part["Z"], at) and label not in part)
-            part = next(same, None)
-            if part is None:
-                part = {"Z": at}
-                parts.append(part)
-            part[label] = numbers
-    segments = tuple(Segment(k + 1, "", part) for k, part in enumerate(parts))
-    return Recording("Gwyddion graphs", name, segments, units)
-
-
-MARKS = {b"WSxM file": parse_wsxm, b"GWYP": parse_gwyddion, b"[DataSet]": parse_nanosurf}
+MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf}
 """Formats by what their files begin with."""

@@ -17,30 +17,18 @@ from jaxtyping import Float
 from afm_jax.scenefile.tables import printable
 from fitting.tables.csv_text import NUMBER, TableError
 
-UNITS = {
-    "m": ("length", 1e9),
-    "mm": ("length", 1e6),
-    "um": ("length", 1e3),
-    "nm": ("length", 1.0),
-    "pm": ("length", 1e-3),
-    "V": ("voltage", 1.0),
-    "mV": ("voltage", 1e-3),
-    "deg": ("angle", 1.0),
-    "rad": ("angle", 180.0 / np.pi),
-    "Hz": ("frequency", 1e-3),
-    "kHz": ("frequency", 1.0),
-    "MHz": ("frequency", 1e3),
-    "N": ("force", 1e9),
-    "nN": ("force", 1.0),
-    "N/m": ("stiffness", 1.0),
-    "m/V": ("sensitivity", 1e9),
-    "nm/V": ("sensitivity", 1.0),
-    "m/sqrt(Hz)": ("spectrum", 1e9),
-    "nm/sqrt(Hz)": ("spectrum", 1.0),
-    "pm/sqrt(Hz)": ("spectrum", 1e-3),
-    "fm/sqrt(Hz)": ("spectrum", 1e-6),
-    "V/sqrt(Hz)": ("voltage spectrum", 1.0),
+_SIZES = {
+    "length": {"m": 1e9, "mm": 1e6, "um": 1e3, "nm": 1.0, "pm": 1e-3},
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
+    "frequency": {"Hz": 1e-3, "kHz": 1.0, "MHz": 1e3},
+    "force": {"N": 1e9, "nN": 1.0},
+    "stiffness": {"N/m": 1.0},
+    "sensitivity": {"m/V": 1e9, "nm/V": 1.0},
+    "spectrum": {"m/sqrt(Hz)": 1e9, "nm/sqrt(Hz)": 1.0, "pm/sqrt(Hz)": 1e-3, "fm/sqrt(Hz)": 1e-6},
+    "voltage spectrum": {"V/sqrt(Hz)": 1.0},
 }
+UNITS = {unit: (quantity, size) for quantity, sizes in _SIZES.items() for unit, size in sizes.items()}
 """What a unit measures, and its size in this package's unit: nm, V, degrees, kHz, nN, N/m, nm/V, nm per root Hz."""
 _SPELLINGS = {"µm": "um", "μm": "um", "°": "deg", "Deg": "deg", "degrees": "deg", "m/√Hz": "m/sqrt(Hz)"}
 
