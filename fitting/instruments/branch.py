@@ -146,26 +146,21 @@ def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " ro
 def _change(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"]) -> float | None:
     """Return by how much the amplitude falls over the farthest quarter of the rows, of it; None where it is flat."""
     rows = max(len(values) // 4, min(len(values), _FEWEST))
-    far, place = values[:rows], offset[:rows]
-    if rows < 4 or np.ptp(place) == 0.0:
+    far, line = values[:rows], _line(offset[:rows], values[:rows])
+    if rows < 4 or line is None:
         return None
-    place = (place - place.mean()) / np.ptp(place)
-    (slope, _), covariance = np.polyfit(place, far, 1, cov=True)
-    change = float(slope) / float(np.median(far))
-    steep = abs(change) > _SLOPING and abs(slope) > 5.0 * float(np.sqrt(covariance[0, 0]))
+    slope, error, scatter = line
+    change = slope * float(np.ptp(offset[:rows]) / np.median(far))
     # a step is a jump of the free amplitude, not a fall
-    of_line = float(np.sum((far - far.mean() - slope * place) ** 2))
     of_step = min(float(np.var(far[:k]) * k + np.var(far[k:]) * (rows - k)) for k in range(1, rows))
-    return change if steep and of_line < of_step else None
+    falls = abs(change) > _SLOPING and abs(slope) > 5.0 * error and scatter**2 * (rows - 2) < of_step
+    return change if falls else None
 
 
 def _scatter(values: Float[np.ndarray, " rows"]) -> float:
     """Return the standard deviation about a straight line: a drift is none, correlated noise counts."""
-    if len(values) < 4:
-        return 0.0
-    place = np.linspace(-1.0, 1.0, len(values))
-    misfit = values - np.polyval(np.polyfit(place, values, 1), place)
-    return float(np.sqrt(np.sum(misfit**2) / (len(values) - 2)))
+    line = _line(np.arange(len(values), dtype=float), values) if len(values) > 3 else None
+    return 0.0 if line is None else line[2]
 
 
 def _contact(values: Float[np.ndarray, " rows"], level: float, scatter: float) -> tuple[int, int]:
