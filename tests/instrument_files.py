@@ -62,17 +62,3 @@ def nanonis_ramp() -> str:
     rows = zip(-1e-9 * offset, 1e-9 * amplitude, lag, 1e-9 * amplitude, lag, strict=True)
     lines = ["Experiment\tZ spectroscopy\t", "f0 (Hz)\t90000\t", "", "[DATA]", "\t".join(names)]
     return "\n".join([*lines, *("\t".join(f"{cell:.9E}" for cell in row) for row in rows)]) + "\n"
-
-
-def gwyddion_bytes() -> bytes:
-    """Return a Gwyddion file with two graphs of `tapping_rows`, as the package gwyfile writes them."""
-    gwyfile = pytest.importorskip("gwyfile.objects")
-    offset, amplitude, lag = tapping_rows()
-    content = gwyfile.GwyContainer()
-    for number, (title, unit, numbers) in enumerate((("Amplitude", "m", 1e-9 * amplitude), ("Phase", "deg", lag))):
-        data = {"xdata": 1e-9 * offset, "ydata": numbers, "description": title}
-        curve = gwyfile.GwyObject("GwyGraphCurveModel", data)
-        units = {f"{side}_unit": gwyfile.GwySIUnit(unitstr=one) for side, one in (("x", "m"), ("y", unit))}
-        graph = gwyfile.GwyObject("GwyGraphModel", {"title": title, "curves": [curve], **units}, {"curves": "O"})
-        content[f"/0/graph/graph/{number + 1}"] = graph
-    return b"GWYP" + content.serialize()

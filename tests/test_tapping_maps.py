@@ -313,7 +313,7 @@ def written(folder: Path, kind: str) -> list[Path]:
 
 @pytest.mark.parametrize("kind", ["npz", "npy", "csv", "ibw", "gwy", "nid"])
 def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
-    if kind == "nid":
+    if kind in {"gwy", "nid"}:
         pytest.importorskip("gwyddionpy")
     amplitude, lag, _ = image()
     found = read_images(*written(tmp_path, kind))
@@ -430,7 +430,7 @@ def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path)
         ("sizes.npz", "must be rows of one size"),
         ("volts.npz", "give --nm-per-volt NM"),
         ("ragged.csv", "cannot be read (ValueError: the number of columns changed"),
-        ("cut.gwy", "damaged or cut off"),
+        ("cut.gwy", "gwyddionpy does not read it"),
     ):
         result = run(tmp_path / name, *CALL, "13.4")
         assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1), name
@@ -440,7 +440,7 @@ def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path)
             ["tapping-map", stored],
             "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM --free-phase-deg DEGREES",
         ),
-        (["read", tmp_path / "image.gwy"], "holds images; their energies: afm-jax tapping-map"),
+        (["read", tmp_path / "image.gwy"], "energies of images: afm-jax tapping-map"),
         (["tapping", stored], "energies of images: afm-jax tapping-map"),
     ):
         result = CliRunner().invoke(main, [str(word) for word in call])

@@ -6,8 +6,6 @@ free tip, because the height does. Where the farther free bins scatter about a s
 errors (noise that is not independent from row to row), all errors are multiplied by that.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -22,50 +20,25 @@ _ONE_RAMP = 0.1
 """Share of a branch's rows that the rows of a bin may be spread over, for the bins to be in the order of time."""
 
 
-class Binned(NamedTuple):
-    """Rows of a table, in the order of time where that is known; arrays of shape (bins,).
-
-    Attributes:
-        offset_nm: mean height of a bin's readings.
-        readings: mean of every quantity, by name.
-        errors: standard error of each mean, by name.
-        rows: number of readings.
-        branch: "approach" or "retract".
-        in_order_of_time: whether the bins stand as they were passed.
-    """
-
-    offset_nm: Float[np.ndarray, " bins"]
-    readings: dict[str, Float[np.ndarray, " bins"]]
-    errors: dict[str, Float[np.ndarray, " bins"]]
-    rows: Int[np.ndarray, " bins"]
-    branch: np.ndarray
-    in_order_of_time: bool
+def ways_of(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> dict[str, Float[np.ndarray, " some"]]:
+    """Return the heights of each branch, in the order of the rows."""
+    return {name: offset_nm[branch == name] for name in dict.fromkeys(branch.tolist())}
 
 
 def faults_of_order(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> tuple[int, int]:
     """Return how many rows repeat a height of their branch, and how many step back against its direction."""
-    repeated = back = 0
-    for name in dict.fromkeys(branch.tolist()):
-        heights = offset_nm[branch == name]
-        steps = np.diff(heights) * np.sign(heights[-1] - heights[0])
-        repeated += len(heights) - len(np.unique(heights))
-        back += int(np.sum(steps < 0.0))
-    return repeated, back
+    ways = ways_of(offset_nm, branch).values()
+    back = sum(int(np.sum(np.diff(way) * np.sign(way[-1] - way[0]) < 0.0)) for way in ways)
+    return sum(len(way) - len(np.unique(way)) for way in ways), back
 
 
-def usual_width(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> float | None:
-    """Return the width in nm of bins for a curve whose heights repeat or are not in order, None for others.
+def usual_width(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> float:
+    """Return the width in nm of bins for a curve whose heights repeat or are not in order.
 
     The width is that of five rows, or of a 200th of them; 0 (only rows of equal height are merged) for few rows.
     """
-    if not any(faults_of_order(offset_nm, branch)):
-        return None
-    widths = []
-    for name in dict.fromkeys(branch.tolist()):
-        heights = offset_nm[branch == name]
-        if len(heights) >= _FEWEST:
-            widths.append(float(np.ptp(heights)) * max(_ROWS / len(heights), 1.0 / _MOST))
-    return max(widths, default=0.0)
+    ways = [way for way in ways_of(offset_nm, branch).values() if len(way) >= _FEWEST]
+    return max((float(np.ptp(way)) * max(_ROWS / len(way), 1.0 / _MOST) for way in ways), default=0.0)
 
 
 def binned(
@@ -75,8 +48,10 @@ def binned(
     free: Bool[np.ndarray, " rows"],
     width_nm: float,
     stated: dict[str, float],
-) -> Binned:
-    """Return the means of the readings of each bin of height, with their errors.
+) -> tuple[dict[str, np.ndarray], bool]:
+    """Return the rows of a table, a bin of height each, and whether they stand as they were passed.
+
+    A row has the mean height `offset_nm`, `rows` (how many readings), `branch`, and every reading's mean and error.
 
     Args:
         offset_nm: heights.
@@ -87,81 +62,65 @@ def binned(
         stated: standard error of a single reading, by name, where that is given instead of the scatter; with `width_nm`
             0 it is needed.
     """
-    parts: list[tuple[np.ndarray, ...]] = []
-    scatter: dict[str, list[np.ndarray]] = {name: [] for name in readings}
-    means: dict[str, list[np.ndarray]] = {name: [] for name in readings}
+    columns: dict[str, list[np.ndarray]] = {}
     in_order = True
     for name in dict.fromkeys(branch.tolist()):
         rows = np.flatnonzero(branch == name)
         rows = rows[np.argsort(offset_nm[rows], kind="stable")]
         height = offset_nm[rows]
-        if width_nm > 0.0:
-            _, place = np.unique(np.floor((height - height[0]) / width_nm), return_inverse=True)
-        else:
-            _, place = np.unique(height, return_inverse=True)
-        counts = np.bincount(place)
-
-        def mean(values: Float[np.ndarray, " some"], place=place, counts=counts) -> Float[np.ndarray, " bins"]:
-            return np.bincount(place, values) / counts
-
-        time = mean(rows.astype(float))
-        spread = np.sqrt(np.maximum(mean((rows - time[place]) ** 2.0), 0.0))
+        number = np.floor((height - height[0]) / width_nm) if width_nm > 0.0 else height
+        _, place, counts = np.unique(number, return_inverse=True, return_counts=True)
+        time = _means(place, rows.astype(float))
+        spread = np.sqrt(np.maximum(_means(place, (rows - time[place]) ** 2.0), 0.0))
         in_order &= bool(np.median(spread) <= _ONE_RAMP * len(rows) + 1.0)
-        at = mean(height)
         whole = np.bincount(place, free[rows]) == counts
         # the nearer half of the free rows may feel the sample already
         whole &= np.cumsum(whole) <= 0.5 * whole.sum()
-        order = np.arange(len(at)) if name == "approach" else np.arange(len(at))[::-1]
+        found = {"offset_nm": _means(place, height), "rows": counts, "branch": np.full(len(counts), name)}
         for key, values in readings.items():
-            bins = mean(values[rows])
-            single = np.full(len(at), stated[key]) if key in stated else _scatter(height, values[rows], place, len(at))
+            means = _means(place, values[rows])
+            single = np.full(len(counts), stated[key]) if key in stated else _scatter(height, values[rows], place)
             error = single / np.sqrt(counts)
-            if key not in stated:
-                error = error * _excess(bins[whole], error[whole], time[whole])
-            means[key].append(bins[order])
-            scatter[key].append(error[order])
-        parts.append((at[order], counts[order], np.full(len(at), name, dtype=object)))
-    offset, counts, names = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return Binned(
-        offset,
-        {key: np.concatenate(columns) for key, columns in means.items()},
-        {key: np.concatenate(columns) for key, columns in scatter.items()},
-        counts,
-        names.astype(str),
-        in_order,
-    )
+            excess = 1.0 if key in stated else _excess(means[whole], error[whole], time[whole])
+            found |= {key: means, error_of(key): excess * error}
+        for key, column in found.items():
+            columns.setdefault(key, []).append(column[:: 1 if name == "approach" else -1])
+    return {key: np.concatenate(parts) for key, parts in columns.items()}, in_order
+
+
+def error_of(name: str) -> str:
+    """Return the name of the column of errors of a reading: `phase_lag_error_deg` of `phase_lag_deg`."""
+    stem, _, unit = name.rpartition("_")
+    return f"{stem}_error_{unit}"
+
+
+def _means(place: Int[np.ndarray, " rows"], values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " bins"]:
+    """Return the mean of the values in each place."""
+    return np.bincount(place, values) / np.bincount(place)
 
 
 def _scatter(
-    height: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], place: Int[np.ndarray, " rows"], bins: int
+    height: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], place: Int[np.ndarray, " rows"]
 ) -> Float[np.ndarray, " bins"]:
     """Return the scatter of single readings about a line over the height, in each bin and its neighbours."""
     # bins of few rows are taken together
-    counts = np.bincount(place)
-    group = np.zeros(bins, dtype=int)
-    number, held = 0, 0
-    for k, count in enumerate(counts.tolist()):
-        if held >= _ROWS:
-            number, held = number + 1, 0
-        group[k] = number
-        held += count
-    if held < _ROWS and number:
-        group[group == number] = number - 1
-    of_row = group[place]
+    group, held = [0], 0
+    for count in np.bincount(place).tolist():
+        full = held >= _ROWS
+        group.append(group[-1] + full)
+        held = count + (0 if full else held)
+    last = group[-1] - (held < _ROWS and group[-1] > 0)
+    groups = np.minimum(group[1:], last)
+    of_row = groups[place]
     rows = np.bincount(of_row).astype(float)
-
-    def mean(numbers: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        return (np.bincount(of_row, numbers) / rows)[of_row]
-
-    x, y = height - mean(height), values - mean(values)
+    x, y = (numbers - _means(of_row, numbers)[of_row] for numbers in (height, values))
     # a column of one height, or of one number, has no slope
-    width = mean(x * x)
-    slope = np.where(width > 0.0, mean(x * y) / np.where(width > 0.0, width, 1.0), 0.0)
-    squares = np.bincount(of_row, (y - slope * x) ** 2)
-    free = np.maximum(rows - 2.0, 0.0)
+    width = _means(of_row, x * x)
+    slope = np.where(width > 0.0, _means(of_row, x * y) / np.where(width > 0.0, width, 1.0), 0.0)
+    squares, freedom = np.bincount(of_row, (y - slope[of_row] * x) ** 2), np.maximum(rows - 2.0, 0.0)
     window = np.ones(2 * _NEIGHBOURS + 1)
-    pooled, freedom = (np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, free))
-    return np.sqrt(pooled / np.maximum(freedom, 1.0))[group]
+    pooled, free = (np.convolve(column, window)[_NEIGHBOURS:-_NEIGHBOURS] for column in (squares, freedom))
+    return np.sqrt(pooled / np.maximum(free, 1.0))[groups]
 
 
 def _excess(

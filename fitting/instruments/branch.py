@@ -1,6 +1,6 @@
 """What the amplitudes of one branch of a curve say: the free level, its noise and jumps, contact and slope."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -30,8 +30,7 @@ _SETTLED = 3.0
 """Scatter about a line, over that of most windows, up to which a window is settled."""
 
 
-@dataclass(frozen=True)
-class ContactSlope:
+class ContactSlope(NamedTuple):
     """The steepest settled part of a branch in contact, and its line.
 
     Attributes:
@@ -49,8 +48,7 @@ class ContactSlope:
     rows: int
 
 
-@dataclass(frozen=True, eq=False)
-class BranchLook:
+class BranchLook(NamedTuple):
     """What one branch shows.
 
     Attributes:
@@ -96,7 +94,11 @@ def look_at(
     engaged = values[touching] > _DEEP * level
     near, fallen = offset[touching][engaged], values[touching][engaged]
     slope = steepest_part(near, fallen, deep=bool(values.min() < 0.5 * level))
-    onset = None if slope is None else _onset(near, fallen, slope, level)
+    onset = None
+    if slope is not None:
+        # where the line through the steepest part meets the free level
+        part = (near >= slope.from_nm) & (near <= slope.to_nm)
+        onset = float(near[part].mean() + (level - fallen[part].mean()) / slope.value)
     edge = offset[first] if first < last else np.inf
     free = offset < edge - (0.1 * (edge - offset[0]) if np.isfinite(edge) else 0.0)
     if free.sum() < _FEWEST:
@@ -144,26 +146,21 @@ def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " ro
 def _change(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"]) -> float | None:
     """Return by how much the amplitude falls over the farthest quarter of the rows, of it; None where it is flat."""
     rows = max(len(values) // 4, min(len(values), _FEWEST))
-    far, place = values[:rows], offset[:rows]
-    if rows < 4 or np.ptp(place) == 0.0:
+    far, line = values[:rows], _line(offset[:rows], values[:rows])
+    if rows < 4 or line is None:
         return None
-    place = (place - place.mean()) / np.ptp(place)
-    (slope, _), covariance = np.polyfit(place, far, 1, cov=True)
-    change = float(slope) / float(np.median(far))
-    steep = abs(change) > _SLOPING and abs(slope) > 5.0 * float(np.sqrt(covariance[0, 0]))
+    slope, error, scatter = line
+    change = slope * float(np.ptp(offset[:rows]) / np.median(far))
     # a step is a jump of the free amplitude, not a fall
-    of_line = float(np.sum((far - far.mean() - slope * place) ** 2))
     of_step = min(float(np.var(far[:k]) * k + np.var(far[k:]) * (rows - k)) for k in range(1, rows))
-    return change if steep and of_line < of_step else None
+    falls = abs(change) > _SLOPING and abs(slope) > 5.0 * error and scatter**2 * (rows - 2) < of_step
+    return change if falls else None
 
 
 def _scatter(values: Float[np.ndarray, " rows"]) -> float:
     """Return the standard deviation about a straight line: a drift is none, correlated noise counts."""
-    if len(values) < 4:
-        return 0.0
-    place = np.linspace(-1.0, 1.0, len(values))
-    misfit = values - np.polyval(np.polyfit(place, values, 1), place)
-    return float(np.sqrt(np.sum(misfit**2) / (len(values) - 2)))
+    line = _line(np.arange(len(values), dtype=float), values) if len(values) > 3 else None
+    return 0.0 if line is None else line[2]
 
 
 def _contact(values: Float[np.ndarray, " rows"], level: float, scatter: float) -> tuple[int, int]:
@@ -197,28 +194,22 @@ def steepest_part(
     if rows < 4 or np.ptp(offset) == 0.0:
         return None
     length = max(_WINDOW_NM, 5.0 * float(np.median(np.diff(offset))))
-    starts = np.searchsorted(offset, offset - length, side="left")
-    lines = [_line(offset[a : b + 1], values[a : b + 1]) for b, a in enumerate(starts.tolist()) if b - a >= 3]
-    ends = [b for b, a in enumerate(starts.tolist()) if b - a >= 3]
+    starts = np.searchsorted(offset, offset - length, side="left").tolist()
+    windows = [(a, b, _line(offset[a : b + 1], values[a : b + 1])) for b, a in enumerate(starts) if b - a >= 3]
     # windows that the far end cuts off count only where there is no whole one
-    whole = [k for k, b in enumerate(ends) if offset[b] - offset[0] >= length] or [len(ends) - 1]
-    whole = [k for k in whole if 0 <= k < len(lines) and lines[k] is not None]
-    if not whole:
-        line = _line(offset, values)
-        chosen, first = line, 0
-        last = rows
-    else:
-        slopes, errors, scatters = np.array([lines[k] for k in whole]).T
+    whole = [window for window in windows if offset[window[1]] - offset[0] >= length] or windows[-1:]
+    whole = [(a, b, line) for a, b, line in whole if line is not None]
+    chosen, first, last = _line(offset, values), 0, rows
+    if whole:
+        slopes, errors, scatters = np.array([line for *_, line in whole]).T
         settled = scatters <= _SETTLED * np.median(scatters) + 1e-12
         steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
         alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
-        end = whole[int(np.flatnonzero(alike)[-1])]
-        last = ends[end] + 1
-        first = _straight_from(offset[:last], values[:last], int(starts[ends[end]]))
-        chosen = _line(offset[first:last], values[first:last])
-        throughout = _line(offset, values)
-        if deep and chosen is not None and throughout is not None and throughout[0] < _ALIKE * chosen[0]:
-            chosen, first, last = throughout, 0, rows
+        start, end, _ = whole[int(np.flatnonzero(alike)[-1])]
+        start = _straight_from(offset[: end + 1], values[: end + 1], start)
+        part = _line(offset[start : end + 1], values[start : end + 1])
+        if not (deep and part is not None and chosen is not None and chosen[0] < _ALIKE * part[0]):
+            chosen, first, last = part, start, end + 1
     if chosen is None or not chosen[0] < -_VAGUE * chosen[1]:
         return None
     return ContactSlope(chosen[0], chosen[1], float(offset[first]), float(offset[last - 1]), last - first)
@@ -251,14 +242,6 @@ def _line(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]
     slope = float(np.sum(place * values)) / width
     scatter = float(np.sqrt(np.sum((values - values.mean() - slope * place) ** 2) / (len(values) - 2)))
     return slope, scatter / float(np.sqrt(width)), scatter
-
-
-def _onset(
-    offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"], slope: ContactSlope, level: float
-) -> float:
-    """Return the height at which the line through the steepest part meets the free level."""
-    part = (offset >= slope.from_nm) & (offset <= slope.to_nm)
-    return float(offset[part].mean() + (level - values[part].mean()) / slope.value)
 
 
 def _jump(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " rows"] | None) -> tuple[float, float] | None:

@@ -1,13 +1,12 @@
 """Amplitude and phase of every pixel, out of arrays and the files of images that instruments write.
 
-Asylum's .ibw is read by igor2 and Gwyddion's .gwy by gwyfile (`pip install 'afm-jax[instruments]'`), every other format
-by gwyddionpy, which runs Gwyddion's own readers on the file (`pip install 'afm-jax[gwyddion]'`). NumPy's arrays and
-text of numbers need nothing.
+Asylum's .ibw is read by igor2 (`pip install 'afm-jax[instruments]'`), every other format by gwyddionpy, which runs
+Gwyddion's own readers on the file (`pip install 'afm-jax[gwyddion]'`). NumPy's arrays and text of numbers need nothing.
 """
 
 import io
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +18,7 @@ from jaxtyping import Float
 from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import LARGEST_BYTES
 from fitting.instruments.columns import ColumnSource, checked_unit, parse_columns
-from fitting.instruments.formats import NANOSURF_KEYS, gwyddion_objects, igor_wave, is_igor
+from fitting.instruments.formats import igor_wave, is_igor
 from fitting.instruments.recording import (
     UNITS,
     Known,
@@ -83,8 +82,8 @@ def read_images(
     """Return amplitude and phase of every pixel of an image.
 
     Args:
-        path: NumPy .npz or .npy, text of numbers (one channel), Asylum .ibw, Gwyddion .gwy or any format that Gwyddion
-            reads; or the arrays of amplitude in nm and phase in degrees, the channels `amplitude` and `phase`.
+        path: NumPy .npz or .npy, text of numbers (one channel), Asylum .ibw or any format that Gwyddion reads; or the
+            arrays of amplitude in nm and phase in degrees, the channels `amplitude` and `phase`.
         phase_path: file of the phase, where amplitude and phase are two.
         columns: which channel is which, as for `read_curves`; a factor of the phase, 1 or -1, says that it lags or
             leads.
@@ -100,10 +99,15 @@ def read_images(
     if phase_path is not None:
         second = _images(phase_path)
         name = f"{name} and {printable(str(phase_path))}"
-        channels = {"amplitude": _first(images, "lockin_amplitude_nm"), "phase": _first(second, "phase_lag_deg")}
+        # a file that is said to hold a role does, whatever its channel is called
+        first, other = (
+            one.channels[_named(one, role) or next(iter(one.channels))]
+            for role, one in zip(_ROLES, (images, second), strict=True)
+        )
+        channels = {"amplitude": first, "phase": other}
         images = images._replace(channels=channels, settings={**second.settings, **images.settings})
     refuse_other_modes(images.settings, name)
-    wanted = parse_columns(columns) if columns else {}
+    wanted = parse_columns(columns)
     taken = {role: _channel(images, role, wanted.get(role), name) for role in _ROLES}
     amplitude, phase = (
         np.asarray(images.channels[one.channel][0], dtype=float) * (abs(one.factor or 1.0) * UNITS[one.unit][1])
@@ -127,11 +131,6 @@ def read_images(
 def _named(images: _Images, role: str) -> str:
     """Return the first channel that is called as one of a role, "" without any."""
     return next((name for name in images.channels if re.fullmatch(_ROLES[role][0], name, re.IGNORECASE)), "")
-
-
-def _first(images: _Images, role: str) -> tuple[np.ndarray, str]:
-    """Return the channel of a role in a file that is said to hold it, whatever it is called."""
-    return images.channels[_named(images, role) or next(iter(images.channels))]
 
 
 def _channel(images: _Images, role: str, source: ColumnSource | None, name: str) -> ColumnSource:
@@ -158,8 +157,6 @@ def _channel(images: _Images, role: str, source: ColumnSource | None, name: str)
 def _images(path: str | Path) -> _Images:
     name, data = printable(str(path)), read_bytes(path, "one file")
     with damaged_as_one_line(name):
-        if data.startswith(b"GWYP"):
-            return _of_gwyddion(gwyddion_objects(data, name), name)
         if data.startswith((b"PK", b"\x93NUMPY")):
             return _of_numpy(np.load(io.BytesIO(data), allow_pickle=False), name)
         if is_igor(data):
@@ -176,10 +173,9 @@ def _of_text(text: str, name: str) -> _Images:
 
 def _of_numpy(loaded: Any, name: str) -> _Images:
     arrays = dict(loaded) if hasattr(loaded, "files") else dict(zip(("amplitude", "phase"), loaded, strict=False))
-    endings = {key: key.rpartition("_")[2].lower() for key in arrays}
-    units = {key: next((unit for unit in UNITS if unit.lower() == ending), "") for key, ending in endings.items()}
+    spelled = {unit.lower(): unit for unit in UNITS}
     channels = {
-        printable(key): (array, units[key])
+        printable(key): (array, spelled.get(key.rpartition("_")[2].lower(), ""))
         for key, array in arrays.items()
         if array.ndim == 2 and array.dtype.kind in "fiu"
     }
@@ -202,16 +198,6 @@ def _of_igor(
     return _Images(channels, settings, known, None if None in sides else (sides[0][0], sides[1][0]))  # type: ignore[index]
 
 
-def _of_gwyddion(content: Mapping[str, Any], name: str) -> _Images:
-    numbers = [match[1] for key in sorted(content) if (match := re.fullmatch(r"/(\d+)/data", key))]
-    fields = [content[f"/{number}/data"] for number in numbers]
-    titles = [content.get(f"/{number}/data/title", number) for number in numbers]
-    units = [one.get("si_unit_z", {}).get("unitstr", "") for one in fields]
-    settings = [content.get(f"/{number}/meta", {}) for number in numbers]
-    images, sizes = [one.data for one in fields], [(one["yreal"], one["xreal"]) for one in fields]
-    return _of_fields(zip(titles, images, units, settings, sizes, strict=True), name)
-
-
 def _of_others(path: Path, name: str) -> _Images:
     """Return what Gwyddion's program finds in a file of any other format; its time and its output are limited."""
     package = package_for("gwyddionpy", "gwyddion", f"{name}: images of this format")
@@ -223,32 +209,19 @@ def _of_others(path: Path, name: str) -> _Images:
             lowest = min(limit for limit in (LARGEST_BYTES, *before) if limit >= 0)
             system.setrlimit(system.RLIMIT_FSIZE, (lowest, before[1]))
         # an absolute path cannot be taken for an option
-        found = package.load(path.resolve(), timeout=_PATIENCE_S).channels.values()
+        found = list(package.load(path.resolve(), timeout=_PATIENCE_S).channels.values())
     except package.GwyddionPyError as error:
         why = printable(str(error).rpartition("gwyconvert: ")[2].splitlines()[0])
         raise TableError(f"{name}: gwyddionpy does not read it ({why[:200]}); export it as .gwy") from None
     finally:
         if system:
             system.setrlimit(system.RLIMIT_FSIZE, before)
-    return _of_fields(((c.name, c.data, c.si_unit_z, c.meta, (c.yreal, c.xreal)) for c in found), name)
-
-
-_Field = tuple[str, np.ndarray, str, Mapping[str, str], tuple[float, float]]
-
-
-def _of_fields(fields: Iterable[_Field], name: str) -> _Images:
-    """Return Gwyddion's channels: title, numbers, unit, settings, height and width of each; of a title the first.
-
-    Raises:
-        TableError: if there is none.
-    """
     channels: dict[str, tuple[np.ndarray, str]] = {}
     settings: dict[str, str] = {}
-    sides = None
-    for title, image, unit, meta, size in fields:
-        channels.setdefault(printable(title), (image, unit_named(unit)))
-        settings = {str(key): str(value) for key, value in meta.items()} | settings
-        sides = sides or (float(size[0]), float(size[1]))
+    for one in found:
+        # of a title the first
+        channels.setdefault(printable(one.name), (one.data, unit_named(one.si_unit_z)))
+        settings = {str(key): str(value) for key, value in one.meta.items()} | settings
     if not channels:
         raise TableError(f"{name}: holds no image; a curve is for `afm-jax tapping`")
-    return _Images(channels, settings, known_from(settings, NANOSURF_KEYS), sides)
+    return _Images(channels, settings, known_from(settings), (float(found[0].yreal), float(found[0].xreal)))

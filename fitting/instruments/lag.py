@@ -274,29 +274,23 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
         off = [abs(float(np.median(turned(readings.zero_deg(one))))) for one in (1.0, -1.0)]
         sign = -1.0 if off[1] < _NEAR_DEG < off[0] else 1.0
     zero = float(np.median(readings.zero_deg(sign)))
-    reason = _reason(by_energy, sign, origin, readings)
-    return PhaseSense(sign, zero, origin, _notes(readings, sign, origin, zero), reason)
-
-
-def _reason(by_energy: float | None, sign: float, origin: str, readings: PhaseReadings) -> str:
-    """Return why no energy is known of a phase that is taken with a sign; empty where one is."""
+    reason, rows = "", readings.giving_energy_away(sign)
     if by_energy == 0.0:
-        return (
+        reason = (
             "with either sign of the phase taps would give energy away: frequency, Q, the drive (force or base) or the "
             "phase is wrong"
         )
-    if by_energy is not None and by_energy != sign:
-        word, rows = ("lag" if sign > 0.0 else "lead"), readings.giving_energy_away(sign)
-        return (
-            f"the phase was said to {word}, but {rows} taps would give energy away then, and with the other sign they "
-            f"do not: {SENSE_OPTION}"
+    elif by_energy is not None and by_energy != sign:
+        reason = (
+            f"the phase was said to {'lag' if sign > 0.0 else 'lead'}, but {rows} taps would give energy away then, "
+            f"and with the other sign they do not: {SENSE_OPTION}"
         )
-    if origin == "unknown":
-        return (
+    elif origin == "unknown":
+        reason = (
             "off resonance energies depend on the sign of the phase, and the curve does not tell whether it lags or "
             f"leads: say {SENSE_OPTION}"
         )
-    return ""
+    return PhaseSense(sign, zero, origin, _notes(readings, sign, origin, zero), reason)
 
 
 _HOW = {

@@ -17,30 +17,18 @@ from jaxtyping import Float
 from afm_jax.scenefile.tables import printable
 from fitting.tables.csv_text import NUMBER, TableError
 
-UNITS = {
-    "m": ("length", 1e9),
-    "mm": ("length", 1e6),
-    "um": ("length", 1e3),
-    "nm": ("length", 1.0),
-    "pm": ("length", 1e-3),
-    "V": ("voltage", 1.0),
-    "mV": ("voltage", 1e-3),
-    "deg": ("angle", 1.0),
-    "rad": ("angle", 180.0 / np.pi),
-    "Hz": ("frequency", 1e-3),
-    "kHz": ("frequency", 1.0),
-    "MHz": ("frequency", 1e3),
-    "N": ("force", 1e9),
-    "nN": ("force", 1.0),
-    "N/m": ("stiffness", 1.0),
-    "m/V": ("sensitivity", 1e9),
-    "nm/V": ("sensitivity", 1.0),
-    "m/sqrt(Hz)": ("spectrum", 1e9),
-    "nm/sqrt(Hz)": ("spectrum", 1.0),
-    "pm/sqrt(Hz)": ("spectrum", 1e-3),
-    "fm/sqrt(Hz)": ("spectrum", 1e-6),
-    "V/sqrt(Hz)": ("voltage spectrum", 1.0),
+_SIZES = {
+    "length": {"m": 1e9, "mm": 1e6, "um": 1e3, "nm": 1.0, "pm": 1e-3},
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
+    "frequency": {"Hz": 1e-3, "kHz": 1.0, "MHz": 1e3},
+    "force": {"N": 1e9, "nN": 1.0},
+    "stiffness": {"N/m": 1.0},
+    "sensitivity": {"m/V": 1e9, "nm/V": 1.0},
+    "spectrum": {"m/sqrt(Hz)": 1e9, "nm/sqrt(Hz)": 1.0, "pm/sqrt(Hz)": 1e-3, "fm/sqrt(Hz)": 1e-6},
+    "voltage spectrum": {"V/sqrt(Hz)": 1.0},
 }
+UNITS = {unit: (quantity, size) for quantity, sizes in _SIZES.items() for unit, size in sizes.items()}
 """What a unit measures, and its size in this package's unit: nm, V, degrees, kHz, nN, N/m, nm/V, nm per root Hz."""
 _SPELLINGS = {"µm": "um", "μm": "um", "°": "deg", "Deg": "deg", "degrees": "deg", "m/√Hz": "m/sqrt(Hz)"}
 
@@ -132,38 +120,37 @@ def number_in(text: str) -> tuple[float, str] | None:
     return float(match[0]), unit_named(match.string[match.end() :])
 
 
-HEADER_KEYS = {
-    "free_frequency_khz": "kHz",
-    "drive_frequency_khz": "kHz",
-    "quality_factor": "",
-    "spring_constant_n_per_m": "N/m",
-    "free_amplitude_nm": "nm",
-    "deflection_nm_per_volt": "nm/V",
-    "nm_per_volt": "nm/V",
-    "averages": "",
+_DRIVE = "Oscillation Control>Center Frequency (Hz)|Conversion Offset 00|Tip Frequency|Vibration freq."
+_HEADER = {
+    "free_frequency_khz": ("kHz", "Hz", "f_res (Hz)|f0 (Hz)|Resonance frequency|Frequency:|ThermalFrequency"),
+    "drive_frequency_khz": ("kHz", "Hz", f"{_DRIVE}|Excitation frequency|DriveFrequency"),
+    "quality_factor": ("", "", "Q|Quality factor (Q)|Q Factor:|ThermalQ"),
+    "spring_constant_n_per_m": ("N/m", "N/m", "Force constant|Spring Constant:|SpringConstant"),
+    "free_amplitude_nm": ("nm", "", ""),
+    "deflection_nm_per_volt": ("nm/V", "m/V", "InvOLS"),
+    "nm_per_volt": ("nm/V", "m/V", "AmpInvOLS"),
+    "averages": ("", "", "Averages"),
 }
-"""What headers say that matters here, and its unit."""
+"""What headers say that matters here: its unit, the one where a text holds none, and its names in all formats; by its
+own name it stands in its own unit."""
 
 
-def known_from(
-    header: Mapping[str, str], keys: Mapping[str, tuple[str, str]], where: str = "header"
-) -> dict[str, Known]:
+def known_from(header: Mapping[str, str], where: str = "header") -> dict[str, Known]:
     """Return what the lines of a header say of the measurement, in this package's units.
 
     Args:
         header: texts by the names that the file gives them.
-        keys: for names in the file the key of `HEADER_KEYS` and the unit where the text holds none.
         where: what the place is called: "header" or "note".
     """
     found = {}
-    for name, (key, unit) in keys.items():
-        said = number_in(header.get(name, ""))
-        if said is None or not said[0] > 0.0:
-            continue
-        quantity, factor = UNITS.get(said[1] or unit, ("", 1.0))
-        if quantity == quantity_of(HEADER_KEYS[key]):
-            # twelve digits: a change of unit must not add others
-            found[key] = Known(float(f"{said[0] * factor:.12g}"), HEADER_KEYS[key], f"{where}: {name}")
+    for key, (own_unit, usual, names) in _HEADER.items():
+        for name in (key, *names.split("|")):
+            said = number_in(header.get(name, ""))
+            if said is not None and said[0] > 0.0:
+                quantity, factor = UNITS.get(said[1] or (own_unit if name == key else usual), ("", 1.0))
+                if quantity == quantity_of(own_unit):
+                    # twelve digits: a change of unit must not add others
+                    found[key] = Known(float(f"{said[0] * factor:.12g}"), own_unit, f"{where}: {name}")
     return found
 
 

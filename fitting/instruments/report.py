@@ -20,15 +20,16 @@ def curves_payload(curves: list[MeasuredCurve]) -> dict[str, Any]:
 def curves_summary(curves: list[MeasuredCurve]) -> str:
     """Return what was read as text: the curves, what is known and from where, what is missing, what was assumed."""
     first = curves[0]
-    known = [[key, _shown(one.value), one.unit, one.origin] for key, one in first.known.items() if key not in _OWN]
+    known = {key: one for key, one in first.known.items() if key not in _OWN}
+    values = [one.value if isinstance(one.value, str) else f"{one.value:.7g}" for one in known.values()]
+    rows = [[key, value, one.unit, one.origin] for (key, one), value in zip(known.items(), values, strict=True)]
+    heads = ["curve", "rows", "heights (nm)", "free amplitude", "in contact", ""]
     lines = [
         f"{first.source} ({first.format}):",
         "",
-        *text_table(
-            ["curve", "rows", "heights (nm)", "free amplitude", "in contact", ""], map(_row, curves), words=(5,)
-        ),
+        *text_table(heads, map(_row, curves), words=(5,)),
         "",
-        *text_table(["known", "value", "unit", "from"], known, words=(0, 2, 3)),
+        *text_table(["known", "value", "unit", "from"], rows, words=(0, 2, 3)),
     ]
     asked = [f"{key}: `{key}=...`" for key in dict.fromkeys(k for c in curves if c.valid for k in c.missing)]
     lines += bullets("The file does not say:", asked)
@@ -39,10 +40,6 @@ def curves_summary(curves: list[MeasuredCurve]) -> str:
 
 _OWN = ("free_amplitude_nm", "offset_origin_nm", "phase_zero_deg", "amplitude_error_nm", "phase_error_deg")
 """What differs from curve to curve; the JSON has it."""
-
-
-def _shown(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.7g}"
 
 
 def _row(curve: MeasuredCurve) -> list[str]:

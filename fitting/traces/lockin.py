@@ -150,37 +150,36 @@ def lockin(
     time, height = (np.asarray(column, dtype=np.float64) for column in (time_us, deflection_nm))
     _check(time, height, period, order)
     orders = np.array(sorted({*range(1, HIGHEST_ORDER + 1), 2 * order}))
-    lines = {int(n): _blocks(time, height, period, int(n), order) for n in orders}
-    values = np.array([blocks.mean() if blocks.size else np.nan for blocks in lines.values()])
-    size, asked = np.abs(values), int(np.flatnonzero(orders == order)[0])
-    errors = np.array([_errors(blocks)[0] if blocks.size else np.nan for blocks in lines.values()])
-    sampling = _sampling_error(time, order * period)
-    phases = [float(within_turn(angle, 360.0 / n)) for angle, n in zip(np.angle(values, deg=True), orders, strict=True)]
+    asked = int(np.searchsorted(orders, order))
+    blocks = [_blocks(time, height, period, int(n), order) for n in orders]
+    values, errors, angle_errors = (np.array(column) for column in zip(*map(_line, blocks), strict=True))
+    size, sampling = np.abs(values), _sampling_error(time, order * period)
+    phases = within_turn(np.angle(values, deg=True), 360.0 / orders)
     found = LockinResult(
         drive_frequency_khz=drive_frequency_khz,
         order=order,
-        response_periods=int(_whole(time, order * period)),
+        response_periods=_whole(time, order * period),
         lockin_amplitude_nm=float(size[asked]),
-        lockin_amplitude_error_nm=math.hypot(float(errors[asked]), sampling * float(size[asked])),
-        phase_deg=phases[asked],
-        phase_error_deg=math.degrees(math.hypot(_errors(lines[order])[1], sampling)),
-        scatter=_scatter(lines[order]),
+        lockin_amplitude_error_nm=math.hypot(errors[asked], sampling * size[asked]),
+        phase_deg=float(phases[asked]),
+        phase_error_deg=math.degrees(math.hypot(angle_errors[asked], sampling)),
+        scatter=float(np.std(blocks[asked]) / max(size[asked], 1e-300)),
         orders=orders,
         amplitudes_nm=size,
         amplitude_errors_nm=errors,
-        phases_deg=np.array(phases),
+        phases_deg=phases,
         # the first harmonic that sampling turns into a slow line; the k-th of a bounce is 3/(4 k^2)
         largest_share=max(SHARE, 0.75 / (order * (period / float(np.median(np.diff(time))) - 1.0)) ** 2),
     )
-    why = _why_not_periodic(found)
-    reasons = (f"not periodic at order {order}: {why}",) if why else ()
     warnings = ["The phase takes time 0 as when the platform is highest."]
     unseen = ", ".join(str(n) for n in orders[np.isnan(size)])
     if unseen:
         warnings.append(f"The trace is too short to see the drive's frequency over {unseen}.")
     if sampling > SHARE / 10.0:
         warnings.append(f"Few phases are sampled (error {sampling:.1%}): sample faster, or not in step with the drive.")
-    return replace(found, valid=not reasons, reasons=reasons, warnings=tuple(warnings))
+    why = _why_not_periodic(found)
+    reasons = () if why is None else (f"not periodic at order {order}: {why}",)
+    return replace(found, valid=why is None, reasons=reasons, warnings=tuple(warnings))
 
 
 def _whole(time: Float[np.ndarray, " samples"], period_us: float) -> int:
@@ -214,20 +213,14 @@ def _blocks(
     return 2.0 / (length or 1.0) * np.diff(until[before] + 0.5 * (wave[before] + at_edge) * (edges - time[before]))
 
 
-def _errors(blocks: Complex[np.ndarray, " blocks"]) -> tuple[float, float]:
-    """Return standard errors of the mean: of its size, and of its angle in rad; NaN of one block."""
-    mean, count = blocks.mean(), len(blocks)
-    size = max(abs(mean), 1e-300)
-    apart = blocks * np.conj(mean) / size
-    if count == 1:
-        return np.nan, np.nan
-    along, across = (float(np.std(part, ddof=1)) / math.sqrt(count) for part in (apart.real, apart.imag))
-    return along, min(across / size, math.pi)
-
-
-def _scatter(blocks: Complex[np.ndarray, " blocks"]) -> float:
-    """Return the root mean square by which blocks differ from their mean, as a share of it."""
-    return float(np.sqrt(np.mean(np.abs(blocks - blocks.mean()) ** 2)) / max(abs(blocks.mean()), 1e-300))
+def _line(blocks: Complex[np.ndarray, " blocks"]) -> tuple[complex, float, float]:
+    """Return the mean of blocks, and standard errors of its size and of its angle in rad; NaN of too few blocks."""
+    if len(blocks) < 2:
+        return complex(blocks[0]) if len(blocks) else np.nan, np.nan, np.nan
+    mean = complex(blocks.mean())
+    apart = blocks * np.exp(-1j * np.angle(mean))
+    along, across = (float(np.std(part, ddof=1)) / math.sqrt(len(blocks)) for part in (apart.real, apart.imag))
+    return mean, along, min(across / max(abs(mean), 1e-300), math.pi)
 
 
 def _sampling_error(time: Float[np.ndarray, " samples"], period: float) -> float:

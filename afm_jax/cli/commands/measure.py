@@ -378,12 +378,12 @@ READ = Command(
     runs="afm_jax.cli.read:curves_of_a_file",
     help="""Read amplitude and phase against height out of an instrument's file.
 
-    FILE is neaSNOM text, WSxM curves, an Asylum .ibw ramp, a NanoSurf .nid, Nanonis .dat or Gwyddion .gwy file, or text
-    separated by tabs, semicolons, commas or blanks, with a head or without (--columns). Says what was found, where each
-    number comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
+    FILE is neaSNOM text, WSxM curves, an Asylum .ibw ramp, a NanoSurf .nid or Nanonis .dat file, or text separated by
+    tabs, semicolons, commas or blanks, with a head or without (--columns). Says what was found, where each number
+    comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
     fit`; of a file of several curves one table each, TABLE_1.csv and so on. Repeated and unordered heights become bins.
     Curves that must not be used (a free amplitude that jumps) are refused by name, and the exit code is 3. Package
-    extra for .ibw and .gwy: `pip install 'afm-jax[instruments]'`.
+    extra for .ibw: `pip install 'afm-jax[instruments]'`.
     """,
     options=(
         click.argument("file", metavar="FILE", type=click.Path(path_type=Path)),
@@ -448,7 +448,7 @@ TAPPING_MAP = Command(
     help="""Read the energy of a tap and the virial off every pixel of an image of amplitude and phase.
 
     IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), text of numbers with
-    amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw and Gwyddion .gwy
+    amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw
     (`pip install 'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs
     its program on the file). Needed are amplitude and phase of the free tip, at the same drive. Each pixel has its own
     error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said once.
