@@ -36,10 +36,9 @@ CALIBRATE = Command(
     SWEEP is Nanonis text, or columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any unit) and, where
     known, phase_deg, amplitude_error_nm (or amplitude_error). A thermal spectrum (NanoSurf .nid, or
     asd_nm_per_sqrt_hz or psd_nm2_per_hz) gives the spring constant, too, by equipartition; with the lever's size also
-    by Sader's method. Comments `# averages = 1000`, `# temperature_k = 296` and so on stand for options. frequency_khz
-    is the undamped natural frequency, not that of the maximum. With --out calibration.json, .png and
-    calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the edge, not explained by the
-    model, or a scale of the deflection that another spring constant contradicts.
+    by Sader's method. frequency_khz is the undamped natural frequency, not that of the maximum. With --out
+    calibration.json, .png and calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the
+    edge, not explained by the model, or a scale of the deflection that another spring constant contradicts.
     """,
     options=(
         click.argument("sweep", metavar="SWEEP", type=click.Path(path_type=Path)),
@@ -62,9 +61,8 @@ CALIBRATE = Command(
         click.option(
             "--scale-error",
             type=Share("a relative error"),
-            metavar="SHARE",
-            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much "
-            "[default: 5 %].",
+            default="5%",
+            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much.",
         ),
     ),
     computes=False,
