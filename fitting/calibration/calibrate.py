@@ -13,7 +13,7 @@ from scipy.special import digamma
 from afm_jax.checks import check_parameter, checked
 from afm_jax.columns import printed_table
 from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
-from afm_jax.results import Result, public_result
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
@@ -46,7 +46,7 @@ class CalibratedValue:
 
 @public_result(picture="fitting.calibration.picture:calibration_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Calibration(Result):
+class Calibration(JudgedResult):
     """What `calibrate` returns, named like the keys of its JSON.
 
     Attributes:
@@ -65,7 +65,6 @@ class Calibration(Result):
         left: estimated distance of chi2 to its minimum.
         fitted: the response at every point, complex as the phase was measured, or the amplitude, in the sweep's unit.
         sweep: what was fitted; of a spectrum the part around the resonance.
-        valid: whether to trust it; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
     """
@@ -85,14 +84,8 @@ class Calibration(Result):
     left: float
     fitted: np.ndarray
     sweep: ResonanceSweep
-    valid: bool = False
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-
-    @property
-    def reason(self) -> str | None:
-        """Why the calibration is not valid; None if it is."""
-        return next(iter(self.reasons), None)
 
     @property
     def table_comments(self) -> list[str]:
@@ -113,7 +106,7 @@ class Calibration(Result):
         own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
         values = {name: vars(value) for name, value in own.items() if isinstance(value, CalibratedValue)}
         values["spring_constant_n_per_m"] = {name: vars(k) for name, k in self.spring_constant_n_per_m.items()}
-        more = {"instrument": self.sweep.instrument, "table_comments": self.table_comments}
+        more = {"valid": self.valid, "instrument": self.sweep.instrument, "table_comments": self.table_comments}
         return {"format": "afm-jax calibrate", "format_version": 2} | own | values | more
 
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -136,7 +129,7 @@ class Calibration(Result):
             "value +- standard error": lambda row: row[1].in_words,
         }
         return [
-            f"{'VALID' if self.valid else 'NOT VALID'}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
+            f"{self.verdict}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
             printed_table("", cells, [*values.items()]),
             f"chi2/dof {self.chi2:.1f}/{self.degrees_of_freedom}, errors: {self.error_origin}",
             *bullets("Reasons:", self.reasons),
@@ -392,4 +385,4 @@ def _judged(e: Calibration) -> Calibration:
         f"The spring constants contradict each other: {doubt}.": doubt is not None,
     }
     warnings = (*e.warnings, *(said for said, holds in notes.items() if holds))
-    return replace(e, valid=not reasons, reasons=tuple(reasons), warnings=warnings)
+    return replace(e, reasons=tuple(reasons), warnings=warnings)

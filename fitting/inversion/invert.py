@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import printed_table, rows_of
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from afm_jax.results import Result, public_result
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.words import bullets, with_error
 from fitting.infer.unknowns import NEUTRAL, UNDAMPED
 from fitting.inversion.flight import invert_rows
@@ -55,7 +55,7 @@ class Line:
 
 @public_result(picture="fitting.inversion.picture:inversion_figure", rows="records")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Inversion(Result):
+class Inversion(JudgedResult):
     """What `invert` finds; rows that give nothing are NaN and have a note.
 
     Attributes:
@@ -69,7 +69,6 @@ class Inversion(Result):
         in_lines: which rows the lines go through.
         lines: by "viscous" and "restitution"; empty where the rows determine none.
         table: what was inverted.
-        valid: whether a line explains the rows.
         reasons: why not.
         warnings: what a reader should know besides.
     """
@@ -84,7 +83,6 @@ class Inversion(Result):
     in_lines: Bool[np.ndarray, " rows"]
     lines: dict[str, Line]
     table: AmplitudeTable
-    valid: bool = False
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -97,11 +95,6 @@ class Inversion(Result):
     def preferred(self) -> str | None:
         """The law of the line with the smaller chi2; None without lines."""
         return min(self.lines, key=lambda name: self.lines[name].chi2, default=None)
-
-    @property
-    def reason(self) -> str | None:
-        """Why the inversion is not valid; None if it is."""
-        return next(iter(self.reasons), None)
 
     def records(self) -> list[dict[str, Any]]:
         """Return the rows, each with its drive."""
@@ -137,7 +130,7 @@ class Inversion(Result):
             f"chi2/dof {line.chi2:.1f}/{line.degrees_of_freedom}"
             for (law, line), name in zip(self.lines.items(), ("viscous_loss", "(1 - r^2)"), strict=False)
         ]
-        head = f"{'VALID' if self.valid else 'NOT VALID'}: {self.table.source}, {self.table.rows} rows"
+        head = f"{self.verdict}: {self.table.source}, {self.table.rows} rows"
         notes = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
         return [head, printed_table("", cells, self.records()), *lines, *notes]
 
@@ -216,7 +209,7 @@ def invert(table: TableLike) -> Inversion:
         warnings=("Q comes without an error: its uncertainty is not in the errors here",) if unsure else (),
     )
     reason = _why_not_valid(result)
-    return replace(result, valid=reason is None, reasons=() if reason is None else (reason,))
+    return replace(result, reasons=() if reason is None else (reason,))
 
 
 def _why_not_valid(e: Inversion) -> str | None:
