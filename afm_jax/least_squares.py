@@ -24,17 +24,11 @@ Evaluate = Callable[[Float[np.ndarray, "some p"], Int[np.ndarray, " some"]], Sea
 
 
 class Box(NamedTuple):
-    """Where searches may go: between bounds (infinite: none), which parameters of each search stay, and how far a step.
-
-    ``longest`` is the most by which a parameter changes at once. ``known`` is information on where each parameter is
-    that steps start from: what the residuals leave open moves by no more than that lets it.
-    """
+    """Where searches may go: between bounds (infinite: none), and which parameters of each search stay."""
 
     lowest: Float[np.ndarray, " p"]
     highest: Float[np.ndarray, " p"]
     fixed: Bool[np.ndarray, "sets p"]
-    longest: float = np.inf
-    known: Float[np.ndarray, " p"] | float = 0.0
 
     def of(self, some: Int[np.ndarray, " some"]) -> "Box":
         """Return the box of some of the searches."""
@@ -62,8 +56,7 @@ def descended(
             break
         some = Searches(*(leaf[active] for leaf in state))
         step = _step(some, box.of(active), damping[active])
-        trial = some.place + np.clip(step, -box.longest, box.longest)
-        trials = evaluate(np.clip(trial, box.lowest, box.highest), active)
+        trials = evaluate(np.clip(some.place + step, box.lowest, box.highest), active)
         better = trials.chi2 <= some.chi2 + rise
         for leaf, new in zip(state, trials, strict=True):
             leaf[active[better]] = new[better]
@@ -75,7 +68,7 @@ def descended(
 def distance(state: Searches, box: Box) -> Float[np.ndarray, " sets"]:
     """Return the estimated distance of the sum of squares to its minimum, g H^-1 g; NaN where not finite.
 
-    H = J^T J, and what is known besides.
+    H = J^T J.
     """
     gradient = np.einsum("snp,sn->sp", state.jacobian, state.residual) * ~_held(state, box)
     step = _step(state, box, np.full(len(state.chi2), _SMALLEST_DAMPING))
@@ -97,8 +90,7 @@ def _step(state: Searches, box: Box, damping: Float[np.ndarray, " sets"]) -> Flo
     scaled = jacobian / unit[:, None, :]
     normal = np.einsum("snp,snq->spq", scaled, scaled)
     # a held parameter's own curvature is 1 instead of 0: its step is then 0
-    own = damping[:, None] + held + np.where(held, 0.0, box.known) / unit**2
-    normal += own[:, :, None] * np.eye(unit.shape[1])
+    normal += (damping[:, None] + held)[:, :, None] * np.eye(unit.shape[1])
     gradient = np.einsum("snp,sn->sp", scaled, state.residual)
     sound = np.all(np.isfinite(normal), axis=(1, 2))
     safe = np.where(sound[:, None, None], normal, np.eye(unit.shape[1]))
@@ -126,12 +118,6 @@ def covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "..
     undetermined = np.any((np.abs(axes) > 1e-6) & flat[..., None, :], axis=-1)
     inverse = (axes / np.where(flat, np.inf, curvature)[..., None, :]) @ np.swapaxes(axes, -2, -1) / unit
     return np.where(undetermined[..., :, None] | undetermined[..., None, :] | ~finite, np.inf, inverse)
-
-
-def whole_covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p p"]:
-    """Return the inverse of Fisher matrices; all infinite where one determines not every parameter."""
-    inverse = covariance_of(fisher)
-    return np.where(np.isfinite(inverse).all(axis=(-2, -1), keepdims=True), inverse, np.inf)
 
 
 IMPROBABLE = 1e-3

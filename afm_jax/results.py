@@ -96,6 +96,27 @@ class Result:
         save(self, path)
 
 
+class JudgedResult(Result):
+    """A result that is valid unless there are reasons why not."""
+
+    reasons: Any
+
+    @property
+    def valid(self) -> bool:
+        """Whether to trust it; `reasons` say why not."""
+        return not self.reasons
+
+    @property
+    def reason(self) -> str | None:
+        """The first of the reasons; None if it is valid."""
+        return next(iter(self.reasons), None)
+
+    @property
+    def verdict(self) -> str:
+        """The first words of its text."""
+        return "VALID" if self.valid else "NOT VALID"
+
+
 if TYPE_CHECKING:
 
     @dataclass_transform(frozen_default=True)

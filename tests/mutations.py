@@ -220,8 +220,8 @@ MUTATIONS = {
     "loss of a line as a sum": Mutation(
         "/ scale, u**2 {- => +} w**2", "tests/test_inversion_law.py::test_values_without_noise_are_exact"
     ),
-    "inverted rebound against the platform": Mutation(
-        "flight.start_velocity {- => +} platform.velocity(flight.start_us)",
+    "inverted rebound with a gain for a loss": Mutation(
+        "np.sqrt(np.maximum(u**2 {+ => -} place[:, 3], 1e-4))",
         "tests/test_inversion.py::test_one_amplitude_and_the_phase_suffice",
     ),
     "resonance damped at the natural frequency": Mutation(

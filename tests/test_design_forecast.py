@@ -111,7 +111,7 @@ def test_the_forecast_is_what_a_fit_states(designed):
     assert np.all(designed.errors[-1] >= by_noise(designed) * (1.0 - 1e-9))
     if designed.prior.problem.tapping:
         return
-    exact = designed.candidates.amplitude_nm[designed.chosen]
+    exact = designed.candidates.readings[designed.chosen, :2]
     result = fit(table_of(designed.drives, exact, 0.003 * exact, quality_factor_error=0.4), "law+delay")
     assert result.valid
     stated = np.array([result.parameters[name].standard_error for name in designed.prior.problem.names], float)

@@ -12,7 +12,6 @@ from afm_jax.least_squares import (
     covariance_of,
     descended,
     distance,
-    whole_covariance_of,
 )
 from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 
@@ -72,25 +71,6 @@ def test_a_search_alone_ends_where_scipys_does(truth):
     np.testing.assert_allclose(end.place, scipy.x, rtol=1e-6, atol=1e-6)
 
 
-def test_a_step_takes_what_is_known_as_further_data():
-    """Of a parameter that the residuals leave open, and of one that they hold; against plain least squares."""
-    slope = np.array([[9.0, 1e-3], [4.0, 2e-3], [1.0, -3e-3]])
-    rest, known = np.array([1.0, 2.0, 5.0]), np.array([0.0, 0.3])
-
-    def straight(places, some):  # noqa: ARG001
-        off = rest + places @ slope.T
-        return Searches(places, off, np.broadcast_to(slope, (len(places), 3, 2)), np.sum(off**2, axis=1))
-
-    start = straight(np.zeros((1, 2)), np.arange(1))
-    box = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros((1, 2), dtype=bool), known=known)
-    one = descended(straight, start, box, settled=0.0, most=1)
-    data = np.vstack([slope, np.diag(np.sqrt(known))])
-    step = np.linalg.lstsq(data, np.append(-rest, [0.0, 0.0]), rcond=None)[0]
-    # the first damping is 1e-6
-    np.testing.assert_allclose(one.place[0], step, rtol=1e-5)
-    np.testing.assert_allclose(distance(start, box), -(rest @ slope) @ step, rtol=1e-9)
-
-
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_a_search_that_is_lost_leaves_the_others_alone(number):
     def spoilt(places, some):
@@ -122,10 +102,6 @@ def test_covariances_are_inverses_where_there_are_some():
     np.testing.assert_allclose(found[1, :2, :2], np.linalg.inv(kept) / unit[1, :2, :2], rtol=1e-9)
     assert np.all(found[1, 2] == np.inf)
     assert np.all(found[3] == np.inf)
-    whole = whole_covariance_of(fisher)
-    assert np.isfinite(whole).all(axis=(1, 2)).tolist() == [True, False, True, False, True]
-    assert np.all(whole[1] == np.inf)
-    np.testing.assert_array_equal(whole[0], found[0])
     np.testing.assert_array_equal(covariance_of(fisher[0]), found[0])
 
 

@@ -39,8 +39,8 @@ def density(khz: np.ndarray, floor: float = 2e-8, quality: float = QUALITY_FACTO
 def thermal_spectrum(averages: float, random: np.random.Generator, *, points: int = 128, known: bool = True):
     khz = np.linspace(86.0, 94.0, points)
     drawn = density(khz) * random.gamma(averages, 1.0 / averages, points)
-    count = {"averages": (averages, None)} if known else {}
-    return ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(drawn), amplitude_unit=DENSITY, settings=count)
+    count = averages if known else None
+    return ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(drawn), amplitude_unit=DENSITY, averages=count)
 
 
 def run(*arguments: object):
@@ -91,10 +91,11 @@ def test_saders_stiffness_is_what_nanosurf_states_in_the_file():
 
 def test_spectra_are_read_from_csv(tmp_path):
     khz = np.linspace(80.0, 100.0, 30)
-    path, head = tmp_path / "spectrum.csv", "# averages = 200\nfrequency_hz,psd_nm2_per_hz"
+    path, head = tmp_path / "spectrum.csv", "frequency_hz,psd_nm2_per_hz"
     np.savetxt(path, np.stack([1e3 * khz, density(khz)], 1), "%.17g", ",", header=head, comments="")
     sweep = read_sweep(path)
-    assert (sweep.averages, sweep.spectrum) == (200.0, True)
+    assert (sweep.averages, sweep.spectrum) == (None, True)
+    assert read_sweep(THERMAL).averages is not None
     np.testing.assert_allclose(sweep.amplitude**2, density(khz), rtol=1e-14)
     cut = tmp_path / "cut.nid"
     cut.write_bytes(THERMAL.read_bytes()[:-8])
@@ -108,9 +109,7 @@ def test_a_line_of_three_points_hides_no_resonance(quality: float, points: int):
     power = density(khz, quality=quality) * np.random.default_rng(points).gamma(100.0, 0.01, points)
     line = points // 10
     power[line : line + 3] += 0.1 * power.max()
-    sweep = ResonanceSweep(
-        frequency_khz=khz, amplitude=np.sqrt(power), amplitude_unit=DENSITY, settings={"averages": (100.0, None)}
-    )
+    sweep = ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(power), amplitude_unit=DENSITY, averages=100.0)
     result = calibrate(sweep)
     assert result.valid, result.reasons
     # 90 kHz to a tenth of the half-width
@@ -127,8 +126,8 @@ def test_the_area_gives_k_where_the_quality_factor_is_hardly_resolved(tmp_path: 
     shape = natural**4 / ((natural**2 - hz**2) ** 2 + (hz * natural / quality) ** 2)
     power = 2.0 * variance / (np.pi * quality * natural) * shape + 1e-5
     drawn = power * np.random.default_rng(3).gamma(32.0, 1.0 / 32.0, hz.size)
-    path = written(tmp_path / "spectrum.txt", 1e-3 * hz, drawn, "averages = 32", "temperature_k = 310")
-    result = run(path, "--json")
+    path = written(tmp_path / "spectrum.txt", 1e-3 * hz, drawn)
+    result = run(path, "--json", "--averages", 32, "--temperature-k", 310)
     assert result.exit_code == 0, result.stderr
     told = strictly(result.stdout)
     found = told["spring_constant_n_per_m"]["equipartition"]
@@ -138,33 +137,23 @@ def test_the_area_gives_k_where_the_quality_factor_is_hardly_resolved(tmp_path: 
     assert any("Q is hardly resolved" in warning for warning in told["warnings"])
 
 
-def test_comments_count_like_options_or_are_refused(tmp_path: Path):
+def test_options_count_and_comments_that_would_are_refused(tmp_path: Path):
     khz = np.linspace(80.0, 100.0, 400)
     drawn = density(khz) * np.random.default_rng(5).gamma(200.0, 0.005, khz.size)
+    path = written(tmp_path / "one.csv", khz, drawn)
 
-    def told(*comments: str, options: tuple[str, ...] = ()) -> dict[str, Any]:
-        return strictly(run(written(tmp_path / "one.csv", khz, drawn, *comments), "--json", *options).stdout)
-
-    def k(answer: dict[str, Any], how: str = "equipartition") -> float:
+    def k(*options: str, how: str = "equipartition") -> float:
+        answer: dict[str, Any] = strictly(run(path, "--json", "--averages", "200", *options).stdout)
         return answer["spring_constant_n_per_m"][how]["value"]
 
-    plain = told("averages = 200")
-    warm = told("averages = 200", "temperature_k = 310")
     # in proportion to T, 296 K without it
-    assert k(warm) / k(plain) == pytest.approx(310.0 / 296.0, rel=1e-12)
-    assert k(told("temperature_k = 310", options=("--averages", "200"))) == pytest.approx(k(warm), rel=1e-12)
-    assert told(options=("--averages", "200", "--temperature-k", "310"))["chi2"] == pytest.approx(warm["chi2"])
-    sized = told("averages = 200", "length_um = 225 +- 2", "width_um = 40 +- 1")
-    of_options = told("averages = 200", options=("--length-um", "225 +- 2", "--width-um", "40 +- 1"))
-    assert k(sized, "sader") == k(of_options, "sader") > 0.0
-    for key in ("quality_factor", "spring_constant_n_per_m", "free_frequency_khz", "mass_ng"):
-        refused = run(written(tmp_path / "two.csv", khz, drawn, "averages = 200", f"{key} = 3"))
+    assert k("--temperature-k", "310") / k() == pytest.approx(310.0 / 296.0, rel=1e-12)
+    assert k("--length-um", "225 +- 2", "--width-um", "40 +- 1", how="sader") > 0.0
+    # what would change the result is never left among the remarks
+    for key in ("averages", "temperature_k", "quality_factor", "spring_constant_n_per_m", "mass_ng"):
+        refused = run(written(tmp_path / "two.csv", khz, drawn, "measured in air", f"{key} = 3"))
         assert refused.exit_code == 2
         assert f"line 2: {key} sets nothing in such a file" in refused.stderr
-    scan = tmp_path / "scan.csv"
-    scan.write_text("# averages = 3\nfrequency_khz,amplitude_nm\n1,2\n2,3\n", encoding="utf-8")
-    with pytest.raises(TableError, match="averages belongs to a thermal spectrum"):
-        read_sweep(scan)
 
 
 def test_the_real_spectrum_meets_the_vendors_numbers(tmp_path):

@@ -84,12 +84,13 @@ class Output:
     failure: Exception | None = None
 
     @classmethod
-    def of(cls, result: Any, **more: Any) -> "Output":
+    def of(cls, result: Any, stem: str = "", **more: Any) -> "Output":
         """Return what is handed out of a result that says itself.
 
         Args:
             result: has `to_dict`, `printed` and `tables`, `reason` (which is a key of the JSON object, too) and, where
                 its impacts may be extrapolated, `impact_speeds_nm_per_us`.
+            stem: what its picture and its JSON file are called; empty: it has none.
             **more: pictures, and what else the output has.
         """
         told = {
@@ -99,6 +100,9 @@ class Output:
             "impact_speeds": getattr(result, "impact_speeds_nm_per_us", None),
             "not_valid": result.reason,
         }
+        if stem:
+            save = later("afm_jax.plots.picture_style:save")
+            told |= {"files": {f"{stem}.png": lambda path: save(result.plot(), path)}, "json_file": f"{stem}.json"}
         return cls(**told | more)
 
     @classmethod

@@ -5,45 +5,34 @@ from collections.abc import Mapping
 from typing import Any
 
 import click
+import numpy as np
 
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Numbers, Orders, option_of
-from afm_jax.plots.picture_style import save
+from afm_jax.cli.values import option_of
 from afm_jax.whole_files import in_callers_words
 from fitting.experiments.candidates import drive_grid
 from fitting.experiments.design import design
 from fitting.experiments.prior import Prior, prior_of_values, read_prior
 from fitting.parameters import LAW_NAMES, PARAMETERS, PRIOR_NUISANCES
 
-_TAPPING = {"orders": "1", "detuning": "1.02:1.1:0.02", "drive_nm": "40,80", "heights": "0.1:0.9:0.1"}
-_SAMPLE = {"orders": "1-4", "detuning": "0.97:1.05:0.01", "drive_nm": "2,4,7,10", "offsets_nm": "-1,0,1"}
-_OF_DESIGN = ("points", "noise", "amplitudes", "largest_nm", "phase_noise_deg")
+_TIP = {"orders": (1,), "detunings": (1.02, 1.04, 1.06, 1.08, 1.1), "amplitudes_nm": (40.0, 80.0)}
+_SAMPLE = {"orders": (1, 2, 3, 4), "detunings": np.arange(97, 106) / 100, "amplitudes_nm": (2.0, 4.0, 7.0, 10.0)}
+"""What is looked at if a call does not say, where the tip or the sample is driven."""
+_OF_DESIGN = ("points", "noise", "interest", "amplitudes", "largest_nm", "phase_noise_deg")
 
 
-def planned(session: Session, *, interest: str | None, **options: Any) -> Output:
+def planned(session: Session, **options: Any) -> Output:
     """Return the drives to measure next, of all combinations of the lists, and what they will determine."""
-    prior = prior_of_options(options)
-    usual = _TAPPING if prior.problem.tapping else _SAMPLE
-    chosen = {name: options[name] for name in ("orders", "detuning", "drive_nm", "offsets_nm", "heights")}
-    for name, text in usual.items():
-        said = chosen[name] is not None or (name == "heights" and chosen["offsets_nm"] is not None)
-        kind = Orders() if name == "orders" else Numbers(positive=False)
-        chosen[name] = chosen[name] if said else kind.convert(text, None, None)
-    names = None if interest is None else tuple(name.strip().replace("-", "_") for name in interest.split(","))
+    prior, places = prior_of_options(options), {"offsets_nm": options["offsets_nm"], "heights": options["heights"]}
+    tapping = prior.problem.tapping
+    if places == {"offsets_nm": None, "heights": None}:
+        places = {"heights": np.arange(1, 10) / 10} if tapping else {"offsets_nm": (-1.0, 0.0, 1.0)}
+    lists = {name: options[name] or usual for name, usual in (_TIP if tapping else _SAMPLE).items()}
     with session.working("forecasting (the first run compiles for some seconds)"):
-        drives = drive_grid(
-            orders=chosen["orders"],
-            amplitudes_nm=chosen["drive_nm"],
-            offsets_nm=chosen["offsets_nm"] or (0.0,),
-            heights=chosen["heights"],
-            detunings=chosen["detuning"],
-            free_frequency_khz=prior.free_frequency_khz,
-            drive=prior.problem.drive,
-        )
-        result = design(prior, drives, interest=names, **{name: options[name] for name in _OF_DESIGN})
-    figure = later("fitting.experiments.picture:design_figure")
-    return Output.of(result, files={"design.png": lambda path: save(figure(result), path)}, json_file="design.json")
+        known = {"free_frequency_khz": prior.free_frequency_khz, "drive": prior.problem.drive}
+        result = design(prior, drive_grid(**lists, **places, **known), **{name: options[name] for name in _OF_DESIGN})
+    return Output.of(result, "design")
 
 
 def prior_of_options(options: Mapping[str, Any]) -> Prior:

@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import example_path, tables_with
-from afm_jax.plots.picture_style import save
 from fitting.inversion.invert import invert
 
 
@@ -21,5 +20,4 @@ def inversion(
     (measured,) = tables_with([example_path() if example or table is None else table], noise, quality_factor)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured)
-    figure = later("fitting.inversion.picture:inversion_figure")
-    return Output.of(result, files={"invert.png": lambda path: save(figure(result), path)}, json_file="invert.json")
+    return Output.of(result, "invert")

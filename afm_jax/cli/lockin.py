@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from afm_jax.cli.command import Output, later
+from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
-from afm_jax.plots.picture_style import save
 from fitting.tables.csv_text import TableError
 from fitting.traces.lockin import lockin, read_trace
 
@@ -21,5 +20,4 @@ def lockin_of_trace(_: Session, *, trace: Path, drive_frequency_khz: float | Non
         result = lockin(read.time_us, read.deflection_nm, frequency, order)
     except TableError as error:
         raise TableError(f"{trace}: {error}") from error
-    figure = later("fitting.traces.picture:lockin_figure")
-    return Output.of(result, files={"lockin.png": lambda path: save(figure(result), path)}, json_file="lockin.json")
+    return Output.of(result, "lockin")

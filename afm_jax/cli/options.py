@@ -14,6 +14,11 @@ def flag(name: str, text: str, *, into: str | None = None) -> Callable[..., Any]
     return click.option(*((name,) if into is None else (name, into)), is_flag=True, help=text)
 
 
+def valued(name: str, kind: Any, text: str, *, into: str | None = None, **more: Any) -> Callable[..., Any]:
+    """Return an option with a value of a kind: as `flag`, and what else click takes."""
+    return click.option(*((name,) if into is None else (name, into)), type=kind, help=text, **more)
+
+
 SCENE = click.argument("scene", metavar="SCENE.toml|PRESET", type=click.Path())
 """The scene that is loaded before the command's function is called, which gets it as a `NamedScene`."""
 LAW = click.option(
@@ -24,16 +29,8 @@ LAW = click.option(
     "place of the scene's, its errors as bands.",
 )
 """With `SCENE` it is loaded, too: the scene has its law then."""
-DRAWS = click.option("--draws", type=click.IntRange(2), default=20, help="Laws drawn from the fit for the bands.")
-NOISE = click.option(
-    "--noise",
-    type=Share("a relative error"),
-    metavar="SHARE",
-    help="Relative error of amplitudes without one, such as 1%.",
-)
-QUALITY_FACTOR = click.option(
-    "--quality-factor",
-    type=ValueAndError(none=True),
-    metavar="Q",
-    help="Instead of the table's; '40 +- 2', or none: no air damping.",
+DRAWS = valued("--draws", click.IntRange(2), "Laws drawn from the fit for the bands.", default=20)
+NOISE = valued("--noise", Share("a relative error"), "Relative error of amplitudes without one, such as 1%.")
+QUALITY_FACTOR = valued(
+    "--quality-factor", ValueAndError(none=True), "Instead of the table's; '40 +- 2', or none: no air damping."
 )

@@ -10,22 +10,19 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
-from afm_jax.checks import checked
+from afm_jax.checks import check_parameter, checked
 from afm_jax.columns import printed_table
 from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
-from afm_jax.results import Result, public_result
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
-from fitting.calibration.sweep import ResonanceSweep, read_sweep, stated_settings
+from fitting.calibration.sweep import ResonanceSweep, read_sweep
 from fitting.tables.csv_text import TableError
 
-FORMAT_VERSION = 2
-AIR_K = (296.0, 3.0)
-"""Temperature of lever and air where none is given."""
-SCALE_ERROR = 0.05
-"""Relative standard error of the deflection's scale where none is given: force curves repeat it to some per cent."""
+_Pair = tuple[float, float | None]
+"""A value with its standard error, if it has one."""
 _LEAST_FREQUENCIES = 6
 """One more than the amplitude has parameters."""
 
@@ -49,7 +46,7 @@ class CalibratedValue:
 
 @public_result(picture="fitting.calibration.picture:calibration_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Calibration(Result):
+class Calibration(JudgedResult):
     """What `calibrate` returns, named like the keys of its JSON.
 
     Attributes:
@@ -68,7 +65,6 @@ class Calibration(Result):
         left: estimated distance of chi2 to its minimum.
         fitted: the response at every point, complex as the phase was measured, or the amplitude, in the sweep's unit.
         sweep: what was fitted; of a spectrum the part around the resonance.
-        valid: whether to trust it; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
     """
@@ -88,14 +84,8 @@ class Calibration(Result):
     left: float
     fitted: np.ndarray
     sweep: ResonanceSweep
-    valid: bool = False
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-
-    @property
-    def reason(self) -> str | None:
-        """Why the calibration is not valid; None if it is."""
-        return next(iter(self.reasons), None)
 
     @property
     def table_comments(self) -> list[str]:
@@ -116,8 +106,8 @@ class Calibration(Result):
         own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
         values = {name: vars(value) for name, value in own.items() if isinstance(value, CalibratedValue)}
         values["spring_constant_n_per_m"] = {name: vars(k) for name, k in self.spring_constant_n_per_m.items()}
-        more = {"instrument": self.sweep.instrument, "table_comments": self.table_comments}
-        return {"format": "afm-jax calibrate", "format_version": FORMAT_VERSION} | own | values | more
+        more = {"valid": self.valid, "instrument": self.sweep.instrument, "table_comments": self.table_comments}
+        return {"format": "afm-jax calibrate", "format_version": 2} | own | values | more
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of calibration_points.csv: the scan and the fit."""
@@ -139,7 +129,7 @@ class Calibration(Result):
             "value +- standard error": lambda row: row[1].in_words,
         }
         return [
-            f"{'VALID' if self.valid else 'NOT VALID'}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
+            f"{self.verdict}: {self.sweep.source}, {counted(self.sweep.points, 'point')}",
             printed_table("", cells, [*values.items()]),
             f"chi2/dof {self.chi2:.1f}/{self.degrees_of_freedom}, errors: {self.error_origin}",
             *bullets("Reasons:", self.reasons),
@@ -152,8 +142,12 @@ class Calibration(Result):
 def calibrate(
     sweep: ResonanceSweep | str | os.PathLike[str],
     *,
+    averages: float | None = None,
+    temperature_k: _Pair | float | None = None,
+    length_um: _Pair | float | None = None,
+    width_um: _Pair | float | None = None,
+    scale_error: float = 0.05,
     static: bool = True,
-    **settings: tuple[float, float | None] | float | None,
 ) -> Calibration:
     """Fit frequency and quality factor of the free cantilever to a scan or a thermal spectrum, and its stiffness.
 
@@ -162,25 +156,47 @@ def calibrate(
     Args:
         sweep: from `read_sweep`, or a file; its phase is used where it is there. Without errors of the amplitudes these
             are estimated from the misfit, and goodness of fit cannot be judged.
+        averages: how many spectra a thermal spectrum is the mean of; None: the file's.
+        temperature_k: of lever and air, a number or a pair with its error; None: the file's, else 296 +- 3.
+        length_um: of a rectangular lever, likewise; with the width it gives k by Sader's method.
+        width_um: of a rectangular lever, likewise.
+        scale_error: relative error of the deflection's scale, of which k by equipartition has twice as much; force
+            curves repeat a scale to some per cent.
         static: the deflection was calibrated by the slope of a force curve (static InvOLS), not by the mode itself.
-        **settings: what the file's comments say where it is left out, each a number or a pair with its error:
-            `averages`, how many spectra a thermal spectrum is the mean of; `temperature_k` of lever and air (else 296
-            +- 3); `length_um` and `width_um` of a rectangular lever, for k by Sader's method; `scale_error`, the
-            relative error of the deflection's scale (else 0.05), of which k by equipartition has twice as much.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `Calibration`.
 
     Raises:
-        ValueError: if an option is impossible.
+        ValueError: if an option is impossible, or a lever has one side only.
         TableError: if the scan has too few points, or its amplitude is the same everywhere.
     """
     if not isinstance(sweep, ResonanceSweep):
         sweep = read_sweep(Path(os.fspath(sweep)))
-    sweep = replace(sweep, settings=stated_settings(sweep, settings))
+    check_parameter("averages", averages, "positive", optional=True)
+    check_parameter("scale_error", scale_error, "positive")
+    warm = temperature_k or (sweep.instrument.get("temperature_k", 296.0), 3.0)
+    given = {"length_um": length_um, "width_um": width_um, "temperature_k": warm}
+    known = {name: _value_and_error(name, one) for name, one in given.items() if one is not None}
+    if ("length_um" in known) != ("width_um" in known):
+        raise ValueError("Sader's method needs both `length_um=...` and `width_um=...`")
+    sweep = replace(sweep, averages=averages or sweep.averages)
     _check_sweep(sweep)
     found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep)
-    return _judged(replace(found, spring_constant_n_per_m=_springs(found, static=static)))
+    springs = _springs(found, known, scale_error, static=static)
+    return _judged(replace(found, spring_constant_n_per_m=springs))
+
+
+def _value_and_error(name: str, given: _Pair | float) -> tuple[float, float]:
+    """Return a value and its error, 0 where there is none.
+
+    Raises:
+        ValueError: if one of them is impossible.
+    """
+    value, error = given if isinstance(given, tuple) else (given, None)
+    check_parameter(name, value, "positive")
+    check_parameter(f"error of {name}", error, "positive", optional=True)
+    return float(value), float(error or 0.0)
 
 
 def _check_sweep(sweep: ResonanceSweep) -> None:
@@ -188,39 +204,39 @@ def _check_sweep(sweep: ResonanceSweep) -> None:
     count = len(np.unique(sweep.frequency_khz))
     if count < _LEAST_FREQUENCIES:
         raise TableError(f"{sweep.source}: measure at {_LEAST_FREQUENCIES} or more frequencies, not at {count}")
-    turning = sweep.phase_deg is not None and np.ptp(sweep.phase_deg) > 0.0 and sweep.amplitude[0] > 0.0
-    if np.ptp(sweep.amplitude) == 0.0 and not turning:
+    if np.ptp(sweep.amplitude) == 0.0:
         value = f"{sweep.amplitude[0]:g} {sweep.amplitude_unit}".strip()
         raise TableError(f"{sweep.source}: the amplitude is {value} at every frequency; sweep across a resonance")
 
 
 def _fitted(sweep: ResonanceSweep) -> Calibration:
     """Return the fit of a scan or of a part of a spectrum, not yet judged."""
-    largest = float(sweep.amplitude.max())
-    error = np.full(sweep.points, 0.01) if sweep.amplitude_error is None else sweep.amplitude_error / largest
-    stated = sweep.averages if sweep.spectrum else sweep.amplitude_error
-    if sweep.spectrum:
-        error = np.full(sweep.points, (sweep.averages or 1.0) ** -0.5)
-    fit = minimum(sweep, error)
-    freedom, chi2 = len(fit.residual) - len(fit.place), float(np.sum(fit.residual**2))
-    # without errors they are what makes chi2/dof 1; a scan without noise keeps rounding for an error
-    scale = max(chi2 / freedom, 1e-12) if stated is None else 1.0
-    # the mean of a term of the gamma deviance is a little above 1
-    size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages)) if sweep.averages else 1.0
-    p_value = np.nan if stated is None else chi2_tail(chi2 / size, freedom)
-    together = _autocorrelation(fit.residual.reshape(-1, sweep.points))
+    largest, averages = float(sweep.amplitude.max()), sweep.averages if sweep.spectrum else None
+    # without errors they are what makes chi2/dof 1
+    error, size, origin = np.full(sweep.points, 1.0 if sweep.spectrum else 0.01), 1.0, "estimated"
+    if averages is not None:
+        # the mean of a term of the gamma deviance is a little above 1
+        size, origin = 2.0 * averages * (np.log(averages) - digamma(averages)), "averages"
+        error = error * averages**-0.5
+    elif sweep.amplitude_error is not None:
+        error, origin = sweep.amplitude_error / largest, "file"
+    (place, best, _), model, reverse = minimum(sweep, error)
+    freedom = len(best.residual) - len(place)
+    # a scan without noise keeps rounding for an error
+    scale = max(best.value / freedom, 1e-12) if origin == "estimated" else 1.0
+    p_value = np.nan if origin == "estimated" else chi2_tail(best.value / size, freedom)
+    together = _autocorrelation(best.residual.reshape(-1, sweep.points))
     # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
-    fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(fit.residual)) < together < 1.0 else 1.0
-    covariance, slope = covariance_of(fit.jacobian.T @ fit.jacobian), fit.jacobian.T @ fit.residual
+    fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(best.residual)) < together < 1.0 else 1.0
+    covariance, slope = covariance_of(best.jacobian.T @ best.jacobian), best.jacobian.T @ best.residual
     left = float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope)
-    covariance = covariance * scale * fewer
-    natural, quality_factor = np.exp(fit.place[:2]).tolist()
-    by_place = np.eye(len(fit.place))
+    natural, quality_factor = np.exp(place[:2]).tolist()
+    by_place = np.eye(len(place))
 
     def known(value: float, slopes: Float[np.ndarray, " p"]) -> CalibratedValue:
         """Return a value whose logarithm has these derivatives by the place."""
         used = np.flatnonzero(slopes)
-        variance = float(slopes[used] @ covariance[np.ix_(used, used)] @ slopes[used])
+        variance = scale * fewer * float(slopes[used] @ covariance[np.ix_(used, used)] @ slopes[used])
         # the variance of a logarithm
         if not variance < 20.0:
             return CalibratedValue(value, None, reason="the scan does not determine it")
@@ -228,25 +244,23 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
             return CalibratedValue(value, None, reason="the model does not explain the scan")
         return _known_to(value, float(np.sqrt(variance)))
 
-    mean_square = None
-    if sweep.spectrum:
-        # the integral of a |L|^2 over all frequencies
-        area = 0.5 * np.pi * 1e3 * natural / quality_factor * fit.place[2] * largest**2
-        mean_square = known(float(area), by_place[0] - by_place[1] + by_place[2] / fit.place[2])
+    # the integral of a |L|^2 over all frequencies
+    area = 0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2
+    by_area = by_place[0] - by_place[1] + by_place[2] / place[2]
     return Calibration(
         frequency_khz=known(natural, by_place[0]),
         quality_factor=known(quality_factor, by_place[1]),
-        mean_square_nm2=mean_square,
+        mean_square_nm2=known(float(area), by_area) if sweep.spectrum else None,
         model=sweep.model,
-        error_origin="estimated" if stated is None else "averages" if sweep.spectrum else "file",
-        phase_reversed=fit.reverse,
-        chi2=chi2 / scale,
+        error_origin=origin,
+        phase_reversed=reverse,
+        chi2=best.value / scale,
         degrees_of_freedom=freedom,
         p_value=p_value,
         residual_autocorrelation=together,
         chi2_without_resonance=chi2_without_resonance(sweep, error) / scale,
         left=left / scale,
-        fitted=largest * (np.conj(fit.model) if fit.reverse else fit.model),
+        fitted=largest * (np.conj(model) if reverse else model),
         sweep=sweep,
     )
 
@@ -287,32 +301,38 @@ def _of_spectrum(sweep: ResonanceSweep) -> Calibration:
     return found if found.sweep.points == sweep.points else replace(found, warnings=(note,))
 
 
-def _springs(found: Calibration, *, static: bool) -> dict[str, CalibratedValue]:
-    """Return the spring constants that a calibration supports; that by equipartition without error if contradicted."""
+def _springs(
+    found: Calibration, known: dict[str, tuple[float, float]], scale_error: float, *, static: bool
+) -> dict[str, CalibratedValue]:
+    """Return the spring constants that a calibration supports; that by equipartition without error if contradicted.
+
+    Args:
+        found: the calibration.
+        known: of lever and air, in the order of `sader`, each with its error; temperature alone where there is no size.
+        scale_error: as of `calibrate`.
+        static: as of `calibrate`.
+    """
     frequency, quality, mean = found.frequency_khz, found.quality_factor, found.mean_square_nm2
     if quality.standard_error is None or frequency.standard_error is None:
         return {}
-    settings, said, springs = found.sweep.settings, found.sweep.instrument.get("spring_constant_n_per_m"), {}
-    warm, warm_error = settings.get("temperature_k", AIR_K)
-    scale_error, _ = settings.get("scale_error", (SCALE_ERROR, None))
-    other = None if said is None else ("the instrument", said, 0.1)
-    if "length_um" in settings:
-        inputs = [(one.value, one.standard_error) for one in (frequency, quality)]
-        inputs += [settings["length_um"], settings["width_um"], (warm, warm_error)]
-        centre = np.array([value for value, _ in inputs])
+    springs, others = {}, []
+    if "spring_constant_n_per_m" in found.sweep.instrument:
+        others = [("the instrument", found.sweep.instrument["spring_constant_n_per_m"], 0.1)]
+    if "length_um" in known:
+        read = [(one.value, one.standard_error) for one in (frequency, quality)]
+        centre, errors = np.array([*read, *known.values()]).T
         value = sader(*centre)
-        moved = centre + np.diag([error or 0.0 for _, error in inputs])
-        share = float(np.linalg.norm([sader(*place) / value - 1.0 for place in moved]))
-        springs["sader"], other = _known_to(value, share), ("Sader's method", value, share)
+        share = float(np.linalg.norm([sader(*place) / value - 1.0 for place in centre + np.diag(errors)]))
+        springs["sader"], others = _known_to(value, share), [("Sader's method", value, share)]
     if mean is not None and mean.standard_error is not None:
+        warm, warm_error = known["temperature_k"]
         value = equipartition(mean.value, warm, static=static)
-        shares = (mean.standard_error / mean.value, (warm_error or 0.0) / warm, 2.0 * scale_error)
-        springs["equipartition"] = _known_to(value, float(np.linalg.norm(shares)))
-        if other is not None:
-            who, wanted, share = other
+        own = float(np.linalg.norm((mean.standard_error / mean.value, warm_error / warm, 2.0 * scale_error)))
+        springs["equipartition"] = _known_to(value, own)
+        for who, wanted, share in others:
             apart = float(np.log(value / wanted))
             # neither is better than 5 %
-            if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((*shares, share, 0.05)):
+            if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((own, share, 0.05)):
                 doubt = (
                     f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
                     f"are {np.exp(-0.5 * apart):.3g} times the true ones"
@@ -365,4 +385,4 @@ def _judged(e: Calibration) -> Calibration:
         f"The spring constants contradict each other: {doubt}.": doubt is not None,
     }
     warnings = (*e.warnings, *(said for said, holds in notes.items() if holds))
-    return replace(e, valid=not reasons, reasons=tuple(reasons), warnings=warnings)
+    return replace(e, reasons=tuple(reasons), warnings=warnings)

@@ -18,36 +18,16 @@ measured/fitted density. Each term is the square of a residual, so that least sq
 """
 
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
 
-from afm_jax.solve.least_squares import Sum, levenberg_marquardt
+from afm_jax.solve.least_squares import Lowest, Sum, levenberg_marquardt
 from fitting.calibration.sweep import ResonanceSweep
 
 _LEAST_SQUARE = 1e-12
 """Of a modelled square, in units of the largest: a trial step may leave less, or a negative one, whose root is none."""
-_SEARCHES = 6
 _STEPS, _SETTLED = 100, 1e-20
-
-
-class ScanFit(NamedTuple):
-    """A scan fitted: amplitudes in units of the largest.
-
-    Attributes:
-        place: ln f0, ln Q and the linear parameters: real and imaginary parts of A, B, C in turn; or a, b, c.
-        residual: of all numbers measured, each over its error; with phase those along the vectors come first.
-        jacobian: of the residuals by the place.
-        model: the complex response, or the amplitude.
-        reverse: the phase was taken with the opposite sign.
-    """
-
-    place: Float[np.ndarray, " p"]
-    residual: Float[np.ndarray, " n"]
-    jacobian: Float[np.ndarray, "n p"]
-    model: Complex[np.ndarray, " points"]
-    reverse: bool
 
 
 def measured_response(sweep: ResonanceSweep) -> Complex[np.ndarray, " points"]:
@@ -83,6 +63,11 @@ def deviance_root(ratio: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return np.sign(apart) * np.sqrt(2.0 * np.maximum(apart - np.log1p(apart), 0.0))
 
 
+def _parts(numbers: Complex[np.ndarray, "n ..."]) -> Float[np.ndarray, "m ..."]:
+    """Return all real parts, and below them all imaginary parts."""
+    return np.concatenate([np.real(numbers), np.imag(numbers)])
+
+
 def _evaluate(
     sweep: ResonanceSweep,
     measured: Complex[np.ndarray, " points"],
@@ -94,32 +79,28 @@ def _evaluate(
     values = np.einsum("ntd,t->nd", terms, place[2:])
     model, slopes = values[:, 0], np.concatenate([values[:, 1:], terms[:, :, 0]], axis=1)
     if sweep.model == "phase":
-        turn = np.exp(-1j * np.angle(measured))
-        off, slopes = turn * (model - measured), turn[:, None] * slopes
-        residual, slopes = (np.concatenate([np.real(part), np.imag(part)]) for part in (off, slopes))
-        error = np.tile(error, 2)
+        residual, slopes = _parts((model - measured) / error), _parts(slopes / error[:, None])
+        return Sum(float(residual @ residual), residual, slopes), model
+    square = np.maximum(np.real(model), _LEAST_SQUARE)
+    slopes = np.where(np.real(model)[:, None] > _LEAST_SQUARE, np.real(slopes), 0.0)
+    model, size = np.sqrt(square), np.abs(measured)
+    if sweep.model == "amplitude":
+        residual, steep = model - size, 0.5 / model
     else:
-        square = np.maximum(np.real(model), _LEAST_SQUARE)
-        slopes = np.where(np.real(model)[:, None] > _LEAST_SQUARE, np.real(slopes), 0.0)
-        model, size = np.sqrt(square), np.abs(measured)
-        if sweep.model == "amplitude":
-            residual, slopes = model - size, slopes / (2.0 * model)[:, None]
-        else:
-            ratio = size**2 / square
-            residual = -deviance_root(ratio)
-            steep = np.divide(1.0 - ratio, residual, out=np.ones_like(ratio), where=residual != 0.0)
-            slopes = slopes * (steep / square)[:, None]
-    residual, slopes = residual / error, slopes / error[:, None]
+        ratio = size**2 / square
+        residual = -deviance_root(ratio)
+        steep = np.divide(1.0 - ratio, residual, out=np.ones_like(ratio), where=residual != 0.0) / square
+    residual, slopes = residual / error, slopes * (steep / error)[:, None]
     return Sum(float(residual @ residual), residual, slopes), model + 0j
 
 
 def _linear(
     sweep: ResonanceSweep, measured: Complex[np.ndarray, " points"], natural: float, quality_factor: float
 ) -> tuple[float, Float[np.ndarray, " p"]]:
-    """Return the best place for a frequency and a quality factor, and the sum of squares that it leaves, about."""
+    """Return the sum of squares about which the best place for a frequency and a quality factor leaves, and it."""
     columns = _terms(sweep, natural, quality_factor)[:, :, 0]
     if sweep.model == "phase":
-        design, wanted = (np.concatenate([np.real(part), np.imag(part)]) for part in (columns, measured))
+        design, wanted = _parts(columns), _parts(measured)
     else:
         # weighted such that the errors are about those of the amplitude, or of the density
         size = np.maximum(np.abs(measured), 1e-6)
@@ -132,12 +113,20 @@ def _linear(
     return chi2, np.array([np.log(natural), np.log(quality_factor), *found])
 
 
-def minimum(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> ScanFit:
-    """Return the least squares of a scan, from the best places of a grid of frequencies and widths.
+def minimum(
+    sweep: ResonanceSweep, error: Float[np.ndarray, " points"]
+) -> tuple[Lowest, Complex[np.ndarray, " points"], bool]:
+    """Return the least squares of a scan, from the best place of a grid of frequencies and widths.
+
+    A place is ln f0, ln Q and the linear parameters: real and imaginary parts of A, B, C in turn; or a, b, c.
 
     Args:
         sweep: the scan.
         error: of each point, in units of the largest amplitude; of a spectrum the relative error of a density.
+
+    Returns:
+        Where chi2 is smallest; the model's response (or amplitude) there, in units of the largest amplitude; and
+        whether the phase was taken with the opposite sign.
     """
     frequency, measured = sweep.frequency_khz, measured_response(sweep)
     span, peak = np.ptp(frequency), frequency[np.argmax(sweep.amplitude)]
@@ -149,21 +138,17 @@ def minimum(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> ScanF
         [*np.linspace(frequency[0], frequency[-1], 12).tolist(), *near.tolist()],
         np.maximum(frequency.mean() / np.geomspace(0.3 * step, 3.0 * span, 10), 0.6).tolist(),
     )
-    starts = sorted(((*_linear(sweep, *place), place[0]) for place in grid), key=lambda start: start[0])
-    longest = np.append([1.0, 1.0], np.full(len(starts[0][1]) - 2, np.inf))
-    ends = []
-    for _, start, signed in starts[:_SEARCHES]:
-        end = levenberg_marquardt(
-            lambda place, signed=signed: _evaluate(sweep, signed, error, place)[0],
-            start,
-            settled=_SETTLED,
-            most=_STEPS,
-            longest=longest,
-        )
-        ends.append((end, signed))
-    best, signed = min(ends, key=lambda end: end[0].sum.value)
-    model = _evaluate(sweep, signed, error, best.place)[1]
-    return ScanFit(best.place, best.sum.residual, best.sum.jacobian, model, reverse=signed is not measured)
+    starts = ((*_linear(sweep, *place), place[0]) for place in grid)
+    _, start, signed = min(starts, key=lambda start: start[0])
+    longest = np.append([1.0, 1.0], np.full(len(start) - 2, np.inf))
+    best = levenberg_marquardt(
+        lambda place: _evaluate(sweep, signed, error, place)[0],
+        start,
+        settled=_SETTLED,
+        most=_STEPS,
+        longest=longest,
+    )
+    return best, _evaluate(sweep, signed, error, best.place)[1], signed is not measured
 
 
 def chi2_without_resonance(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> float:

@@ -11,8 +11,7 @@ unit); ``phase_deg`` and ``amplitude_error_nm`` (or ``amplitude_error``) may joi
 by its line ``[DATA]``.
 
 A thermal spectrum is a sweep whose amplitude is the root of a spectral density: NanoSurf's .nid, or a CSV file with
-``asd_nm_per_sqrt_hz`` or ``psd_nm2_per_hz`` and a comment ``# averages = 1000``, the number of spectra averaged.
-Comments may also say ``temperature_k``, ``length_um`` and ``width_um`` of the lever, and ``scale_error``.
+``asd_nm_per_sqrt_hz`` or ``psd_nm2_per_hz``.
 
 Nanonis writes a header of tab-separated lines, then a block of data. The columns read are ``Frequency Shift (Hz)`` with
 ``Center Frequency (Hz)`` (or ``Frequency (Hz)``), ``Amplitude (m)`` and, where it is there, ``Phase (deg)``; others are
@@ -21,8 +20,7 @@ passed over.
 
 import contextlib
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,19 +30,9 @@ from jaxtyping import Float, Int
 from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.whole_files import first_bytes
-from fitting.instruments.formats import holds_curves, read_recording
+from fitting.instruments.formats import read_recording
 from fitting.instruments.recording import UNITS, Recording
-from fitting.tables.csv_text import (
-    Column,
-    Faults,
-    FileSetting,
-    Form,
-    TableError,
-    column_of,
-    fault_in_number,
-    read_columns,
-    read_text,
-)
+from fitting.tables.csv_text import Column, Faults, Form, TableError, column_of, read_columns, read_text
 
 DENSITY = "nm/sqrt(Hz)"
 """The unit that makes a sweep a thermal spectrum."""
@@ -68,19 +56,6 @@ SWEEP = Form(
 )
 """The columns that a CSV file may have, and the attribute of `ResonanceSweep` that each becomes."""
 _UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}
-_SETTINGS = {
-    setting.key: setting
-    for setting in (
-        FileSetting("averages", "1000", lowest=0.5),
-        FileSetting("temperature_k", "296 +- 3", unit="K", error="maybe"),
-        FileSetting("length_um", "225 +- 2", unit="um", error="maybe"),
-        FileSetting("width_um", "40 +- 1", unit="um", error="maybe"),
-        FileSetting("scale_error", "0.05"),
-    )
-}
-"""What comments of a CSV file say, in place of options of `calibrate`."""
-
-
 _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error")
 
 
@@ -97,11 +72,10 @@ class ResonanceSweep(Result):
             of the response in all directions.
         amplitude_unit: "nm", empty where the file does not say, "nm/sqrt(Hz)" of a thermal spectrum.
         instrument: what the instrument itself found, for comparison: ``frequency_khz``, ``quality_factor``; of a
-            thermal spectrum also ``spring_constant_n_per_m``.
-        settings: value and error of ``averages`` (how many periodograms a thermal spectrum is the mean of),
-            ``temperature_k``, ``length_um``, ``width_um`` and ``scale_error``, as far as they are known.
+            thermal spectrum also ``spring_constant_n_per_m``, and ``temperature_k`` if it says that.
+        averages: how many periodograms a thermal spectrum is the mean of; None: not known.
         source: path of the file as it was given.
-        lines: the line of the file that each point stands in, shape (points,).
+        lines: only for making one: the line of the file that each point stands in, for messages.
 
     Raises:
         TableError: if a value is impossible, or the lengths differ.
@@ -113,23 +87,22 @@ class ResonanceSweep(Result):
     amplitude_error: Float[np.ndarray, " points"] | None = None
     amplitude_unit: str = "nm"
     instrument: dict[str, float] = field(default_factory=dict)
-    settings: Mapping[str, tuple[float, float | None]] = field(default_factory=dict)
+    averages: float | None = None
     source: str = "sweep in memory"
-    lines: Int[np.ndarray, " points"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    lines: InitVar[Int[np.ndarray, " points"] | None] = None
 
-    def __post_init__(self):
-        faults = Faults(self.source, place="line" if len(self.lines) else "row")
-        columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
+    def __post_init__(self, lines: Int[np.ndarray, " points"] | None):
+        faults = Faults(self.source, place="row" if lines is None else "line")
         points = np.size(self.frequency_khz)
-        lines = np.array(self.lines if len(self.lines) else np.arange(1, points + 1), dtype=np.int64)
-        arrays = {name: column_of(name, values, len(lines), faults) for name, values in columns.items()}
+        columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
+        arrays = {name: column_of(name, values, points, faults) for name, values in columns.items()}
         faults.raise_any()
         for name, values in arrays.items():
-            SWEEP.check_numbers(name, values, lines, faults)
+            SWEEP.check_numbers(name, values, np.arange(1, points + 1) if lines is None else lines, faults)
         faults.raise_any()
         # The sort is stable: repeated measurements at one frequency keep their order.
         order = np.argsort(arrays["frequency_khz"], kind="stable")
-        for name, values in (arrays | {"lines": lines}).items():
+        for name, values in arrays.items():
             ordered = values[order]
             ordered.setflags(write=False)
             object.__setattr__(self, name, ordered)
@@ -138,11 +111,6 @@ class ResonanceSweep(Result):
     def points(self) -> int:
         """The number of points of the frequency scan."""
         return len(self.frequency_khz)
-
-    @property
-    def averages(self) -> float | None:
-        """How many periodograms a thermal spectrum is the mean of, or None: not known."""
-        return self.settings.get("averages", (None, None))[0]
 
     @property
     def spectrum(self) -> bool:
@@ -163,7 +131,7 @@ class ResonanceSweep(Result):
     def within(self, low_khz: float, high_khz: float) -> "ResonanceSweep":
         """Return the points between two frequencies; of a spectrum those that are above zero."""
         kept = (self.frequency_khz >= low_khz) & (self.frequency_khz <= high_khz) & (self.amplitude > 0.0)
-        columns = {name: getattr(self, name) for name in (*_COLUMNS, "lines")}
+        columns = {name: getattr(self, name) for name in _COLUMNS}
         return replace(self, **{name: None if column is None else column[kept] for name, column in columns.items()})
 
 
@@ -182,24 +150,17 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         text = first_bytes(path, 1 << 16)
     if text.startswith(b"[DataSet]") or _NANONIS.search(text):
         return _sweep_of(read_recording(path))
-    if text and holds_curves(text[:4096], str(path)):
-        raise TableError(
-            f"{path}: holds curves against height, no resonance sweep; `afm-jax tapping` reads the energy of a tap "
-            "off amplitude and phase"
-        )
     faults = Faults(str(path))
-    table = read_columns(read_text(path), SWEEP, _SETTINGS, faults)
-    unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
-    for key in {"averages", "scale_error"} & set(table.settings if unit != DENSITY else ()):
-        faults.add(f"{key} belongs to a thermal spectrum (asd_nm_per_sqrt_hz or psd_nm2_per_hz); remove the line")
+    table = read_columns(read_text(path), SWEEP, {}, faults)
     faults.raise_any()
-    named = {"amplitude_unit": unit, "settings": table.settings, "lines": table.lines, "source": str(path)}
-    return ResonanceSweep(**table.columns, **named)
+    unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
+    named: dict[str, Any] = table.columns | {"amplitude_unit": unit, "lines": table.lines, "source": str(path)}
+    return ResonanceSweep(**named)
 
 
 _NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)
 _SHIFT, _CENTRE = "Frequency Shift", "Center Frequency"
-_FOUND = ("frequency_khz", "quality_factor", "spring_constant_n_per_m")
+_FOUND = ("frequency_khz", "quality_factor", "spring_constant_n_per_m", "temperature_k")
 
 
 def _sweep_of(recording: Recording) -> ResonanceSweep:
@@ -226,7 +187,6 @@ def _sweep_of(recording: Recording) -> ResonanceSweep:
             f"shift and the center frequency), but {', '.join(channels)}"
         )
     known = {key.removeprefix("free_"): one.value for key, one in recording.known.items()}
-    errors = {"averages": None, "temperature_k": 3.0}
     spectrum = density is not None
     used = (khz > 0.0) & (size > 0.0) if spectrum else np.ones(len(khz), dtype=bool)
     return ResonanceSweep(
@@ -235,29 +195,6 @@ def _sweep_of(recording: Recording) -> ResonanceSweep:
         phase_deg=None if spectrum or phase is None else phase[used],
         amplitude_unit=DENSITY if spectrum else "nm",
         instrument={key: float(known[key]) for key in _FOUND if key in known},
-        settings={key: (float(known[key]), error) for key, error in errors.items() if key in known},
+        averages=float(known["averages"]) if "averages" in known else None,
         source=recording.source,
     )
-
-
-def stated_settings(
-    sweep: ResonanceSweep, given: Mapping[str, tuple[float, float | None] | float | None]
-) -> dict[str, tuple[float, float | None]]:
-    """Return the settings of a call, each with its error, in front of those of the file.
-
-    Raises:
-        TypeError: if there is no such setting.
-        ValueError: if a value is impossible, or a lever has one side only.
-    """
-    found = dict(sweep.settings)
-    for key, value in given.items():
-        if key not in _SETTINGS:
-            raise TypeError(f"there is no setting `{key}`; the settings are {', '.join(_SETTINGS)}")
-        if value is not None:
-            found[key] = value if isinstance(value, tuple) else (float(value), None)
-            fault = fault_in_number(_SETTINGS[key], *found[key])
-            if fault is not None:
-                raise ValueError(f"`{key}` {fault}")
-    if ("length_um" in found) != ("width_um" in found):
-        raise ValueError("Sader's method needs both `length_um=...` and `width_um=...`")
-    return found

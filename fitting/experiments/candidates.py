@@ -38,7 +38,7 @@ def drive_grid(
     amplitudes_nm: Numbers,
     detunings: Numbers,
     free_frequency_khz: float,
-    offsets_nm: Numbers = (0.0,),
+    offsets_nm: Numbers | None = None,
     drive: str = "sample",
     heights: Numbers | None = None,
 ) -> Drives:
@@ -50,7 +50,7 @@ def drive_grid(
         detunings: drive frequencies as multiples of each order's resonance 2 N f0 (of f0 where the cantilever is driven
             itself).
         free_frequency_khz: f0.
-        offsets_nm: mean heights of the platform above the tip's rest position.
+        offsets_nm: mean heights of the platform above the tip's rest position; None: 0 alone.
         drive: what is driven: "sample", "force" (on the tip) or "base".
         heights: in place of the offsets, distances of the sample from the rest position of a tip that is driven itself,
             as shares of its free amplitude: 0.9 is where it begins to tap.
@@ -59,7 +59,10 @@ def drive_grid(
         ValueError: if a list is empty or a number impossible, or there are too many combinations.
     """
     check_drive(drive)
-    sample, places = drive == "sample", offsets_nm if heights is None else heights
+    if offsets_nm is not None and heights is not None:
+        raise ValueError("`offsets_nm` and `heights` both say where the sample can be; give one")
+    sample, places = drive == "sample", heights if offsets_nm is None else offsets_nm
+    places = (0.0,) if places is None else places
     positive = {"free_frequency_khz": free_frequency_khz, "orders": orders, "amplitudes_nm": amplitudes_nm}
     for name, numbers in (positive | {"detunings": detunings}).items():
         check_parameter(name, np.asarray(numbers), "positive")
@@ -105,20 +108,17 @@ class Candidates:
     Attributes:
         drives: all that can be driven.
         why_not: a key of `LEFT_OUT` for each drive; empty for those that can be planned with.
-        amplitude_nm: expected peak and lock-in amplitude, shape (rows, 2); of a cantilever that is driven itself
-            its lag in degrees too, shape (rows, 3).
-        error_nm: standard errors of their measurement, the model's own error included; infinite where not usable.
+        readings: expected peak and lock-in amplitude in nm, and lag in degrees; NaN of what is not read.
         approach_speed_nm_per_us: expected.
         slope: derivatives of the readings by the parameters, made independent and of unit variance as a fit does it
-            (without a model error: divided by their errors), shape (rows, k, p); 0 where not usable.
+            (without a model error: divided by their errors), shape (rows, 3, p); 0 where not usable.
     """
 
     drives: Drives
     why_not: tuple[str, ...]
-    amplitude_nm: Float[np.ndarray, "rows k"]
-    error_nm: Float[np.ndarray, "rows k"]
+    readings: Float[np.ndarray, "rows 3"]
     approach_speed_nm_per_us: Float[np.ndarray, " rows"]
-    slope: Float[np.ndarray, "rows k p"]
+    slope: Float[np.ndarray, "rows 3 p"]
 
     @property
     def usable(self) -> Bool[np.ndarray, " rows"]:
@@ -165,11 +165,21 @@ _LEAST = 1e-12
 """Stands for 0 where an unknown is the logarithm of a parameter."""
 
 
-def _explained(prior: Prior, drives: Drives, noise: float, phase_noise_deg: float, amplitudes: str) -> Explained:
-    """Return drives as rows of a fit that have read what is expected; its Jacobian is by the prior's parameters."""
+def explained(
+    prior: Prior, drives: Drives, *, noise: float, amplitudes: str = "both", phase_noise_deg: float = PHASE_NOISE_DEG
+) -> Explained:
+    """Return drives as rows of a fit that have read what is expected; its Jacobian is by the prior's parameters.
+
+    Args:
+        prior: the law and the instrument.
+        drives: what can be driven.
+        noise: standard error of an amplitude relative to it.
+        amplitudes: what is read: "peak", "lockin" or "both"; of a cantilever that is driven itself always the lock-in
+            amplitude and the lag.
+        phase_noise_deg: standard error of the lag in degrees.
+    """
     model, theta = model_of(prior, drives, prior.values)
     found = orbits_at(model, theta)
-    slopes = model.slopes(theta, found.orbits)
     readings, out = found.orbits.readings, np.zeros(len(found.number), bool)
     tapping = prior.problem.tapping
     read = [not tapping and amplitudes != "lockin", tapping or amplitudes != "peak", tapping]
@@ -178,7 +188,8 @@ def _explained(prior: Prior, drives: Drives, noise: float, phase_noise_deg: floa
     model = replace(model, data=replace(model.data, read=expected, error=error))
     lasting = model.law.lasting
     weights = weights_of(model, theta, found.orbits, out) if lasting else plain_weights(model.data, 0.0, out)
-    jacobian = (weights.whitening @ (slopes / _by_unknown(model, theta))).reshape(-1, theta.size)
+    slopes = model.slopes(theta, found.orbits) / _by_unknown(model, theta)
+    jacobian = (weights.whitening @ slopes).reshape(-1, theta.size)
     return Explained(model, Descent(theta, found.orbits, 0.0, out, jacobian), weights, found, 0.0, settled=True)
 
 
@@ -190,54 +201,38 @@ def _by_unknown(model: Model, theta: Float[np.ndarray, " p"]) -> Float[np.ndarra
     return change
 
 
-def candidates_of(
-    prior: Prior,
-    drives: Drives,
-    *,
-    noise: float,
-    amplitudes: str = "both",
-    largest_nm: float = np.inf,
-    phase_noise_deg: float = PHASE_NOISE_DEG,
-) -> Candidates:
+def candidates_of(prior: Prior, drives: Drives, rows: Explained, largest_nm: float = np.inf) -> Candidates:
     """Return what a measurement at every drive would say, by derivatives of the predicted readings.
 
     Args:
         prior: the law and the instrument; orbits must be there for values as uncertain as it is.
         drives: what can be driven.
-        noise: standard error of an amplitude relative to it.
-        amplitudes: what is read: "peak", "lockin" or "both"; of a cantilever that is driven itself always the lock-in
-            amplitude and the lag.
+        rows: the drives, from `explained`.
         largest_nm: peak amplitude that the instrument takes; of a cantilever that is driven itself the free one.
-        phase_noise_deg: standard error of the lag in degrees.
     """
-    rows = _explained(prior, drives, noise, phase_noise_deg, amplitudes)
-    orbits, number, weights = rows.end.orbits, rows.found.number, rows.weights
+    orbits, number = rows.end.orbits, rows.found.number
     sure = (number == 1) & (np.abs(orbits.fold) > NEAR_FOLD)
     for values in prior.draws(DRAWS, least=MARGIN)[1:]:
         drawn = model_of(prior, drives, values)
         found = orbits_at(*drawn, np.flatnonzero(sure))
         sure &= (found.number == 1) & (np.abs(found.orbits.fold) > NEAR_FOLD)
-    kinds, slope = 3 if prior.problem.tapping else 2, rows.end.jacobian.reshape(len(sure), READINGS, -1)
+    slope = rows.end.jacobian.reshape(len(sure), READINGS, -1)
     size = drives.amplitude_nm if prior.problem.tapping else orbits.readings[:, 0]
     holds = {
         "measured": same_drives(drives, prior.measured),
         "no orbit": number == 0,
         "unsure": ~sure | ~np.isfinite(slope).all(axis=(1, 2)),
         "too large": size > largest_nm,
-        "inaccurate": weights.reasons != "",
+        "inaccurate": rows.weights.reasons != "",
     }
     why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), "") for row in range(len(sure)))
-    usable = np.array([not reason for reason in why_not])[:, None]
-    whitening = np.where(usable[:, :, None], weights.whitening, 0.0)
-    # the covariance of what is used is the inverse of W^T W
-    variance = np.diagonal(np.linalg.pinv(np.swapaxes(whitening, 1, 2) @ whitening), axis1=1, axis2=2)
+    usable = np.array([not reason for reason in why_not])[:, None, None]
     return Candidates(
         drives=drives,
         why_not=why_not,
-        amplitude_nm=orbits.readings[:, :kinds],
-        error_nm=np.sqrt(np.where(weights.used & usable, variance, np.inf))[:, :kinds],
+        readings=np.mod(rows.model.data.read, [np.inf, np.inf, 360.0]),
         approach_speed_nm_per_us=orbits.approach,
-        slope=np.where(usable[:, :, None], slope, 0.0)[:, :kinds],
+        slope=np.where(usable, slope, 0.0),
     )
 
 
@@ -247,13 +242,7 @@ def standard_errors(information: Float[np.ndarray, "... p p"]) -> Float[np.ndarr
 
 
 def forecast(
-    prior: Prior,
-    candidates: Candidates,
-    chosen: Int[np.ndarray, " points"],
-    *,
-    noise: float,
-    amplitudes: str = "both",
-    phase_noise_deg: float = PHASE_NOISE_DEG,
+    prior: Prior, rows: Explained, candidates: Candidates, chosen: Int[np.ndarray, " points"]
 ) -> Float[np.ndarray, "steps p"]:
     """Return the standard errors that a fit will state, before and after each chosen point.
 
@@ -262,40 +251,36 @@ def forecast(
 
     Args:
         prior: the law and the instrument.
-        candidates: all drives.
+        rows: the drives, from `explained`.
+        candidates: the same drives.
         chosen: numbers of the points.
-        noise: standard error of an amplitude relative to it.
-        amplitudes: what is read, as of `candidates_of`.
-        phase_noise_deg: standard error of a lag in degrees.
     """
     each = candidates.information[chosen]
     errors = standard_errors(prior.information + np.cumsum([np.zeros_like(prior.information), *each], axis=0))
     if prior.problem.lasting and chosen.size:
-        drives = Drives(*(column[chosen] for column in candidates.drives))
-        rows = _explained(prior, drives, noise, phase_noise_deg, amplitudes)
-        errors[1:] = [_stated(prior, rows, count) for count in range(1, len(chosen) + 1)]
+        errors[1:] = [_stated(prior, rows, chosen[: 1 + last]) for last in range(len(chosen))]
     return errors
 
 
-def _stated(prior: Prior, rows: Explained, count: int) -> Float[np.ndarray, " p"]:
-    """Return the standard errors that a fit of the first rows states: with everything unknown that it has."""
-    orbits, law, own = rows.end.orbits, rows.model.law, prior.problem.own
+def _stated(prior: Prior, rows: Explained, chosen: Int[np.ndarray, " points"]) -> Float[np.ndarray, " p"]:
+    """Return the standard errors that a fit of some of the rows states: with everything unknown that it has."""
+    law, own, measured = rows.model.law, prior.problem.own, np.isin(np.arange(len(rows.found.number)), chosen)[:, None]
+    orbits = rows.end.orbits._replace(x=np.where(measured, rows.end.orbits.x, np.nan))
     if isinstance(law, FormulaLaw):
         # a fit has drag whatever the formula is; a prior that a fit left is of the formula alone
         drag = not len(prior.measured) and "viscous_loss" not in (*law.own, *law.fixed)
-        ends = float(orbits.approach[:count].min()), float(orbits.approach[:count].max())
+        ends = float(orbits.approach[chosen].min()), float(orbits.approach[chosen].max())
         law = replace(law, own=(*law.own, "viscous_loss") if drag else law.own).beside(ends, SMOOTH)
     model = replace(rows.model, law=law, remainders=remainders_of(rows.model, rows.end.theta, orbits))
     places, theta = [model.names.index(name) for name in prior.problem.names], np.zeros(len(model.names))
     theta[places], change = rows.end.theta, _by_unknown(rows.model, rows.end.theta)
-    of_rows = (rows.weights.whitening @ model.slopes(theta, orbits))[:count].reshape(-1, theta.size)
+    of_rows = (rows.weights.whitening @ model.slopes(theta, orbits))[chosen].reshape(-1, theta.size)
     of_prior = np.zeros((len(places), theta.size))
     known, axes = np.linalg.eigh(prior.sizes[:, None] * prior.information * prior.sizes)
     of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / prior.sizes * change
     of_law = np.diag(model.prior[1])[: theta.size - len(model.instrument)]
     end = rows.end._replace(theta=theta, jacobian=np.concatenate([of_rows, of_prior, of_law]))
-    used = rows.weights.used & (np.arange(len(orbits.x)) < count)[:, None]
-    fit = replace(rows, model=model, end=end, weights=rows.weights._replace(used=used))
+    fit = replace(rows, model=model, end=end, weights=rows.weights._replace(used=rows.weights.used & measured))
     errors = np.sqrt(np.diag(fit.covariance))[places] * np.abs(change)
     if not len(prior.measured):
         stated = closest_parameters(fit, own, prior.fixed).errors[: len(own)]

@@ -14,20 +14,21 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.checks import check_count, check_parameter, checked, require_float64
 from afm_jax.columns import rows_of
 from afm_jax.impact.law import extrapolation_of
-from afm_jax.results import Result, public_result
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, known, text_table, with_error
-from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
+from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, explained, forecast
 from fitting.experiments.prior import Prior, prior_of_fit
 from fitting.infer.result import FitResult
 from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import Drives
 
-FORMAT_VERSION = 2
-"""Version of the JSON layout; raised when a key changes its meaning or goes."""
 AMPLITUDES = ("both", "peak", "lockin")
-_READINGS = ("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg")
+_EXACT = (
+    "The quality factor is taken as exactly known, which makes every forecast too good: give it with its error, such "
+    "as '40 +- 2'."
+)
 _PRINTED = {
     "order": ("N", "d"),
     "drive_frequency_khz": ("kHz", ".8g"),
@@ -44,7 +45,7 @@ _PRINTED = {
 
 @public_result(picture="fitting.experiments.picture:design_figure", rows="points")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Design(Result):
+class Design(JudgedResult):
     """The drives to measure next and the errors to expect: what `design` returns, named like the keys of its JSON.
 
     Attributes:
@@ -55,7 +56,6 @@ class Design(Result):
         chosen: numbers of the points among the candidates, the most useful first.
         errors: standard error of every parameter so far and after each point, as a fit will state it, shape
             (points + 1, p); infinite where not determined.
-        valid: there is something to measure, and it determines the parameters of interest.
         reasons: what makes the design invalid.
         warnings: what a reader should know besides.
     """
@@ -66,7 +66,6 @@ class Design(Result):
     candidates: Candidates
     chosen: Int[np.ndarray, " points"]
     errors: Float[np.ndarray, "steps p"]
-    valid: bool
     reasons: list[str]
     warnings: list[str]
 
@@ -76,21 +75,14 @@ class Design(Result):
         return Drives(*(column[self.chosen] for column in self.candidates.drives))
 
     @property
-    def reason(self) -> str | None:
-        """Why the design must not be followed; None if it may."""
-        return next(iter(self.reasons), None)
-
-    @property
     def columns(self) -> dict[str, list[Any]]:
-        """The drives under the names of a table's columns, the readings to expect, and their errors."""
+        """The drives under the names of a table's columns, and the readings to expect."""
         found, chosen, tapping = self.candidates, self.chosen, self.prior.problem.tapping
         names = "order", "drive_frequency_khz", f"{'free' if tapping else 'drive'}_amplitude_nm", "offset_nm"
         columns: dict[str, Any] = dict(zip(names, self.drives, strict=True))
-        readings = zip(_READINGS, found.amplitude_nm[chosen].T, found.error_nm[chosen].T, strict=False)
-        for (name, unit), value, error in readings:
-            if np.isfinite(error).all():
-                columns[f"expected_{name}_{unit}"] = value % 360.0 if unit == "deg" else value
-                columns[f"expected_{name}_error_{unit}"] = error
+        readings = zip(("peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg"), found.readings.T, strict=True)
+        read = {f"expected_{name}": reading[chosen] for name, reading in readings}
+        columns |= {name: reading for name, reading in read.items() if np.isfinite(reading).all()}
         columns["expected_approach_speed_nm_per_us"] = found.approach_speed_nm_per_us[chosen]
         return {name: column.tolist() for name, column in columns.items()}
 
@@ -111,15 +103,15 @@ class Design(Result):
 
     def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
         entries = {}
-        for parameter, value, error in zip(
-            self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist(), strict=True
-        ):
-            entry = entries[parameter.name] = {"value": value, "unit": parameter.unit, "standard_error": error}
-            ends = (value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error)
-            entry["interval95"] = np.clip(ends, parameter.lowest, parameter.highest).tolist()
-            if not np.isfinite(error):
-                no_error = {"standard_error": None, "interval95": [None, None]}
-                entry |= no_error | {"reason": "the measurements do not determine it"}
+        each = zip(self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist(), strict=True)
+        for parameter, value, error in each:
+            known, ends = np.isfinite(error), value + TWO_SIDED_95 * error * np.array([-1.0, 1.0])
+            entries[parameter.name] = {
+                "value": value,
+                "unit": parameter.unit,
+                "standard_error": error if known else None,
+                "interval95": np.clip(ends, parameter.lowest, parameter.highest).tolist() if known else [None, None],
+            }
         return entries
 
     def to_dict(self) -> dict[str, Any]:
@@ -127,7 +119,7 @@ class Design(Result):
         names = ("valid", "reasons", "warnings", "noise", "expected", "measured_so_far")
         return {
             "format": "afm-jax design",
-            "format_version": FORMAT_VERSION,
+            "format_version": 2,
             "drive": self.prior.problem.drive,
             "model": self.prior.problem.model,
             **{name: getattr(self, name) for name in names},
@@ -144,22 +136,21 @@ class Design(Result):
 
     def printed(self) -> list[Any]:
         """Return the verdict, the points, what they will determine, and notes."""
-        columns, usable, table = self.columns, self.candidates.usable, {}
-        for name in (name for name in _PRINTED if name in columns):
-            (head, form), (stem, _, unit) = _PRINTED[name], name.rpartition("_")
-            table[head] = [f"{value:{form}}" for value in columns[name]]
-            errors = columns.get(f"{stem}_error_{unit}", [])
-            if errors:
-                table[head] = [f"{cell} +- {error:{form}}" for cell, error in zip(table[head], errors, strict=True)]
+        usable, points = self.candidates.usable, self.points()
+        table = {
+            head: [f"{value:{form}}" for value in self.columns[name]]
+            for name, (head, form) in _PRINTED.items()
+            if name in self.columns
+        }
         for name in self.interest[:4]:
-            table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in self.points()]
+            table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in points]
         then = [
             f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
             for name, entry in self.expected.items()
         ]
         left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in self.candidates.left_out.items()]
-        verdict, prior = "VALID" if self.valid else "NOT VALID", self.prior
-        title = f"{verdict}: {len(self.chosen)} points to measure next for {', '.join(self.interest)}"
+        prior = self.prior
+        title = f"{self.verdict}: {len(self.chosen)} points to measure next for {', '.join(self.interest)}"
         return [
             f"{title} ({prior.problem.model}, {prior.source})",
             *bullets("Reasons:", self.reasons),
@@ -226,12 +217,12 @@ def design(  # noqa: PLR0913
     check_parameter("noise", noise, "between 0 and 1")
     check_parameter("largest_nm", largest_nm, "positive", optional=True)
     check_parameter("phase_noise_deg", phase_noise_deg, "positive")
-    reading: dict[str, Any] = {"noise": noise, "phase_noise_deg": phase_noise_deg, "amplitudes": amplitudes}
-    candidates = candidates_of(prior, drives, largest_nm=largest_nm or np.inf, **reading)
+    rows = explained(prior, drives, noise=noise, amplitudes=amplitudes, phase_noise_deg=phase_noise_deg)
+    candidates = candidates_of(prior, drives, rows, largest_nm or np.inf)
     usable = np.flatnonzero(candidates.usable)
     matters = np.array([name in interest for name in names])
     chosen = usable[choose_points(prior.information, candidates.information[usable], points, matters)]
-    errors = forecast(prior, candidates, chosen, **reading)
+    errors = forecast(prior, rows, candidates, chosen)
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
     left_out = "; ".join(f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items())
     reasons = {
@@ -241,7 +232,8 @@ def design(  # noqa: PLR0913
     }
     few = f"Only {chosen.size} of the {points} points asked for can be planned with: all are chosen."
     beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
-    notes = (*prior.notes, few if 0 < chosen.size < points else None, beyond)
+    exact = prior.quality_factor is not None and "quality_factor" not in names
+    notes = (*prior.notes, _EXACT if exact else None, few if 0 < chosen.size < points else None, beyond)
     return Design(
         prior=prior,
         interest=tuple(interest),
@@ -249,7 +241,6 @@ def design(  # noqa: PLR0913
         candidates=candidates,
         chosen=chosen,
         errors=errors,
-        valid=not any(reasons.values()),
         reasons=[said for said, holds in reasons.items() if holds],
         warnings=[note for note in notes if note],
     )
@@ -270,12 +261,11 @@ def choose_points(
     unit = 1.0 / np.sqrt(np.where(strength > 0.0, strength, 1.0))
     # a little information on every parameter: the first points, which alone determine nothing, can then be compared
     so_far, gains = unit[:, None] * prior * unit + 1e-9 * np.eye(len(unit)), unit[:, None] * each * unit
-    nuisances = np.flatnonzero(~matters)
 
     def score(information: Float[np.ndarray, "n p p"]) -> Float[np.ndarray, " n"]:
         """Return log det of the information about what matters: log det F - log det F_nuisances."""
-        whole = np.linalg.slogdet(information)[1]
-        return whole - np.linalg.slogdet(information[:, nuisances[:, None], nuisances])[1] if nuisances.size else whole
+        whole, nuisances = np.linalg.slogdet(information)[1], information[:, ~matters][:, :, ~matters]
+        return whole - np.linalg.slogdet(nuisances)[1]
 
     chosen: list[int] = []
     for _ in range(min(points, len(each))):

@@ -25,10 +25,6 @@ from fitting.tables.csv_text import FARTHEST, TableError, read_fit_json
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
 DRAW_SEED = 1997
-EXACT_QUALITY_FACTOR = (
-    "The quality factor is taken as exactly known, which makes every forecast too good: give it with its error, such "
-    "as '40 +- 2'."
-)
 
 
 @public_result()
@@ -133,14 +129,11 @@ def prior_of_values(  # noqa: PLR0913
     check_constraints(known, model, own, drive)
     given = {name: value for name, (value, _) in known.items()} | dict(values or {})
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), drive=drive)
-    assumed, notes = ", ".join(name for name in own if name not in given), []
-    if assumed:
-        notes.append(
-            f"Not given, and taken from the paper's contact: {assumed}. The forecast is as good as these values; "
-            "design again from a first fit."
-        )
-    if quality_factor is not None and "quality_factor" not in known:
-        notes.append(EXACT_QUALITY_FACTOR)
+    assumed = ", ".join(name for name in own if name not in given)
+    note = (
+        f"Not given, and taken from the paper's contact: {assumed}. The forecast is as good as these values; design "
+        "again from a first fit."
+    )
     return Prior(
         problem=problem,
         values=_checked_values(problem, paper_values(model, mass_ng or 1.0) | given),
@@ -150,7 +143,7 @@ def prior_of_values(  # noqa: PLR0913
         mass_ng=mass_ng,
         uncertainty=uncertainty,
         source="values assumed" if assumed else "values given",
-        notes=tuple(notes),
+        notes=(note,) if assumed else (),
     )
 
 
@@ -214,12 +207,8 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
     driven = [one for one in tables if (one.get("drive") or "sample") == drive]
     columns = "order", "drive_frequency_khz", f"{'free' if problem.tapping else 'drive'}_amplitude_nm", "offset_nm"
-    law, notes = payload.get("law"), []
-    if not payload["valid"]:
-        reason = " ".join(payload.get("reasons") or ["no reason given."])
-        notes.append(f"The fit that the design rests on is not valid: {reason}")
-    if table.get("quality_factor") is not None and "quality_factor" not in found:
-        notes.append(EXACT_QUALITY_FACTOR)
+    law, valid = payload.get("law"), payload["valid"]
+    note = f"The fit that the design rests on is not valid: {' '.join(payload.get('reasons') or ['no reason given.'])}"
     return Prior(
         problem=problem,
         values=_checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
@@ -231,8 +220,8 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         uncertainty=uncertainty,
         measured=np.array([[place for one in driven for place in one[name]] for name in columns], float).T,
         source=f"fit of {table.get('source', 'a table')}",
-        notes=tuple(notes),
-        law=law_of_dict(law) if law and law.get("numbers") and payload["valid"] else None,
+        notes=() if valid else (note,),
+        law=law_of_dict(law) if law and law.get("numbers") and valid else None,
     )
 
 

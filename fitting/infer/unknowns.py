@@ -23,7 +23,7 @@ from fitting.predict.orbit import COUNT, READINGS, Local, Orbits, Row, followed,
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
-_UNDAMPED = 1e15
+UNDAMPED = 1e15
 """Quality factor of no air damping: by an infinite one there is no derivative."""
 REMAINDERS = 7
 """Leading terms that the corrections of impacts that last leave out."""
@@ -60,7 +60,7 @@ class Data:
         time: from -1/2 to 1/2 where a table's rows stand in order of time, else 0.
         number: of the row's table.
         drives: what is driven in each table.
-        free_frequency_khz, quality_factor: as each row's table gives them; `_UNDAMPED`: no air damping.
+        free_frequency_khz, quality_factor: as each row's table gives them; `UNDAMPED`: no air damping.
         mass_ng: of the tip.
     """
 
@@ -104,7 +104,7 @@ def data_of(table: AmplitudeTable | SeveralTables, task: Task) -> Data:
         if quality is not None and np.isnan(quality):
             known = task.known.get(name_of_table("quality_factor", label)) or task.known["quality_factor"]
             quality = known[0]
-        heads.append((member.free_frequency_khz, _UNDAMPED if quality is None else float(quality)))
+        heads.append((member.free_frequency_khz, UNDAMPED if quality is None else float(quality)))
         columns.append(_columns_of(member, quality))
     number = np.repeat(np.arange(len(tables)), [member.rows for member in tables])
     whole = {name: np.concatenate([part[name] for part in columns]) for name in columns[0]}
@@ -189,7 +189,7 @@ _MOVES = {
     "phase_drift_deg": "phase_zero_deg",
 }
 """Which `Local` a quantity moves."""
-_NEUTRAL = {"drive_calibration": 1.0, "tip_calibration": 1.0}
+NEUTRAL = {"drive_calibration": 1.0, "tip_calibration": 1.0}
 """What stands for the absence of a quantity, if that is not 0 or what the table gives."""
 
 
@@ -254,7 +254,7 @@ class Model:
     def _instrument_at(self, theta: Any, numpy: Any = np) -> dict[str, Any]:
         """Return every quantity of the instrument for each row, by its kind."""
         data, first = self.data, len(self.names) - len(self.instrument)
-        known = {name: numpy.full(data.time.shape, _NEUTRAL.get(name, 0.0)) for name in _MOVES}
+        known = {name: numpy.full(data.time.shape, NEUTRAL.get(name, 0.0)) for name in _MOVES}
         known |= {name: numpy.asarray(getattr(data, name)) for name in _FACTORS}
         for i, quantity in enumerate(self.instrument):
             value = quantity.at(theta[first + i], numpy)

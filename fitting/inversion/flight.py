@@ -1,169 +1,81 @@
-"""From amplitudes and phase of a single-impact orbit to its flight, and from the flight to the impact: no law needed.
+"""From amplitudes and phase of single-impact orbits to their impacts: no law needed.
 
-The response's amplitude and phase say when the tip leaves the platform and how fast; the rest is free flight, until it
-meets the platform again. Where three numbers are measured (peak, lock-in amplitude, phase) the two unknowns are their
-least squares.
+Orbits are those of the fits' program (`fitting.predict.orbit`), over the table of an impact that loses nothing and
+takes no time. What an impact really does to the squared rebound speed and to the delay is free for every row: with
+coordinate, phase of arrival and delay these are five unknowns for the three gaps of an orbit and up to three readings
+(peak and lock-in amplitude, phase), of which the least squares are taken. What air, spring and the platform's motion do
+during the contact is that of a Hertz contact as long as the delay, for want of a law that tells lead and offset apart.
 """
 
-from functools import partial
-from typing import NamedTuple
-
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Float
 
-from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
-from afm_jax.impact.lasting_impact import gained_and_longer, indentation, middle_of_contact
-from afm_jax.impact.orbits import FlightEnds, lockin, peak_amplitude
-from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
-from afm_jax.solve.lanes import compiled_quickly
+from afm_jax.impact.law_table import EXCESS, KNOTS, coordinate_of, table_of
+from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.predict.orbit import Row, evaluated
 
+_NOTHING = table_of(0.0, EXCESS**2, np.zeros(KNOTS), np.zeros(4))
 _HALF_SINE = 0.42441318157838753
 """4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
-_ANGLES = (-0.45, 0.0, 0.45)
-"""Starts of the search: angle of the response in rad beside a half sine's."""
+_STEPS, _ARRIVED = 40, 1e-9
+"""Steps of Gauss and Newton, and the last one of a row that has arrived, in their units."""
 
 
-class MeasuredRow(NamedTuple):
-    """One row: its drive, and peak, lock-in amplitude and phase (nm, nm, degrees) with errors; arrays of one row."""
-
-    platform: Platform
-    order: Float[Array, ""]
-    value: Float[Array, " 3"]
-    error: Float[Array, " 3"]
-    """Infinite where nothing was measured."""
-
-
-class Inverted(NamedTuple):
-    """Rows inverted; arrays with a leading axis of rows."""
-
-    impact: Float[np.ndarray, "rows 3"]
-    """Approach speed, rebound speed and delay."""
-    covariance: Float[np.ndarray, "rows 3 3"]
-    chi2: Float[np.ndarray, " rows"]
-    """Of the measured numbers; 0 where there are only two."""
-    converged: Bool[np.ndarray, " rows"]
-
-
-def flight_of(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> FlightEnds:
-    """Return the flight that leaves the platform with unknowns: the start's phase nu t + phi, log of the velocity.
-
-    Its end is where it meets the platform about a response period later, by Newton's method.
-    """
-    nu = row.platform.angular_frequency / row.order
-    start = (unknowns[0] - jnp.deg2rad(row.value[2])) / nu
-    velocity = jnp.exp(unknowns[1])
-    position = row.platform.position(start)
-
-    def ends(duration):
-        z, v = cantilever.propagator(duration)(position, velocity)
-        height, speed = row.platform.position_and_velocity(start + duration)
-        return z, v, z - height, v - speed
-
-    def step(_, duration):
-        _, _, gap, rate = ends(duration)
-        # the tip must be closing in: a step is no longer than a tenth of the response period
-        move = jnp.where(rate < 0.0, -gap / jnp.where(rate < 0.0, rate, 1.0), 0.0)
-        return duration + jnp.clip(move, -0.1 * period, 0.1 * period)
-
-    period = row.order * row.platform.period_us
-    found = lax.stop_gradient(lax.fori_loop(0, 8, step, period))
-    _, _, gap, rate = ends(found)
-    # one more step carries the derivative of the root
-    duration = found - gap / lax.stop_gradient(rate)
-    end_position, end_velocity, _, _ = ends(duration)
-    return FlightEnds(start, duration, position, velocity, end_position, end_velocity)
-
-
-def readings(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
-    """Return peak and lock-in amplitude in nm and the phase in degrees that a flight makes."""
-    platform = row.platform
-    end = flight.start_us + flight.duration_us
-    tau = jnp.maximum(row.order * platform.period_us - flight.duration_us, 0.0)
-    # in contact the tip is below the platform's rest surface by the indentation
-    middle = middle_of_contact(cantilever, platform, end + 0.5 * tau)
-    nu = platform.angular_frequency / row.order
-    depth = indentation(platform.velocity(end) - flight.end_velocity, tau, middle, cantilever, nu)
-    amplitude, phase = lockin(cantilever, platform, flight, row.order, delayed=True, indentation=depth)
-    return jnp.stack([peak_amplitude(cantilever, flight), amplitude, phase])
-
-
-def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
-    """Return approach speed, rebound speed and delay between a flight and the next, of a free tip on a sample at rest.
-
-    What air, spring and the platform's motion do during a Hertz contact is taken back (`gained_and_longer`): its
-    duration is the delay, for want of a law that tells lead and offset apart.
-    """
-    platform = row.platform
-    end = flight.start_us + flight.duration_us
-    approach = platform.velocity(end) - flight.end_velocity
-    rebound = flight.start_velocity - platform.velocity(flight.start_us)
-    delay = row.order * platform.period_us - flight.duration_us
-    middle = middle_of_contact(cantilever, platform, flight.start_us - 0.5 * delay)
-
-    def taken_back(tau):
-        return gained_and_longer(approach, jnp.maximum(tau, 0.0), middle, cantilever)
-
-    free_delay = lax.fori_loop(0, 3, lambda _, free_delay: delay - taken_back(free_delay)[1], delay)
-    square = jnp.where(rebound > 0.0, rebound**2 - taken_back(delay)[0], -1.0)
-    free_rebound = jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), jnp.nan)
-    return jnp.stack([approach, free_rebound, free_delay])
-
-
-@compiled_quickly()
-@partial(jax.vmap, in_axes=(0, 0, None))
-def _evaluate(
-    unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever
-) -> tuple[Float[Array, " 6"], Float[Array, "6 2"]]:
-    """Return the residuals of a place, then the impact that it says, and their derivatives by the unknowns."""
-
-    def twice(unknowns):
-        flight = flight_of(unknowns, row, cantilever)
-        apart = readings(flight, row, cantilever) - row.value
-        # the phase is known modulo a drive period
-        turn = 360.0 / row.order
-        apart = apart.at[2].set((apart[2] + 0.5 * turn) % turn - 0.5 * turn)
-        residual = jnp.where(jnp.isfinite(row.error), apart / row.error, 0.0)
-        both = jnp.concatenate([residual, impact_of(flight, row, cantilever)])
-        return both, both
-
-    slopes, both = jax.jacfwd(twice, has_aux=True)(unknowns)
-    return both, slopes
-
-
-def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
-    """Return the impacts of rows with a phase and at least one amplitude: the least squares of the two unknowns.
+def invert_rows(
+    row: Row,
+    instrument: Float[np.ndarray, "rows quantities"],
+    read: Float[np.ndarray, "rows 3"],
+    error: Float[np.ndarray, "rows 3"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the impacts of rows with a phase and at least one amplitude, NaN where there is no such orbit.
 
     Args:
-        rows: arrays with a leading axis of rows.
-        cantilever: its frequency and Q, exactly known.
+        row: the drives.
+        instrument: the last columns of `Local`.
+        read: peak and lock-in amplitude in nm, phase in degrees.
+        error: their standard errors, infinite where nothing was measured.
+
+    Returns:
+        Approach speed, rebound speed and delay of every row; how they change with independent errors of the readings,
+        of unit variance; how with each column of the instrument; and chi2, 0 where only two numbers were read.
     """
-    height = np.where(np.isfinite(rows.error[:, 0]), rows.value[:, 0], rows.value[:, 1] / _HALF_SINE)
     # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi
-    speed = np.repeat(np.log(np.asarray(cantilever.angular_frequency) * height), len(_ANGLES))
-    kept = np.stack([np.pi + np.tile(_ANGLES, len(height)), speed], axis=1)
-    each = jax.tree.map(lambda part: np.repeat(np.asarray(part), len(_ANGLES), axis=0), rows)
-
-    def look(places: Float[np.ndarray, "some 2"], some: Int[np.ndarray, " some"]) -> Searches:
-        # all places at once, so that one program serves: what the others have is known already
-        kept[some] = places
-        residual, slopes = (np.asarray(part)[some, :3] for part in _evaluate(kept, each, cantilever))
-        chi2 = np.sum(residual**2, axis=1)
-        return Searches(places, residual, slopes, np.where(np.isfinite(chi2), chi2, np.inf))
-
-    box = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros(kept.shape, dtype=bool), longest=0.3)
-    ends = descended(look, look(kept.copy(), np.arange(len(kept))), box, settled=1e-24, most=30)
-    impact, slopes = (np.asarray(part)[:, 3:] for part in _evaluate(ends.place, each, cantilever))
-    spread = whole_covariance_of(np.swapaxes(ends.jacobian, 1, 2) @ ends.jacobian)
-    covariance = slopes @ spread @ np.swapaxes(slopes, 1, 2)
-    # a search has arrived if its minimum is within a thousandth of a standard error
-    good = (distance(ends, box) < 1e-6) & (impact[:, :2] > 0.0).all(axis=1)
-    good &= np.isfinite(covariance).all(axis=(1, 2))
-    # of equally good ones that with the shortest contact
-    response = np.repeat(np.asarray(rows.order * rows.platform.period_us), len(_ANGLES))
-    score = np.where(good, ends.chi2 + 1e-3 * (impact[:, 2] / response) ** 2, np.inf).reshape(len(height), -1)
-    best = np.argmin(score, axis=1) + len(_ANGLES) * np.arange(len(score))
-    return Inverted(impact[best], covariance[best], ends.chi2[best], good[best])
+    height = np.where(np.isfinite(error[:, 0]), read[:, 0], read[:, 1] / _HALF_SINE)
+    speed = RAD_PER_US_PER_KHZ * instrument[:, 0] * height
+    period = 1e3 * row.order / row.drive_frequency_khz
+    zero, u = np.zeros_like(speed), speed
+    # coordinate, phase of arrival and delay; what the impact does to the squared speed, and to the delay
+    place = np.stack([coordinate_of(u, 0.0), row.order * (np.pi - np.deg2rad(read[:, 2])), zero, zero, zero], axis=1)
+    unit = np.stack([zero + 1.0, zero + 0.3, 0.02 * period, 0.1 * u**2, 0.02 * period], axis=1)
+    steps = 0
+    while True:
+        steps += 1
+        hertz = u**0.2
+        local = np.column_stack([place[:, 3:], place[:, 4] * hertz, zero, zero, zero, instrument])
+        slopes, found, _ = evaluated(place[:, :3], local, row, _NOTHING, "sample")
+        slopes[:, :, 4] += slopes[:, :, 5] * hertz[:, None]
+        lost = ~np.isfinite(slopes).all(axis=(1, 2))
+        slopes[lost], found[lost] = 0.0, 0.0
+        slopes[:, 3:6], off, u = slopes[:, 3:6] / error[:, :, None], (found[:, 3:6] - read) / error, found[:, 6]
+        gaps, readings = (slopes[:, part, :5] * unit[:, None] for part in (slice(3), slice(3, 6)))
+        # orbits stay closed; along what is free then chi2 becomes smallest
+        closing, free = np.linalg.pinv(gaps), np.swapaxes(np.linalg.svd(gaps)[2][:, 3:], 1, 2)
+        best = -free @ np.linalg.pinv(readings @ free)
+        step = (best @ off[:, :, None] - (closing + best @ readings @ closing) @ found[:, :3, None])[..., 0]
+        longest = np.max(np.abs(step), axis=1)
+        place = place + unit * step / np.maximum(longest, 1.0)[:, None]
+        place[:, 0] = np.clip(place[:, 0], 1e-4, KNOTS - 1.01)
+        if steps == _STEPS or (lost | (longest < _ARRIVED)).all():
+            break
+    w = np.sqrt(np.maximum(u**2 + place[:, 3], 1e-4))
+    # approach speed, rebound speed and delay by the place
+    change = np.zeros((len(u), 3, 5))
+    change[:, 0, 0], change[:, 1, 3], change[:, 2, 4] = slopes[:, 6, 0], 0.5 / w, 1.0
+    change[:, 1, 0] = u / w * slopes[:, 6, 0]
+    change *= unit[:, None]
+    shared = best @ slopes[:, 3:6, 9:] - (closing + best @ readings @ closing) @ slopes[:, :3, 9:]
+    impact = np.stack([u, w, place[:, 4]], axis=1)
+    impact[lost | (longest >= _ARRIVED) | (u**2 + place[:, 3] <= 0.0)] = np.nan
+    # what changes is NaN where the impact is
+    change = np.where(np.isfinite(impact)[:, :, None], change, np.nan)
+    return impact, change @ best, change @ shared, np.sum(off**2, axis=1)

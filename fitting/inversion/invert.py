@@ -1,29 +1,23 @@
 """Direct inversion: amplitude and phase of each row give the speeds of its impact and the collision delay, no law."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import printed_table, rows_of
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from afm_jax.results import Result, public_result
-from afm_jax.solve.lanes import filled
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.words import bullets, with_error
-from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
+from fitting.infer.unknowns import NEUTRAL, UNDAMPED
+from fitting.inversion.flight import invert_rows
 from fitting.models import constraints_of, readings_of
+from fitting.predict.orbit import Local, Row
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
 
-_BLOCK = 64
-"""Rows come filled up to a multiple of this, so that one program serves most tables."""
 _OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _SLOW = 2.5
@@ -32,8 +26,8 @@ POWERS = {"viscous": 1, "restitution": 2}
 """By the law the power n of u_in in u_in^2 - u_out^2 = epsilon + slope u_in^n; slopes are viscous_loss and 1 - r^2."""
 
 
-_EXACT = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}
-"""What all rows share, where the table does not say it."""
+_INSTRUMENT = Local._fields[6:]
+"""Quantities of the instrument that all rows share."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +55,7 @@ class Line:
 
 @public_result(picture="fitting.inversion.picture:inversion_figure", rows="records")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Inversion(Result):
+class Inversion(JudgedResult):
     """What `invert` finds; rows that give nothing are NaN and have a note.
 
     Attributes:
@@ -75,7 +69,6 @@ class Inversion(Result):
         in_lines: which rows the lines go through.
         lines: by "viscous" and "restitution"; empty where the rows determine none.
         table: what was inverted.
-        valid: whether a line explains the rows.
         reasons: why not.
         warnings: what a reader should know besides.
     """
@@ -90,7 +83,6 @@ class Inversion(Result):
     in_lines: Bool[np.ndarray, " rows"]
     lines: dict[str, Line]
     table: AmplitudeTable
-    valid: bool = False
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -103,11 +95,6 @@ class Inversion(Result):
     def preferred(self) -> str | None:
         """The law of the line with the smaller chi2; None without lines."""
         return min(self.lines, key=lambda name: self.lines[name].chi2, default=None)
-
-    @property
-    def reason(self) -> str | None:
-        """Why the inversion is not valid; None if it is."""
-        return next(iter(self.reasons), None)
 
     def records(self) -> list[dict[str, Any]]:
         """Return the rows, each with its drive."""
@@ -143,7 +130,7 @@ class Inversion(Result):
             f"chi2/dof {line.chi2:.1f}/{line.degrees_of_freedom}"
             for (law, line), name in zip(self.lines.items(), ("viscous_loss", "(1 - r^2)"), strict=False)
         ]
-        head = f"{'VALID' if self.valid else 'NOT VALID'}: {self.table.source}, {self.table.rows} rows"
+        head = f"{self.verdict}: {self.table.source}, {self.table.rows} rows"
         notes = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
         return [head, printed_table("", cells, self.records()), *lines, *notes]
 
@@ -182,31 +169,30 @@ def invert(table: TableLike) -> Inversion:
             f"{table.source}: no row has a phase with an amplitude; add the columns phase_deg and phase_error_deg, or "
             "use `afm-jax fit`"
         )
-    read = np.where(measured, value, 1.0)[chosen], np.where(measured, error, np.inf)[chosen]
-    stated = constraints_of(table, None)
-    known = _EXACT | {"quality_factor": table.quality_factor, "free_frequency_khz": table.free_frequency_khz}
-    known |= {name: value for name, (value, _) in stated.items()}
-    found = _inverted(table, chosen, *read, known)
-    moved = [_inverted(table, chosen, *read, known | {name: sum(both)}) for name, both in stated.items()]
-    good = np.logical_and.reduce([one.converged for one in (found, *moved)])
-    rows = chosen[good]
+    value, error = np.where(measured, value, 1.0)[chosen], np.where(measured, error, np.inf)[chosen]
+    stated = {name: pair for name, pair in constraints_of(table, None).items() if name in _INSTRUMENT}
+    known = NEUTRAL | {name: value for name, (value, _) in stated.items()}
+    known |= {"quality_factor": table.quality_factor or UNDAMPED, "free_frequency_khz": table.free_frequency_khz}
+    drive = (table.order, table.drive_frequency_khz, table.excitation_nm, table.offset_nm)
+    row = Row(*(np.asarray(column, float)[chosen] for column in drive), phase_deg=value[:, 2], free=chosen < 0)
+    instrument = np.tile([known.get(name, 0.0) for name in _INSTRUMENT], (chosen.size, 1))
 
     def of_table(part: Float[np.ndarray, "chosen ..."]) -> Float[np.ndarray, "rows ..."]:
-        """Return numbers of the chosen rows as those of all rows, NaN where there are none."""
+        """Return numbers of the chosen rows as those of all rows, NaN of the others."""
         whole = np.full((table.rows, *part.shape[1:]), np.nan)
-        whole[rows] = part[good]
+        whole[chosen] = part
         return whole
 
-    impact, covariance = of_table(found.impact), of_table(found.covariance)
-    changes = [(one.impact - found.impact)[:, :, None] for one in moved]
-    shared = of_table(np.concatenate([np.zeros((chosen.size, 3, 0)), *changes], axis=2))
+    impact, own, shared, chi2 = map(of_table, invert_rows(row, instrument, value, error))
+    rows = np.flatnonzero(np.isfinite(impact).all(axis=1))
+    covariance = own @ np.swapaxes(own, 1, 2)
+    shared = shared[:, :, [_INSTRUMENT.index(name) for name in stated]] * [error for _, error in stated.values()]
     lines, fast = _lines(impact[rows], covariance[rows], shared[rows])
     note = np.full(table.rows, "no phase with an amplitude: nothing to invert", dtype=object)
     note[chosen] = "no flight between two impacts has this amplitude and phase"
     note[rows] = np.where(fast, "", f"slower than {_SLOW} sqrt(epsilon): left out of the lines")
-    for row, chi2 in zip(rows, found.chi2[good], strict=True):
-        if chi2 > _OUTLIER:
-            note[row] = f"amplitudes and phase contradict each other (chi2 {chi2:.3g} of one degree of freedom)"
+    for i in rows[chi2[rows] > _OUTLIER]:
+        note[i] = f"amplitudes and phase contradict each other (chi2 {chi2[i]:.3g} of one degree of freedom)"
     u, w, delay = impact.T
     unsure = table.quality_factor is not None and table.quality_factor_error is None
     result = Inversion(
@@ -223,7 +209,7 @@ def invert(table: TableLike) -> Inversion:
         warnings=("Q comes without an error: its uncertainty is not in the errors here",) if unsure else (),
     )
     reason = _why_not_valid(result)
-    return replace(result, valid=reason is None, reasons=() if reason is None else (reason,))
+    return replace(result, reasons=() if reason is None else (reason,))
 
 
 def _why_not_valid(e: Inversion) -> str | None:
@@ -237,29 +223,6 @@ def _why_not_valid(e: Inversion) -> str | None:
     if all(abs(one.epsilon) < 2 * one.epsilon_error and abs(one.slope) < 2 * one.slope_error for one in lines):
         return "the rows determine no coefficient of either line to two standard errors: measure more finely"
     return None
-
-
-def _inverted(
-    table: AmplitudeTable,
-    chosen: Int[np.ndarray, " chosen"],
-    value: Float[np.ndarray, "chosen 3"],
-    error: Float[np.ndarray, "chosen 3"],
-    instrument: Mapping[str, Any],
-) -> Inverted:
-    """Return some rows inverted with an instrument; `value` and `error` are what they read."""
-    per_nm = np.array([instrument["tip_calibration"], instrument["tip_calibration"], 1.0])
-    zero = np.array([0.0, 0.0, instrument["phase_zero_deg"]])
-    size = -(-chosen.size // _BLOCK) * _BLOCK
-    amplitude = instrument["drive_calibration"] * table.excitation_nm
-    offset = instrument["offset_origin_nm"] + table.offset_nm
-    drive = (part[chosen] for part in (amplitude, table.drive_frequency_khz, offset, table.order.astype(float)))
-    columns = (*drive, (value - zero) / per_nm, error / per_nm)
-    amplitude, frequency, offset, order, read, spread = (jnp.asarray(filled(column, size)) for column in columns)
-    # every field an array of the rows' shape, for `vmap`
-    platform = Platform(amplitude, frequency, offset, offset_rate_nm_per_us=jnp.zeros(size))
-    rows = MeasuredRow(platform, order, read, spread)
-    cantilever = Cantilever(instrument["free_frequency_khz"], instrument["quality_factor"], table.mass_ng)
-    return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
 
 
 def _lines(

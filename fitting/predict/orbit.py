@@ -336,6 +336,11 @@ def _in_blocks(work, *trees):
     return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
+def evaluated(x: Float[np.ndarray, "rows 3"], local: Float[np.ndarray, "rows local"], row: Row, table, drive: str):
+    """Return what `_evaluated` makes of any number of rows, as arrays of NumPy."""
+    return _in_blocks(lambda *block: _evaluated.outside(*block, table, drive), x, local, row)
+
+
 def followed(
     x: Float[np.ndarray, "rows 3"],
     local: Float[np.ndarray, "rows local"],
@@ -363,9 +368,7 @@ def followed(
     with np.errstate(all="ignore"):
         for left in reversed(range(most)):
             some = row.take(moving)
-            slopes[moving], found[moving], state[moving] = _in_blocks(
-                lambda *block: _evaluated.outside(*block, table, drive), x[moving], local[moving], some
-            )
+            slopes[moving], found[moving], state[moving] = evaluated(x[moving], local[moving], some, table, drive)
             if not left:
                 break
             step = -_solved(slopes[moving, :3, :3], found[moving, :3, None])[..., 0]

@@ -3,7 +3,7 @@
 import click
 
 from afm_jax.cli.command import Command
-from afm_jax.cli.options import flag
+from afm_jax.cli.options import flag, valued
 
 VERIFY = Command(
     name="verify",
@@ -15,8 +15,8 @@ VERIFY = Command(
     3 if one is too large.
     """,
     options=(
-        click.option("--states", type=click.IntRange(min=1), default=10_000, help="Random states of each kind."),
-        click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the random states."),
+        valued("--states", click.IntRange(min=1), "Random states of each kind.", default=10_000),
+        valued("--seed", click.IntRange(min=0), "Seed of the random states.", default=0),
     ),
 )
 
@@ -35,11 +35,11 @@ ACCURACY = Command(
     """,
     options=(
         click.argument("study", default="map", metavar="[map|collide|SCENE.toml|PRESET]", type=click.Path()),
-        click.option(
+        valued(
             "--contacts",
-            type=click.IntRange(1, 10_000),
+            click.IntRange(1, 10_000),
+            "For a scene: the arrival of which contact is compared.",
             default=10,
-            help="For a scene: the arrival of which contact is compared.",
         ),
         flag("--quick", "Few and small measurements: to see that it works."),
     ),

@@ -4,7 +4,7 @@ import click
 
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.contact_options import CONTACT_OPTIONS
-from afm_jax.cli.options import flag
+from afm_jax.cli.options import flag, valued
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Ends, Finite, Numbers
 
@@ -33,35 +33,29 @@ COLLIDE = Command(
     """,
     options=(
         *CONTACT_OPTIONS,
-        click.option(
+        valued(
             "--speeds",
-            type=Numbers("speed", example="12,15,20"),
-            metavar="LIST",
-            help="Approach speeds in nm/us: 12,15,20 or start:stop:step as 12:200:10 (with the stop where it fits), "
+            Numbers("speed", example="12,15,20"),
+            "Approach speeds in nm/us: 12,15,20 or start:stop:step as 12:200:10 (with the stop where it fits), "
             "or both. Left out: 20 speeds from 1.1 times the capture speed to 200.",
+            metavar="LIST",
         ),
-        click.option(
-            "--accuracy",
-            type=Finite(positive=True),
-            default=1e-9,
-            help="Wanted relative accuracy of the rebound speed.",
-        ),
+        valued("--accuracy", Finite(positive=True), "Wanted relative accuracy of the rebound speed.", default=1e-9),
         flag(
             "--make-law",
             "Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
             "law.json and law.csv, which scene files and --law take, and the formulas closest to it.",
         ),
-        click.option(
+        valued(
             "--speed-range",
-            type=Ends(),
+            Ends(),
+            "With --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed to 250.",
             metavar="LOW:HIGH",
-            help="With --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed "
-            "to 250.",
         ),
-        click.option(
+        valued(
             "--points",
-            type=click.IntRange(min=10, max=100_000),
-            help="With --make-law: number of speeds that formulas are fitted to; 512 without.",
+            click.IntRange(min=10, max=100_000),
+            "With --make-law: number of speeds that formulas are fitted to; 512 without.",
         ),
     ),
     check=_check_law,

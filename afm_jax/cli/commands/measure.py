@@ -1,5 +1,6 @@
 """Commands that read data of instruments, fit them, and plan what to measure next."""
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import click
 
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
-from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
+from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag, valued
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Finite, Numbers, Orders, Share, ValueAndError, option_of
 from fitting.parameters import (
@@ -22,12 +23,20 @@ from fitting.parameters import (
 )
 
 
-def _number(name: str, unit: str, text: str) -> Any:
-    """Return the option of a number with its error."""
-    short = ("--spring-constant",) if name.startswith("spring") else ()
-    return click.option(f"--{name}", *short, type=ValueAndError(), metavar=unit, help=text)
+def _numbers(names: Mapping[str, str]) -> list[Any]:
+    """Return the options of numbers with their errors, whose names tell their units, from what help says of them."""
+    short = {"spring_constant_n_per_m": ("--spring-constant",)}
+    return [
+        click.option(option_of(name), *short.get(name, ()), type=ValueAndError(), help=text)
+        for name, text in names.items()
+    ]
 
 
+_OF_LEVER = {
+    "length_um": "Length of a rectangular lever, '225 +- 2' with its error: Sader's method.",
+    "width_um": "Its width.",
+    "temperature_k": "Of lever and air [default: the file's, 296 +- 3].",
+}
 CALIBRATE = Command(
     name="calibrate",
     runs="afm_jax.cli.calibrate:calibration",
@@ -36,45 +45,29 @@ CALIBRATE = Command(
     SWEEP is Nanonis text, or columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any unit) and, where
     known, phase_deg, amplitude_error_nm (or amplitude_error). A thermal spectrum (NanoSurf .nid, or
     asd_nm_per_sqrt_hz or psd_nm2_per_hz) gives the spring constant, too, by equipartition; with the lever's size also
-    by Sader's method. Comments `# averages = 1000`, `# temperature_k = 296` and so on stand for options. frequency_khz
-    is the undamped natural frequency, not that of the maximum. With --out calibration.json, .png and
-    calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the edge, not explained by the
-    model, or a scale of the deflection that another spring constant contradicts.
+    by Sader's method. frequency_khz is the undamped natural frequency, not that of the maximum. With --out
+    calibration.json, .png and calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the
+    edge, not explained by the model, or a scale of the deflection that another spring constant contradicts.
     """,
     options=(
         click.argument("sweep", metavar="SWEEP", type=click.Path(path_type=Path)),
-        click.option(
-            "--averages",
-            type=Finite(positive=True),
-            metavar="N",
-            help="Spectra that a thermal spectrum is the mean of.",
-        ),
-        _number("length-um", "UM", "Length of a rectangular lever, '225 +- 2' with its error: Sader's method."),
-        _number("width-um", "UM", "Its width."),
-        _number("temperature-k", "K", "Of lever and air [default: the file's, 296 +- 3]."),
-        click.option(
+        valued("--averages", Finite(positive=True), "Spectra that a thermal spectrum is the mean of."),
+        *_numbers(_OF_LEVER),
+        valued(
             "--deflection",
-            type=click.Choice(["static", "mode"]),
+            click.Choice(["static", "mode"]),
+            "How a thermal spectrum got its nm: by the slope of a force curve (static InvOLS), or for the mode itself.",
             default="static",
-            help="How a thermal spectrum got its nm: by the slope of a force curve (static InvOLS), or for the mode "
-            "itself.",
         ),
-        click.option(
+        valued(
             "--scale-error",
-            type=Share("a relative error"),
-            metavar="SHARE",
-            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much "
-            "[default: 5 %].",
+            Share("a relative error"),
+            "Relative error of the deflection's scale (its sensitivity), of which k has twice as much.",
+            default="5%",
         ),
     ),
     computes=False,
 )
-
-
-def _check_lists(_: Session, options: Options) -> None:
-    """Check that places are said once."""
-    if options["offsets_nm"] is not None and options["heights"] is not None:
-        raise click.UsageError("--offsets-nm and --heights both say where the sample can be; give one")
 
 
 DESIGN = Command(
@@ -90,92 +83,65 @@ DESIGN = Command(
     not determine the law.
     """,
     options=(
-        click.option(
-            "--orders",
-            type=Orders(),
-            metavar="LIST",
-            help="Drive periods an impact; else 1-4, or 1 where the tip is driven.",
-        ),
-        click.option(
+        valued("--orders", Orders(), "Drive periods an impact; else 1-4, or 1 where the tip is driven."),
+        valued(
             "--detuning",
-            type=Numbers(),
-            metavar="LIST",
-            help="Drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 "
-            "where the tip is driven, else 1.02:1.1:0.02.",
+            Numbers(),
+            "Drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 where the "
+            "tip is driven, else 1.02:1.1:0.02.",
+            into="detunings",
         ),
-        click.option(
+        valued(
             "--drive-nm",
-            type=Numbers(),
-            metavar="LIST",
-            help="Drive amplitudes, else 2,4,7,10; or free ones, else 40,80.",
+            Numbers(),
+            "Drive amplitudes, else 2,4,7,10; or free ones, else 40,80.",
+            into="amplitudes_nm",
         ),
-        click.option("--offsets-nm", type=Numbers(positive=False), metavar="LIST", help="Offsets; else -1,0,1."),
-        click.option(
+        valued("--offsets-nm", Numbers(positive=False), "Offsets; else -1,0,1."),
+        valued(
             "--heights",
-            type=Numbers(positive=False),
-            metavar="LIST",
-            help="Where the tip is driven, in place of offsets: distances of the sample as shares of each free "
-            "amplitude; else 0.1:0.9:0.1.",
+            Numbers(positive=False),
+            "Where the tip is driven, in place of offsets: distances of the sample as shares of each free amplitude; "
+            "else 0.1:0.9:0.1.",
         ),
-        click.option("--largest-nm", type=Finite(), metavar="X", help="Peak amplitude that the instrument takes."),
-        click.option("--points", type=click.IntRange(1, 200), default=8, help="How many to choose."),
-        click.option(
-            "--for", "interest", metavar="NAMES", help="Parameters to be known well, as r,epsilon; else the law's."
-        ),
-        click.option(
-            "--noise",
-            type=Share("a relative error"),
-            default="1%",
-            metavar="SHARE",
-            help="Relative error of an amplitude.",
-        ),
-        click.option("--phase-noise-deg", type=Finite(), default=0.2, metavar="X", help="Error of a lag, tip driven."),
-        click.option(
-            "--amplitudes",
-            type=click.Choice(("both", "peak", "lockin")),
-            default="both",
-            help="What is read of a point.",
-        ),
-        click.option(
+        valued("--largest-nm", Finite(), "Peak amplitude that the instrument takes."),
+        valued("--points", click.IntRange(1, 200), "How many to choose.", default=8),
+        valued("--for", Names(), "Parameters to be known well, as r,epsilon; else the law's.", into="interest"),
+        valued("--noise", Share("a relative error"), "Relative error of an amplitude.", default="1%"),
+        valued("--phase-noise-deg", Finite(), "Error of a lag, tip driven.", default=0.2),
+        valued("--amplitudes", click.Choice(("both", "peak", "lockin")), "What is read of a point.", default="both"),
+        valued(
             "--uncertainty",
-            type=Share("a relative error"),
+            Share("a relative error"),
+            "How far the law may be off where no fit says.",
             default="10%",
-            metavar="SHARE",
-            help="How far the law may be off where no fit says.",
         ),
-        click.option(
+        valued(
             "--fit",
-            type=click.Path(path_type=Path),
+            click.Path(path_type=Path),
+            "A fit to add to, as `afm-jax fit --json` writes it, or its folder.",
             metavar="JSON",
-            help="A fit to add to, as `afm-jax fit --json` writes it, or its folder.",
         ),
-        click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
-        click.option("--mass-ng", type=Finite(), metavar="X", help="Effective mass of the tip."),
-        click.option(
-            "--drive",
-            type=click.Choice(("sample", "force", "base")),
-            help="What is driven: the sample, or the cantilever itself; else the sample.",
-        ),
+        valued("--model", click.Choice(MODELS), "What will be fitted; else law+delay, or the fit's."),
+        valued("--mass-ng", Finite(), "Effective mass of the tip."),
+        valued("--drive", click.Choice(("sample", "force", "base")), "What is driven; else the sample."),
         *(
-            click.option(
+            valued(
                 option_of(name),
-                type=Finite(),
-                metavar="X",
-                help=f"{', '.join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))}; else the paper's.",
+                Finite(),
+                f"{', '.join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))}; else the paper's.",
             )
             for name in LAW_NAMES
         ),
         *(
-            click.option(
+            valued(
                 option_of(nuisance.name),
-                type=ValueAndError(none=nuisance.name == "quality_factor"),
-                metavar="X",
-                help=f"{nuisance.meaning}, such as '{nuisance.example}'.",
+                ValueAndError(none=nuisance.name == "quality_factor"),
+                f"{nuisance.meaning}, such as '{nuisance.example}'.",
             )
             for nuisance in PRIOR_NUISANCES
         ),
     ),
-    check=_check_lists,
 )
 
 
@@ -195,53 +161,46 @@ FIT = Command(
     """,
     options=(
         click.argument("tables", metavar="[TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path)),
-        click.option(
+        valued(
             "--model",
-            default="law",
-            type=click.Choice(MODELS),
-            help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
+            click.Choice(MODELS),
+            "; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
             + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
             "of tapping curves on resonance too.",
+            default="law",
         ),
         NOISE,
         QUALITY_FACTOR,
         flag("--scale-errors", "Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1."),
         flag("--robust", "Leave outliers out, one row in ten at most."),
-        click.option(
+        valued(
             "--free",
-            type=Names(),
-            metavar="NAME,...",
-            help="The parameters that are fitted, if not all that are not fixed; of a contact, if left out, "
+            Names(),
+            "The parameters that are fitted, if not all that are not fixed; of a contact, if left out, "
             f"{','.join(CONTACT_DEFAULT)}.",
         ),
-        click.option(
-            "--fix", "fixed", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="Hold a parameter at a value."
-        ),
-        click.option(
+        valued("--fix", Fixed(), "Hold a parameter at a value.", into="fixed", multiple=True, metavar="NAME=VALUE"),
+        valued(
             "--constrain",
-            "constraints",
-            type=Constraint(),
+            Constraint(),
+            f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model; of a contact also "
+            "one that is held, at the value then.",
+            into="constraints",
             multiple=True,
             metavar="NAME=VALUE+-ERROR",
-            help=f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model; "
-            "of a contact also one that is held, at the value then.",
         ),
-        click.option(
-            "--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have."
-        ),
+        valued("--no", Names(), "contact: effects that it does not have.", into="left_out"),
         flag("--compare", "Fit the rival models too and say what the table can tell.", into="comparing"),
         flag(
             "--posterior",
             "Credible intervals, too, by the no-U-turn sampler (extra `nuts`); where impacts last, of a Gaussian "
             "around the fit.",
         ),
-        click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the random numbers."),
-        click.option(
+        valued("--seed", click.IntRange(min=0), "Seed of the random numbers.", default=0),
+        valued(
             "--share",
-            type=Names(),
-            metavar="NAME,...",
-            help="Of several tables: nuisances (of --constrain) that all have in common, or all; left out, each has "
-            "its own.",
+            Names(),
+            "Of several tables: nuisances (of --constrain) that all have in common, or all; else each has its own.",
         ),
         flag("--example", "Fit the bundled table instead of a file."),
     ),
@@ -287,33 +246,25 @@ LOCKIN = Command(
     """,
     options=(
         click.argument("trace", metavar="TRACE", type=click.Path(path_type=Path)),
-        click.option(
-            "--drive-frequency-khz", type=Finite(positive=True), metavar="KHZ", help="Of the platform; else the file's."
-        ),
-        click.option(
-            "--order", type=click.IntRange(1, 8), default=1, help="Drive periods in a period of the response."
-        ),
+        valued("--drive-frequency-khz", Finite(positive=True), "Of the platform; else the file's."),
+        valued("--order", click.IntRange(1, 8), "Drive periods in a period of the response.", default=1),
     ),
     computes=False,
 )
 
-_LEVER = (
-    ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
-    ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
-    ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
-    (
-        "spring-constant-n-per-m",
-        "N_PER_M",
-        "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are over it, in nm^2.",
-    ),
-)
-_READING_NUMBERS = (
-    *_LEVER,
-    ("free-amplitude-nm", "NM", "Amplitude of the free tip; else the median of the rows far from the sample."),
-    ("offset-origin-nm", "NM", "Height (growing towards the tip) at which the sample is at the tip's rest position."),
-    ("amplitude-error-nm", "NM", "Standard error of every amplitude; else the scatter of the free rows."),
-    ("phase-error-deg", "DEGREES", "Standard error of every phase; else the scatter of the free rows."),
-)
+_LEVER = {
+    "drive_frequency_khz": "Frequency of the drive; where nothing says it, the free frequency.",
+    "free_frequency_khz": "Natural frequency of the free cantilever, '90 +- 0.01' with its error.",
+    "quality_factor": "Its quality factor, '200 +- 5' with its error.",
+    "spring_constant_n_per_m": "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are "
+    "over it, in nm^2.",
+}
+_READING_NUMBERS = _LEVER | {
+    "free_amplitude_nm": "Amplitude of the free tip; else the median of the rows far from the sample.",
+    "offset_origin_nm": "Height (growing towards the tip) at which the sample is at the tip's rest position.",
+    "amplitude_error_nm": "Standard error of every amplitude; else the scatter of the free rows.",
+    "phase_error_deg": "Standard error of every phase; else the scatter of the free rows.",
+}
 
 
 class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
@@ -324,53 +275,47 @@ class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
         return text if text == "slope" else super().read(text)
 
 
-_PHASE_SENSE = click.option(
+_PHASE_SENSE = valued(
     "--phase-sense",
-    type=click.Choice(["lag", "lead"]),
-    help="Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the readings "
-    "decide where they can.",
+    click.Choice(["lag", "lead"]),
+    "Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the readings decide "
+    "where they can.",
 )
+
+
+def _columns(text: str) -> Callable[..., Any]:
+    """Return the option that says which channel is what."""
+    return valued("--columns", str, text, metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...", default="", show_default=False)
+
+
 READING = (
-    click.option(
-        "--columns",
-        metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
-        default="",
-        show_default=False,
-        help="Which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
-        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and "
-        "retract in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.",
+    _columns(
+        "Which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
+        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and retract "
+        "in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8."
     ),
-    click.option(
+    valued(
         "--drive",
-        type=click.Choice(["base", "force"]),
-        help="What drives the tip: a piezo at its base (assumed without this option), or a force (photothermal, "
-        "magnetic).",
+        click.Choice(["base", "force"]),
+        "What drives the tip: a piezo at its base (assumed without this option), or a force (photothermal, magnetic).",
     ),
     _PHASE_SENSE,
-    click.option(
+    valued(
         "--nm-per-volt",
-        type=NmPerVolt(),
+        NmPerVolt(),
+        "Sensitivity of an amplitude in volts; `slope`: such that the amplitude falls by 1 nm per nm in contact.",
         metavar="NM|slope",
-        help="Sensitivity of an amplitude in volts; `slope`: such that the amplitude falls by 1 nm per nm in contact.",
     ),
-    click.option(
+    valued(
         "--bin-nm",
-        type=Finite(),
-        metavar="NM",
-        help="Width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins "
-        "of five rows where heights repeat or are not in order.",
+        Finite(),
+        "Width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins of five "
+        "rows where heights repeat or are not in order.",
     ),
-    *(_number(*row) for row in _READING_NUMBERS),
+    *_numbers(_READING_NUMBERS),
 )
 """How an instrument's file becomes rows of a table: `read`, and `tapping` of such a file."""
-READING_OPTIONS = (
-    "columns",
-    "drive",
-    "phase_sense",
-    "nm_per_volt",
-    "bin_nm",
-    *(name.replace("-", "_") for name, _, _ in _READING_NUMBERS),
-)
+READING_OPTIONS = ("columns", "drive", "phase_sense", "nm_per_volt", "bin_nm", *_READING_NUMBERS)
 """Names of the arguments that `READING` adds, as `read_curves` takes them."""
 
 READ = Command(
@@ -387,7 +332,7 @@ READ = Command(
     """,
     options=(
         click.argument("file", metavar="FILE", type=click.Path(path_type=Path)),
-        click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of the file."),
+        valued("--curve", click.IntRange(1), "Only this curve of the file."),
         *READING,
     ),
     computes=False,
@@ -419,8 +364,8 @@ TAPPING = Command(
         click.argument("curve_files", metavar="[CURVE]...", nargs=-1, type=click.Path(path_type=Path)),
         NOISE,
         *READING,
-        click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file."),
-        click.option("--model", default="viscous+delay", help="Of the law, as for `afm-jax fit`."),
+        valued("--curve", click.IntRange(1), "Only this curve of an instrument's file."),
+        valued("--model", str, "Of the law, as for `afm-jax fit`.", default="viscous+delay"),
         flag("--example", "Analyse the bundled raw file, simulated with the defects of real ones."),
         flag("--no-law", "Leave the impact law out: energy, thresholds and speeds only, at once."),
         flag(
@@ -433,13 +378,12 @@ TAPPING = Command(
 )
 
 
-_IMAGE_NUMBERS = (
-    *_LEVER,
-    ("free-amplitude-nm", "NM", "Amplitude of the free tip, as the instrument reads it, '13.4 +- 0.1'."),
-    ("free-phase-deg", "DEGREES", "Phase of the free tip, as the instrument reads it, '90 +- 0.05' [its error: 0.2]."),
-    ("nm-per-volt", "NM", "Sensitivity of an amplitude in volts."),
-    ("tip-calibration", "C", "True over stated amplitude; '1 +- 0.02'."),
-)
+_IMAGE_NUMBERS = _LEVER | {
+    "free_amplitude_nm": "Amplitude of the free tip, as the instrument reads it, '13.4 +- 0.1'.",
+    "free_phase_deg": "Phase of the free tip, as the instrument reads it, '90 +- 0.05' [its error: 0.2].",
+    "nm_per_volt": "Sensitivity of an amplitude in volts.",
+    "tip_calibration": "True over stated amplitude; '1 +- 0.02'.",
+}
 
 
 TAPPING_MAP = Command(
@@ -459,29 +403,19 @@ TAPPING_MAP = Command(
     options=(
         click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path)),
         click.argument("phase_image", metavar="[PHASE_IMAGE]", required=False, type=click.Path(path_type=Path)),
-        click.option(
-            "--columns",
-            metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
-            default="",
-            show_default=False,
-            help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.",
-        ),
-        click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What is driven."),
+        _columns("Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase."),
+        valued("--drive", click.Choice(["base", "force"]), "What is driven.", default="base"),
         _PHASE_SENSE,
-        *(_number(*row) for row in _IMAGE_NUMBERS),
-        click.option(
-            "--amplitude-error-nm", type=Finite(positive=True), metavar="NM", help="Standard error of a pixel's."
-        ),
-        click.option(
-            "--phase-error-deg", type=Finite(positive=True), metavar="DEGREES", help="Standard error of a pixel's."
-        ),
-        click.option(
+        *_numbers(_IMAGE_NUMBERS),
+        valued("--amplitude-error-nm", Finite(positive=True), "Standard error of a pixel's."),
+        valued("--phase-error-deg", Finite(positive=True), "Standard error of a pixel's."),
+        valued(
             "--format",
-            "formats",
-            type=click.Choice(["npz", "gsf", "zarr"]),
+            click.Choice(["npz", "gsf", "zarr"]),
+            "Of the arrays written into --out (gsf: for Gwyddion); may be given several times.",
+            into="formats",
             multiple=True,
             default=("npz",),
-            help="Of the arrays written into --out (gsf: for Gwyddion); may be given several times.",
         ),
     ),
     computes=False,

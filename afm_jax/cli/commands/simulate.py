@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.options import DRAWS, LAW, SCENE, flag
+from afm_jax.cli.options import DRAWS, LAW, SCENE, flag, valued
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Ends, Finite, Grid, Orders, Share
 
@@ -23,13 +23,9 @@ BASINS = Command(
     """,
     options=(
         SCENE,
-        click.option("--grid", type=Grid(), default="300x300", help="Drive phases x rebound speeds."),
-        click.option(
-            "--speeds",
-            "speeds_nm_per_us",
-            type=Ends(),
-            metavar="LOW:HIGH",
-            help="Range of the rebound speed, in nm/us.",
+        valued("--grid", Grid(), "Drive phases x rebound speeds.", default="300x300"),
+        valued(
+            "--speeds", Ends(), "Range of the rebound speed, in nm/us.", into="speeds_nm_per_us", metavar="LOW:HIGH"
         ),
         LAW,
         DRAWS,
@@ -51,12 +47,10 @@ BIFURCATION = Command(
     """,
     options=(
         SCENE,
-        click.option(
-            "--parameter", metavar="P=a:b:n", required=True, help="A parameter of the scene file and its values."
-        ),
+        valued("--parameter", str, "A parameter of the scene file and its values.", metavar="P=a:b:n", required=True),
         flag("--both", "Ramp up and then down, so that hysteresis shows."),
         flag("--down", "Ramp down instead of up."),
-        click.option("--impacts", type=click.IntRange(200), default=2000, help="At every value."),
+        valued("--impacts", click.IntRange(200), "At every value.", default=2000),
         LAW,
         DRAWS,
     ),
@@ -76,11 +70,9 @@ CHART = Command(
     """,
     options=(
         SCENE,
-        click.option(
-            "--x", metavar="P=a:b:n", required=True, help="A parameter of the scene file: the chart's columns."
-        ),
-        click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows."),
-        click.option("--orders", type=click.IntRange(1, 100), default=8, help="Highest order N."),
+        valued("--x", str, "A parameter of the scene file: the chart's columns.", metavar="P=a:b:n", required=True),
+        valued("--y", str, "Another one: its rows.", metavar="P=a:b:n", required=True),
+        valued("--orders", click.IntRange(1, 100), "Highest order N.", default=8),
         LAW,
         DRAWS,
     ),
@@ -101,11 +93,9 @@ LYAPUNOV = Command(
     """,
     options=(
         SCENE,
-        click.option("--impacts", type=click.IntRange(20), default=2000, help="Impacts to average over."),
-        click.option("--transient", type=click.IntRange(0), default=500, help="Impacts before."),
-        click.option(
-            "--parameter", metavar="P=a:b:n", help="A parameter of the scene file and its values, one motion each."
-        ),
+        valued("--impacts", click.IntRange(20), "Impacts to average over.", default=2000),
+        valued("--transient", click.IntRange(0), "Impacts before.", default=500),
+        valued("--parameter", str, "A parameter of the scene file and its values, one motion each.", metavar="P=a:b:n"),
         LAW,
         DRAWS,
     ),
@@ -124,25 +114,16 @@ CONTINUE = Command(
     """,
     options=(
         SCENE,
-        click.option(
-            "--order", metavar="N", required=True, type=click.IntRange(1, 1_000_000), help="Drive periods of the orbit."
-        ),
-        click.option(
-            "--impacts",
-            metavar="M",
-            default=1,
-            type=click.IntRange(0, 64),
-            help="Impacts in them; 0: the tip meets nothing.",
-        ),
-        click.option(
+        valued("--order", click.IntRange(1, 1_000_000), "Drive periods of the orbit.", required=True),
+        valued("--impacts", click.IntRange(0, 64), "Impacts in them; 0: the tip meets nothing.", default=1),
+        valued(
             "--parameter",
+            str,
+            "A parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.",
             metavar="P=A:B",
             required=True,
-            help="A parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.",
         ),
-        click.option(
-            "--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both."
-        ),
+        valued("--second", str, "Another one: the special points are followed as curves in both.", metavar="P=A:B"),
         LAW,
     ),
 )
@@ -161,19 +142,14 @@ EFFECTS = Command(
     """,
     options=(
         SCENE,
-        click.option(
+        valued(
             "--accuracy",
-            type=Share(),
+            Share(),
+            "Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
             default="1%",
-            help="Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
         ),
-        click.option(
-            "--duration-us",
-            type=Finite(positive=True),
-            metavar="T",
-            help="How long to follow each scene at most, in us.",
-        ),
-        click.option("--only", metavar="NAME,...", help="The effects to look at; all if left out."),
+        valued("--duration-us", Finite(positive=True), "How long to follow each scene at most, in us."),
+        valued("--only", str, "The effects to look at; all if left out.", metavar="NAME,..."),
     ),
 )
 
@@ -192,18 +168,16 @@ ORBITS = Command(
     """,
     options=(
         SCENE,
-        click.option(
+        valued(
             "--order",
-            metavar="N",
+            click.IntRange(1, 1_000_000),
+            "Drive periods between two impacts, a positive integer.",
             required=True,
-            type=click.IntRange(1, 1_000_000),
-            help="Drive periods between two impacts, a positive integer.",
         ),
-        click.option(
+        valued(
             "--impacts",
-            metavar="M",
-            type=click.IntRange(1, 1_000_000),
-            help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
+            click.IntRange(1, 1_000_000),
+            "Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
         ),
         LAW,
     ),
@@ -250,54 +224,40 @@ SIMULATE = Command(
     """,
     options=(
         SCENE,
-        click.option(
+        valued(
             "--heights",
-            type=Course(),
+            Course(),
+            "Record an approach curve, both ways: heights of the sample in nm, negative below the rest position.",
             metavar="FROM:TO:COUNT",
-            help="Record an approach curve, both ways: heights of the sample in nm, negative below the rest position.",
         ),
-        click.option(
-            "--duration-us", type=Finite(positive=True), metavar="T", help="How long to follow the scene, in us."
-        ),
-        click.option(
+        valued("--duration-us", Finite(positive=True), "How long to follow the scene, in us."),
+        valued(
             "--periods",
-            type=Finite(positive=True),
-            metavar="P",
-            help="How long, in periods of the drive. Without a duration the end is where the motion has settled, after "
+            Finite(positive=True),
+            "How long, in periods of the drive. Without a duration the end is where the motion has settled, after "
             f"{DEFAULT_PERIODS} of them at most.",
         ),
-        click.option(
+        valued(
             "--harmonics",
-            type=Orders("multiple"),
-            default="1",
-            metavar="K,...",
-            help="Multiples of the response frequency omega/N at which amplitude and phase are read, besides the "
+            Orders("multiple"),
+            "Multiples of the response frequency omega/N at which amplitude and phase are read, besides the "
             "drive's (N times it), which always is.",
+            default="1",
         ),
-        click.option(
+        valued(
             "--accuracy",
-            type=Finite(positive=True),
+            Finite(positive=True),
+            "Of every resolved contact: relative of the rebound speed.",
             default=1e-9,
-            help="Of every resolved contact: relative of the rebound speed.",
         ),
-        click.option(
+        valued(
             "--samples",
-            type=click.Choice(["uniform"]),
-            help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
+            click.Choice(["uniform"]),
+            "Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
             "time, as `afm-jax lockin` reads it.",
         ),
-        click.option(
-            "--noise",
-            type=Share("a relative error"),
-            metavar="SHARE",
-            help="With --heights: of the amplitudes in curve.csv; else 0.3%.",
-        ),
-        click.option(
-            "--phase-noise-deg",
-            type=Finite(positive=True),
-            metavar="X",
-            help="With --heights: of the lags in curve.csv; else 0.2.",
-        ),
+        valued("--noise", Share("a relative error"), "With --heights: of the amplitudes in curve.csv; else 0.3%."),
+        valued("--phase-noise-deg", Finite(positive=True), "With --heights: of the lags in curve.csv; else 0.2."),
         LAW,
     ),
     check=_check_simulation,
@@ -338,13 +298,12 @@ SWEEP = Command(
     """,
     options=(
         click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path)),
-        click.option(
+        valued(
             "--workers",
-            type=click.IntRange(1, 1024),
-            metavar="N",
-            help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
+            click.IntRange(1, 1024),
+            "Processes of this machine that share its cores, by Dask; 1: this one alone.",
         ),
-        click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work."),
+        valued("--scheduler", str, "A Dask scheduler whose workers do the work.", metavar="tcp://..."),
         flag("--plot", "Draw a sweep of one or two axes, sweep.png."),
         LAW,
     ),
