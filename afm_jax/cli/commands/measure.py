@@ -170,7 +170,7 @@ DESIGN = Command(
                 option_of(nuisance.name),
                 type=ValueAndError(none=nuisance.name == "quality_factor"),
                 metavar="X",
-                help=f"{nuisance.meaning}, such as '{nuisance.example}'.",
+                help=f"{nuisance.meaning}, 'VALUE +- ERROR'.",
             )
             for nuisance in PRIOR_NUISANCES
         ),
