@@ -86,11 +86,11 @@ def _known_of_drifts(table: AmplitudeTable, given: Mapping[str, tuple[float, flo
     """
     phase = table.phase_and_error_deg[0] is not None
     known = {}
-    for drift, start, neutral, there in (
+    for drift, start, neutral, measured in (
         ("phase_drift_deg", "phase_zero_deg", 0.0, phase),
         ("free_amplitude_drift", "drive_calibration", 1.0, table.tapping),
     ):
-        if there and drifts(table):
+        if measured and drifts(table):
             known[drift] = given.get(drift, (0.0, USUAL_DRIFTS[drift]))
             value, error = table.calibration.get(start, (neutral, 0.0))
             known[start] = value, float(np.hypot(error, 0.5 * np.hypot(*known[drift])))
@@ -119,17 +119,18 @@ def task_of(
     Arguments and errors are as of `fit`.
     """
     each = [_known_of(member, model, constraints) for member in table.tables]
-    there = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
-    common = _shared(table, each, share, there) if isinstance(table, SeveralTables) else there
+    nuisances = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
+    common = _shared(table, each, share, nuisances) if isinstance(table, SeveralTables) else nuisances
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: each[0][name] for name in (*own, *common) if name in each[0]}
-    for member, label, told in zip(table.tables, table.labels, each, strict=True):
+    for member, label, of_table in zip(table.tables, table.labels, each, strict=True):
         if model == "contact" and member.tapping:
             _check_above_resonance(member)
         # what is each table's own may differ by what a delay takes up in common
-        checked = {name: pair for name, pair in told.items() if name in common or name != "offset_origin_nm"}
+        checked = {name: pair for name, pair in of_table.items() if name in common or name != "offset_origin_nm"}
         check_constraints(checked, model, own, member.drive)
-        known |= {name_of_table(name, label): told[name] for name in there if name in told and name not in common}
+        separate = [name for name in nuisances if name in of_table and name not in common]
+        known |= {name_of_table(name, label): of_table[name] for name in separate}
     if isinstance(table, SeveralTables):
         table.check_different()
     return Task(known, Problem(model, own + tuple(filter(is_nuisance, known)), tuple(effects), table.drive))
@@ -199,7 +200,7 @@ def _shared(
     tables: SeveralTables,
     each: Sequence[dict[str, tuple[float, float]]],
     share: Sequence[str],
-    there: Sequence[str],
+    nuisances: Sequence[str],
 ) -> list[str]:
     """Return the nuisances that several tables share.
 
@@ -209,9 +210,9 @@ def _shared(
     for name in share:
         if name not in (*NUISANCE_NAMES, "all"):
             raise ValueError(f"`share` must be chosen from {', '.join(NUISANCE_NAMES)} and all, but one is {name!r}")
-        if name not in (*there, "all"):
+        if name not in (*nuisances, "all"):
             raise ValueError(f"`share` names {name}, but no table gives it with an error; state it, or leave it out")
-    shared = [name for name in there if "all" in share or name in share]
+    shared = [name for name in nuisances if "all" in share or name in share]
     for name in shared:
         said = ["nothing of it" if name not in known else "{:g} +- {:g}".format(*known[name]) for known in each]
         for label, words in zip(tables.labels, said, strict=True):

@@ -130,13 +130,14 @@ def _by_distance(
             continue
         if model == "contact":
             other = results[model].law
-            own = np.interp(speeds, other.approach_speed_nm_per_us, other.rebound_speed_nm_per_us)
+            by_model = np.interp(speeds, other.approach_speed_nm_per_us, other.rebound_speed_nm_per_us)
         else:
             fixed = _options_of(model, options).get("fixed") or {}
             names = [known.name for known in LAW if known.name in MODELS[model] and known.name not in fixed]
-            own = rebound_by_formula(fixed | closest_loss(names, speeds, rebound, 1.0 / half, fixed), speeds)
-        row["largest_distance"] = float(np.max(np.abs(own - rebound) / half))
-        row["largest_relative_distance"] = float(np.max(np.abs(own - rebound) / rebound))
+            found = closest_loss(names, speeds, rebound, 1.0 / half, fixed)
+            by_model = rebound_by_formula(fixed | found, speeds)
+        row["largest_distance"] = float(np.max(np.abs(by_model - rebound) / half))
+        row["largest_relative_distance"] = float(np.max(np.abs(by_model - rebound) / rebound))
     return sorted(rows, key=lambda row: row["largest_distance"] or 0.0)
 
 

@@ -317,12 +317,11 @@ class FitResult(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "table"}
-        if not self.tables:
-            del own["tables"]
+        left_out = {"table"} if self.tables else {"table", "tables"}
+        names = [field.name for field in dataclasses.fields(self) if field.name not in left_out]
         return plain(
             {"format": FIT_FORMAT, "format_version": FIT_FORMAT_VERSION}
-            | own
+            | {name: getattr(self, name) for name in names}
             | {
                 "correlations": {"names": list(self.parameters), "matrix": self.correlations},
                 "law": self.law.to_dict(),

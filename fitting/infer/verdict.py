@@ -238,8 +238,8 @@ def _without_error(evidence: Evidence) -> list[tuple[str, float]]:
     found = []
     for table, label in zip(evidence.table.tables, evidence.table.labels, strict=True):
         if table.quality_factor is not None and table.quality_factor_error is None:
-            own = name_of_table("quality_factor", label)
-            found.append((own if own in evidence.parameters else "quality_factor", table.quality_factor))
+            name = name_of_table("quality_factor", label)
+            found.append((name if name in evidence.parameters else "quality_factor", table.quality_factor))
     return list(dict.fromkeys(found))
 
 
