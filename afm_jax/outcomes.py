@@ -63,7 +63,8 @@ class Rule(Generic[E]):
     """A sentence that is said of a result where something is the case.
 
     Attributes:
-        when: the cases of it that a result's evidence shows, a sentence for each; or whether it is the case at all.
+        when: the cases of it that a result's evidence shows, a sentence for each; or one case in words, "" if it is not
+            the case; or whether it is the case at all.
         sentence: what is said, with `{e.name}` for what the evidence has, and `{case}` for one of the cases; or a
             function of evidence and case.
     """
@@ -74,7 +75,7 @@ class Rule(Generic[E]):
     def said_of(self, evidence: E) -> list[str]:
         """Return what the rule says of a result: a sentence for each case."""
         cases, sentence = self.when(evidence), self.sentence
-        each = cases if isinstance(cases, Iterable) else [True] * bool(cases)
+        each = cases if isinstance(cases, Iterable) and not isinstance(cases, str) else [cases] * bool(cases)
         if isinstance(sentence, str):
             return [sentence.format(e=evidence, case=case) for case in each]
         return [sentence(evidence, case) for case in each]

@@ -1,5 +1,6 @@
 """Results as JSON that every reader accepts: arrays as lists, NaN and infinity as null."""
 
+import dataclasses
 import json
 import math
 from collections.abc import Mapping
@@ -20,10 +21,15 @@ def strict_json(value: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as dicts, lists, strings, numbers, booleans and None; whatever is not finite becomes None."""
+    """Return a value as dicts, lists, strings, numbers, booleans and None; whatever is not finite becomes None.
+
+    A dataclass becomes a dict of its fields.
+    """
     # NumPy's and JAX's arrays and numbers, without importing either
     if hasattr(value, "tolist"):
         value = value.tolist()
+    if dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -1,9 +1,9 @@
 """What is fitted of one table or of several, and what is known beforehand: a `Task`, from a fit's options."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -84,18 +84,16 @@ def _known_of_drifts(table: AmplitudeTable, given: Mapping[str, tuple[float, flo
         table: whose rows may stand in order of time.
         given: what the caller says.
     """
-    if not drifts(table):
-        return {}
-    assumed = []
-    if table.phase_and_error_deg[0] is not None:
-        assumed.append(("phase_drift_deg", "phase_zero_deg", 0.0))
-    if table.tapping:
-        assumed.append(("free_amplitude_drift", "drive_calibration", 1.0))
+    phase = table.phase_and_error_deg[0] is not None
     known = {}
-    for drift, start, neutral in assumed:
-        known[drift] = given.get(drift, (0.0, USUAL_DRIFTS[drift]))
-        value, error = table.calibration.get(start, (neutral, 0.0))
-        known[start] = value, float(np.hypot(error, 0.5 * np.hypot(*known[drift])))
+    for drift, start, neutral, measured in (
+        ("phase_drift_deg", "phase_zero_deg", 0.0, phase),
+        ("free_amplitude_drift", "drive_calibration", 1.0, table.tapping),
+    ):
+        if measured and drifts(table):
+            known[drift] = given.get(drift, (0.0, USUAL_DRIFTS[drift]))
+            value, error = table.calibration.get(start, (neutral, 0.0))
+            known[start] = value, float(np.hypot(error, 0.5 * np.hypot(*known[drift])))
     return known
 
 
@@ -116,13 +114,26 @@ def task_of(
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
 ) -> Task:
-    """Return what a fit has to do; arguments and errors as of `fit`."""
-    options = {"free": free, "fixed": fixed, "effects": effects}
+    """Return what a fit has to do: one law, and nuisances that are common or each table's own.
+
+    Arguments and errors are as of `fit`.
+    """
+    each = [_known_of(member, model, constraints) for member in table.tables]
+    nuisances = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
+    common = _shared(table, each, share, nuisances) if isinstance(table, SeveralTables) else nuisances
+    own = model_parameters(model, None if free is None else tuple(free), fixed)
+    known = {name: each[0][name] for name in (*own, *common) if name in each[0]}
+    for member, label, of_table in zip(table.tables, table.labels, each, strict=True):
+        if model == "contact" and member.tapping:
+            _check_above_resonance(member)
+        # what is each table's own may differ by what a delay takes up in common
+        checked = {name: pair for name, pair in of_table.items() if name in common or name != "offset_origin_nm"}
+        check_constraints(checked, model, own, member.drive)
+        separate = [name for name in nuisances if name in of_table and name not in common]
+        known |= {name_of_table(name, label): of_table[name] for name in separate}
     if isinstance(table, SeveralTables):
-        return _joint_task(table, model, share, constraints, **options)
-    known = _known_of(table, model, constraints)
-    problem = problem_of(table, model, constraints=known, **options)
-    return Task(known, problem)
+        table.check_different()
+    return Task(known, Problem(model, own + tuple(filter(is_nuisance, known)), tuple(effects), table.drive))
 
 
 def _known_of(
@@ -134,30 +145,6 @@ def _known_of(
         usual = USUAL_ERRORS["quality_factor"] * table.quality_factor
         known = {"quality_factor": (table.quality_factor, usual)} | known
     return known
-
-
-def problem_of(
-    table: AmplitudeTable,
-    model: str,
-    *,
-    free: Sequence[str] | None = None,
-    fixed: dict[str, float] | None = None,
-    constraints: dict[str, tuple[float, float]] | None = None,
-    effects: Sequence[str] = EFFECTS,
-) -> Problem:
-    """Return what is fitted for a table: the model's parameters, and the nuisances that are constrained.
-
-    Raises:
-        ValueError: if there is no such model or parameter, or a constraint is impossible.
-        TableError: if a contact is to be fitted to a tip that is driven near resonance.
-    """
-    if model == "contact" and table.tapping:
-        _check_above_resonance(table)
-    own = model_parameters(model, None if free is None else tuple(free), fixed)
-    known = constraints_of(table, constraints)
-    check_constraints(known, model, own, table.drive)
-    nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
-    return Problem(model, own + nuisances, tuple(effects), table.drive)
 
 
 _LEAST_RATIO = 1.01
@@ -194,11 +181,10 @@ def check_constraints(
     Raises:
         ValueError: if a constraint is on no parameter, impossible, or says what a delay says already.
     """
+    names = (*own, *NUISANCE_NAMES)
     for name, (value, error) in known.items():
-        if name not in (*own, *NUISANCE_NAMES):
-            raise ValueError(
-                f"the constraint on {name!r} is on no parameter: choose from {', '.join((*own, *NUISANCE_NAMES))}"
-            )
+        if name not in names:
+            raise ValueError(f"the constraint on {name!r} is on no parameter: choose from {', '.join(names)}")
         if not (np.isfinite(value) and 0.0 < error < np.inf):
             raise ValueError(
                 f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
@@ -210,66 +196,32 @@ def check_constraints(
         )
 
 
-def _joint_task(
+def _shared(
     tables: SeveralTables,
-    model: str,
+    each: Sequence[dict[str, tuple[float, float]]],
     share: Sequence[str],
-    constraints: dict[str, tuple[float, float]] | None,
-    **options: Any,
-) -> Task:
-    """Return what a fit of several tables has to do: one law, and nuisances that are shared or each table's own.
-
-    Raises:
-        ValueError: if there is no such nuisance to share, or the tables contradict each other on it.
-    """
-    each = [_known_of(table, model, constraints) for table in tables.tables]
-    there = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
-    shared = _shared(share, there)
-    _check_shared(tables, each, shared)
-    several = {name: pair for name, pair in each[0].items() if name in shared}
-    # what is each table's own may differ by what a delay takes up in common
-    own = problem_of(tables.tables[0], model, constraints=several, **options).own
-    for table, known in zip(tables.tables, each, strict=True):
-        checked = {name: pair for name, pair in known.items() if name != "offset_origin_nm"}
-        problem_of(replace(table, calibration={}), model, constraints=checked, **options)
-    tables.check_different()
-    known = {name: pair for name, pair in each[0].items() if name in (*own, *shared)}
-    for label, told in zip(tables.labels, each, strict=True):
-        known |= {name_of_table(name, label): told[name] for name in there if name in told and name not in shared}
-    nuisances = tuple(name for name in known if is_nuisance(name))
-    return Task(known, Problem(model, own + nuisances, tuple(options["effects"]), tables.drive))
-
-
-def _shared(share: Sequence[str], there: Sequence[str]) -> list[str]:
+    nuisances: Sequence[str],
+) -> list[str]:
     """Return the nuisances that several tables share.
 
     Raises:
-        ValueError: if there is no such nuisance.
+        ValueError: if there is no such nuisance, or tables do not say the same of it.
     """
     for name in share:
         if name not in (*NUISANCE_NAMES, "all"):
             raise ValueError(f"`share` must be chosen from {', '.join(NUISANCE_NAMES)} and all, but one is {name!r}")
-        if name not in (*there, "all"):
+        if name not in (*nuisances, "all"):
             raise ValueError(f"`share` names {name}, but no table gives it with an error; state it, or leave it out")
-    return [name for name in there if "all" in share or name in share]
-
-
-def _check_shared(tables: SeveralTables, each: Sequence[dict[str, tuple[float, float]]], shared: Sequence[str]) -> None:
-    """Check that tables say the same of what they share.
-
-    Raises:
-        ValueError: if they do not.
-    """
+    shared = [name for name in nuisances if "all" in share or name in share]
     for name in shared:
-        for known, label in zip(each, tables.labels, strict=True):
-            if known.get(name) != each[0].get(name):
-                said = [
-                    f"{where} {'says nothing of it' if pair is None else 'says {:g} +- {:g}'.format(*pair)}"
-                    for where, pair in ((tables.labels[0], each[0].get(name)), (label, known.get(name)))
-                ]
+        said = ["nothing of it" if name not in known else "{:g} +- {:g}".format(*known[name]) for known in each]
+        for label, words in zip(tables.labels, said, strict=True):
+            if words != said[0]:
                 raise ValueError(
-                    f"{name} is shared, but {', and '.join(said)}; say it once (`constraints=...`), or do not share it"
+                    f"{name} is shared, but {tables.labels[0]} says {said[0]}, and {label} says {words}; say it once "
+                    "(`constraints=...`), or do not share it"
                 )
+    return shared
 
 
 def drifts(table: AmplitudeTable) -> bool:
@@ -279,23 +231,17 @@ def drifts(table: AmplitudeTable) -> bool:
 
 def readings_of(
     table: AmplitudeTable | SeveralTables,
-) -> tuple[Float[np.ndarray, "rows k"], Float[np.ndarray, "rows k"]]:
-    """Return peak and lock-in amplitude and the phase, if the table has one; and their errors. NaN: not measured."""
-    if isinstance(table, SeveralTables):
-        parts = list(zip(*map(readings_of, table.tables), strict=True))
-        kinds = max(part.shape[1] for part in parts[0])
-        values, errors = (
-            [np.pad(p, ((0, 0), (0, kinds - p.shape[1])), constant_values=np.nan) for p in part] for part in parts
-        )
-        return np.concatenate(values), np.concatenate(errors)
-    peak, lockin = table.peak_amplitude_nm, table.lockin_amplitude_nm
-    columns = [(peak, table.peak_amplitude_error_nm), (lockin, table.lockin_amplitude_error_nm)]
-    phase, error = table.phase_and_error_deg
-    if phase is not None:
-        columns.append((phase, error))
-    blank = np.full(table.rows, np.nan)
-    values, errors = ([blank if one is None else one for one in part] for part in zip(*columns, strict=True))
-    return np.stack(values, axis=1), np.stack(errors, axis=1)
+) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"]]:
+    """Return peak and lock-in amplitude and the phase, and their errors. NaN: not measured."""
+    values, errors = [], []
+    for one in table.tables:
+        phase, its_error = one.phase_and_error_deg
+        blank = np.full(one.rows, np.nan)
+        columns = one.peak_amplitude_nm, one.lockin_amplitude_nm, phase
+        of_error = one.peak_amplitude_error_nm, one.lockin_amplitude_error_nm, its_error
+        values.append(np.column_stack([blank if column is None else column for column in columns]))
+        errors.append(np.column_stack([blank if column is None else column for column in of_error]))
+    return np.concatenate(values), np.concatenate(errors)
 
 
 class Reach(IntEnum):
@@ -328,13 +274,11 @@ def tip_work(table: AmplitudeTable, quality_factor: float | None) -> Complex[np.
     Its real part is twice the virial over k, its imaginary part minus the energy lost in a period over pi k. NaN where
     not both amplitude and lag were measured. Under "base" the height is that of the deflection that is read.
     """
-    read = readings_of(table)[0]
-    if read.shape[1] < 3:
-        return np.full(table.rows, np.nan, dtype=complex)
+    _, amplitude, lag = readings_of(table)[0].T
     ratio = np.asarray(table.drive_frequency_khz) / float(table.free_frequency_khz)
     gamma = (1.0 - ratio) * (1.0 + ratio) + 1j * ratio * (0.0 if quality_factor is None else 1.0 / quality_factor)
     free = np.asarray(table.excitation_nm)
-    height = -read[:, 1] * np.exp(-1j * (np.deg2rad(read[:, 2]) - np.angle(gamma)))
+    height = -amplitude * np.exp(-1j * (np.deg2rad(lag) - np.angle(gamma)))
     if table.drive == "base":
         height = height * np.exp(-1j * np.angle(1.0 - gamma))
         free = free / np.abs(1.0 - gamma)

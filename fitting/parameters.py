@@ -21,26 +21,23 @@ class Parameter:
         meaning: what it is, in a line.
         lowest: end of the range that a fit may take.
         highest: its other end.
-        reference: the value that stands for its absence, from which ``sign`` and ``width`` count.
-        sign: of a loss: the optimiser's coordinate y is that of value = reference + sign y^2. The bound becomes an
-            interior, smooth minimum of the coordinate, so that a fit that ends there converges like any other.
-        width: of a parameter of any sign: the coordinate is that of value = reference + width y. Without both the
-            coordinate is the logarithm of the value.
-        starts: range within which searches start, of the loss where there is a ``sign``, else of the value; even where
-            there is a ``width`` or it is ``even``, else logarithmic.
+        reference: the value that stands for its absence.
+        sign: of a loss of instantaneous laws, on which side of the reference its values lie.
+        width: of a parameter of the law that may have any sign, the scale on which it varies.
+        starts: range within which searches start, of the loss of r, else of the value; even where there is a ``width``
+            or it is ``even``, else logarithmic; None: no search starts from it.
         even: see ``starts``.
         drive_power: ``starts`` are in units of this power of the drives' speeds beta omega, the lowest of the slowest
             drive and the highest of the fastest, for on them depends what an impact captures.
         mass_power: likewise of the effective mass in ng.
         advice: what to measure so that the amplitudes determine it, if there is more to say than of any.
-        example: of a quantity of the instrument, given with its error.
     """
 
     name: str
     unit: str = ""
     meaning: str = ""
-    lowest: float
-    highest: float
+    lowest: float = -math.inf
+    highest: float = math.inf
     reference: float = 0.0
     sign: int = 0
     width: float = 0.0
@@ -49,12 +46,6 @@ class Parameter:
     drive_power: float = 0.0
     mass_power: float = 0.0
     advice: str = ""
-    example: str = ""
-
-    @property
-    def bound(self) -> float | None:
-        """The value at which the loss vanishes; None for a parameter without such an end."""
-        return self.reference if self.sign else None
 
 
 _SLOW = "measure slow impacts too: small drives, close to where the orbit is lost"
@@ -75,7 +66,6 @@ LAW = (
         unit="nm^2/us^2",
         meaning="adhesion, 2 delta/m",
         lowest=0.0,
-        highest=1e12,
         sign=1,
         starts=(1e-4, 30.0),
         drive_power=2.0,
@@ -86,7 +76,6 @@ LAW = (
         unit="nm/us",
         meaning="loss linear in speed",
         lowest=0.0,
-        highest=1e6,
         sign=1,
         starts=(1e-4, 10.0),
         drive_power=1.0,
@@ -101,8 +90,6 @@ DELAY = (
         unit="us (nm/us)^0.2",
         meaning="Hertz contact time at 1 nm/us",
         lowest=0.0,
-        highest=1e3,
-        sign=1,
         # a factor of 5 around the paper's tip
         starts=(0.04, 1.0),
         mass_power=0.4,
@@ -132,63 +119,45 @@ DELAY = (
 """What a collision delay is made of."""
 
 NUISANCES = (
-    Parameter(name="quality_factor", meaning="of the free resonance", lowest=0.51, highest=1e9, example="40 +- 2"),
+    Parameter(name="quality_factor", meaning="of the free resonance", lowest=0.51),
     Parameter(
         name="offset_origin_nm",
         unit="nm",
         meaning="what the table's offsets lack",
-        lowest=-1e3,
-        highest=1e3,
-        width=1.0,
-        example="0 +- 0.3",
     ),
     Parameter(
         name="tip_calibration",
         meaning="measured over true amplitude of the tip",
         lowest=0.1,
         highest=10.0,
-        example="1 +- 0.02",
     ),
     Parameter(
         name="drive_calibration",
         meaning="true over stated amplitude of the platform, or of the free tip",
         lowest=0.1,
         highest=10.0,
-        example="1 +- 0.02",
     ),
     Parameter(
         name="free_frequency_khz",
         unit="kHz",
         meaning="of the free resonance",
         lowest=1e-3,
-        highest=1e6,
-        example="90 +- 0.01",
     ),
     Parameter(
         name="phase_zero_deg",
         unit="degrees",
         meaning="what the instrument adds to every phase",
-        lowest=-1e3,
-        highest=1e3,
-        width=1.0,
-        example="0 +- 0.2",
     ),
     Parameter(
         name="phase_drift_deg",
         unit="degrees",
         meaning="what the phase drifts by from the first row to the last",
-        lowest=-1e3,
-        highest=1e3,
-        width=1.0,
-        example="0 +- 3",
     ),
     Parameter(
         name="free_amplitude_drift",
         meaning="what the free amplitude drifts by from the first row to the last, over itself",
         lowest=-0.9,
         highest=0.9,
-        width=0.01,
-        example="0 +- 0.03",
     ),
 )
 """What the instrument adds; each has a Gaussian constraint."""
@@ -197,32 +166,12 @@ DRIFT_NAMES = ("phase_drift_deg", "free_amplitude_drift")
 PRIOR_NUISANCES = tuple(nuisance for nuisance in NUISANCES if nuisance.name not in DRIFT_NAMES)
 """Those that may be known before anything is measured."""
 
-SHAPES = (
-    Parameter(
-        name="loss_speed_squared_nm2_per_us2",
-        unit="nm^2/us^2",
-        meaning="square of the speed by which a bridge's pull raises that of the drag",
-        lowest=0.0,
-        highest=1e6,
-    ),
-    Parameter(
-        name="delay_square_nm2_per_us",
-        unit="nm^2/us",
-        meaning="second term of the lead of a slow way out",
-        lowest=-1e6,
-        highest=1e6,
-    ),
-)
-"""What decides the shape of loss and delay in the model discrepancy, each with a prior; no law is printed with them."""
-
 CONTACT = tuple(
     Parameter(
         name=known.name,
         unit=known.unit,
-        meaning=known.meaning,
         lowest=known.fitted[0],
         highest=known.fitted[1],
-        sign=int(known.allowed == "not negative"),
         width=known.width,
         starts=known.starts,
         even=known.evenly is not None,
@@ -232,7 +181,7 @@ CONTACT = tuple(
 )
 """The parameters of `Contact.paper`, by its keywords."""
 
-PARAMETERS = {parameter.name: parameter for parameter in (*LAW, *DELAY, *SHAPES, *NUISANCES, *CONTACT)}
+PARAMETERS = {parameter.name: parameter for parameter in (*LAW, *DELAY, *NUISANCES, *CONTACT)}
 """All of them by name."""
 
 _OF = " of "
@@ -311,7 +260,10 @@ DELAY_LAW = LawFormula(
 )
 DELAY_NAMES = tuple(DELAY_LAW.paper)
 LAW_NAMES = tuple(parameter.name for parameter in (*LAW, *DELAY))
-LOSS_SHAPE, DELAY_SHAPE = tuple(parameter.name for parameter in SHAPES)
+LOSS_SHAPE, DELAY_SHAPE = "loss_speed_squared_nm2_per_us2", "delay_square_nm2_per_us"
+"""What decides the shape of loss and delay in the model discrepancy, each with a prior; no law is printed with them:
+the square of the speed by which a bridge's pull raises that of the drag; the second term of the lead of a slow way out.
+"""
 NUISANCE_NAMES = tuple(parameter.name for parameter in NUISANCES)
 CONTACT_NAMES = tuple(parameter.name for parameter in CONTACT)
 CONTACT_DEFAULT = ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa")
@@ -342,39 +294,28 @@ def model_parameters(
     if model not in MODELS:
         raise ValueError(f"`model` must be one of {', '.join(MODELS)}, but is {model!r}")
     names, held = CONTACT_NAMES if model == "contact" else MODELS[model], fixed or {}
-    _check_fixed(model, names, held)
     usual = CONTACT_DEFAULT if model == "contact" else names
     chosen = tuple(name for name in usual if name not in held) if free is None else free
-    for name in chosen:
-        if name not in names:
-            raise ValueError(f"`free` must be chosen from {', '.join(names)}, but one is {name!r}")
-        if name in held:
-            raise ValueError(f"{name} is both fitted (`free=...`) and held (`fixed=...`); remove it from one")
-    if len(set(chosen)) < len(chosen) or not chosen:
-        raise ValueError("`free` must name at least one parameter that is not fixed, and none twice")
-    if model == "contact":
-        return chosen
-    loose = [name for name in names if name not in (*chosen, *held)]
-    if loose:
-        raise ValueError(f"{' and '.join(loose)} must be fitted (`free=...`) or held at a value (`fixed=...`)")
-    return tuple(name for name in names if name in chosen)
-
-
-def _check_fixed(model: str, names: tuple[str, ...], fixed: Mapping[str, float]) -> None:
-    """Check the values of parameters that are held fixed.
-
-    Raises:
-        ValueError: if a name or value is impossible.
-    """
-    for name, value in fixed.items():
-        if name not in names:
-            raise ValueError(
-                f"`fixed` must name parameters of the model {model!r} ({', '.join(names)}), but one is {name!r}"
-            )
+    for option, given in (("fixed", held), ("free", chosen)):
+        for name in given:
+            if name not in names:
+                raise ValueError(
+                    f"`{option}` must name parameters of the model {model!r} ({', '.join(names)}), but one is {name!r}"
+                )
+    for name, value in held.items():
         parameter = PARAMETERS[name]
+        if name in chosen:
+            raise ValueError(f"{name} is both fitted (`free=...`) and held (`fixed=...`); remove it from one")
         if not math.isfinite(value) or not parameter.lowest <= value <= parameter.highest:
             between = f"between {parameter.lowest:g} and {parameter.highest:g} {parameter.unit}".rstrip()
             raise ValueError(f"`fixed`: {name} must lie {between}, but is {value!r}")
+    if len(set(chosen)) < len(chosen) or not chosen:
+        raise ValueError("`free` must name at least one parameter that is not fixed, and none twice")
+    # of a contact what is neither fitted nor held is the paper's
+    loose = [name for name in MODELS[model] if name not in (*chosen, *held)]
+    if loose:
+        raise ValueError(f"{' and '.join(loose)} must be fitted (`free=...`) or held at a value (`fixed=...`)")
+    return chosen if model == "contact" else tuple(sorted(chosen, key=names.index))
 
 
 def paper_values(model: str, mass_ng: float = 1.0) -> dict[str, float]:

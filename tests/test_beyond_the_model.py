@@ -97,7 +97,7 @@ def test_what_a_fit_of_the_contact_holds_is_not_exact(truth):
         low, high = result.parameters[name].interval95
         assert low is None or low < PAPER[name]
         assert high is None or PAPER[name] < high
-    (said,) = [warning for warning in result.warnings if warning.startswith("Held, with errors that are assumed: ")]
+    (said,) = [warning for warning in result.warnings if warning.startswith("Assumed, because nothing states it: ")]
     assert "structural_amplitude_n_per_m = 40 +- 12" in said
 
 

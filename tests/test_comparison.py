@@ -1,4 +1,4 @@
-"""Models compared on one table: information criteria, and what becomes of a rival that cannot be fitted."""
+"""Models compared on one table: information criteria, and which options are about which model."""
 
 from pathlib import Path
 
@@ -21,15 +21,8 @@ def compared(table):
     return compare(table, MODELS)
 
 
-@pytest.fixture(scope="module")
-def fitted(table):
-    """Return the fits of the models that stand, as `compare` takes them."""
-    return {model: fit(table, model) for model in MODELS if model != "viscous"}
-
-
 @pytest.mark.slow
 def test_models_are_compared_by_their_information(compared):
-    assert compared.failed == {}
     rows = {row["model"]: row for row in compared.rows}
     assert set(rows) == set(MODELS)
     for model, row in rows.items():
@@ -43,27 +36,20 @@ def test_models_are_compared_by_their_information(compared):
     assert "tells plainly: law: a restitution with adhesion" in compared.verdict
 
 
-@pytest.mark.slow
-def test_a_rival_that_fails_is_reported_beside_those_that_stand(table, compared, fitted, monkeypatch):
-    """Those that stand are known already, and not fitted again."""
+def test_fits_that_are_known_are_not_made_again_and_a_constraint_goes_to_the_models_that_have_it(table, monkeypatch):
+    asked = {}
 
-    def fails(*_, **__):
-        raise FloatingPointError
+    def noted(whole, model, **options):
+        asked[model] = options["constraints"]
+        return fit(whole, model, **options)
 
-    monkeypatch.setattr(comparison, "fit", fails)
-    found = compare(table, MODELS, known=fitted)
-    assert found.failed == {"viscous": "FloatingPointError"}
-    assert "The fit of viscous failed: FloatingPointError." in found.verdict
-    without = [row for row in compared.rows if row["model"] != "viscous"]
-    assert [row["model"] for row in found.rows] == [row["model"] for row in without]
-    assert found.rows[0]["chi2"] == pytest.approx(without[0]["chi2"])
-
-
-def test_a_model_alone_is_compared_with_nothing(table):
-    found = compare(table, ("law", "viscous"), constraints={"r": (0.95, 0.01), "quality_factor": (40.0, 0.4)})
-    assert list(found.results) == ["law"]
-    assert "the constraint on 'r' is on no parameter" in found.failed["viscous"]
-    assert found.verdict.startswith("There is nothing to compare law: a restitution with adhesion (r, epsilon) with.")
+    monkeypatch.setattr(comparison, "fit", noted)
+    known = {"law": fit(table, "law")}
+    found = compare(
+        table, ("law", "viscous"), known=known, constraints={"r": (0.95, 0.01), "quality_factor": (40.0, 1.0)}
+    )
+    assert found.results["law"] is known["law"]
+    assert asked == {"viscous": {"quality_factor": (40.0, 1.0)}}
 
 
 def test_a_wrong_call_is_no_failed_rival(table):

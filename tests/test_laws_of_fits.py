@@ -164,6 +164,6 @@ def test_of_the_closest_formula_no_loss_is_negative():
     """Of a law that gives 50 nm^2/us^2 epsilon vanishes, and u_out = r u_in is least squares by hand."""
     u = np.geomspace(25.0, 180.0, 30)
     rebound, weight = np.sqrt(0.9 * u**2 + 50.0), 1.0 / (0.1 + 0.01 * u)
-    found = closest_loss(("r", "epsilon"), u, rebound, weight, {}, 8)
+    found = closest_loss(("r", "epsilon"), u, rebound, weight, {})
     assert found["epsilon"] == 0.0
     assert found["r"] == pytest.approx(np.sum(weight**2 * u * rebound) / np.sum((weight * u) ** 2), rel=1e-12)

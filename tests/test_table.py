@@ -273,7 +273,7 @@ def test_repeated_readings_give_the_errors_that_a_table_lacks(tmp_path: Path):
         np.testing.assert_allclose(np.asarray(found), errors, rtol=1e-6)
     np.testing.assert_allclose(np.asarray(table.phase_error_deg), np.full(16, wider * degrees), rtol=1e-6)
     said = f"peak_amplitude_nm +- {100.0 * wider * share:.3g} % (15 rows of 5 drives, widened 1.14 times"
-    assert table.remarks[0].startswith(f"errors from repeated readings: {said}")
+    assert table.remarks[0].startswith(f"Errors from repeated readings: {said}")
     write_table(table, tmp_path / "written.csv")
     assert read_table(tmp_path / "written.csv").remarks == table.remarks
     # three repeats are too few

@@ -14,7 +14,7 @@ from afm_jax.whole_files import in_callers_words
 from fitting.experiments.candidates import drive_grid
 from fitting.experiments.design import design
 from fitting.experiments.prior import Prior, prior_of_values, read_prior
-from fitting.parameters import LAW_NAMES, PARAMETERS, PRIOR_NUISANCES
+from fitting.parameters import LAW_NAMES, PRIOR_NUISANCES
 
 _TIP = {"orders": (1,), "detunings": (1.02, 1.04, 1.06, 1.08, 1.1), "amplitudes_nm": (40.0, 80.0)}
 _SAMPLE = {"orders": (1, 2, 3, 4), "detunings": np.arange(97, 106) / 100, "amplitudes_nm": (2.0, 4.0, 7.0, 10.0)}
@@ -57,7 +57,7 @@ def prior_of_options(options: Mapping[str, Any]) -> Prior:
     instrument = {nuisance.name: given[nuisance.name] for nuisance in PRIOR_NUISANCES if nuisance.name in given}
     for name, (_, error) in instrument.items():
         if name not in {"quality_factor", "free_frequency_khz"} and error is None:
-            raise click.UsageError(f"{option_of(name)} needs its standard error; write '{PARAMETERS[name].example}'")
+            raise click.UsageError(f"{option_of(name)} needs its standard error; write 'VALUE +- ERROR'")
     quality_factor, _ = given.get("quality_factor", (math.inf, None))
     return prior_of_values(
         model or "law+delay",

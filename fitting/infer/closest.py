@@ -17,9 +17,6 @@ from fitting.predict.law import FormulaLaw
 
 _AT_BOUND = 0.01
 """Loss over its error below which it is taken to vanish."""
-_ROUNDS = 8
-"""Steps to the closest formula: squared rebound speeds are nearly linear in what is fitted."""
-_BEGIN = {"delay_hertz": 0.2, "delay_lead_nm": 5.0, "delay_offset_nm": 0.0}
 _LOSSES = {parameter.name: parameter.reference for parameter in LAW}
 """Parameters of losses, and the value of each without one."""
 _SAME, _SHARED = 1e-8, 1e-3
@@ -77,33 +74,28 @@ def closest_parameters(explained: Explained, own: tuple[str, ...], fixed: Mappin
     model, theta, law = explained.model, explained.end.theta, explained.model.law
     root = root_of(covariance_of_unknowns(explained))
     if law.lasting and isinstance(law, FormulaLaw):
-        found = _projected(explained, own, fixed)
+        values, factor, vanishing = _projected(explained, own, fixed)
     else:
         places = [model.names.index(name) for name in own]
         values = np.array([float(law.value_of(name, theta[i])) for name, i in zip(own, places, strict=True)])
         slope = np.array([law.slope_of(name, theta[i]) for name, i in zip(own, places, strict=True)])
-        vanishes = dict(zip(own, held_at_bound(explained)[places].tolist(), strict=True))
-        found = _Own(values, slope[:, None] * root[places], {name for name in own if vanishes[name]})
+        factor, held = slope[:, None] * root[places], held_at_bound(explained)
+        vanishing = {name for name, place in zip(own, places, strict=True) if held[place]}
     first = len(model.names) - len(model.instrument)
     pairs = [(q.at(float(y)), q.slope(float(y))) for q, y in zip(model.instrument, theta[first:], strict=True)]
     of_instrument = np.reshape([slope for _, slope in pairs], (-1, 1)) * root[first:]
     return Closest(
         names=(*own, *(quantity.name for quantity in model.instrument)),
-        values=np.append(found.values, [value for value, _ in pairs]),
-        factor=np.concatenate([found.factor, of_instrument]),
-        vanishes=(*(name in found.vanishing for name in own), *(False for _ in pairs)),
+        values=np.append(values, [value for value, _ in pairs]),
+        factor=np.concatenate([factor, of_instrument]),
+        vanishes=(*(name in vanishing for name in own), *(False for _ in pairs)),
     )
 
 
-class _Own(NamedTuple):
-    """The model's own parameters, as `Closest`."""
-
-    values: Float[np.ndarray, " p"]
-    factor: Float[np.ndarray, "p m"]
-    vanishing: set[str]
-
-
-def _projected(explained: Explained, own: tuple[str, ...], fixed: Mapping[str, float]) -> _Own:
+def _projected(
+    explained: Explained, own: tuple[str, ...], fixed: Mapping[str, float]
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p m"], set[str]]:
+    """Return the formula closest to the law: values, their change with independent unknowns, which losses vanish."""
     used = explained.weights.used.any(axis=1) & ~explained.model.data.row.free
     speeds = explained.end.orbits.approach[used & np.isfinite(explained.end.orbits.approach)]
     law = explained.law_at(speeds)
@@ -111,10 +103,10 @@ def _projected(explained: Explained, own: tuple[str, ...], fixed: Mapping[str, f
     u, (rebound, delay), factor = speeds[there], law.law[:, there], law.factor[:, there]
     if u.size < len(own) or not np.isfinite(factor).all():
         values = explained.model.law.values(explained.model.of_law(explained.end.theta))
-        return _Own(np.array([values[name] for name in own]), np.full((len(own), factor.shape[2]), np.nan), set())
+        return np.array([values[name] for name in own]), np.full((len(own), factor.shape[2]), np.nan), set()
     weight = 1.0 / np.maximum(np.linalg.norm(factor, axis=2), 1e-300)
     losses, late = ([name for name in own if name in kind] for kind in (_LOSSES, DELAY_TERMS))
-    values = dict(fixed) | closest_loss(losses, u, rebound, weight[0], fixed, _ROUNDS)
+    values = dict(fixed) | closest_loss(losses, u, rebound, weight[0], fixed)
     vanishing = {name for name in losses if values[name] == _LOSSES[name]}
     w = np.maximum(rebound_by_formula(values, u), 0.1 * rebound)
     by_loss = {"r": values.get("r", 1.0) * u**2 / w, "epsilon": -0.5 / w, "viscous_loss": -0.5 * u / w}
@@ -126,16 +118,13 @@ def _projected(explained: Explained, own: tuple[str, ...], fixed: Mapping[str, f
         # as if it were free, for its limit
         changes[name] = _solved(np.column_stack([slope, by_loss[name]]), factor[0], weight[0])[-1]
     columns = np.reshape([DELAY_TERMS[name](u, w) for name in late], (-1, u.size)).T
-    begin = {name: _BEGIN[name] for name in late}
     ends = np.reshape([(PARAMETERS[name].lowest, PARAMETERS[name].highest) for name in late], (-1, 2))
-    off = weight[1] * (delay_by_formula(dict(fixed) | begin, u, w) - delay)
-    start = np.array(list(begin.values()))
-    moved = bounded(off, weight[1][:, None] * columns, start, ends, np.ones(len(late), dtype=bool))
-    values |= dict(zip(late, (start + moved).tolist(), strict=True))
+    off = weight[1] * (delay_by_formula(fixed, u, w) - delay)
+    values |= dict(zip(late, bounded(off, weight[1][:, None] * columns, ends).tolist(), strict=True))
     # the formula's delay changes with its rebound speed
     beside = factor[1] - values.get("delay_lead_nm", 0.0) / w[:, None] ** 2 * along
     changes |= dict(zip(late, _solved(columns, beside, weight[1]), strict=True))
-    return _Own(np.array([values[name] for name in own]), np.array([changes[name] for name in own]), vanishing)
+    return np.array([values[name] for name in own]), np.array([changes[name] for name in own]), vanishing
 
 
 def _solved(

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from afm_jax.units import TWO_SIDED_95
 
@@ -16,11 +16,6 @@ class LawWithErrors(NamedTuple):
     factor: Float[np.ndarray, "2 n m"]
     capture: float
     capture_factor: Float[np.ndarray, " m"]
-
-    def without_errors(self) -> "LawWithErrors":
-        """Return the law with nothing known of its errors: NaN."""
-        nothing = np.full_like(self.factor, np.nan), np.full_like(self.capture_factor, np.nan)
-        return self._replace(factor=nothing[0], capture_factor=nothing[1])
 
 
 AtSpeeds = Callable[[Float[np.ndarray, " n"]], LawWithErrors]
@@ -107,13 +102,11 @@ def closest_loss(
     rebound: Float[np.ndarray, " n"],
     weight: Float[np.ndarray, " n"],
     known: Mapping[str, float],
-    rounds: int = 1,
 ) -> dict[str, float]:
     """Return the parameters of the formula closest to a law, as u_out is to be close; no loss is negative.
 
     Least squares in u_out by Gauss-Newton steps from the law itself: about speeds w, u_out of the formula is
-    (u_out^2 + w^2)/(2 w) to first order, which is linear in the terms of the loss. One round is a problem without other
-    minima.
+    (u_out^2 + w^2)/(2 w) to first order, which is linear in the terms of the loss.
 
     Args:
         family: of r, viscous_loss and epsilon those that are looked for.
@@ -121,25 +114,25 @@ def closest_loss(
         rebound: of the law, all positive.
         weight: of each.
         known: values of others of them.
-        rounds: how many steps.
     """
     if not family:
         return {}
     columns = np.stack([speeds ** _POWERS[name] for name in family], axis=1)
     lossless = square_by_formula({name: value for name, value in known.items() if name not in family}, speeds)
     w, terms = rebound, np.zeros(len(family))
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         steep = 0.5 * weight / w
         scale = np.linalg.norm(steep[:, None] * columns, axis=0)
         target = lossless + w**2 - 2.0 * w * rebound
         ends = np.stack([np.zeros(scale.size), np.full(scale.size, np.inf)], axis=1)
-        matrix, moving = steep[:, None] * columns / scale, np.ones(scale.size, dtype=bool)
-        terms = bounded(-steep * target, matrix, np.zeros(scale.size), ends, moving) / scale
+        terms = bounded(-steep * target, steep[:, None] * columns / scale, ends) / scale
         w = np.sqrt(np.maximum(lossless - columns @ terms, (_SLOWEST * rebound) ** 2))
     found = zip(family, terms.tolist(), strict=True)
     return {name: max(1.0 - term, 0.0) ** 0.5 if name == "r" else term for name, term in found}
 
 
+_ROUNDS = 8
+"""Steps to the closest formula: squared rebound speeds are nearly linear in what is fitted."""
 _SLOWEST = 0.1
 """Rebound speed of a formula over that of the law that it is compared with at which it is held: it may capture."""
 
@@ -155,29 +148,22 @@ def root_of(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
 
 
 def bounded(
-    residual: Float[np.ndarray, " n"],
-    slope: Float[np.ndarray, "n k"],
-    begin: Float[np.ndarray, " k"],
-    ends: Float[np.ndarray, "k 2"],
-    moving: Bool[np.ndarray, " k"],
+    residual: Float[np.ndarray, " n"], slope: Float[np.ndarray, "n k"], ends: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, " k"]:
-    """Return the least-squares step between bounds: what would leave its range is held at the end.
+    """Return the solution of least squares between bounds: what would leave its range is held at the end.
 
     Args:
-        residual: whose sum of squares is to become smallest.
+        residual: where all values are 0.
         slope: its derivatives.
-        begin: values at which the step begins.
         ends: lowest and highest value of each.
-        moving: which of the values change.
     """
-    change = np.zeros_like(begin)
-    moving = moving.copy()
-    for _ in range(begin.size):
-        held = residual + slope[:, ~moving] @ change[~moving]
-        change[moving] = np.linalg.lstsq(slope[:, moving], -held, rcond=None)[0]
-        out = moving & ((begin + change < ends[:, 0]) | (begin + change > ends[:, 1]))
+    values, moving = np.zeros(len(ends)), np.ones(len(ends), dtype=bool)
+    for _ in range(len(ends)):
+        held = residual + slope[:, ~moving] @ values[~moving]
+        values[moving] = np.linalg.lstsq(slope[:, moving], -held, rcond=None)[0]
+        out = moving & ((values < ends[:, 0]) | (values > ends[:, 1]))
         if not out.any():
             break
-        change[out] = np.clip(begin + change, ends[:, 0], ends[:, 1])[out] - begin[out]
+        values[out] = np.clip(values, ends[:, 0], ends[:, 1])[out]
         moving &= ~out
-    return change
+    return values

@@ -5,7 +5,7 @@ Energies and delta with their intervals (`Loss`), beside the parameters, are the
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +20,7 @@ from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.strict_json import plain
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from fitting.infer.law import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_formula
-from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
+from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
 ENOUGH = 1e-2
@@ -37,7 +37,7 @@ class Convergence:
         iterations: of it.
         gradient: largest slope of chi2 by an unknown, per standard error.
         estimated_distance: by how much chi2 lies above its minimum, g H^-1 g.
-        reason: why there is nothing to check, None if there is.
+        reason: why chi2 is not at a minimum, None if it is.
     """
 
     converged: bool
@@ -133,10 +133,9 @@ class FittedTable:
         used: how many of them count.
         chi2: of its readings, of what is known of its own nuisances.
         readings: how many there are.
-        pull: how far its law is from that of the others, as standard deviations of a single Gaussian number; None where
+        pull: how far its law is from that of the others, as standard deviations of a single Gaussian number; NaN where
             they do not determine it.
         p_value: probability of a larger pull if all have the same law.
-        pulls: by how much it moves each parameter of the law, in standard deviations of that.
         nuisances: its own, as `FitResult.parameters`.
     """
 
@@ -146,9 +145,8 @@ class FittedTable:
     used: int
     chi2: float
     readings: int
-    pull: float | None
-    p_value: float | None
-    pulls: dict[str, float | None]
+    pull: float
+    p_value: float
     nuisances: dict[str, FittedParameter]
 
 
@@ -317,35 +315,20 @@ class FitResult(Result):
     loss: Loss | None = None
     tables: tuple[FittedTable, ...] = ()
 
-    @property
-    def repeats(self) -> RepeatedReadings | None:
-        """How the readings of drives that were repeated scatter, over their errors; None where none was."""
-        return repeats_of(self.table)
-
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        return {
-            "format": FIT_FORMAT,
-            "format_version": FIT_FORMAT_VERSION,
-            "model": self.model,
-            "valid": self.valid,
-            "reasons": self.reasons,
-            "warnings": self.warnings,
-            "parameters": {name: plain(asdict(value)) for name, value in self.parameters.items()},
-            "correlations": {"names": list(self.parameters), "matrix": plain(self.correlations)},
-            "chi2": plain(self.chi2),
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "p_value": plain(self.p_value),
-            "aic": plain(self.aic),
-            "law": self.law.to_dict(),
-            "loss": None if self.loss is None else plain(asdict(self.loss)),
-            "rows": {name: plain(column) for name, column in vars(self.rows).items()},
-            "convergence": plain(asdict(self.convergence)),
-            "input": plain({"tables": [*map(vars, self.table.tables)]} if self.tables else vars(self.table)),
-            "settings": plain(self.settings),
-            "repeats": None if (repeats := self.repeats) is None else plain(asdict(repeats)),
-            "versions": self.versions,
-        } | ({"tables": [plain(asdict(table)) for table in self.tables]} if self.tables else {})
+        left_out = {"table"} if self.tables else {"table", "tables"}
+        names = [field.name for field in dataclasses.fields(self) if field.name not in left_out]
+        return plain(
+            {"format": FIT_FORMAT, "format_version": FIT_FORMAT_VERSION}
+            | {name: getattr(self, name) for name in names}
+            | {
+                "correlations": {"names": list(self.parameters), "matrix": self.correlations},
+                "law": self.law.to_dict(),
+                "input": self.table,
+                "repeats": repeats_of(self.table),
+            }
+        )
 
 
 @compiled_quickly(level=0)
@@ -381,8 +364,10 @@ def interval_of(value: float, error: float, lowest: float = -np.inf) -> WithInte
     return WithInterval(value, (float(max(value - reach, lowest)), float(value + reach)))
 
 
-def scaled(known: WithInterval, factor: float) -> WithInterval:
-    """Return a value and its interval in another unit."""
+def scaled(known: WithInterval | None, factor: float) -> WithInterval | None:
+    """Return a value and its interval in another unit; None if it is not known."""
+    if known is None:
+        return None
     low, high = (None if end is None else end * factor for end in known.interval95)
     return WithInterval(known.value * factor, (low, high))
 
@@ -406,22 +391,19 @@ def loss_of(
         parameters: of the fit.
         formula: values of the model's formula, those that are held included; None: it has none.
     """
-    three = np.geomspace(*measured, 3)
     # two digits, and within what was measured
-    three = np.clip([float(f"{speed:.2g}") for speed in three], *measured)
+    three = np.clip([float(f"{speed:.2g}") for speed in np.geomspace(*measured, 3)], *measured)
     points = law(np.resize(three, LAW_POINTS))
-    energies = []
-    for u, w, factor in zip(three.tolist(), points.law[0, :3].tolist(), points.factor[0, :3], strict=True):
-        taken = None
-        if mass_ng is not None:
-            # a sample at rest gives no energy
-            error = mass_ng * w * float(np.linalg.norm(factor))
-            taken = interval_of(0.5 * mass_ng * (u**2 - w**2), error, lowest=0.0)
-        energies.append(EnergyLost(u, taken, None if taken is None else scaled(taken, EV_PER_AJ)))
-    delta = None
-    if "epsilon" in parameters and mass_ng is not None:
-        epsilon = parameters["epsilon"]
-        delta = scaled(WithInterval(epsilon.value, epsilon.interval95), 0.5 * mass_ng)
+    errors, taken, delta = np.linalg.norm(points.factor[0], axis=1), [None] * 3, None
+    if mass_ng is not None:
+        # a sample at rest gives no energy
+        taken = [
+            interval_of(0.5 * mass_ng * (u**2 - w**2), mass_ng * w * error, lowest=0.0)
+            for u, w, error in zip(three.tolist(), points.law[0].tolist(), errors.tolist(), strict=False)
+        ]
+        epsilon = parameters.get("epsilon")
+        delta = epsilon and scaled(WithInterval(epsilon.value, epsilon.interval95), 0.5 * mass_ng)
+    energies = [EnergyLost(u, one, scaled(one, EV_PER_AJ)) for u, one in zip(three.tolist(), taken, strict=True)]
     off = off_at = None
     if formula is not None:
         speeds = np.geomspace(*measured, LAW_POINTS)
@@ -432,7 +414,7 @@ def loss_of(
         energies=tuple(dict.fromkeys(energies)),
         energies_reason=NO_MASS if mass_ng is None else None,
         delta_aj=delta,
-        delta_ev=None if delta is None else scaled(delta, EV_PER_AJ),
+        delta_ev=scaled(delta, EV_PER_AJ),
         formula_off=off,
         formula_off_at_nm_per_us=off_at,
         capture_speed_nm_per_us=interval_of(points.capture, float(np.linalg.norm(points.capture_factor)), lowest=0.0),

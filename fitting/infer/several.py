@@ -56,13 +56,11 @@ class Pull(NamedTuple):
     Attributes:
         pull: of its law, as standard deviations of a single Gaussian number; NaN where the others do not determine it.
         p_value: probability of a larger one by chance.
-        pulls: by how much it moves each free parameter of the law, in standard deviations of that; NaN likewise.
         chi2: its part of the sum of squares.
     """
 
     pull: float
     p_value: float
-    pulls: Float[np.ndarray, " l"]
     chi2: float
 
 
@@ -79,22 +77,14 @@ def pulls_of(parts: Parts) -> list[Pull]:
         matrix, vector = parts.matrix[table], parts.vector[table]
         chi2 = float(parts.square[table] + 2.0 * change @ vector + change @ matrix @ change)
         known = np.isfinite(np.diag(others)) & np.isfinite(np.diag(everything))
-        pulls = np.full(parts.law.size, np.nan)
-        if not known.any():
-            found.append(Pull(np.nan, np.nan, pulls, chi2))
-            continue
         some = np.ix_(known, known)
         # in units of what the others leave open
         unit = np.sqrt(np.diag(others)[known])
         variance, axes = np.linalg.eigh((others[some] - everything[some]) / np.outer(unit, unit))
         said = variance > _LEAST_SHARE
         square = float(np.sum((axes.T @ (moved[known] / unit))[said] ** 2 / variance[said]))
-        spread = np.diag(others - everything)[known] / unit**2
-        pulls[known] = np.where(
-            spread > _LEAST_SHARE, moved[known] / unit / np.sqrt(np.maximum(spread, _LEAST_SHARE)), 0.0
-        )
-        p_value = chi2_tail(square, int(said.sum())) if said.any() else 1.0
+        p_value = chi2_tail(square, int(said.sum())) if said.any() else 1.0 if known.any() else np.nan
         # beyond what a probability can hold, all but the largest direction count nothing
-        pull = -NormalDist().inv_cdf(0.5 * p_value) if p_value > 0.0 else float(np.sqrt(square))
-        found.append(Pull(pull, p_value, pulls, chi2))
+        pull = float(np.sqrt(square)) if p_value == 0.0 else -NormalDist().inv_cdf(0.5 * p_value)
+        found.append(Pull(pull, p_value, chi2))
     return found

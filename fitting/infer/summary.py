@@ -14,7 +14,7 @@ from afm_jax.version import version_of
 from fitting.infer.closest import Closest, closest_parameters, covariance_of_unknowns, held_at_bound
 from fitting.infer.explain import Explained
 from fitting.infer.intervals import UNDETERMINED, UNEXPLAINED, Interval, Unknown, linear_interval, profile_interval
-from fitting.infer.law import AtSpeeds, LawWithErrors, containing, speed_range
+from fitting.infer.law import LawWithErrors, containing, speed_range
 from fitting.infer.result import (
     ENOUGH,
     Convergence,
@@ -72,25 +72,26 @@ class Fitted(NamedTuple):
 def convergence_of(explained: Explained, optimiser: str, iterations: int) -> Convergence:
     """Return how far chi2 is from its minimum, unknowns that are held at a bound left out."""
     end = explained.end
-    jacobian, residual = end.jacobian, end.residual
-    if not (np.isfinite(jacobian).all() and np.isfinite(residual).all()):
-        reason = "the slopes of the residuals are not finite where the search ended"
-        return Convergence(False, optimiser, iterations, np.inf, np.inf, reason)  # noqa: FBT003
-    slope = jacobian.T @ residual
-    moves = ~held_at_bound(explained) & ~((end.theta <= explained.model.lowest) & (slope > 0.0))
-    covariance = covariance_of(jacobian[:, moves].T @ jacobian[:, moves])
-    known = np.isfinite(np.diag(covariance))
-    step = np.where(known, np.where(np.isfinite(covariance), covariance, 0.0) @ np.where(known, slope[moves], 0.0), 0.0)
-    distance = float(slope[moves] @ step)
-    errors = np.sqrt(np.where(known, np.diag(covariance), 0.0))
-    gradient = float(np.max(np.abs(2.0 * slope[moves] * errors), initial=0.0))
-    return Convergence(explained.settled and distance < ENOUGH, optimiser, iterations, gradient, distance)
+    jacobian, residual, distance, gradient = end.jacobian, end.residual, np.inf, np.inf
+    reason = "the slopes of the residuals are not finite where the search ended"
+    if np.isfinite(jacobian).all() and np.isfinite(residual).all():
+        slope = jacobian.T @ residual
+        moves = ~held_at_bound(explained) & ~((end.theta <= explained.model.lowest) & (slope > 0.0))
+        covariance = covariance_of(jacobian[:, moves].T @ jacobian[:, moves])
+        known = np.isfinite(np.diag(covariance))
+        slope, covariance = slope[moves][known], covariance[np.ix_(known, known)]
+        distance = float(slope @ covariance @ slope)
+        gradient = float(np.max(np.abs(2.0 * slope * np.sqrt(np.diag(covariance))), initial=0.0))
+        reason = None if explained.settled else "which orbits the rows have, and what they count, does not settle"
+        if distance >= ENOUGH:
+            reason = f"chi2 lies an estimated {distance:.2g} above its minimum"
+    return Convergence(reason is None, optimiser, iterations, gradient, distance, reason)
 
 
 def summary_of(
     table: AmplitudeTable | SeveralTables, task: Task, fitted: Fitted, settings: dict[str, Any]
 ) -> FitResult:
-    """Return the result of a fit.
+    """Return the result of a fit: the law and its loss with bands, parameters with intervals, rows, the verdict.
 
     Args:
         table: what was fitted.
@@ -99,57 +100,83 @@ def summary_of(
         settings: every option of the fit.
     """
     explained, problem, data = fitted.explained, task.problem, fitted.explained.model.data
-    closest, rows = closest_parameters(explained, problem.own, settings["fixed"]), _rows_of(explained, table)
+    law, theta = explained.model.law, explained.model.of_law(explained.end.theta)
+    chi2, rows = explained.end.chi2, _rows_of(explained, table)
+    closest = closest_parameters(explained, problem.own, settings["fixed"])
     counted = data.measured & ~rows.set_aside[:, None]
     freedom = int(counted.sum() + data.no_orbit.sum()) + len(task.known) - len(closest.names)
-    judged = freedom > 0 and settings["error_scale"] is None and settings["robust"] is None
-    other = None
-    if fitted.other is not None:
-        there = closest_parameters(fitted.other, problem.own, settings["fixed"])
-        other = dict(zip(there.names, there.values.tolist(), strict=True)), fitted.other.end.chi2
+    judged = freedom > 0 and settings["error_scale"] is None
+    other, elsewhere, other_minimum = fitted.other, None, None
+    if other is not None:
+        elsewhere = closest_parameters(other, problem.own, settings["fixed"])
+        other_minimum = dict(zip(elsewhere.names, elsewhere.values.tolist(), strict=True)), other.end.chi2
     pulls = _compare_tables(explained, table)
-    unexplained = [Interval(None, None, UNEXPLAINED)] * len(closest.names)
+    speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
     evidence = Evidence(
         table=table,
-        parameters=_parameters(task, closest, np.full(len(closest.names), np.inf), unexplained),
+        parameters=_parameters(task, closest, None),
         convergence=fitted.convergence,
         rows=rows,
-        chi2=explained.end.chi2,
+        chi2=chi2,
         freedom=freedom,
-        p_value=chi2_tail(explained.end.chi2, freedom) if judged else float("nan"),
-        other_minimum=other,
+        p_value=chi2_tail(chi2, freedom) if judged else float("nan"),
+        other_minimum=other_minimum,
         error_scale=settings["error_scale"],
         robust=settings["robust"] is not None,
         correlations=_correlations(closest.factor),
-        untabulated=_untabulated(explained, rows),
-        contact_share=_contact_share(explained),
+        untabulated=tuple(np.flatnonzero(law.misses_accuracy(theta, speeds)).tolist()),
         refused=explained.refused,
-        contact=problem.model == "contact",
         pulls=tuple(pull.p_value for pull in pulls),
         run=(fitted.before.run, explained.run),
         short=explained.short,
         unwidened=np.where(np.isfinite(rows.residual), fitted.before.residual[:, : rows.residual.shape[1]], np.nan),
         held=tuple(settings["held"]),
-        courses=courses_along_rows(explained, table),
     )
     # errors that assume the model would be confident numbers about a law that is not there
     known = not misfits(evidence)
     if known:
-        evidence = replace(evidence, parameters=_known_parameters(task, fitted, closest, settings))
-    return _result(task, fitted, evidence, closest, pulls, settings, known=known)
+        parameters = _parameters(task, closest, intervals_of(fitted, closest))
+        if other is not None and elsewhere is not None:
+            theirs = _parameters(task, elsewhere, intervals_of(fitted._replace(explained=other), elsewhere))
+            parameters = {name: parameter.containing(theirs[name]) for name, parameter in parameters.items()}
+        evidence = replace(evidence, parameters=parameters)
 
+    def law_at(speeds: Float[np.ndarray, " n"]) -> LawWithErrors:
+        law = explained.law_at(speeds)
+        law = law if other is None else containing(law, other.law_at(speeds))
+        # nothing is known of the errors
+        nothing = law._replace(factor=np.nan * law.factor, capture_factor=np.nan * law.capture_factor)
+        return law if known else nothing
 
-def _known_parameters(
-    task: Task, fitted: Fitted, closest: Closest, settings: dict[str, Any]
-) -> dict[str, FittedParameter]:
-    """Return the parameters with errors and intervals, so large that they hold those of another minimum too."""
-    parameters = _parameters(task, closest, closest.errors, intervals_of(fitted, closest))
-    if fitted.other is None:
-        return parameters
-    there = closest_parameters(fitted.other, task.problem.own, settings["fixed"])
-    elsewhere = fitted._replace(explained=fitted.other, other=None)
-    theirs = _parameters(task, there, there.errors, intervals_of(elsewhere, there))
-    return {name: parameter.containing(theirs[name]) for name, parameter in parameters.items()}
+    common = [not is_of_one_table(name) for name in closest.names]
+    values = dict(settings["fixed"]) | {name: parameter.value for name, parameter in evidence.parameters.items()}
+    formula, loss = None if problem.model == "contact" else values, None
+    if np.isfinite(speeds).any():
+        loss = loss_of(law_at, speed_range(speeds), table.mass_ng, evidence.parameters, formula)
+    reasons, warnings = judge_fit(evidence)
+    delay = CollisionDelay(*law.coefficients(theta)[0][:3]) if problem.lasting else None
+    return FitResult(
+        model=problem.model,
+        parameters={name: one for name, one in evidence.parameters.items() if not is_of_one_table(name)},
+        correlations=np.where(known, evidence.correlations, np.nan)[np.ix_(common, common)],
+        chi2=chi2,
+        degrees_of_freedom=freedom,
+        p_value=evidence.p_value,
+        aic=chi2 + 2.0 * len(closest.names),
+        valid=not reasons,
+        reasons=reasons,
+        warnings=warnings,
+        law=FittedLaw(
+            law_at, speeds, delay=delay, mass_ng=table.mass_ng, origin=f"{problem.model} fitted to {table.source}"
+        ),
+        loss=loss,
+        rows=rows,
+        convergence=fitted.convergence,
+        table=table,
+        settings=settings,
+        versions={name: version_of(name) for name in _PACKAGES},
+        tables=_fitted_tables(evidence, pulls),
+    )
 
 
 def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
@@ -200,246 +227,101 @@ def _profile_of(fitted: Fitted, name: str, error: float) -> Interval:
 def _rows_of(explained: Explained, table: AmplitudeTable | SeveralTables) -> FittedRows:
     """Return measured and predicted readings."""
     data, orbits, weights = explained.model.data, explained.end.orbits, explained.weights
-    read = readings_of(table)[0]
-    kinds, number = read.shape[1], explained.found.number
-    exists, reasons = number > 0, weights.reasons.copy()
-    drawn = np.isfinite(read).any(axis=1) & ~data.measured.any(axis=1)
-    reasons[drawn] = ATTRACTED
+    by_law, number, read = explained.by_law_alone(), explained.found.number, readings_of(table)[0]
+    exists, reasons, hits = number > 0, weights.reasons.copy(), ~data.row.free
+    reasons[np.isfinite(read).any(axis=1) & ~data.measured.any(axis=1)] = ATTRACTED
     counted = data.measured & (reasons == "")[:, None]
-    size = np.concatenate([np.abs(data.read[:, :2]), np.full((len(exists), 1), SIZE_OF_PHASE)], axis=1)
+    size = np.column_stack([np.abs(data.read[:, :2]), np.full(len(exists), SIZE_OF_PHASE)])
     error = np.where(counted, np.hypot(data.error, weights.model_error[:, None] * size), np.nan)
     # an instantaneous law without an orbit predicts no amplitude; one that lasts is asked for the others alone
     compared = np.where(exists[:, None] | (not explained.model.law.lasting), orbits.readings, np.nan)
-    predicted = np.where(exists[:, None], explained.by_law_alone().readings, np.nan)
-    phases = {}
-    if kinds == READINGS:
-        phases = {
-            "predicted_phase_deg": predicted[:, 2],
-            "measured_phase_deg": read[:, 2],
-            "phase_error_deg": error[:, 2],
-        }
+    predicted = np.where(exists[:, None], by_law.readings, np.nan)
+    phase = np.isfinite(read[:, 2]).any()
     return FittedRows(
         predicted_nm=predicted[:, :2],
         measured_nm=read[:, :2],
-        residual=((compared - data.read) / error)[:, :kinds],
+        residual=((compared - data.read) / error)[:, : READINGS if phase else 2],
         error_nm=error[:, :2],
         model_error=weights.model_error,
         used=counted.any(axis=1),
-        set_aside=(reasons != "").astype(bool),
-        approach_speed_nm_per_us=np.where(exists & ~data.row.free, explained.by_law_alone().approach, np.nan),
+        set_aside=reasons != "",
+        approach_speed_nm_per_us=np.where(exists & hits, by_law.approach, np.nan),
         orbits=number,
-        near_fold=exists & (np.abs(orbits.fold) < NEAR_FOLD) & ~data.row.free,
+        near_fold=exists & hits & (np.abs(orbits.fold) < NEAR_FOLD),
         reasons=tuple(reasons.tolist()),
-        **phases,
+        predicted_phase_deg=predicted[:, 2] if phase else None,
+        measured_phase_deg=read[:, 2] if phase else None,
+        phase_error_deg=error[:, 2] if phase else None,
     )
 
 
-_KINDS = (("peak amplitude", ""), ("lock-in amplitude", ""), ("phase", "degrees"))
-"""What is read, and its unit if it does not drift by a share."""
-_FOLLOWING = 4.0
-"""Slope of the residuals along the rows, in its standard errors, beyond which it is not taken to be chance."""
-
-
-def courses_along_rows(explained: Explained, table: AmplitudeTable | SeveralTables) -> dict[str, list[str]]:
-    """Return which readings of a table follow its rows, and by how much from the first to the last, by its label.
-
-    Only tables that say nothing of the order of their rows are looked at. Of each reading a course along the rows is
-    fitted beside everything else.
-    """
-    data, end, weights = explained.model.data, explained.end, explained.weights
-    if not np.isfinite(end.jacobian).all():
-        return {}
-    freedom = max(int(weights.used.sum()) - len(explained.model.law.own), 1)
-    scale, courses = np.sqrt(max(1.0, end.chi2 / freedom)), {}
-    basis, size, _ = np.linalg.svd(
-        end.jacobian / np.maximum(np.linalg.norm(end.jacobian, axis=0), 1e-300), full_matrices=False
-    )
-    basis = basis[:, size > 1e-10 * max(float(size[0]), 1e-300)]
-    for number, (member, label) in enumerate(zip(table.tables, table.labels, strict=True)):
-        mine = data.number == number
-        for kind, (name, unit) in enumerate(_KINDS):
-            if member.rows_in_order_of_time or not weights.used[mine, kind].any():
-                continue
-            course = np.zeros((mine.size, READINGS))
-            share = 1.0 if unit else np.abs(end.orbits.readings[mine, kind])
-            course[mine, kind] = np.where(weights.used[mine, kind], np.linspace(-0.5, 0.5, member.rows) * share, 0.0)
-            white = np.einsum("nij,nj->ni", weights.whitening, course).ravel()
-            column = np.append(white, np.zeros(end.residual.size - white.size))
-            apart = column - basis @ (basis.T @ column)
-            length = float(apart @ apart)
-            if length <= 1e-6 * float(column @ column):
-                continue
-            slope = -float(apart @ end.residual) / length
-            if abs(slope) * np.sqrt(length) > _FOLLOWING * scale:
-                drift = f"{slope:+.2g} {unit}" if unit else f"{100.0 * slope:+.2g} %"
-                courses.setdefault(label, []).append(f"{name} {drift}")
-    return courses
-
-
-def _result(
-    task: Task,
-    fitted: Fitted,
-    evidence: Evidence,
-    closest: Closest,
-    pulls: list[Pull],
-    settings: dict[str, Any],
-    *,
-    known: bool,
-) -> FitResult:
-    """Return the result of a fit whose errors are known, or are not: the law and its loss with bands, the verdict."""
-    explained, table, problem, rows = fitted.explained, evidence.table, task.problem, evidence.rows
-
-    def law_at(speeds: Float[np.ndarray, " n"]) -> LawWithErrors:
-        law = explained.law_at(speeds)
-        if fitted.other is not None:
-            law = containing(law, fitted.other.law_at(speeds))
-        return law if known else law.without_errors()
-
-    at: AtSpeeds = law_at
-    values = dict(settings["fixed"]) | {name: parameter.value for name, parameter in evidence.parameters.items()}
-    formula = None if problem.model == "contact" else values
-    speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
-    loss = None
-    if np.isfinite(speeds).any():
-        loss = loss_of(at, speed_range(speeds), table.mass_ng, evidence.parameters, formula)
-    reasons, warnings = judge_fit(evidence)
-    coefficients, _ = explained.model.law.coefficients(explained.model.of_law(explained.end.theta))
-    common = [i for i, name in enumerate(closest.names) if not is_of_one_table(name)]
-    return FitResult(
-        model=problem.model,
-        parameters={name: one for name, one in evidence.parameters.items() if not is_of_one_table(name)},
-        correlations=_correlations(closest.factor if known else np.full_like(closest.factor, np.nan))[
-            np.ix_(common, common)
-        ],
-        chi2=explained.end.chi2,
-        degrees_of_freedom=evidence.freedom,
-        p_value=evidence.p_value,
-        aic=explained.end.chi2 + 2.0 * len(closest.names),
-        valid=not reasons,
-        reasons=reasons,
-        warnings=warnings,
-        law=FittedLaw(
-            at,
-            speeds,
-            delay=CollisionDelay(*coefficients[:3]) if problem.lasting else None,
-            mass_ng=table.mass_ng,
-            origin=f"{problem.model} fitted to {table.source}",
-        ),
-        loss=loss,
-        rows=rows,
-        convergence=fitted.convergence,
-        table=table,
-        settings=settings,
-        versions={name: version_of(name) for name in _PACKAGES},
-        tables=_fitted_tables(evidence, pulls, problem.own),
-    )
-
-
-def _parameters(
-    task: Task, closest: Closest, errors: Float[np.ndarray, " p"], intervals: list[Interval]
-) -> dict[str, FittedParameter]:
-    """Return the parameters with errors and intervals."""
-    parameters = {}
-    for i, (name, interval) in enumerate(zip(closest.names, intervals, strict=True)):
-        error = float(errors[i])
+def _parameters(task: Task, closest: Closest, intervals: list[Interval] | None) -> dict[str, FittedParameter]:
+    """Return the parameters, with errors and intervals if the model explains the data."""
+    parameters, unexplained = {}, Interval(None, None, UNEXPLAINED)
+    for i, (name, error) in enumerate(zip(closest.names, closest.errors.tolist(), strict=True)):
+        interval = unexplained if intervals is None else intervals[i]
         # of a contact's parameter that may be 0 for all the data say, the other end is a limit
         vanishes = closest.vanishes[i] or (name in CONTACT_NAMES and interval.low is None and interval.high is not None)
         parameters[name] = FittedParameter(
             value=float(closest.values[i]),
             unit=parameter_called(name).unit,
-            standard_error=error if not vanishes and np.isfinite(error) else None,
+            standard_error=error if intervals is not None and np.isfinite(error) and not vanishes else None,
             interval95=(interval.low, interval.high),
             interval_reason=interval.reason,
             interval_kind=interval.kind,
-            undetermined=not np.isfinite(closest.errors[i]),
+            undetermined=not np.isfinite(error),
             at_bound=vanishes,
             constraint=task.known.get(name),
         )
     return parameters
 
 
-def _untabulated(explained: Explained, rows: FittedRows) -> tuple[int, ...]:
-    """Return the rows whose impacts the table of a contact does not hold to its accuracy."""
-    law, theta = explained.model.law, explained.model.of_law(explained.end.theta)
-    speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
-    return tuple(np.flatnonzero(law.misses_accuracy(theta, speeds)).tolist())
-
-
-def _contact_share(explained: Explained) -> float:
-    """Return the largest share of a drive's period that the tip is in contact."""
-    model, orbits = explained.model, explained.end.orbits
-    hertz = float(model.law.coefficients(model.of_law(explained.end.theta))[0][0])
-    used = explained.weights.used.any(axis=1) & np.isfinite(orbits.approach)
-    if not used.any():
-        return 0.0
-    # us times kHz; 1e-3 makes it a share of the period
-    return float(np.max(1e-3 * hertz * orbits.approach[used] ** -0.2 * model.data.row.drive_frequency_khz[used]))
-
-
 def _compare_tables(explained: Explained, table: AmplitudeTable | SeveralTables) -> list[Pull]:
     """Return the pulls of several tables on the law; none of one table."""
     if not isinstance(table, SeveralTables):
         return []
-    model, end = explained.model, explained.end
-    law = model.law
-    count, tables = len(model.names), len(table.labels)
+    model, end, tables = explained.model, explained.end, len(table.labels)
     number = np.full(end.residual.size, tables)
-    number[: 3 * table.rows] = np.repeat(table.number, 3)
-    own = np.zeros((tables, count), bool)
-    for i, name in enumerate(model.names):
-        if is_of_one_table(name):
-            own[table.labels.index(name.partition(" of ")[2]), i] = True
-            number[end.residual.size - count + i] = int(np.flatnonzero(own[:, i])[0])
-    places = np.array([i for i, name in enumerate(model.names) if name in law.own])
-    # r falls where its unknown, 1 - r^2, grows
-    sign = np.sign([law.slope_of(model.names[i], float(end.theta[i])) for i in places])
-    blocks = [number == t for t in range(tables + 1)]
-    matrix = np.array([end.jacobian[block].T @ end.jacobian[block] for block in blocks])
+    number[: READINGS * table.rows] = np.repeat(table.number, READINGS)
+    own = np.array([[name.partition(" of ")[2] == label for name in model.names] for label in table.labels])
+    # what is known of the unknowns stands last
+    of_priors = number[-len(model.names) :]
+    of_priors[own.any(axis=0)] = np.argmax(own, axis=0)[own.any(axis=0)]
+    blocks = [(end.jacobian[number == t], end.residual[number == t]) for t in range(tables + 1)]
     parts = Parts(
-        matrix=matrix,
-        vector=np.array([end.jacobian[block].T @ end.residual[block] for block in blocks]),
-        square=np.array([end.residual[block] @ end.residual[block] for block in blocks]),
+        matrix=np.array([slope.T @ slope for slope, _ in blocks]),
+        vector=np.array([slope.T @ residual for slope, residual in blocks]),
+        square=np.array([residual @ residual for _, residual in blocks]),
         own=own,
-        law=places,
+        law=np.flatnonzero([name in model.law.own for name in model.names]),
     )
-    return [pull._replace(pulls=sign * pull.pulls) for pull in pulls_of(parts)]
+    return pulls_of(parts)
 
 
-def _fitted_tables(evidence: Evidence, pulls: list[Pull], law: tuple[str, ...]) -> tuple[FittedTable, ...]:
+def _fitted_tables(evidence: Evidence, pulls: list[Pull]) -> tuple[FittedTable, ...]:
     """Return what there is to say of each of several tables; nothing of one."""
-    table, fitted = evidence.table, []
+    fitted, rows, table = [], evidence.rows, evidence.table
     if not isinstance(table, SeveralTables):
         return ()
-
     for t, (member, label, pull) in enumerate(zip(table.tables, table.labels, pulls, strict=True)):
         mine = table.number == t
-        nuisances = {name: name_of_table(name, label) for name in NUISANCE_NAMES}
+        names = {name: name_of_table(name, label) for name in NUISANCE_NAMES}
         fitted.append(
             FittedTable(
                 source=member.source,
                 name=label,
                 rows=member.rows,
-                used=int(evidence.rows.used[mine].sum()),
-                chi2=pull.chi2,
-                readings=int(np.isfinite(evidence.rows.residual[mine]).sum()),
-                pull=_or_none(pull.pull),
-                p_value=_or_none(pull.p_value),
-                pulls={name: _or_none(size) for name, size in zip(law, pull.pulls, strict=False)},
-                nuisances={
-                    name: evidence.parameters[key] for name, key in nuisances.items() if key in evidence.parameters
-                },
+                used=int(rows.used[mine].sum()),
+                readings=int(np.isfinite(rows.residual[mine]).sum()),
+                **pull._asdict(),
+                nuisances={name: evidence.parameters[own] for name, own in names.items() if own in evidence.parameters},
             )
         )
     return tuple(fitted)
 
 
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _correlations(factor: Float[np.ndarray, "p m"]) -> Float[np.ndarray, "p p"]:
     """Return correlations of parameters that change with independent unknowns; NaN where nothing is known of one."""
     error = np.linalg.norm(factor, axis=1)
-    known = np.isfinite(error) & (error > 0.0)
-    unit = np.where(known[:, None], factor / np.where(known, error, 1.0)[:, None], 0.0)
-    return np.where(np.outer(known, known), unit @ unit.T, np.nan)
+    unit = factor / np.where(error > 0.0, error, np.nan)[:, None]
+    return np.where(np.isfinite(np.outer(error, error)), unit @ unit.T, np.nan)

@@ -1,27 +1,34 @@
 """Whether to trust a fit, in words: what makes it invalid, and what a reader should know besides.
 
 A fit is valid only if what is left of the amplitudes passes an absolute test, whatever the options:
-chi2 by its probability; with a robust fit the share of outliers, and chi2 without them by its probability; with scaled
-errors the scale, and what is known of the parameters; always that neighbouring residuals are not correlated, neither in
-the table's order (a drift, a sweep the model does not follow) nor over the approach speed (a wrong law).
+chi2 by its probability, of a robust fit without outliers, and the share of these; with scaled errors the scale; always
+that neighbouring residuals are not correlated, neither in the table's order (a drift, a sweep the model does not
+follow) nor over the approach speed (a wrong law).
 
 The rules are the three lists at the end: `MISFITS`, `REASONS` and `WARNINGS`.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN, chi2_tail
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN
 from afm_jax.outcomes import Rule, Rules, judge
 from fitting.infer.explain import LARGEST_SHARE, MOST_OUTLIERS, OUTLIER
 from fitting.infer.intervals import UNSETTLED
-from fitting.infer.result import ENOUGH, NO_MASS, Convergence, FittedParameter, FittedRows
-from fitting.infer.rows import OUTLIER_LEFT_OUT, TOO_SLOW
+from fitting.infer.result import NO_MASS, Convergence, FittedParameter, FittedRows
+from fitting.infer.rows import OUTLIER_LEFT_OUT
 from fitting.models import Held
-from fitting.parameters import DELAY_NAMES, DRIFT_NAMES, USUAL_ERRORS, name_of_table, parameter_called
+from fitting.parameters import (
+    CONTACT_NAMES,
+    DELAY_NAMES,
+    USUAL_DRIFTS,
+    USUAL_ERRORS,
+    name_of_table,
+    parameter_called,
+)
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import ERRORS_OF_REPEATS, AmplitudeTable
 
@@ -36,19 +43,23 @@ _RUN, _LONGEST_RUN = 3.0, 3.5
 """Standard deviations by which residuals run together over the speed from which that is said, and what is left of that
 beside a wider model discrepancy from which the model does not explain the table."""
 _CORRELATED = 4.0
-"""Correlation of neighbouring residuals, in standard deviations of those of independent ones, from which they are
-taken to be correlated: by chance in one fit of ten thousand."""
+"""Correlation of neighbouring residuals, or their slope along the rows, in standard deviations of those of independent
+ones, from which they are taken to be correlated: by chance in one fit of ten thousand."""
 _NEGLIGIBLE = 0.3
 """Root mean square of the residuals, in errors, below which their pattern is of no consequence."""
 _FEWEST_NEIGHBOURS = 8
-_LONG_CONTACT = 0.2
-"""Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
+_FASTEST_KHZ, _SMALLEST_NM = 2e4, 1.0
+"""What no cantilever is faster than, and what amplitude impacts take at least: a bridge alone is that long."""
 _REFUSED = (
     "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
     "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude. The energy of a tap needs "
     "no law: `afm-jax tapping CURVE`."
 )
-_AT_BOUND = 0.005
+_CAUSES = (
+    "Another law may (near resonance a collision delay decides: models with +delay; `compare` tries several), the "
+    "errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, impacts longer than a fifth "
+    "of a period (measure at lower frequencies), or some rows not single-impact orbits (if only a few: `robust=True`)"
+)
 
 
 @dataclass(frozen=True)
@@ -62,18 +73,14 @@ class Evidence:
     chi2: float
     freedom: int
     p_value: float
-    other_minimum: tuple[dict[str, float], float] | None
-    error_scale: float | None
-    robust: bool
     correlations: Float[np.ndarray, "p p"]
+    other_minimum: tuple[dict[str, float], float] | None = None
+    error_scale: float | None = None
+    robust: bool = False
     untabulated: tuple[int, ...] = ()
     """Rows whose impacts the table of a contact does not hold to its accuracy."""
-    contact_share: float = 0.0
-    """Largest share of a drive's period that the tip is in contact."""
     refused: bool = False
     """Hardly a row is left that a law of impacts can be read off."""
-    contact: bool = False
-    """Whether a contact was fitted."""
     pulls: tuple[float, ...] = ()
     """Of several tables, the probability that each one's law is that of the others."""
     run: tuple[float, float] = (0.0, 0.0)
@@ -84,34 +91,11 @@ class Evidence:
     """What a fit of the contact holds, with its errors."""
     short: float = 0.0
     """Share of the loss by which the model discrepancy of short range was added for that."""
-    courses: dict[str, list[str]] = field(default_factory=dict)
-    """Which readings of a table follow its rows, whose order nothing says, by the table's label."""
-
-    @property
-    def undetermined(self) -> list[str]:
-        """Names of the parameters that the data do not determine, not even to first order."""
-        return [name for name, parameter in self.parameters.items() if parameter.undetermined]
-
-    @property
-    def contradictions(self) -> dict[str, float]:
-        """How far each parameter is from what was measured of it otherwise, in standard errors of that."""
-        known = {name: (p.value, *p.constraint) for name, p in self.parameters.items() if p.constraint is not None}
-        return {name: (value - given) / error for name, (value, given, error) in known.items()}
 
     @property
     def outliers(self) -> Bool[np.ndarray, " rows"]:
         """Which rows are far off."""
         return np.any(np.abs(np.nan_to_num(self.rows.residual)) > OUTLIER, axis=1)
-
-    @property
-    def most_outliers(self) -> float:
-        """How many outliers a robust fit may have."""
-        return max(1.0, MOST_OUTLIERS * self.rows.used.sum())
-
-    @property
-    def chi2_per_freedom(self) -> float:
-        """chi2 over the degrees of freedom."""
-        return self.chi2 / self.freedom
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
@@ -159,7 +143,7 @@ def correlation_excess(residual: Float[np.ndarray, "rows k"]) -> float:
     return float(np.sum(bounded[1:] * bounded[:-1]) / np.sqrt(others / count))
 
 
-def _one_sided(evidence: Evidence) -> list[str]:
+def _one_sided(evidence: Evidence) -> str:
     """Return that some rows are off to one side: chance gives as large residuals of either sign.
 
     A robust fit is for such rows.
@@ -170,162 +154,115 @@ def _one_sided(evidence: Evidence) -> list[str]:
     rows = int((count > 0).sum())
     excess = float(np.sum(of_row**3) / np.sqrt(15.0 * max(rows, 1)))
     if rows <= _FEWEST_NEIGHBOURS or abs(excess) < _ONE_SIDED or evidence.robust:
-        return []
+        return ""
     far = np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)]
     side = "above" if excess > 0.0 else "below"
     said = f"residuals are far off to one side ({excess:+.3g} standard deviations of their cubes)"
-    return [f"{said}: predicted {side} what was read for {_lines(evidence, np.sort(far))}"]
+    return f"{said}: predicted {side} what was read for {_lines(evidence, np.sort(far))}"
 
 
-def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
-    """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
-    residual, pulls = evidence.rows.residual, evidence.contradictions
-    inside = residual[np.abs(residual) <= OUTLIER]
-    freedom = inside.size + len(pulls) - len(evidence.parameters)
-    chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
-    return chi2, freedom, chi2_tail(chi2, freedom) if freedom > 0 else float("nan")
+def _too_many_outliers(evidence: Evidence) -> str:
+    """Return how many rows of a robust fit are far off, in words, if it leaves so many out no longer."""
+    far, used = int(evidence.outliers.sum()), int(evidence.rows.used.sum())
+    most = f"a robust fit leaves at most one row of {1.0 / MOST_OUTLIERS:g} out"
+    said = f"{far} of {used} rows are off by more than {OUTLIER:g} errors, and {most}"
+    return said if evidence.robust and far > max(1.0, MOST_OUTLIERS * used) else ""
 
 
-def _pull_in_words(evidence: Evidence, name: str, pull: float) -> str:
-    parameter = evidence.parameters[name]
-    given, error = parameter.constraint or (float("nan"), float("nan"))
-    return f"{name} = {parameter.value:.5g} is {abs(pull):.1f} standard errors from the given {given:g} +- {error:.2g}"
+def _pulled(evidence: Evidence, least: float, most: float) -> list[str]:
+    """Return the parameters so many standard errors from what was measured of them otherwise, in words."""
+    said = []
+    for name, parameter in evidence.parameters.items():
+        given, error = parameter.constraint or (parameter.value, np.inf)
+        pull = abs(parameter.value - given) / error
+        if least < pull <= most:
+            what = (
+                f"{name} = {parameter.value:.5g} is {pull:.1f} standard errors from the given {given:g} +- {error:.2g}"
+            )
+            said.append(what)
+    return said
 
 
-def _contradicted(evidence: Evidence) -> list[str]:
-    """Return by how much scaled amplitudes contradict what is known beforehand, taken together, in words."""
-    pulls = evidence.contradictions
-    if evidence.error_scale is None or not pulls:
-        return []
-    improbable = chi2_tail(sum(pull**2 for pull in pulls.values()), len(pulls)) < IMPROBABLE
-    return [", ".join(f"{name} by {pull:+.1f}" for name, pull in pulls.items())] if improbable else []
-
-
-def _torn(evidence: Evidence) -> list[str]:
-    """Return what the amplitudes contradict of what was measured otherwise, in words."""
-    torn = [_pull_in_words(evidence, name, pull) for name, pull in evidence.contradictions.items() if abs(pull) > TORN]
-    return ["; ".join(torn)] if torn else []
-
-
-def _not_converged(evidence: Evidence) -> list[str]:
-    """Return how far the search is from a minimum, in words."""
-    convergence = evidence.convergence
-    if convergence.converged:
-        return []
-    if not np.isfinite(convergence.estimated_distance):
-        return ["chi2 bends downwards where the search ended, which is no minimum"]
-    if convergence.estimated_distance < ENOUGH:
-        return ["which orbits the rows have, and what they count, does not settle"]
-    return [f"chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"]
-
-
-def _not_explained(evidence: Evidence) -> list[str]:
-    """Return on which grounds the model does not explain the data, and what may be the reason, in words."""
+def _not_explained(evidence: Evidence) -> str:
+    """Return on which grounds the model does not explain the data, what may be the reason, and which rows are off."""
     grounds = misfits(evidence)
-    return [f"{'; '.join(grounds)}. {_why_not_explained(evidence)}"] if grounds else []
-
-
-def _why_not_explained(evidence: Evidence) -> str:
-    worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
+    worst = np.max(np.abs(np.nan_to_num(evidence.rows.residual)), axis=1)
     far = np.argsort(-worst)[: max(1, len(worst) // 20)]
-    tail = f"farthest off: {_lines(evidence, np.sort(far))}"
-    # counting outliers less helps where the others are well explained: not if most are off, or off together
-    scaled = (evidence.error_scale or 1.0) * np.abs(np.nan_to_num(evidence.rows.residual))
-    few = 2 * np.any(scaled > OUTLIER, axis=1).sum() <= evidence.rows.used.sum()
-    if few and not evidence.robust and not _correlations(evidence):
-        tail += " (if only a few are wrong: `robust=True`)"
-    if evidence.contact_share > _LONG_CONTACT:
-        return (
-            f"Impacts last up to {100.0 * evidence.contact_share:.0f} % of a drive period: too long to be impacts of a "
-            f"platform that hardly moves meanwhile; measure at lower frequencies, or at lower orders; {tail}."
-        )
-    return (
-        "Another law may (near resonance a collision delay decides: models with +delay; `compare` tries several), "
-        "the errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows not "
-        f"single-impact orbits; {tail}."
-    )
+    return f"{'; '.join(grounds)}. {_CAUSES}; farthest off: {_lines(evidence, np.sort(far))}." if grounds else ""
 
 
-def _disagreeing(evidence: Evidence) -> list[str]:
+def _disagreeing(evidence: Evidence) -> str:
     """Return which tables' laws are not that of the others, in words; nothing where all may have one."""
     pulls = np.array(evidence.pulls)
-    far = np.flatnonzero(pulls * pulls.size < IMPROBABLE)
-    named = sorted(far, key=lambda t: pulls[t])
-    said = [f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in named]
-    return ["; ".join(said)] if said else []
+    far = sorted(np.flatnonzero(pulls * pulls.size < IMPROBABLE), key=lambda t: pulls[t])
+    return "; ".join(f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in far)
 
 
 def value_at_bound(value: float) -> str:
     """Return the value of a parameter at its bound in words: that of a loss is 0 or 1, not 3e-15."""
-    return f"{value:z.0f}" if abs(value - round(value)) < _AT_BOUND else f"{value:.4g}"
+    return f"{round(value, 2):z.4g}"
 
 
-def helpful_measurement(name: str) -> str:
+def _not_identified(evidence: Evidence) -> str:
+    """Return the parameters that the data do not determine, not even to first order, with what to measure, in words."""
+    names = [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
+    advice = "; ".join(dict.fromkeys(_helpful_measurement(name) for name in names))
+    return f"{' and '.join(names)}; {advice}" if names else ""
+
+
+def _helpful_measurement(name: str) -> str:
     """Return what to measure, or to say, so that a parameter gets determined."""
-    return (
-        parameter_called(name).advice
-        or "measure at other drives, orders or offsets too, or hold it fixed at a known value"
-    )
+    usual = "measure at other drives, orders or offsets too, or hold it fixed at a known value"
+    return parameter_called(name).advice or usual
 
 
-def _damping_warnings(evidence: Evidence) -> list[str]:
-    warnings: dict[str, list[str]] = {}
-    for table, label in zip(evidence.table.tables, evidence.table.labels, strict=True):
-        own = name_of_table("quality_factor", label)
-        along = evidence.parameters.get(own) or evidence.parameters.get("quality_factor")
-        said = _damping_warning(table, along)
-        if said:
-            warnings.setdefault(said, []).append(label)
-    if not isinstance(evidence.table, SeveralTables):
-        return list(warnings)
-    return [f"{', '.join(labels)}: {said}" for said, labels in warnings.items()]
+def _open_ones(evidence: Evidence) -> list[str]:
+    """Return the parameters whose intervals are open to both sides, where nothing worse is known, in words.
 
-
-def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:
-    """Return what there is to say of a table's quality factor, which was fitted along or not; "" for nothing."""
-    if along is not None:
-        usual = USUAL_ERRORS["quality_factor"]
-        assumed = (table.quality_factor or 0.0, usual * (table.quality_factor or 0.0))
-        if table.quality_factor_error is not None or along.constraint != assumed:
-            return ""
-        given, error = assumed
-        return (
-            f"quality_factor = {given:g} is given without an error: {100.0 * usual:g} % was assumed "
-            f"({given:g} +- {error:.3g}). The loss depends on it: state it, like `# quality_factor = {given:g} +- 1`."
-        )
-    if table.quality_factor is None or table.quality_factor_error is not None:
-        return ""
-    known = f"quality_factor = {table.quality_factor:g}"
-    return (
-        f"{known} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: "
-        f"`# {known} +- 1` lets the intervals show it."
-    )
-
-
-def _repeat_warnings(evidence: Evidence) -> list[str]:
-    """Return what repeated readings say of the errors, or that these are theirs."""
-    said = [remark for one in evidence.table.tables for remark in one.remarks if remark.startswith(ERRORS_OF_REPEATS)]
-    if said:
-        return [f"{remark[0].upper()}{remark[1:]}." for remark in dict.fromkeys(said)]
-    repeats = repeats_of(evidence.table)
-    if repeats is None or IMPROBABLE <= repeats.p_value <= 1.0 - IMPROBABLE:
+    An end that its search did not find is no end of what the data allow: there one side is enough.
+    """
+    # a tapping curve tells those of the delay only together; the law does not hang on each
+    together = DELAY_NAMES if evidence.table.tapping else ()
+    if misfits(evidence) or _not_identified(evidence):
         return []
-    large = repeats.error_ratio > 1.0
     return [
-        f"Readings of a drive scatter {repeats.error_ratio:.2g} times as much as their errors say ({repeats.rows} rows "
-        f"of {repeats.drives} drives): "
-        + ("the errors are too small, or something drifted." if large else "the errors are larger than the noise.")
+        f"{name} is not identified: {parameter.interval_reason}; {_helpful_measurement(name)}"
+        for name, parameter in evidence.parameters.items()
+        if UNSETTLED in (parameter.interval_reason or "")
+        or (name not in together and parameter.interval95 == (None, None))
     ]
 
 
-_FASTEST_KHZ, _SMALLEST_NM = 2e4, 1.0
-"""What no cantilever is faster than, and what amplitude impacts take at least: a bridge alone is that long."""
+def _without_error(evidence: Evidence) -> list[tuple[str, float]]:
+    """Return the quality factors that tables give without an error: names as the fit's parameters, and values."""
+    found = []
+    for table, label in zip(evidence.table.tables, evidence.table.labels, strict=True):
+        if table.quality_factor is not None and table.quality_factor_error is None:
+            name = name_of_table("quality_factor", label)
+            found.append((name if name in evidence.parameters else "quality_factor", table.quality_factor))
+    return list(dict.fromkeys(found))
 
 
-def _usual_nm(evidence: Evidence) -> list[float]:
-    """Return the median of the amplitudes, none where nothing was read."""
-    read = evidence.rows.measured_nm[np.isfinite(evidence.rows.measured_nm)]
-    return [float(np.median(read))] if read.size else []
+def _assumed(evidence: Evidence) -> str:
+    """Return what has an error only because one was assumed, in words."""
+    usual = {name: (value, USUAL_ERRORS["quality_factor"] * value) for name, value in _without_error(evidence)}
+    known = {held.name: (held.value, held.error) for held in evidence.held if held.assumed}
+    for name, parameter in evidence.parameters.items():
+        drift = 0.0, USUAL_DRIFTS.get(parameter_called(name).name)
+        if parameter.constraint is not None and parameter.constraint in (usual.get(name), drift):
+            known[name] = parameter.constraint
+    mass = evidence.table.mass_ng is None and any(name in CONTACT_NAMES for name in evidence.parameters)
+    said = [f"mass_ng = 1 ({NO_MASS})"] if mass else []
+    return ", ".join([*said, *(f"{name} = {value:.4g} +- {error:.2g}" for name, (value, error) in known.items())])
+
+
+def _scatter(evidence: Evidence) -> str:
+    """Return how far repeated readings contradict their errors, in words."""
+    repeats = repeats_of(evidence.table)
+    if repeats is None or IMPROBABLE <= repeats.p_value <= 1.0 - IMPROBABLE:
+        return ""
+    rows = f"{repeats.rows} rows of {repeats.drives} drives"
+    return f"{repeats.error_ratio:.2g} times as much as their errors say ({rows})"
 
 
 def _limits(evidence: Evidence) -> list[str]:
@@ -343,161 +280,84 @@ def _limits(evidence: Evidence) -> list[str]:
     return found
 
 
-def _other_minimum(evidence: Evidence) -> list[str]:
-    if evidence.other_minimum is None:
-        return []
-    values, chi2 = evidence.other_minimum
+def _other_minimum(evidence: Evidence) -> str:
+    """Return another minimum's chi2 and parameters, in words; nothing where there is none."""
+    values, chi2 = evidence.other_minimum or ({}, 0.0)
     said = ", ".join(f"{name} = {value:.5g}" for name, value in values.items())
-    return [f"chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {said}"]
+    return said and f"chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {said}"
 
 
-def _open_ones(evidence: Evidence) -> list[str]:
-    """Return the parameters whose intervals are open to both sides, where nothing worse is known, in words.
-
-    An end that its search did not find is no end of what the data allow: there one side is enough.
-    """
-    # a tapping curve tells those of the delay only together; the law does not hang on each
-    together = (*(DELAY_NAMES if evidence.table.tapping else ()), *evidence.undetermined)
-    if misfits(evidence) or _not_identified(evidence):
-        return []
-    unsettled = {name for name, known in evidence.parameters.items() if UNSETTLED in (known.interval_reason or "")}
-    return [
-        f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}"
-        for name, parameter in evidence.parameters.items()
-        if name in unsettled or (name not in together and parameter.interval95 == (None, None))
-    ]
-
-
-def _not_identified(evidence: Evidence) -> list[str]:
-    """Return the parameters that the data do not determine and must, with what to measure, in words."""
-    names = evidence.undetermined
-    return [f"{' and '.join(names)}; {_advice(names)}"] if names else []
-
-
-def _advice(names: list[str]) -> str:
-    return "; ".join(dict.fromkeys(helpful_measurement(name) for name in names))
-
-
-def _held_in_words(held: Held) -> str:
-    return f"{held.name} = {held.value:.4g} +- {held.error:.2g}"
-
-
-def _assumed(evidence: Evidence) -> list[str]:
-    """Return what is held with errors that are assumed, and how to say them, in words."""
-    held = [held for held in evidence.held if held.assumed]
-    if not held:
-        return []
-    better = f'`constraints={{"{held[0].name}": ({held[0].value:.4g}, {0.1 * held[0].error:.2g})}}`'
-    said = f"{', '.join(map(_held_in_words, held))}; law, band and intervals hang on them"
-    return [f"{said}: say what is known better, like {better}"]
-
-
-def _tied_pairs(evidence: Evidence) -> list[str]:
+def _tied_pairs(evidence: Evidence) -> str:
     """Return the pairs of parameters that are determined only together, with their correlation, in words."""
-    names, matrix = list(evidence.parameters), evidence.correlations
-    pairs = [
-        f"{names[i]} and {names[j]} ({matrix[i, j]:+.3f})"
-        for i in range(len(names))
-        for j in range(i + 1, len(names))
-        if abs(matrix[i, j]) > _TIED
-    ]
-    return [", ".join(pairs)] if pairs else []
+    names, related = list(evidence.parameters), np.triu(evidence.correlations, 1)
+    pairs = np.argwhere(np.abs(related) > _TIED).tolist()
+    return ", ".join(f"{names[i]} and {names[j]} ({related[i, j]:+.3f})" for i, j in pairs)
 
 
 def _excluded(evidence: Evidence) -> list[str]:
     """Return the rows that are excluded, for every reason, in words."""
-    rows = np.flatnonzero(evidence.rows.set_aside)
-    reasons = evidence.rows.reasons or (TOO_SLOW,) * len(evidence.rows.set_aside)
+    reasons = np.array(evidence.rows.reasons)
     return [
-        f"{reason}: {_lines(evidence, [row for row in rows if reasons[row] == reason])}"
-        for reason in dict.fromkeys(reasons[row] for row in rows)
-        if reason != OUTLIER_LEFT_OUT
+        f"{reason}: {_lines(evidence, reasons == reason)}"
+        for reason in dict.fromkeys(evidence.rows.reasons)
+        if reason not in ("", OUTLIER_LEFT_OUT)
     ]
 
 
-def _model_error(evidence: Evidence) -> list[str]:
+def _model_error(evidence: Evidence) -> str:
     """Return how large a model error was added to which rows, in words."""
-    rows = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
-    worst = 100.0 * float(evidence.rows.model_error[rows].max(initial=0.0))
-    small = "small amplitudes" if evidence.table.tapping else "slow impacts"
-    return [f"{worst:.1f} % was added to the errors of {small}: {_lines(evidence, rows)}"] if rows.size else []
+    error = np.where(evidence.rows.used, evidence.rows.model_error, 0.0)
+    small, lines = "small amplitudes" if evidence.table.tapping else "slow impacts", _lines(evidence, error > _STATED)
+    return f"{100.0 * error.max():.1f} % was added to the errors of {small}: {lines}" if lines else ""
 
 
-def _unseen(evidence: Evidence) -> Bool[np.ndarray, " rows"]:
+def _unseen(evidence: Evidence) -> str:
     """Return on which rows no orbit was seen, though the model has a steady one."""
-    unseen = np.zeros(evidence.table.rows) if evidence.table.no_orbit is None else evidence.table.no_orbit
-    return (unseen > 0) & (evidence.rows.orbits > 0)
+    unseen = evidence.table.no_orbit
+    return "" if unseen is None else _lines(evidence, (unseen > 0) & (evidence.rows.orbits > 0))
 
 
-def _robust_loss(evidence: Evidence) -> list[str]:
-    """Return the goodness of a robust fit without its outliers, and which these are, in words."""
-    if not evidence.robust:
-        return []
-    chi2, freedom, p_value = _without_outliers(evidence)
-    probability = f" (probability {p_value:.2g})" if freedom > 0 else ""
-    left_out = np.isin(evidence.rows.reasons or "", OUTLIER_LEFT_OUT)
-    outliers = "".join(f"; outliers: {lines}" for lines in _named(evidence, evidence.outliers | left_out))
-    return [f"{chi2:.1f}/{freedom}{probability}{outliers}"]
-
-
-def _courses(evidence: Evidence) -> list[str]:
-    """Return which readings follow the rows of each table, in words."""
-    several = len(evidence.table.labels) > 1
-    return [
-        f"{f'{label}: ' if several else ''}Residuals follow the rows ({', '.join(courses)} from the first to the last)"
-        for label, courses in evidence.courses.items()
-    ]
-
-
-def _untold_drifts(evidence: Evidence) -> list[str]:
-    """Return the drifts along the rows that are hardly told by anything but what is assumed of them, in words."""
-    drifts = [
-        f"{name} = {known.constraint[0]:g} +- {known.constraint[1]:g}"
-        for name, known in evidence.parameters.items()
-        if parameter_called(name).name in DRIFT_NAMES
-        and known.constraint is not None
-        and (known.standard_error or np.inf) > 0.5 * known.constraint[1]
-    ]
-    return [", ".join(drifts)] if drifts else []
-
-
-def _named(evidence: Evidence, marked: Bool[np.ndarray, " rows"]) -> list[str]:
-    """Return marked rows in words; nothing where no row is marked."""
-    rows = np.flatnonzero(marked)
-    return [_lines(evidence, rows)] if rows.size else []
+def _courses(evidence: Evidence) -> str:
+    """Return which readings follow the rows of tables that do not say that these stand in order of time, in words."""
+    tables, labels, said = evidence.table.tables, evidence.table.labels, []
+    ends = np.cumsum([table.rows for table in tables])[:-1]
+    for table, label, residual in zip(tables, labels, np.split(evidence.rows.residual, ends), strict=True):
+        if table.rows_in_order_of_time:
+            continue
+        for name, column in zip(("peak amplitude", "lock-in amplitude", "phase"), residual.T, strict=False):
+            seen = column[np.isfinite(column)]
+            course, count = np.linspace(-1.0, 1.0, table.rows)[np.isfinite(column)], max(seen.size, 1)
+            course -= course.sum() / count
+            spread = max(1.0, float(np.linalg.norm(seen)) / count**0.5)
+            slope = -float(course @ seen) / max(float(np.linalg.norm(course)) * spread, 1e-300)
+            if abs(slope) > _CORRELATED:
+                said.append(f"{label}: {name} {slope:+.1f}")
+    return ", ".join(said)
 
 
 def _lines(evidence: Evidence, rows: Any) -> str:
-    """Return 'line 7' or 'lines 7, 9, 12 and 3 more' of the table's file; 'line B.csv:7' of several."""
+    """Return 'line 7' or 'lines 7, 9, 12 and 3 more' of the table's file; 'line B.csv:7' of several; "" without rows.
+
+    Args:
+        evidence: with the table.
+        rows: which, or for each whether it is one of them.
+    """
     numbers = evidence.table.row_names[np.asarray(rows)].tolist()
     shown = ", ".join(numbers[:6]) + (f" and {len(numbers) - 6} more" if len(numbers) > 6 else "")
-    return f"{'line' if len(numbers) == 1 else 'lines'} {shown}"
+    return f"line{'s' if len(numbers) > 1 else ''} {shown}" if numbers else ""
 
 
 MISFITS: Rules[Evidence] = (
-    Rule(lambda e: e.p_value < IMPROBABLE, "chi2/dof = {e.chi2_per_freedom:.3g} (probability {e.p_value:.1g})"),
-    (
-        Rule(
-            lambda e: [(n, e.rows.used.sum()) for n in [e.outliers.sum()] if e.robust and n > e.most_outliers],
-            "{case[0]} of {case[1]} rows are off by more than "
-            f"{OUTLIER:g} errors, and a robust fit leaves at most one row of {1.0 / MOST_OUTLIERS:g} out",
-        ),
-        Rule(
-            lambda e: [
-                (chi2 / freedom, p_value)
-                for chi2, freedom, p_value in [_without_outliers(e)]
-                if e.robust and p_value < IMPROBABLE
-            ],
-            "without outliers chi2/dof = {case[0]:.3g} (probability {case[1]:.1g})",
-        ),
+    Rule(
+        lambda e: [e.chi2 / e.freedom] if e.p_value < IMPROBABLE else [],
+        "chi2/dof = {case:.3g} (probability {e.p_value:.1g})",
     ),
+    Rule(_too_many_outliers, "{case}"),
     Rule(
         lambda e: (e.error_scale or 0.0) > LARGEST_SCALE,
         "the amplitudes' errors would have to be {e.error_scale:.3g} times those stated, and more than "
-        f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
-        "to within that)",
+        f"{LARGEST_SCALE:g} is a misfit, not a matter of scale",
     ),
-    Rule(_contradicted, "it contradicts what is known beforehand, in standard errors: {case}"),
     Rule(
         lambda e: [100.0 * e.short] if e.run[1] > _LONGEST_RUN or e.short >= LARGEST_SHARE else [],
         "residuals run together over the approach speed ({e.run[0]:.1f} standard deviations; {e.run[1]:.1f} beside a "
@@ -510,97 +370,90 @@ MISFITS: Rules[Evidence] = (
 
 REASONS: Rules[Evidence] = (
     (
-        Rule(lambda e: e.convergence.reason is not None, "Not converged: {e.convergence.reason}."),
+        Rule(lambda e: not np.isfinite(e.convergence.estimated_distance), "Not converged: {e.convergence.reason}."),
         Rule(_not_identified, "Not identified: the amplitudes do not determine {case}."),
-        Rule(_not_converged, "Not converged: {case}."),
+        Rule(lambda e: not e.convergence.converged, "Not converged: {e.convergence.reason}."),
     ),
-    Rule(lambda e: _named(e, (e.rows.orbits == 0) & e.rows.used), "No stable orbit at the fitted law for {case}."),
+    Rule(lambda e: _lines(e, (e.rows.orbits == 0) & e.rows.used), "No stable orbit at the fitted law for {case}."),
     Rule(
-        lambda e: [_lines(e, e.untabulated)] if e.untabulated else [],
+        lambda e: e.untabulated and _lines(e, e.untabulated),
         "The table of the fitted contact's impacts misses its accuracy for {case}: the contact's numbers are too "
         "extreme; hold some of them fixed.",
     ),
     Rule(_not_explained, "The model does not explain the data: {case}"),
     Rule(
-        _torn,
+        lambda e: "; ".join(_pulled(e, TORN, np.inf)),
         "The amplitudes contradict what is known beforehand: {case}. "
         "Either that is wrong, or the model makes up for what it lacks.",
     ),
-    Rule(
-        _disagreeing,
-        "The tables do not have one law: {case}; look at what is different there, or leave it out.",
-    ),
+    Rule(_disagreeing, "The tables do not have one law: {case}; find what is different there, or leave it out."),
     Rule(lambda e: e.freedom <= 0, "As many parameters as amplitudes: the goodness of fit cannot be judged."),
     Rule(_open_ones, "{case}."),
 )
 """What makes a fit invalid."""
 
 WARNINGS: Rules[Evidence] = (
-    Rule(_damping_warnings, "{case}"),
     Rule(
-        lambda e: e.table.mass_ng is None and e.contact,
-        f"1 ng assumed: {NO_MASS}. Each of the contact's parameters depends on it.",
+        lambda e: [f"{name} = {value:g}" for name, value in _without_error(e) if name not in e.parameters],
+        "{case} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: give "
+        "its error, like `# {case} +- 1`.",
+    ),
+    Rule(
+        _assumed,
+        "Assumed, because nothing states it: {case}. Law, band and intervals depend on it: state what is known, like "
+        "`# quality_factor = 40 +- 1`, or by `constraints=...`.",
     ),
     Rule(
         lambda e: [f for f in [max(table.free_frequency_khz for table in e.table.tables)] if f > _FASTEST_KHZ],
         "free_frequency_khz = {case:g} is more than any cantilever's: was it written in Hz for kHz?",
     ),
     Rule(
-        lambda e: [usual for usual in _usual_nm(e) if usual < _SMALLEST_NM],
+        lambda e: [usual for usual in [float(np.nanmedian(e.rows.measured_nm))] if usual < _SMALLEST_NM],
         "Amplitudes are {case:.2g} nm in the median: were they written in micrometres for nanometres?",
     ),
-    Rule(_repeat_warnings, "{case}"),
     Rule(
-        lambda e: [_pull_in_words(e, name, by) for name, by in e.contradictions.items() if PULLED < abs(by) <= TORN],
-        "{case}: check it, the loss depends on it.",
+        lambda e: [one for table in e.table.tables for one in table.remarks if one.startswith(ERRORS_OF_REPEATS)],
+        "{case}.",
     ),
+    Rule(_scatter, "Readings of a drive scatter {case}: the errors are of another size, or something drifted."),
+    Rule(lambda e: _pulled(e, PULLED, TORN), "{case}: check it, the loss depends on it."),
     Rule(_limits, "{case}."),
     Rule(
         _other_minimum,
         "Another minimum explains the data about as well ({case}; the band of the law and the intervals hold both.",
     ),
-    Rule(
-        _tied_pairs,
-        "Determined only together, hardly apart: {case}. The law may be sharp all the same: see its band.",
-    ),
+    Rule(_tied_pairs, "Determined only together, hardly apart: {case}; the law's band may be narrow all the same."),
     Rule(
         lambda e: [100.0 * e.short] if e.run[0] >= _RUN and e.short > 0.0 else [],
         "Residuals run together over the approach speed ({e.run[0]:.1f} standard deviations): the model lacks a "
         "shape; a model discrepancy of {case:.0f} % of the loss at any speed is in law, band and intervals.",
     ),
-    Rule(_assumed, "Held, with errors that are assumed: {case}."),
     Rule(_excluded, "Excluded, because these impacts are {case}."),
     Rule(_model_error, "A model error of up to {case}."),
     Rule(
-        lambda e: _named(e, _unseen(e)),
+        _unseen,
         "No orbit was seen, though the fitted model has a steady one, for {case}: the tip may have settled on another "
         "motion; start it otherwise, or remove the row.",
     ),
     Rule(
-        lambda e: _named(e, e.rows.orbits > 1),
+        lambda e: _lines(e, e.rows.orbits > 1),
         "Several stable orbits coexist for {case}: the one closest to the measurement was taken.",
     ),
-    Rule(lambda e: _named(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
-    Rule(_robust_loss, "Robust fit: outliers are left out; without them chi2/dof = {case}."),
+    Rule(lambda e: _lines(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
+    Rule(
+        lambda e: _lines(e, e.outliers | np.isin(e.rows.reasons or "", OUTLIER_LEFT_OUT)) if e.robust else "",
+        "Robust fit: these outliers are left out: {case}.",
+    ),
     Rule(
         lambda e: e.error_scale is not None,
         "The amplitudes' errors were scaled by {e.error_scale:.3g} so that chi2/dof = 1: whether they are of the right "
-        f"size cannot be judged, only that the scale is believable (at most {LARGEST_SCALE:g}) and that residuals are "
-        "random.",
+        "size cannot be judged.",
     ),
-    Rule(
-        lambda e: e.error_scale is None and e.p_value > 1.0 - 1e-6,
-        "The errors look too large: chi2 is improbably small.",
-    ),
+    Rule(lambda e: e.p_value > 1.0 - 1e-6, "The errors look too large: chi2 is improbably small."),
     Rule(
         _courses,
-        "{case}, as drifts do. If the rows stand as they were measured, say `# rows = in order of time`: drifts are "
-        "then fitted along.",
-    ),
-    Rule(
-        _untold_drifts,
-        "The rows, which stand in order of time, hardly determine what is assumed here: {case}. Rows of the free tip "
-        "before and after the others determine drifts; `constraints=...` takes what is known of them.",
+        "Residuals follow the rows ({case} standard deviations from the first to the last), as drifts do. If the rows "
+        "stand as they were measured, say `# rows = in order of time`: drifts are then fitted along.",
     ),
 )
 """What a reader should know besides."""

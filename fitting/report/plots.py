@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
@@ -20,7 +21,7 @@ _WIDTH_INCHES, DPI = 6.4, 190.0
 """Narrow enough that letters can still be read on a screen of 420 pixels."""
 _KINDS = ("peak", "lock-in", "phase")
 _EXCLUDED = "#999999"
-_ROW_AXIS = "rows, by order N, drive frequency (kHz), amplitude and offset"
+_ROW_AXIS = "rows, by order N, drive frequency, amplitude and offset"
 _HEIGHT = "height of the sample over the tip's rest position (nm)"
 _APPROACH = "approach speed (nm/µs)"
 
@@ -66,8 +67,7 @@ def speed_figure(result: FitResult) -> Figure:
     figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
     axes, speed = figure.subplots(), result.rows.approach_speed_nm_per_us
     _draw_expected(axes)
-    for kind in range(result.rows.residual.shape[1]):
-        residual = result.rows.residual[:, kind]
+    for kind, residual in enumerate(result.rows.residual.T):
         if np.isfinite(residual).any():
             axes.plot(speed, residual, "o", ms=3.5, color=COLOURS[kind], label=_KINDS[kind])
     if (np.isfinite(speed) & np.isfinite(result.rows.residual).any(axis=1)).any():
@@ -79,24 +79,8 @@ def speed_figure(result: FitResult) -> Figure:
 
 
 def models_figure(compared: Comparison) -> Figure:
-    """Return the figure of what the models say: each one's rebound speed as deviation from the law's."""
-    figure = Figure(figsize=(_WIDTH_INCHES, 4.0), layout="constrained")
-    axes = figure.subplots()
-    first = compared.rows[0]["model"]
-    best = compared.results.get(first, next(iter(compared.results.values()))).law
-    speed, reference = best.approach_speed_nm_per_us, best.rebound_speed_nm_per_us
-    with np.errstate(invalid="ignore", divide="ignore"):
-        low, high = (
-            100.0 * (end / reference - 1.0) for end in (best.rebound_low_nm_per_us, best.rebound_high_nm_per_us)
-        )
-        axes.fill_between(speed, low, high, color="0.85", lw=0, label="95 % band of the law")
-        for name in (row["model"] for row in compared.rows):
-            axes.plot(speed, 100.0 * (compared.rebounds.get(name, reference) / reference - 1.0), label=name)
-    log_speed_axis(axes)
-    axes.set_xlabel(_APPROACH)
-    axes.set_ylabel("rebound speed: deviation from\nthe law of the fit (%)")
-    axes.legend(fontsize=SMALL, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
+    """Return the figure of a comparison: the law of the fit that it is about."""
+    return law_figure(next(iter(compared.results.values())))
 
 
 def draw_amplitudes(axes: Axes, result: FitResult) -> None:
@@ -106,11 +90,9 @@ def draw_amplitudes(axes: Axes, result: FitResult) -> None:
         _draw_readings(axes, result, kind, result.rows.measured_nm[:, kind], result.rows.predicted_nm[:, kind])
     _mark_missing(axes, result, ranking, places)
     if not result.table.tapping:
-        _mark_orders(axes, result, above=True)
+        _mark_orders(axes, result, "N = {}")
         axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
+        _plain_numbers(axes.yaxis)
     axes.set_ylabel("amplitude (nm)")
     axes.tick_params(labelbottom=False)
 
@@ -142,13 +124,10 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
     """Draw the normalised residuals row by row."""
     ranking, places = _row_axis(result)
     _draw_expected(axes)
-    for kind in range(result.rows.residual.shape[1]):
-        residual = result.rows.residual[ranking, kind]
-        # readings of other kinds are in a panel above, with their names
-        alone = kind == 2 and not result.table.tapping and np.isfinite(residual).any()
-        axes.plot(places, residual, "o", ms=3, color=COLOURS[kind], label="phase, residual" if alone else None)
+    for colour, residual in zip(COLOURS, result.rows.residual[ranking].T, strict=False):
+        axes.plot(places, residual, "o", ms=3, color=colour)
     if not result.table.tapping:
-        _mark_orders(axes, result, above=False)
+        _mark_orders(axes, result)
     axes.set_ylabel("residual (errors)")
     axes.set_xlabel(_HEIGHT if result.table.tapping else _ROW_AXIS)
 
@@ -156,9 +135,14 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
 def log_speed_axis(axes: Axes) -> None:
     """Make an axis of speeds logarithmic, with plain numbers at it."""
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    _plain_numbers(axes.xaxis)
+
+
+def _plain_numbers(axis: Axis) -> None:
+    """Write 1, 2, 5, 10, ... at a logarithmic axis."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _draw_expected(axes: Axes) -> None:
@@ -189,36 +173,15 @@ def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray, places: np
             axes.axvline(place, color=colour, lw=0.8, ls=":", label=None if count else label)
 
 
-def _mark_orders(axes: Axes, result: FitResult, *, above: bool) -> None:
-    """Separate the orders N by lines; name them above the panel, or their first and last drive frequency below it."""
+def _mark_orders(axes: Axes, result: FitResult, name: str = "") -> None:
+    """Separate the orders N by lines, with their names above the panel."""
     ranking, places = _row_axis(result)
-    order, frequency = result.table.order[ranking], result.table.drive_frequency_khz[ranking]
-    ticks = []
+    order = result.table.order[ranking]
     for number in np.unique(order):
         first, last = places[order == number][[0, -1]]
-        ticks += [first, last]
         axes.axvline(last + 0.5, color="0.7", lw=0.8)
-        if above:
-            axes.annotate(
-                f"N = {number}",
-                (0.5 * (first + last), 1.0),
-                xycoords=("data", "axes fraction"),
-                xytext=(0, 3),
-                textcoords="offset points",
-                ha="center",
-                fontsize=SMALL,
-            )
-    if not above:
-        # where two orders meet, one name for both
-        names = [f"{frequency[int(place)]:.4g}" for place in ticks]
-        inner = [f"{last}, {first}" for last, first in zip(names[1:-1:2], names[2::2], strict=True)]
-        axes.set_xticks(
-            [ticks[0], *(last + 0.5 for last in ticks[1:-1:2]), ticks[-1]],
-            [names[0], *inner, names[-1]],
-            rotation=35,
-            ha="right",
-            rotation_mode="anchor",
-        )
+        middle = 0.5 * (first + last), 1.02
+        axes.annotate(name.format(number), middle, xycoords=("data", "axes fraction"), ha="center", fontsize=SMALL)
 
 
 def draw_law(axes: Axes, result: FitResult) -> None:
@@ -254,19 +217,11 @@ def draw_losses(axes: Axes, result: FitResult) -> None:
 
 def draw_delay(axes: Axes, result: FitResult) -> None:
     """Draw the collision delay, which is zero where impacts are instantaneous."""
-    law, reached = result.law, result.rows.reached_nm_per_us
+    law = result.law
     columns = 1e3 * np.stack([law.collision_delay_us, law.delay_low_us, law.delay_high_us])
     axes.axhline(0, color="0.6", ls="--", lw=0.9)
     _draw_with_band(axes, result, *columns)
     axes.set_ylabel("collision delay (ns)")
-    # below the measured speeds the delay may fall steeply: the values at these, and 0, decide the height
-    slowest, fastest = np.min(reached, initial=np.inf), np.max(reached, initial=0.0)
-    inside = (law.approach_speed_nm_per_us >= slowest) & (law.approach_speed_nm_per_us <= fastest)
-    values = columns[np.isfinite(columns) & inside]
-    if values.size:
-        low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
-        margin = 0.12 * (high - low) or 1.0
-        axes.set_ylim(low - margin, high + margin)
 
 
 def _draw_with_band(axes: Axes, result: FitResult, value: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:

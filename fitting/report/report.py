@@ -81,18 +81,14 @@ def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
 def _table_sections(result: FitResult) -> list[ReportSection]:
     """Return each of several tables' pull, what it has to itself, and what an impact takes."""
     sections, pulls, own = [], [], []
-    law = list(result.tables[0].pulls) if result.tables else []
     for one in result.tables:
-        cells = [one.name, f"{one.used}/{one.rows}", f"{one.chi2:.1f}/{one.readings}", known(one.pull, ".2f")]
-        pulls.append([*cells, *(known(one.pulls[name], "+.2f") for name in law)])
-        for name, parameter in one.nuisances.items():
-            given = "-" if parameter.constraint is None else "{:g} +- {:g}".format(*parameter.constraint)
-            own.append([one.name, name, value_in_words(parameter), interval_in_words(parameter), given])
+        pulls.append([one.name, f"{one.used}/{one.rows}", f"{one.chi2:.1f}/{one.readings}", known(one.pull, ".2f")])
+        own += [[one.name, *_parameter_cells(name, parameter)] for name, parameter in one.nuisances.items()]
     if pulls:
-        head = ["table", "rows used", "chi2/readings", "pull", *(f"on {name}" for name in law)]
-        sections.append(ReportSection("Tables", [Table("Tables", head, pulls), Text(f"  {PULLS}.")]))
+        head = ["table", "rows used", "chi2/readings", "pull"]
+        sections.append(ReportSection("Tables", [Table("Tables", head, pulls), Text(PULLS)]))
     if own:
-        head = ["table", "of its own", "value", "95 % interval", "given"]
+        head = ["table", "of its own", "value", "std. error", "95 % interval"]
         sections.append(ReportSection("Nuisances", [Table("Of each table", head, own, words=(head[1], head[-1]))]))
     losses = losses_in_words(result) if result.valid else []
     if losses:
@@ -125,10 +121,8 @@ def _sampled(posterior: Posterior) -> ReportSection:
     head = ["parameter", "mean", "from", "to"]
     said = "95 % credible intervals (posterior, flat priors):"
     if posterior.method == "gaussian":
-        worth = posterior.chains.effective_samples[0]
-        said = (
-            f"95 % intervals of samples of the Gaussian around the fit (of 120, weighted to chi2, {worth:.0f} count):"
-        )
+        worth = f"of 120, weighted to chi2, {posterior.chains.effective_samples[0]:.0f} count"
+        said = f"95 % intervals of samples of the Gaussian around the fit ({worth}):"
     wrong = [f"Not converged: {reason}" for reason in posterior.reasons]
     return ReportSection("Posterior", [Text(said), Table("By parameter", head, rows), Bullets(wrong)])
 
@@ -136,10 +130,7 @@ def _sampled(posterior: Posterior) -> ReportSection:
 def row_records(result: FitResult) -> list[dict[str, Any]]:
     """Return a mapping per row of the table: what was set, measured and predicted, and whether it was used."""
     table, rows = result.table, result.rows
-    columns: dict[str, Any] = (
-        {"table": np.array(table.labels)[table.number]} if isinstance(table, SeveralTables) else {}
-    )
-    columns |= {
+    columns: dict[str, Any] = {
         "line": table.lines,
         "order": table.order,
         "drive_frequency_khz": table.drive_frequency_khz,
@@ -161,7 +152,8 @@ def row_records(result: FitResult) -> list[dict[str, Any]]:
         columns["measured_phase_deg"] = rows.measured_phase_deg
         columns["predicted_phase_deg"] = rows.predicted_phase_deg
         columns["phase_residual"] = rows.residual[:, 2]
-    return rows_of(columns)
+    of_table = {"table": np.array(table.labels)[table.number]} if isinstance(table, SeveralTables) else {}
+    return rows_of(of_table | columns)
 
 
 def write_report(

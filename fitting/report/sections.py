@@ -7,7 +7,7 @@ forbids a browser to load anything. Every text is escaped when it enters the pag
 import base64
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -57,14 +57,12 @@ class Table:
         head: the columns' names.
         rows: a cell for each column.
         words: names of columns that hold words, not numbers.
-        numbered: the first column holds numbers, which a terminal sets to the right.
     """
 
     caption: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     words: Collection[str] = ()
-    numbered: bool = False
     kind: ClassVar[str] = "table"
 
 
@@ -150,24 +148,14 @@ def lines_of(part: Part) -> list[str]:
             return [words]
         case Bullets(items, title):
             return [*([title] if title and items else []), *(f"  - {item}" for item in items)]
-        case Table(head=head, rows=rows, words=words, numbered=numbered):
-            to_the_left = [k for k, name in enumerate(head) if name in words or (k == 0 and not numbered)]
-            return text_table(head, rows, words=to_the_left)
+        case Table(head=head, rows=rows, words=words):
+            return text_table(head, rows, words=[k for k, name in enumerate(head) if name in words or k == 0])
         case Picture():
             return []
 
 
-def page_of(report: Report, lead: Sequence[Part] = ()) -> str:
-    """Return a report as one HTML file; it is well-formed XML too.
-
-    Args:
-        report: what it shows.
-        lead: parts between the verdict and the links to the sections.
-    """
-    verdict = "" if report.verdict in {"VALID", "NOT VALID"} else report.verdict.removeprefix("NOT VALID: ")
-    lead = [with_signs(part) for part in (*map(Text, report.about), *lead)]
-    sections = [replace(one, parts=[with_signs(part) for part in one.parts]) for one in report.sections]
-    shown = replace(report, sections=sections)
+def page_of(report: Report) -> str:
+    """Return a report as one HTML file; it is well-formed XML too."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent),
         autoescape=True,
@@ -176,25 +164,11 @@ def page_of(report: Report, lead: Sequence[Part] = ()) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["signed"] = signed
+    verdict = "" if report.verdict in {"VALID", "NOT VALID"} else report.verdict.removeprefix("NOT VALID: ")
     return environment.get_template("page.html.jinja").render(
-        result=shown, title=report.title, lead=lead, words=in_signs(verdict)
+        result=report, title=report.title, lead=[*map(Text, report.about)], words=verdict
     )
-
-
-def with_signs(part: Part) -> Part:
-    """Return a part with the signs that a terminal may lack, µs, ² and ±; what is HTML already stays."""
-
-    def signed(words: str) -> str:
-        return words if isinstance(words, Markup) else in_signs(words).replace("+-", "±")
-
-    match part:
-        case Text(words):
-            return replace(part, words=signed(words))
-        case Table(head=head, rows=rows, words=words):
-            cells = [[signed(cell) for cell in row] for row in rows]
-            return replace(part, head=[*map(signed, head)], rows=cells, words=[*map(signed, words)])
-        case _:
-            return part
 
 
 def _allowed(value: Any) -> Any:
@@ -204,9 +178,9 @@ def _allowed(value: Any) -> Any:
     return _FORBIDDEN.sub("\ufffd", value)
 
 
-def in_signs(words: str) -> str:
-    """Return text with the signs that a terminal may lack: µs for us, ² for ^2."""
-    return re.sub(r"\bus\b", "µs", words).replace("^2", "²").replace("^3", "³")
+def signed(words: str) -> str:
+    """Return text with the signs that a terminal may lack: µs for us, ² for ^2, ± for +-."""
+    return re.sub(r"\bus\b", "µs", words).replace("^2", "²").replace("^3", "³").replace("+-", "±")
 
 
 def pairs(caption: str, head: tuple[str, str], values: Mapping[str, Any]) -> Table:

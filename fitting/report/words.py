@@ -30,27 +30,19 @@ def losses_in_words(result: FitResult) -> list[list[str]]:
     loss = result.loss
     if loss is None:
         return []
-    rows = [
-        [
-            f"energy lost at {one.approach_speed_nm_per_us:.3g} nm/us",
-            f"{known_in_words(one.energy_aj, 'aJ')}, {known_in_words(one.energy_ev, 'eV')}",
-        ]
-        for one in loss.energies
-        if one.energy_aj is not None and one.energy_ev is not None
-    ]
-    if loss.energies_reason is not None:
-        rows.append(["energy lost", f"not known: {loss.energies_reason}"])
-    if loss.delta_aj is not None and loss.delta_ev is not None:
-        rows.append(
-            ["delta = m epsilon/2", f"{known_in_words(loss.delta_aj, 'aJ')}, {known_in_words(loss.delta_ev, 'eV')}"]
-        )
+
+    def both(in_aj: WithInterval | None, in_ev: WithInterval | None) -> str:
+        pairs = (in_aj, "aJ"), (in_ev, "eV")
+        return ", ".join(known_in_words(known, unit) for known, unit in pairs if known is not None)
+
+    named = {f"energy lost at {one.approach_speed_nm_per_us:.3g} nm/us": one for one in loss.energies}
+    rows = [[name, both(one.energy_aj, one.energy_ev)] for name, one in named.items() if one.energy_aj is not None]
+    rows += [] if loss.energies_reason is None else [["energy lost", f"not known: {loss.energies_reason}"]]
+    rows += [] if loss.delta_aj is None else [["delta = m epsilon/2", both(loss.delta_aj, loss.delta_ev)]]
     return [*rows, ["captured below (extrapolated)", known_in_words(loss.capture_speed_nm_per_us, "nm/us")]]
 
 
-PULLS = (
-    "Pull: how far a table's law is from that of the others, in standard deviations; then by how much it moves each "
-    "parameter of the law, in standard deviations of that move"
-)
+PULLS = "  Pull: how far a table's law is from that of the others, in standard deviations."
 
 
 def formulas(result: FitResult) -> list[str]:
@@ -129,8 +121,7 @@ def band_width(result: FitResult) -> tuple[float, float, float, float] | None:
     if not reached.size:
         return None
     slowest, fastest, law = float(reached.min()), float(reached.max()), result.law
-    inside = (law.approach_speed_nm_per_us > slowest) & (law.approach_speed_nm_per_us < fastest)
-    speeds = np.concatenate(([slowest], law.approach_speed_nm_per_us[inside], [fastest]))
+    speeds = np.clip(law.approach_speed_nm_per_us, slowest, fastest)
     rebound, high = (
         np.interp(speeds, law.approach_speed_nm_per_us, column)
         for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us)

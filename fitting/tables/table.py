@@ -73,7 +73,7 @@ from fitting.tables.csv_text import (
 
 LEAST_REPEATS = 4
 """Readings beyond the first of each drive from which on their scatter gives errors."""
-ERRORS_OF_REPEATS = "errors from repeated readings: "
+ERRORS_OF_REPEATS = "Errors from repeated readings: "
 """How the remark begins that says so."""
 # Above one half: an overdamped cantilever does not vibrate.
 LOWEST_QUALITY_FACTOR = math.nextafter(0.5, 1.0)

@@ -137,7 +137,7 @@ DESIGN = Command(
             valued(
                 option_of(nuisance.name),
                 ValueAndError(none=nuisance.name == "quality_factor"),
-                f"{nuisance.meaning}, such as '{nuisance.example}'.",
+                f"{nuisance.meaning}, 'VALUE +- ERROR'.",
             )
             for nuisance in PRIOR_NUISANCES
         ),
