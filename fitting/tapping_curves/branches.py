@@ -84,7 +84,7 @@ def side_of(repulsive: bool | np.bool_) -> str:  # noqa: FBT001
     return "repulsive" if repulsive else "attractive"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class CurveBranch:
     """What tells one branch of a curve from the others.
 
@@ -215,6 +215,10 @@ def repulsive_rows(
     return repulsive
 
 
+FEWEST_ROWS = 3
+"""Of a group or a stretch of rows that gets an energy of its own."""
+
+
 def smooth_stretches(
     curve: TappingCurve, touching: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
 ) -> list[np.ndarray]:
@@ -238,7 +242,7 @@ def smooth_stretches(
             usual = float(np.median(others)) if len(others) else 0.0
             if steps[i] > max(_JUMP_ERRORS * np.hypot(error[i], error[i + 1]), _JUMP_STEPS * usual):
                 cuts.append(i + 1)
-        found += [stretch for stretch in np.split(rows, cuts) if len(stretch)]
+        found += [stretch for stretch in np.split(rows, cuts) if len(stretch) >= FEWEST_ROWS]
     return found
 
 

@@ -23,21 +23,21 @@ energy. What is left says of a point that it is measured, bracketed, or below a 
 *One energy for all taps* is an assumption that narrows the instrument. It stands apart and makes no curve valid.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, covariance_of, descended, distance
 from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.lag import free_lag_deg, turned
 from fitting.parameters import USUAL_DRIFTS
-from fitting.tapping_curves.branches import CurveBranch, free_ends, ways
+from fitting.tapping_curves.branches import FEWEST_ROWS, CurveBranch, free_ends, ways
 from fitting.tapping_curves.curve import (
     HARMONICS_FACTOR,
     Given,
@@ -50,7 +50,7 @@ from fitting.tapping_curves.curve import (
 
 _HARMONICS = 40
 """The sum of those of a brief impact converges like 1/n; beyond them a contact lasts too long to excite them."""
-(_inverse_triangle,) = get_lapack_funcs(("trtri",), dtype=float)
+Pairs = Float[np.ndarray, "2 rows"]
 
 
 class Energies(NamedTuple):
@@ -60,19 +60,15 @@ class Energies(NamedTuple):
         energy_aj: E.
         harmonics_aj: what the air takes of it at the harmonics.
         virial_aj: mean of force times height, of the first harmonic.
-        amplitude_slope: change with the amplitude read, in aJ/nm.
-        lag_slope: change with the lag, in aJ/degree.
-        virial_amplitude_slope: change of the virial with the amplitude read, in aJ/nm.
-        virial_lag_slope: change of the virial with the lag, in aJ/degree.
+        amplitude_slopes: changes of energy and virial with the amplitude read, in aJ/nm, shape (2, rows).
+        lag_slopes: changes of energy and virial with the lag, in aJ/degree, shape (2, rows).
     """
 
     energy_aj: Rows
     harmonics_aj: Rows
     virial_aj: Rows
-    amplitude_slope: Rows
-    lag_slope: Rows
-    virial_amplitude_slope: Rows
-    virial_lag_slope: Rows
+    amplitude_slopes: Pairs
+    lag_slopes: Pairs
 
 
 def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
@@ -83,27 +79,20 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
         instrument: what turns its readings into motion.
     """
     motion = motion_of(curve, instrument)
-    gamma, z, free = motion.gamma, motion.height, motion.free_amplitude_nm
     scale = curve.spring_constant_n_per_m.value * curve.tip_calibration.value**2
-    force = gamma * (z + free)
-    first = -np.pi * np.imag(force * np.conj(z))
+    force, z = motion.gamma * (motion.height + motion.free_amplitude_nm), motion.height
 
-    def change(dz):
-        return scale * (gamma * dz * np.conj(z) + force * np.conj(dz))
+    def energy_and_virial(work):
+        return scale * np.stack([-np.pi * np.imag(work), 0.5 * np.real(work)])
 
-    with np.errstate(invalid="ignore", divide="ignore"):
-        by_amplitude = change(motion.reading / curve.amplitude_nm)
-    by_lag = change(-1j * motion.reading) * np.pi / 180.0
+    def slopes(dz):
+        return energy_and_virial(motion.gamma * dz * np.conj(z) + force * np.conj(dz))
+
+    energy, virial = energy_and_virial(force * np.conj(z))
     harmonics = scale * _lost_at_harmonics(curve, instrument, np.abs(force))
-    return Energies(
-        energy_aj=scale * first - harmonics,
-        harmonics_aj=harmonics,
-        virial_aj=0.5 * scale * np.real(force * np.conj(z)),
-        amplitude_slope=-np.pi * by_amplitude.imag,
-        lag_slope=-np.pi * by_lag.imag,
-        virial_amplitude_slope=0.5 * by_amplitude.real,
-        virial_lag_slope=0.5 * by_lag.real,
-    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        by_amplitude = slopes(motion.reading / curve.amplitude_nm)
+    return Energies(energy - harmonics, harmonics, virial, by_amplitude, slopes(-1j * np.pi / 180.0 * motion.reading))
 
 
 def _lost_at_harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> Rows:
@@ -126,11 +115,9 @@ def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:
     return middle + np.hypot(first[1] - middle, 0.5 * (first[0] - first[2]))
 
 
-def noise_of(curve: TappingCurve, found: Energies) -> tuple[Rows, Rows]:
+def noise_of(curve: TappingCurve, found: Energies) -> Pairs:
     """Return the standard error of each energy and each virial from the noise of its own row, in aJ."""
-    amplitude, lag = curve.amplitude_error_nm, curve.lag_error_deg
-    energy = np.hypot(found.amplitude_slope * amplitude, found.lag_slope * lag)
-    return energy, np.hypot(found.virial_amplitude_slope * amplitude, found.virial_lag_slope * lag)
+    return np.hypot(found.amplitude_slopes * curve.amplitude_error_nm, found.lag_slopes * curve.lag_error_deg)
 
 
 FEWEST_FREE_ROWS = 3
@@ -185,12 +172,8 @@ class _Unknown(NamedTuple):
     given: Given
 
 
-class _Means(NamedTuple):
-    """Means of free rows: the weights of the rows in each, its value and its error."""
-
-    weights: Float[np.ndarray, "means rows"]
-    mean: Float[np.ndarray, " means"]
-    error: Float[np.ndarray, " means"]
+Means = tuple[Float[np.ndarray, "means rows"], Float[np.ndarray, " means"], Float[np.ndarray, " means"]]
+"""Means of free rows: the weights of the rows in each, its value and its error."""
 
 
 class Solution(NamedTuple):
@@ -249,6 +232,7 @@ class Lever:
         curves: the curves.
         free: the rows of the free tip of each.
         unknowns: of the instrument.
+        lags: places among them of the free tip's lags, and their curves' numbers.
         minimum: of what is stated and the means of free rows.
     """
 
@@ -263,17 +247,12 @@ class Lever:
         for number, (curve, here) in enumerate(zip(self.curves, self.free, strict=True)):
             unknowns += _unknowns_of(number, curve, here)
             share, error = (part / curve.free_amplitude_nm for part in (curve.amplitude_nm, curve.amplitude_error_nm))
-            lags = _means(curve, curve.lag_deg, curve.lag_error_deg, here, _frequencies(curve), turning=True)
+            lags = _means(curve, curve.lag_deg, curve.lag_error_deg, here, _frequencies(curve))
             self._means.append((lags, _means(curve, share, error, here, _levels(curve))))
         self.unknowns = tuple(unknowns)
         self._start = np.array([unknown.given.value for unknown in unknowns])
         self._unit = np.array([unknown.given.error for unknown in unknowns])
-        # the zero that several curves or frequencies state is one and the same, and counts once
-        self._zeros = [
-            (i, zero)
-            for i, one in enumerate(unknowns)
-            if one.kind == "free_lag_deg" and (zero := self.curves[one.curve or 0].phase_zero_deg)
-        ]
+        self.lags = [(i, one.curve or 0) for i, one in enumerate(unknowns) if one.kind == "free_lag_deg"]
         # all but linear: a few steps more are as good as none
         self.minimum = _minimum(self.residual, self.jacobian, np.zeros(len(unknowns)), until=1e-20)
 
@@ -314,9 +293,11 @@ class Lever:
         left = [x[: len(self.unknowns)]]
         for number, (lags, shares) in enumerate(self._means):
             lag, factor = self._of_rows(x, number)
-            left.append(turned(lags.weights @ lag - lags.mean) / lags.error)
-            left.append((shares.weights @ factor - shares.mean) / shares.error)
-        off = [turned(self.zero_at(x, i) - zero.value) / max(zero.error, 1e-4) for i, zero in self._zeros]
+            for (weights, mean, error), column in ((lags, lag), (shares, factor)):
+                left.append(turned(weights @ column - mean) / error)
+        zeros = [(i, zero) for i, number in self.lags if (zero := self.curves[number].phase_zero_deg)]
+        off = [turned(self.zero_at(x, i) - zero.value) / max(zero.error, 1e-4) for i, zero in zeros]
+        # the zero that several curves or frequencies state is one and the same, and counts once
         return np.concatenate([*left, np.array(off) / np.sqrt(max(len(off), 1))])
 
     def zero_at(self, x: np.ndarray, place: int) -> Any:
@@ -329,8 +310,8 @@ class Lever:
         """Return the changes of the residuals by the unknowns."""
         return _slopes(self.residual, x, len(self.unknowns))
 
-    def slopes(self, curve: TappingCurve, number: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the changes of each row's energy and virial by every unknown, shape (rows, unknowns).
+    def slopes(self, curve: TappingCurve, number: int, x: np.ndarray) -> Float[np.ndarray, "2 rows unknowns"]:
+        """Return the changes of each row's energy and virial by every unknown.
 
         Args:
             curve: readings at which they are taken.
@@ -342,8 +323,7 @@ class Lever:
             found = energies(curve, self.instrument(number, y))
             return np.stack([found.energy_aj, found.virial_aj])
 
-        energy, virial = _slopes(of, x, len(self.unknowns))
-        return energy, virial
+        return _slopes(of, x, len(self.unknowns))
 
     def errors_of_rows(self, number: int) -> Rows:
         """Return the standard error of each energy from what all rows share.
@@ -353,7 +333,7 @@ class Lever:
         given, errors = self.stated, np.sqrt(np.diag(self.minimum.covariance))
         errors[: len(COMMON)] = 1.0
         curve, found = self.curves[number], energies(self.curves[number], self.instrument(number, given))
-        by, _ = self.slopes(curve, number, given)
+        by = self.slopes(curve, number, given)[0]
         return np.hypot(np.linalg.norm(by * errors, axis=1), curve.relative_error * found.energy_aj)
 
     def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
@@ -436,41 +416,36 @@ def _means(
     errors: Rows,
     free: Bool[np.ndarray, " rows"],
     kinds: Int[np.ndarray, " rows"],
-    *,
-    turning: bool = False,
-) -> _Means:
+) -> Means:
     """Return means of the free rows of each kind, their errors with what they scatter beyond their noise.
 
     Where the order of the rows is known each stretch of neighbours has means of its own, which tell a drift.
+
+    Args:
+        curve: the curve.
+        values: of its rows, degrees or parts of one, which are far from a turn.
+        errors: theirs.
+        free: rows of the free tip.
+        kinds: number of each row's kind.
     """
-    found = []
-    for kind in np.unique(kinds).tolist():
+    weights, means, mean_errors = [], [], []
+    for kind in np.unique(kinds):
         rows = np.flatnonzero(free & (kinds == kind) & np.isfinite(values))
-        for part in _stretches(curve, rows):
-            off = values[part] - values[part[0]]
-            off = turned(off) if turning else off
-            information = errors[part] ** -2.0
+        parts = [rows]
+        if curve.time is not None:
+            runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+            parts = [
+                part for run in runs for part in np.array_split(run, min(len(run) // _FEWEST_OF_MEAN, _MOST_MEANS) or 1)
+            ]
+        for part in parts:
+            if not len(part):
+                continue
+            off, information = turned(values[part] - values[part[0]]), errors[part] ** -2.0
             excess = np.sqrt(max(np.var(off) - 1.0 / information.mean(), 0.0))
-            weights = np.zeros(curve.rows)
-            weights[part] = information / information.sum()
-            mean = values[part[0]] + np.average(off, weights=information)
-            found.append((weights, mean, np.hypot(information.sum() ** -0.5, excess)))
-    if not found:
-        return _Means(np.zeros((0, curve.rows)), np.zeros(0), np.zeros(0))
-    return _Means(*(np.array(column) for column in zip(*found, strict=True)))
-
-
-def _stretches(curve: TappingCurve, rows: Int[np.ndarray, " some"]) -> list[np.ndarray]:
-    """Return the rows in one piece, or where their order in time is known those that follow each other in several."""
-    if not len(rows) or curve.time is None:
-        return [rows] if len(rows) else []
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    return [
-        part
-        for run in runs
-        for part in np.array_split(run, max(1, min(len(run) // _FEWEST_OF_MEAN, _MOST_MEANS)))
-        if len(part)
-    ]
+            weights.append(np.bincount(part, information / information.sum(), curve.rows))
+            means.append(values[part[0]] + weights[-1][part] @ off)
+            mean_errors.append(np.hypot(information.sum() ** -0.5, excess))
+    return np.reshape(weights, (-1, curve.rows)), np.array(means), np.array(mean_errors)
 
 
 _SHALLOW = 0.03
@@ -506,7 +481,6 @@ class Smoother(NamedTuple):
         place: of the bins.
         starts: where each begins.
         weights: of the rows in their bins.
-        variance: of the bins' averages.
         size: standard deviation of the process.
         inverse: of the averages' covariance, noise and process.
     """
@@ -514,7 +488,6 @@ class Smoother(NamedTuple):
     place: Float[np.ndarray, " bins"]
     starts: Int[np.ndarray, " bins"]
     weights: Float[np.ndarray, " rows"]
-    variance: Float[np.ndarray, " bins"]
     size: float
     inverse: Float[np.ndarray, "bins bins"]
 
@@ -529,9 +502,7 @@ class Smoother(NamedTuple):
         middle = np.add.reduceat(weights * place, starts)
         # places of several bins may be one
         own = np.diag(1.0 / total + 1e-12 * size**2)
-        factor = np.linalg.cholesky(matern(middle, middle, size) + own)
-        root = _inverse_triangle(factor.T)[0]
-        return cls(middle, starts, weights, 1.0 / total, size, root @ root.T)
+        return cls(middle, starts, weights, size, np.linalg.inv(matern(middle, middle, size) + own))
 
     def average(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted averages over the bins of values of the rows, shape (rows, ...)."""
@@ -585,8 +556,6 @@ def _smoothed(
     return replace(curve, amplitude_nm=amplitude, lag_deg=lag), place, stretches
 
 
-FEWEST_ROWS = 3
-"""Of a group of rows that gets an energy of its own."""
 _FAR, _MOST_OUTLIERS = 4.0, 0.2
 """Residual in standard errors from which a row is excluded, and share of rows that may be."""
 _ALLOWED = 3.0
@@ -673,7 +642,7 @@ def within(ratio: float, measured: np.ndarray, *columns: np.ndarray) -> tuple[fl
     return tuple(float(np.interp(ratio, measured, column)) for column in columns)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class TappingBranch(CurveBranch):
     """Rows of one drive, one way and one side of the phase, and the energy along them.
 
@@ -693,6 +662,7 @@ class EnergyFunctions:
     Attributes:
         lever: the curves of its lever, and their instrument.
         number: of the curve among them.
+        smooth: the curve with smooth readings, at which errors of energies are taken.
         energies: of every row, with the instrument where statements and free rows put it.
         branches: energy and virial along each.
         outliers: rows too far from the others.
@@ -704,6 +674,7 @@ class EnergyFunctions:
 
     lever: Lever
     number: int
+    smooth: TappingCurve
     energies: Energies
     branches: tuple[TappingBranch, ...]
     outliers: Bool[np.ndarray, " rows"]
@@ -743,20 +714,13 @@ def energies_along(
     root = axes * np.sqrt(np.maximum(size, 0.0))
     by_instrument = np.concatenate([c.by_instrument for c in curves]) @ root
     low, high, possible = positive_bands(estimate, noise, certain, by_instrument)
-    share = lever.curves[0].relative_error
-    middle, common = 0.5 * (low + high), TWO_SIDED_95 * share * 0.5 * (low + high)
+    middle = 0.5 * (low + high)
+    common = TWO_SIDED_95 * lever.curves[0].relative_error * middle
     low, high = np.maximum(middle - np.hypot(middle - low, common), 0.0), middle + np.hypot(high - middle, common)
-    ends = np.cumsum([len(c.noise_aj) for c in curves])[:-1]
-    bands = zip(np.split(low, ends), np.split(high, ends), strict=True)
+    bands = zip(curves, low.reshape(-1, _POINTS), high.reshape(-1, _POINTS), strict=True)
+    curves = iter([replace(curve, energy_low_aj=below, energy_high_aj=above) for curve, below, above in bands])
     return [
-        replace(
-            one,
-            possible=possible,
-            branches=tuple(
-                replace(branch, curve=replace(branch.curve, energy_low_aj=below, energy_high_aj=above))
-                for branch, (below, above) in zip(one.branches, bands, strict=False)
-            ),
-        )
+        replace(one, possible=possible, branches=tuple(replace(branch, curve=next(curves)) for branch in one.branches))
         for one in each
     ]
 
@@ -767,60 +731,52 @@ def _along(
     """Return the energies along the branches of one curve, their bands not yet told."""
     # where the instrument's search did not settle there is no energy
     stretches = stretches if lever.minimum.settled else ()
-    curve, x, at = lever.curves[number], lever.minimum.at, lever.instrument(number)
+    curve, at = lever.curves[number], lever.instrument(number)
     smooth, place, stretches = _smoothed(curve, stretches, at.free_amplitude_factor)
     found, at_smooth = energies(curve, at), energies(smooth, at)
-    energy_slopes, virial_slopes = lever.slopes(smooth, number, x)
-    outliers, branches, chi2, freedom, scales = np.zeros(curve.rows, bool), [], 0.0, 0.0, [1.0]
-    share = curve.relative_error
+    by_instrument = lever.slopes(smooth, number, lever.minimum.at)
+    outliers, branches, fits = np.zeros(curve.rows, bool), [], []
     for rows in stretches:
-        fit = _stretch(curve, rows, place, found.energy_aj, at_smooth.amplitude_slope, at_smooth.lag_slope)
-        by_reading = at_smooth.virial_amplitude_slope, at_smooth.virial_lag_slope
+        fit = _stretch(curve, rows, place, found.energy_aj, at_smooth.amplitude_slopes[0], at_smooth.lag_slopes[0])
+        by_reading = at_smooth.amplitude_slopes[1], at_smooth.lag_slopes[1]
         of_virial = _stretch(curve, fit.rows, place, found.virial_aj, *by_reading)
         outliers[rows] = ~np.isin(rows, fit.rows)
-        chi2, freedom, scales = chi2 + fit.chi2, freedom + fit.freedom, [*scales, fit.scale]
+        fits.append(fit)
         for side in (False, True):
             here = fit.rows[repulsive[fit.rows] == side]
             if len(here) < FEWEST_ROWS:
                 continue
             ratios = 1.0 + _SHALLOW - np.exp(place[here])
             ratio = np.linspace(max(ratios.min(), 0.0), ratios.max(), _POINTS)
-            estimate, noise, by = _at(lever, number, fit, found.energy_aj, energy_slopes, ratio)
-            virial, virial_noise, virial_by = _at(lever, number, of_virial, found.virial_aj, virial_slopes, ratio)
-            virial_variance = virial_noise**2 + (share * virial) ** 2
-            virial_variance += np.einsum("nu,uv,nv->n", virial_by, lever.minimum.covariance, virial_by)
-            heights = np.interp(_place_of(ratio), fit.smoother.place, fit.smoother.average(curve.offset_nm[fit.rows]))
+            estimate, noise, by = _at(lever, number, fit, found.energy_aj, by_instrument[0], ratio)
+            virial, virial_noise, virial_by = _at(lever, number, of_virial, found.virial_aj, by_instrument[1], ratio)
+            variance = np.einsum("nu,uv,nv->n", virial_by, lever.minimum.covariance, virial_by) + virial_noise**2
+            heights = fit.smoother.average(curve.offset_nm[fit.rows])
             uncertain = _ALLOWED * np.median(curve.amplitude_error_nm[here] / curve.free_amplitude_nm[here])
-            branches.append(
-                TappingBranch(
-                    drive_frequency_khz=float(curve.drive_frequency_khz[here[0]]),
-                    free_amplitude_nm=float(curve.free_amplitude_nm[here[0]]),
-                    retract=bool(curve.retract[here[0]]),
-                    repulsive=side,
-                    rows=np.sort(here),
-                    curve=EnergyCurve(
-                        amplitude_ratio=ratio,
-                        height_nm=heights,
-                        energy_low_aj=estimate,
-                        energy_high_aj=estimate,
-                        virial_aj=virial,
-                        virial_error_aj=np.sqrt(virial_variance),
-                        estimate_aj=estimate,
-                        noise_aj=noise,
-                        by_instrument=by,
-                        certain=1.0 - ratio > uncertain,
-                    ),
-                )
+            along = EnergyCurve(
+                amplitude_ratio=ratio,
+                height_nm=np.interp(np.log(_SHALLOW + 1.0 - ratio), fit.smoother.place, heights),
+                energy_low_aj=estimate,
+                energy_high_aj=estimate,
+                virial_aj=virial,
+                virial_error_aj=np.sqrt(variance + (curve.relative_error * virial) ** 2),
+                estimate_aj=estimate,
+                noise_aj=noise,
+                by_instrument=by,
+                certain=1.0 - ratio > uncertain,
             )
+            drive = float(curve.drive_frequency_khz[here[0]]), float(curve.free_amplitude_nm[here[0]])
+            branches.append(TappingBranch(*drive, bool(curve.retract[here[0]]), side, rows=np.sort(here), curve=along))
     return EnergyFunctions(
         lever=lever,
         number=number,
+        smooth=smooth,
         energies=found,
         branches=tuple(sorted(branches, key=lambda b: (b.drive, b.retract, b.repulsive))),
         outliers=outliers,
-        rows_chi2=chi2,
-        rows_freedom=freedom,
-        scale=max(scales),
+        rows_chi2=sum((fit.chi2 for fit in fits), 0.0),
+        rows_freedom=sum((fit.freedom for fit in fits), 0.0),
+        scale=max([1.0, *(fit.scale for fit in fits)]),
         possible=True,
     )
 
@@ -871,11 +827,6 @@ def _stretch(
     return _Stretch(here, smoother, chi2, freedom, scale)
 
 
-def _place_of(ratio: np.ndarray) -> np.ndarray:
-    """Return the places of amplitudes, of the free one, as of `losses`."""
-    return np.log(_SHALLOW + 1.0 - ratio)
-
-
 def _at(
     lever: Lever,
     number: int,
@@ -885,7 +836,7 @@ def _at(
     ratio: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a smooth function at some amplitudes, its own standard error, and its change by every unknown."""
-    weights, variance = fit.smoother.at(_place_of(ratio))
+    weights, variance = fit.smoother.at(np.log(_SHALLOW + 1.0 - ratio))
     mean = weights @ fit.smoother.average(values[fit.rows])
     by = weights @ fit.smoother.average(slopes[fit.rows])
     # with more of a free amplitude the same ratio is at a larger reading; a branch may be all at one amplitude
@@ -939,21 +890,18 @@ def _densest(mean: float, error: float, low: float, high: float) -> tuple[float,
     Equal tails would never hold a truth that is next to nothing.
     """
     below, above = (low - mean) / error, (high - mean) / error
-    flip = below > 0.0
-    if flip:
+    if below > 0.0:
         # the tail that is left, without cancellation
-        below, above = -above, -below
-
-    def inside(half: float) -> float:
-        return float(ndtr(min(above, half)) - ndtr(max(below, -half))) if max(below, -half) < min(above, half) else 0.0
-
-    near, far, wanted = 0.0, 40.0, 0.95 * float(ndtr(above) - ndtr(below))
-    for _ in range(60):
-        half = 0.5 * (near + far)
-        near, far = (near, half) if inside(half) > wanted else (half, far)
-    ends = max(below, -far), min(above, far)
-    ends = (-ends[1], -ends[0]) if flip else ends
-    return mean + error * ends[0], mean + error * ends[1]
+        low, high = _densest(-mean, error, -high, -low)
+        return -high, -low
+    inside = 0.95 * (ndtr(above) - ndtr(below))
+    last, first, half = ndtri(ndtr(below) + inside), ndtri(ndtr(above) - inside), ndtri(0.5 + 0.5 * inside)
+    ends = -half, half
+    if last > -below:
+        ends = below, last
+    elif -first > above:
+        ends = max(first, above - 9.0), above
+    return mean + error * float(ends[0]), mean + error * float(ends[1])
 
 
 def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
@@ -962,19 +910,18 @@ def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
     It is the middle of its band, beside how much of it a standard error of the frequency, as known, is; None where no
     energy is above nothing.
     """
-    known, found = float(np.sqrt(functions.lever.minimum.covariance[0, 0])), []
-    for number, branch in enumerate(functions.branches):
-        c = branch.curve
-        by = known * np.abs(c.by_instrument[:, 0])
-        for n in np.flatnonzero(c.certain & (c.energy_low_aj > 0.0)):
-            at = {
-                "branch": number,
-                "amplitude_ratio": float(c.amplitude_ratio[n]),
-                "energy_aj": float(c.energy_aj[n]),
-                "interval95_aj": (float(c.energy_low_aj[n]), float(c.energy_high_aj[n])),
-                "by_frequency_aj": float(by[n]),
-            }
-            found.append(at)
+    known = np.sqrt(functions.lever.minimum.covariance[0, 0])
+    found = [
+        {
+            "branch": number,
+            "amplitude_ratio": float(c.amplitude_ratio[n]),
+            "energy_aj": float(c.energy_aj[n]),
+            "interval95_aj": (float(c.energy_low_aj[n]), float(c.energy_high_aj[n])),
+            "by_frequency_aj": float(known * abs(c.by_instrument[n, 0])),
+        }
+        for number, c in enumerate(branch.curve for branch in functions.branches)
+        for n in np.flatnonzero(c.certain & (c.energy_low_aj > 0.0))
+    ]
     return min(found, key=lambda at: at["by_frequency_aj"] / at["energy_aj"], default=None)
 
 
@@ -995,28 +942,27 @@ def what_narrows(functions: EnergyFunctions) -> str:
     What is known of a combination g of the unknowns to an error e takes (S C g)^2/(e^2 + g C g) off the variance S C S.
     """
     branch, point = largest_of(functions.branches)
-    lever, c = functions.lever, functions.branches[branch].curve
-    rows, x, covariance = functions.branches[branch].rows, lever.minimum.at, lever.minimum.covariance
-    by, noise = c.by_instrument[point], float(c.noise_aj[point])
-    places = [i for i, one in enumerate(lever.unknowns) if one.curve == functions.number and one.rows[rows[0]]]
-    lag = next(i for i in places if lever.unknowns[i].kind == "free_lag_deg")
+    lever, c, row = functions.lever, functions.branches[branch].curve, functions.branches[branch].rows[0]
+    x, covariance, by = lever.minimum.at, lever.minimum.covariance, c.by_instrument[point]
+    lag = next(i for i, n in lever.lags if n == functions.number and lever.unknowns[i].rows[row])
     of_zero = _slopes(lambda y: np.array([lever.zero_at(y, lag)]), x, len(x))[0]
     of_frequency = lever.unknowns[0].given.error * np.eye(len(x))[0]
-    zero = "the zero of the phase to 0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')"
-    error = f"{1e-5 * np.exp(lever.values(x)[0]):.1g}"
-    free = f"the free frequency to 1e-5 of itself ('# free_frequency_khz = VALUE +- {error}')"
-    more = {zero: (of_zero, 0.2), free: (of_frequency, 1e-5)}
-    today = float(by @ covariance @ by)
-    half = {
-        words: TWO_SIDED_95
-        * np.sqrt(max(today - (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g), 0.0) + noise**2)
-        for words, (g, e) in more.items()
-    }
-    words = min(half, key=lambda name: half[name])
-    now = TWO_SIDED_95 * np.sqrt(today + noise**2)
-    if half[words] > _NARROWS * now:
+
+    def half_of_band(g: np.ndarray, e: float) -> float:
+        narrower = (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g)
+        return TWO_SIDED_95 * float(np.sqrt(max(by @ covariance @ by - narrower, 0.0) + c.noise_aj[point] ** 2))
+
+    frequency = f"{1e-5 * np.exp(lever.values(x)[0]):.1g}"
+    half, words = min(
+        (half_of_band(of_zero, 0.2), "the zero of the phase to 0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')"),
+        (
+            half_of_band(of_frequency, 1e-5),
+            f"the free frequency to 1e-5 of itself ('# free_frequency_khz = VALUE +- {frequency}')",
+        ),
+    )
+    if half > _NARROWS * half_of_band(of_zero, np.inf):
         return "zero of the phase and free frequency would not narrow that; less noise or more rows would"
-    return f"state {words}, which would leave +- {half[words]:.2g} aJ"
+    return f"state {words}, which would leave +- {half:.2g} aJ"
 
 
 def differences_of_ways(functions: EnergyFunctions) -> list[dict[str, Any]]:
@@ -1026,23 +972,19 @@ def differences_of_ways(functions: EnergyFunctions) -> list[dict[str, Any]]:
     """
     found, covariance = [], functions.lever.minimum.covariance
     share = functions.lever.curves[functions.number].relative_error
-    for i, one in enumerate(functions.branches):
-        for j, other in enumerate(functions.branches):
-            if one.retract or not other.retract or (one.drive, one.repulsive) != (other.drive, other.repulsive):
-                continue
-            low, high = (
-                end(b.curve.amplitude_ratio[place] for b in (one, other)) for end, place in ((max, 0), (min, -1))
-            )
-            if not low < high:
-                continue
-            ratio = np.linspace(low, high, _POINTS)
-            (a, of_a, by_a), (b, of_b, by_b) = (estimates_at(branch.curve, ratio) for branch in (one, other))
-            off, by = b - a, by_b - by_a
-            variance = of_a**2 + of_b**2 + np.einsum("nu,uv,nv->n", by, covariance, by) + (share * off) ** 2
-            error = np.sqrt(variance)
-            most = int(np.argmax(np.abs(off) / error))
-            at = {"amplitude_ratio": ratio[most], "energy_aj": off[most], "standard_error": error[most]}
-            found.append({"approach": i, "retract": j} | at)
+    for (i, one), (j, other) in itertools.product(enumerate(functions.branches), repeat=2):
+        low = max(b.curve.amplitude_ratio[0] for b in (one, other))
+        high = min(b.curve.amplitude_ratio[-1] for b in (one, other))
+        same = (one.drive, one.repulsive) == (other.drive, other.repulsive)
+        if one.retract or not other.retract or not same or not low < high:
+            continue
+        ratio = np.linspace(low, high, _POINTS)
+        (a, of_a, by_a), (b, of_b, by_b) = (estimates_at(branch.curve, ratio) for branch in (one, other))
+        off, by = b - a, by_b - by_a
+        error = np.sqrt(of_a**2 + of_b**2 + np.einsum("nu,uv,nv->n", by, covariance, by) + (share * off) ** 2)
+        most = int(np.argmax(np.abs(off) / error))
+        at = {"amplitude_ratio": ratio[most], "energy_aj": off[most], "standard_error": error[most]}
+        found.append({"approach": i, "retract": j} | at)
     return found
 
 
@@ -1065,8 +1007,6 @@ class OneEnergy:
         error_aj: its standard error but for spring constant and calibration.
         nuisances: of the instrument.
         instrument: at the minimum.
-        used: rows that were fitted.
-        outliers: rows too far from the others.
         residual: of the rows fitted, in standard errors; NaN elsewhere.
         minimum: chi2 of rows, free rows and what is stated, its degrees of freedom.
         scale: what the rows' own errors were multiplied by.
@@ -1076,43 +1016,25 @@ class OneEnergy:
     error_aj: Float[np.ndarray, " groups"]
     nuisances: tuple[Nuisance, ...]
     instrument: Instrument
-    used: Bool[np.ndarray, " rows"]
-    outliers: Bool[np.ndarray, " rows"]
     residual: Rows
     minimum: Solution
     scale: float
 
+    @property
+    def used(self) -> Bool[np.ndarray, " rows"]:
+        """Rows that were fitted."""
+        return np.isfinite(self.residual)
 
-def one_energy(
-    lever: Lever,
-    groups: Sequence[np.ndarray],
-    stretches: Sequence[np.ndarray],
-    *,
-    scale_errors: bool = False,
-) -> OneEnergy:
+
+def one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve, scale: float = 1.0) -> OneEnergy:
     """Return one energy for each group of rows of a lever's only curve, the instrument free within what is stated.
 
     Args:
         lever: the curve, and its instrument.
         groups: rows that share an energy.
-        stretches: rows along which readings are smooth.
-        scale_errors: multiply the rows' own errors such that chi2 is as large as its degrees of freedom, if larger.
+        smooth: the curve with smooth readings, at which errors of energies are taken.
+        scale: what the rows' own errors are multiplied by.
     """
-    curve = lever.curves[0]
-    smooth, _, _ = _smoothed(curve, stretches, lever.instrument(0).free_amplitude_factor)
-    found = _one_energy(lever, groups, smooth, 1.0)
-    far = np.abs(np.nan_to_num(found.residual)) > _FAR
-    kept = [rows[~far[rows]] for rows in groups]
-    if 0 < far.sum() <= _MOST_OUTLIERS * found.used.sum() and all(len(rows) for rows in kept):
-        found = replace(_one_energy(lever, kept, smooth, 1.0), outliers=far)
-        groups = kept
-    minimum = found.minimum
-    scale = float(np.sqrt(max(minimum.chi2, 0.0) / max(minimum.degrees_of_freedom, 1))) if scale_errors else 1.0
-    return replace(_one_energy(lever, groups, smooth, scale), outliers=found.outliers) if scale > 1.0 else found
-
-
-def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve, scale: float) -> OneEnergy:
-    """Return the least squares of the instrument with the rows of groups, each of one energy."""
     curve, count = lever.curves[0], len(lever.unknowns)
     rows, group = np.concatenate(groups), np.repeat(np.arange(len(groups)), [len(part) for part in groups])
     own = (group[:, None] == np.arange(len(groups))).astype(float)
@@ -1135,8 +1057,8 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
         noise, there = off(x)[1], energies(smooth, lever.instrument(0, x))
         missing = (x[count:][group] - there.energy_aj[rows]) / (noise / scale) ** 2
         moved = replace(smooth, amplitude_nm=smooth.amplitude_nm.copy(), lag_deg=smooth.lag_deg.copy())
-        moved.amplitude_nm[rows] += missing * (there.amplitude_slope * smooth.amplitude_error_nm**2)[rows]
-        moved.lag_deg[rows] += missing * (there.lag_slope * smooth.lag_error_deg**2)[rows]
+        moved.amplitude_nm[rows] += missing * (there.amplitude_slopes[0] * smooth.amplitude_error_nm**2)[rows]
+        moved.lag_deg[rows] += missing * (there.lag_slopes[0] * smooth.lag_error_deg**2)[rows]
         by = lever.slopes(moved, 0, x)[0][rows]
         of_free = np.pad(lever.jacobian(x), ((0, 0), (0, len(groups))))
         return np.concatenate([of_free, np.concatenate([by, -own], axis=1) / noise[:, None]])
@@ -1144,16 +1066,13 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
     start = energies(curve, lever.instrument(0)).energy_aj
     x = np.concatenate([lever.minimum.at, [float(np.mean(start[part])) for part in groups]])
     minimum = _minimum(residual, jacobian, x)
-    left, noise = off(minimum.at)
-    residuals, used = np.full(curve.rows, np.nan), np.zeros(curve.rows, bool)
-    residuals[rows], used[rows] = left / noise, True
+    residuals = np.full(curve.rows, np.nan)
+    residuals[rows] = np.divide(*off(minimum.at))
     return OneEnergy(
         energy_aj=minimum.at[count:],
         error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
         nuisances=lever.nuisances(0, minimum),
         instrument=lever.instrument(0, minimum.at),
-        used=used,
-        outliers=np.zeros(curve.rows, bool),
         residual=residuals,
         minimum=minimum,
         scale=scale,

@@ -102,7 +102,7 @@ def _band_in_words(low: float, high: float) -> str:
 def _along_the_branches(result: Tapping) -> list[ReportSection]:
     """Return the energy of each branch at some amplitudes, and what is known of the instrument."""
     functions = result.functions
-    if functions is None or not result.branches:
+    if not result.branches:
         return []
     head = ["energy (aJ) at A/A0 =", "measured", *(f"{ratio:g}" for ratio in HEADLINE), "largest"]
     several = len({branch.drive for branch in result.branches}) > 1

@@ -126,7 +126,7 @@ class Tapping(Result):
         rows: state, energy and virial of each row of the table.
         groups: the kinds of rows that may share an energy.
         fit: one energy for each group, fitted with the instrument; None without a phase or rows.
-        functions: the energy as a smooth function along each branch, the instrument cut off from it; or None.
+        functions: the energy as a smooth function along each branch, the instrument cut off from it.
         scale_errors: whether errors are multiplied where the rows scatter more.
         followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: energy that a tap takes at most, where only the amplitude was recorded; else None.
@@ -141,7 +141,7 @@ class Tapping(Result):
     rows: TapRows
     groups: tuple[EnergyGroup, ...]
     fit: OneEnergy | None
-    functions: EnergyFunctions | None
+    functions: EnergyFunctions
     scale_errors: bool
     followed: OneEnergy | None
     bound_aj: float | None
@@ -153,7 +153,7 @@ class Tapping(Result):
     @property
     def branches(self) -> tuple[TappingBranch, ...]:
         """Each with its energy and virial over the amplitude."""
-        return () if self.functions is None else self.functions.branches
+        return self.functions.branches
 
     @property
     def mass_ng(self) -> float:
@@ -272,7 +272,7 @@ class Tapping(Result):
     @property
     def least_on_frequency(self) -> dict[str, Any] | None:
         """The energy that hangs least on the free frequency, and where; None where none is above nothing."""
-        return None if self.functions is None else least_on_frequency(self.functions)
+        return least_on_frequency(self.functions)
 
     @property
     def energy_along_branches_aj(self) -> Rows:
@@ -304,7 +304,7 @@ class Tapping(Result):
     @property
     def way_differences(self) -> list[dict[str, Any]]:
         """By how much the energy differs between approach and retract, by the numbers of the branches."""
-        return [] if self.functions is None else differences_of_ways(self.functions)
+        return differences_of_ways(self.functions)
 
     def in_unit(self, text: str) -> str:
         """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant.
@@ -378,7 +378,7 @@ class Tapping(Result):
     def _fits(self) -> dict[str, Any]:
         """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
         fit, functions, smooth, statistics = self.fit, self.functions, None, {}
-        if functions is not None:
+        if functions.branches:
             smooth = {
                 "valid": not self.why_not_functions,
                 "reason": self.why_not_functions or None,

@@ -1,7 +1,7 @@
 """`tapping`: what a tapping curve says of a tap, and where its drive allows it of the impact law."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -15,6 +15,7 @@ from fitting.instruments.lag import AS_STATED, PhaseReadings, PhaseSense, sense_
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
 from fitting.tapping_curves.branches import (
+    FEWEST_ROWS,
     changes,
     free_rows,
     hardly_touching_rows,
@@ -27,7 +28,6 @@ from fitting.tapping_curves.branches import (
 from fitting.tapping_curves.curve import (
     Given,
     Instrument,
-    Rows,
     TappingCurve,
     given_or_usual,
     lag_of_free_tip,
@@ -36,7 +36,6 @@ from fitting.tapping_curves.curve import (
 )
 from fitting.tapping_curves.energy import (
     FEWEST_FREE_ROWS,
-    FEWEST_ROWS,
     Lever,
     OneEnergy,
     energies,
@@ -286,35 +285,52 @@ def _check_range(curve: TappingCurve, zero: float, name: str) -> None:
 
 def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool) -> Tapping:
     """Return everything but the law."""
-    free = free_rows(curve)
+    free, held = free_rows(curve), held_rows(curve)
     lever = Lever([curve], [free])
-    given, found = lever.instrument(0, lever.stated), energies(curve, lever.instrument(0))
-    plain, kind = energies(curve, given), _kinds_of_rows(curve, given, free)
-    groups, alike = _groups(curve, kind.touching & ~kind.rough & ~kind.early, kind.repulsive)
-    stretches = [rows for rows in smooth_stretches(curve, kind.touching, kind.repulsive) if len(rows) >= FEWEST_ROWS]
-    fitted = one_energy(lever, alike, stretches, scale_errors=scale_errors) if groups else None
-    functions = energies_along(lever, [stretches], [kind.repulsive])[0] if stretches else None
-    followed = None
+    given = lever.instrument(0, lever.stated)
+    plain, departure = energies(curve, given), turned(curve.lag_deg - lag_of_free_tip(curve, given))
+    touching = ~free & ~held & np.isfinite(curve.lag_deg)
+    repulsive = ~free & repulsive_rows(curve, touching, departure)
+    rough = rough_rows(curve, touching & repulsive) | rough_rows(curve, touching & ~repulsive)
+    early = touching & hardly_touching_rows(motion_of(curve, given))
+    early &= (touching & ~rough & ~early).sum() >= FEWEST_ROWS
+    stretches = smooth_stretches(curve, touching, repulsive)
+    functions = energies_along(lever, [stretches], [repulsive])[0]
+    groups, alike = _groups(curve, touching & ~rough & ~early & ~functions.outliers, repulsive)
+    fitted = followed = None
+    if groups:
+        fitted = one_energy(lever, alike, functions.smooth)
+        scale = np.sqrt(fitted.minimum.chi2 / max(fitted.minimum.degrees_of_freedom, 1))
+        if scale_errors and scale > 1.0:
+            fitted = one_energy(lever, alike, functions.smooth, float(scale))
     if curve.time is None and sum(map(len, alike)) >= _FEWEST_TO_FOLLOW:
         # with drifts, as if the rows stood in the order of time
         in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
-        followed = one_energy(Lever([in_order], [free]), alike, stretches)
-    believed = functions or fitted
-    alone = kind.touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
-    nothing = np.zeros(curve.rows, bool)
-    states = [kind.free, kind.held, np.isnan(kind.lag_departure_deg), kind.repulsive]
-    state = np.select(states, ["free", "held", "touching", "repulsive"], "attractive")
+        followed = one_energy(Lever([in_order], [free]), alike, functions.smooth)
+    silent = np.isnan(curve.lag_deg)
+    alone = touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
+    # why a row is not in the fit, or what it is for: the first that holds
+    notes = {
+        "free: fixes the zero of the phase" if curve.has_phase else "free": free,
+        "excluded: the tip is held, a tenth of the free amplitude is left or less": held,
+        "excluded: no phase, only a bound": silent,
+        "not in the one energy: off the smooth fall of its branch, so probably not one impact a period": rough,
+        "not in the one energy: hardly touching yet, taps need not come every period": early,
+        "excluded: its energy is more than 4 standard errors from the others'": functions.outliers,
+        f"excluded: fewer than {FEWEST_ROWS} rows of this branch": alone,
+    }
+    states = {"free": free, "held": held, "touching": silent, "repulsive": repulsive}
     rows = TapRows(
-        state=tuple(state.tolist()),
-        lag_departure_deg=kind.lag_departure_deg,
+        state=_named(states, "attractive"),
+        lag_departure_deg=departure,
         energy_aj=plain.energy_aj,
         energy_noise_aj=noise_of(curve, plain)[0],
         energy_systematic_aj=lever.errors_of_rows(0),
-        energy_of_fit_aj=found.energy_aj,
+        energy_of_fit_aj=functions.energies.energy_aj,
         virial_aj=plain.virial_aj,
         largest_energy_aj=largest_energies(curve, given),
-        used=nothing if fitted is None else fitted.used,
-        note=_notes(curve, kind, far=nothing if believed is None else believed.outliers, alone=alone),
+        used=np.zeros(curve.rows, bool) if fitted is None else fitted.used,
+        note=_named(notes, ""),
     )
     result = Tapping(
         table=table,
@@ -325,47 +341,17 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         functions=functions,
         scale_errors=scale_errors,
         followed=followed,
-        bound_aj=None if curve.has_phase else _bound(curve, given, free),
-        hysteresis=tuple(changes(curve, free=free, repulsive=kind.repulsive)),
+        bound_aj=None if curve.has_phase else _bound(curve, given, ~free & ~held),
+        hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
         speeds=None,
         versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
     )
     return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
 
 
-class _KindsOfRows(NamedTuple):
-    """What the rows of a curve are.
-
-    Attributes:
-        free: of the free tip.
-        held: the sample holds the tip.
-        touching: neither, with a phase.
-        repulsive: on the repulsive branch.
-        rough: off the smooth fall of their branch.
-        early: hardly touching yet.
-        lag_departure_deg: lag less that of the free tip.
-    """
-
-    free: Bool[np.ndarray, " rows"]
-    held: Bool[np.ndarray, " rows"]
-    touching: Bool[np.ndarray, " rows"]
-    repulsive: Bool[np.ndarray, " rows"]
-    rough: Bool[np.ndarray, " rows"]
-    early: Bool[np.ndarray, " rows"]
-    lag_departure_deg: Rows
-
-
-def _kinds_of_rows(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> _KindsOfRows:
-    """Return what the rows of a curve are, the instrument as given."""
-    held = held_rows(curve)
-    departure = turned(curve.lag_deg - lag_of_free_tip(curve, given))
-    touching = ~free & ~held & np.isfinite(curve.lag_deg)
-    repulsive = ~free & repulsive_rows(curve, touching, departure)
-    rough = rough_rows(curve, touching & repulsive) | rough_rows(curve, touching & ~repulsive)
-    early = touching & hardly_touching_rows(motion_of(curve, given))
-    if (touching & ~rough & ~early).sum() < FEWEST_ROWS:
-        early = np.zeros(curve.rows, bool)
-    return _KindsOfRows(free, held, touching, repulsive, rough, early, departure)
+def _named(rows: dict[str, Bool[np.ndarray, " rows"]], others: str) -> tuple[str, ...]:
+    """Return of each row the name of the first rows that it is among."""
+    return tuple(np.select(list(rows.values()), list(rows), others).tolist())
 
 
 def _energies_along(result: Tapping) -> np.ndarray:
@@ -392,36 +378,19 @@ def _groups(
     return groups, rows
 
 
-def _notes(curve: TappingCurve, kind: _KindsOfRows, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
-    """Return why each row is not in the fit, or what it is for; the first reason that holds."""
-    said = {
-        "free": "free: fixes the zero of the phase" if curve.has_phase else "free",
-        "held": "excluded: the tip is held, a tenth of the free amplitude is left or less",
-        "silent": "excluded: no phase, only a bound",
-        "rough": "not in the one energy: off the smooth fall of its branch, so probably not one impact a period",
-        "early": "not in the one energy: hardly touching yet, taps need not come every period",
-        "far": "excluded: its energy is more than 4 standard errors from the others'",
-        "alone": f"excluded: fewer than {FEWEST_ROWS} rows of this branch",
-    }
-    which |= kind._asdict() | {"silent": np.isnan(curve.lag_deg)}
-    return tuple(np.select([which[name] for name in said], list(said.values()), "").tolist())
-
-
-def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> float | None:
+def _bound(curve: TappingCurve, given: Instrument, touching: Bool[np.ndarray, " rows"]) -> float | None:
     """Return the least of the rows' largest energies that hold for every tap of the curve, with 95 % for its errors."""
-    touching = ~free & ~held_rows(curve)
     if not touching.any():
         return None
-    largest = largest_energies(curve, given)[touching]
     quality = curve.quality_factor
     share = np.hypot(curve.relative_error, quality.error / quality.value)
-    return float(np.max(largest) * np.exp(1.645 * share))
+    return float(np.max(largest_energies(curve, given)[touching]) * np.exp(1.645 * share))
 
 
 def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
     """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
     curve = result.curve
-    instrument = fitted.instrument if result.described or result.functions is None else result.functions.instrument
+    instrument = fitted.instrument if result.described else result.functions.instrument
     start = speeds(curve, instrument)
     calibration = curve.tip_calibration
     moved = [

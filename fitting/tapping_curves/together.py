@@ -16,7 +16,6 @@ from fitting.tables.table import TableLike, as_table
 from fitting.tapping_curves.branches import CurveBranch, smooth_stretches
 from fitting.tapping_curves.energy import (
     COMMON,
-    FEWEST_ROWS,
     Lever,
     Nuisance,
     TappingBranch,
@@ -143,20 +142,14 @@ def together(curves: Sequence[Tapping]) -> TappingTogether:
         TableError: if not the same is stated of their lever.
     """
     _same_lever(curves)
-    moved, chosen = list(curves), [i for i, one in enumerate(curves) if one.functions is not None]
+    moved, chosen = list(curves), [i for i, one in enumerate(curves) if one.branches]
     if len(chosen) < 2:
         return TappingTogether(curves=tuple(moved), lever=None, scatter=())
     lever = Lever([curves[i].curve for i in chosen], [curves[i].rows.free for i in chosen])
     states = [np.array(curves[i].rows.state) for i in chosen]
     repulsive = [state == "repulsive" for state in states]
-    stretches = [
-        [
-            rows
-            for rows in smooth_stretches(curve, (state == "attractive") | (state == "repulsive"), side)
-            if len(rows) >= FEWEST_ROWS
-        ]
-        for curve, state, side in zip(lever.curves, states, repulsive, strict=True)
-    ]
+    touching = [(state == "attractive") | (state == "repulsive") for state in states]
+    stretches = list(map(smooth_stretches, lever.curves, touching, repulsive))
     for i, functions in zip(chosen, energies_along(lever, stretches, repulsive), strict=True):
         rows = replace(curves[i].rows, energy_of_fit_aj=functions.energies.energy_aj)
         moved[i] = replace(curves[i], functions=functions, rows=rows)
@@ -241,7 +234,6 @@ def _parts_at(
 
     The curve's own is what its errors leave open if what all have in common were known. NaN where not measured.
     """
-    assert one.functions is not None  # noqa: S101
     curve, covariance, common = branch.curve, one.functions.lever.minimum.covariance, len(COMMON)
     gain = np.linalg.solve(covariance[:common, :common], covariance[:common])
     estimate, noise, by = estimates_at(curve, ratio)

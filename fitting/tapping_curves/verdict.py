@@ -14,11 +14,10 @@ from afm_jax.outcomes import Rule, Rules
 from afm_jax.words import interval
 from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS, USUAL_ERRORS
-from fitting.tapping_curves.branches import free_ends, ways
+from fitting.tapping_curves.branches import FEWEST_ROWS, free_ends, ways
 from fitting.tapping_curves.curve import TappingCurve, lag_of_free_tip
 from fitting.tapping_curves.energy import (
     FEWEST_FREE_ROWS,
-    FEWEST_ROWS,
     EnergyFunctions,
     Nuisance,
     OneEnergy,
@@ -173,11 +172,11 @@ def _bracketed(e: Any) -> list[str]:
 
 NO_FUNCTIONS: tuple[Rule[Any], ...] = (
     Rule(
-        lambda e: e.functions is not None and not e.functions.lever.minimum.settled,
+        lambda e: not e.functions.lever.minimum.settled,
         "the least squares of the instrument, from what is stated and free rows, does not settle",
     ),
     Rule(
-        lambda e: e.functions is None or e.largest is None,
+        lambda e: e.largest is None,
         "no branch has enough rows in contact for an energy of a tap",
     ),
     Rule(lambda e: _torn(e.functions), "the energy along the branches has no instrument as given: {case}"),
