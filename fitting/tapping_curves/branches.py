@@ -261,37 +261,31 @@ def changes(
         free: from `free_rows`.
         repulsive: which of the others are on the repulsive branch.
     """
-    parts: dict[tuple[float, float], dict[bool, np.ndarray]] = {}
-    for part in ways(curve):
-        drive = float(curve.drive_frequency_khz[part[0]]), float(curve.free_amplitude_nm[part[0]])
-        parts.setdefault(drive, {})[bool(curve.retract[part[0]])] = part
+    parts = {
+        (
+            float(curve.drive_frequency_khz[part[0]]),
+            float(curve.free_amplitude_nm[part[0]]),
+            bool(curve.retract[part[0]]),
+        ): part
+        for part in ways(curve)
+    }
+    heights = {
+        "contact": lambda part: _contact(curve, part, free),
+        "half": lambda part: _half(curve, part),
+        "branch": lambda part: _turn(curve, part[~free[part]], repulsive),
+    }
     found = []
-    for drive, here in parts.items():
-        into, back = here.get(False), here.get(True)
-        for change in ("contact", "half", "branch"):
-            ends = [
-                None if p is None else _height(change, curve, p, free=free, repulsive=repulsive) for p in (into, back)
-            ]
-            if ends != [None, None]:
-                found.append(Hysteresis(change, *drive, approach=ends[0], retract=ends[1]))
+    for drive in dict.fromkeys(key[:2] for key in parts):
+        for change, height in heights.items():
+            into, back = (height(parts[*drive, way]) if (*drive, way) in parts else None for way in (False, True))
+            if into or back:
+                found.append(Hysteresis(change, *drive, approach=into, retract=back))
     return found
 
 
-def _height(
-    change: str,
-    curve: TappingCurve,
-    part: np.ndarray,
-    *,
-    free: Bool[np.ndarray, " rows"],
-    repulsive: Bool[np.ndarray, " rows"],
-) -> Height | None:
-    if change == "contact":
-        return _contact(curve, part, free)
-    if change == "half":
-        return _half(curve, part)
-    touching = part[~free[part]]
+def _turn(curve: TappingCurve, touching: np.ndarray, repulsive: Bool[np.ndarray, " rows"]) -> Height | None:
+    """Return where a way turns repulsive: between the last attractive row in front of the nearest repulsive one."""
     before = np.flatnonzero(~repulsive[touching])
-    # the last attractive row in front of the nearest repulsive one
     if not before.size or before[-1] + 1 == len(touching):
         return None
     return _between(*curve.offset_nm[touching[before[-1] : before[-1] + 2]].tolist())
@@ -318,45 +312,29 @@ def _between(low: float, high: float) -> Height:
 def _contact(curve: TappingCurve, part: np.ndarray, free: Bool[np.ndarray, " rows"]) -> Height | None:
     """Return where the amplitude leaves that of the free tip: between two rows, or where its fall began."""
     touching = ~free[part]
-    if not touching.any() or touching[0]:
+    first = int(np.argmax(touching))
+    if not touching.any() or first == 0:
         return None
-    first = int(np.flatnonzero(touching)[0])
-    bracket = _between(float(curve.offset_nm[part[first - 1]]), float(curve.offset_nm[part[first]]))
+    bracket = _between(*curve.offset_nm[part[first - 1 : first + 1]].tolist())
     below = np.flatnonzero(curve.amplitude_nm[part] < _WINDOW * curve.free_amplitude_nm[part])
     until = min(below[0] if below.size else len(part), first + _MOST_ROWS)
-    if until - first < 4:
-        return bracket
-    rows = part[:until]
-    height, amplitude = curve.offset_nm[rows], curve.amplitude_nm[rows]
-    error, level = curve.amplitude_error_nm[rows], curve.free_amplitude_nm[rows[0]]
-    fit = _hinge(height, amplitude, error, float(level))
+    fit = _hinge(curve, part[:until], bracket.offset_nm) if until - first >= 4 else None
     return fit if fit is not None and fit.standard_error < bracket.standard_error else bracket
 
 
-def _hinge(height: np.ndarray, amplitude: np.ndarray, error: np.ndarray, level: float) -> Height | None:
-    """Return where a straight fall from a level began, by least squares; None where a step explains it better."""
-    target = (amplitude - level) / error
-
-    def chi2(at: np.ndarray, *, step: bool) -> np.ndarray:
-        """Return the least sum of squares of each place, in closed form."""
-        beyond = np.maximum(height - at[:, None], 0.0)
-        fall, jump = beyond / error, (beyond > 0.0) / error
-        ff, ft = np.sum(fall**2, axis=1), fall @ target
-        if not step:
-            return target @ target - ft**2 / ff
-        jj, fj, jt = np.sum(jump**2, axis=1), np.sum(fall * jump, axis=1), jump @ target
-        determinant = ff * jj - fj**2
-        # one row beyond tells a step only
-        both = determinant > 1e-9 * ff * jj
-        explained = (jj * ft**2 - 2.0 * fj * ft * jt + ff * jt**2) / np.where(both, determinant, 1.0)
-        return target @ target - np.where(both, explained, jt**2 / jj)
-
+def _hinge(curve: TappingCurve, rows: np.ndarray, step_nm: float) -> Height | None:
+    """Return where a straight fall from the free amplitude began; None where a step explains it better."""
+    height, error = curve.offset_nm[rows], curve.amplitude_error_nm[rows]
+    target = (curve.amplitude_nm[rows] - curve.free_amplitude_nm[rows]) / error
     grid = np.linspace(height[0], height[-2], min(_STEPS * len(height), _MOST_STEPS))
-    hinges = chi2(grid, step=False)
-    best = int(np.argmin(hinges))
-    if chi2(0.5 * (height[1:-1] + height[:-2]), step=True).min() < hinges[best] - 2.0 * _FREE:
+    fall = np.maximum(height - grid[:, None], 0.0) / error
+    # the least squares of the slope, in closed form
+    chi2 = target @ target - (fall @ target) ** 2 / np.sum(fall**2, axis=1)
+    best = int(np.argmin(chi2))
+    step = np.stack([np.maximum(height - step_nm, 0.0), height > step_nm], axis=1) / error[:, None]
+    if np.sum((target - step @ np.linalg.lstsq(step, target)[0]) ** 2) < chi2[best] - 2.0 * _FREE:
         return None
-    inside = grid[hinges < hinges[best] + max(1.0, hinges[best] / len(height))]
+    inside = grid[chi2 < chi2[best] + max(1.0, chi2[best] / len(height))]
     return Height(float(grid[best]), float(max(0.5 * (inside[-1] - inside[0]), grid[1] - grid[0])))
 
 
@@ -365,7 +343,6 @@ _FEWEST_SMOOTH = 6
 _ROUGH = 5.0
 _HARDLY = 0.2
 """Of the free amplitude: change of the motion up to which taps need not come every period."""
-_ROUNDS = 8
 _BENT = 0.005
 """Of the free amplitude: what the straight line of a branch may be bent beyond a parabola."""
 
@@ -390,29 +367,14 @@ def rough_rows(curve: TappingCurve, chosen: Bool[np.ndarray, " rows"]) -> Bool[n
         rows = part[chosen[part]]
         if len(rows) < _FEWEST_SMOOTH:
             continue
-        height, level = curve.offset_nm[rows], curve.free_amplitude_nm[rows[0]]
+        height, amplitude, level = curve.offset_nm[rows], curve.amplitude_nm[rows], curve.free_amplitude_nm[rows[0]]
         place = (height - height.mean()) / max(np.ptp(height), 1e-12)
         allowed = np.maximum(curve.amplitude_error_nm[rows], _BENT * level / _ROUGH)
-        smooth = np.ones(len(rows), bool)
-        for _ in range(_ROUNDS):
-            off = _off_parabola(place, curve.amplitude_nm[rows], allowed, smooth)
-            again = np.abs(off) <= _ROUGH
-            if again.sum() < _FEWEST_SMOOTH or (again == smooth).all():
-                break
-            smooth = again
-        rough[rows] = ~smooth
+
+        def off(factors: np.ndarray, place=place, amplitude=amplitude, allowed=allowed) -> np.ndarray:
+            return (amplitude - np.polyval(factors, place)) / allowed
+
+        # rows far off have hardly a pull by Cauchy's loss
+        smooth = least_squares(off, np.polyfit(place, amplitude, _DEGREE), loss="cauchy").x
+        rough[rows] = np.abs(off(smooth)) > _ROUGH
     return rough
-
-
-def _off_parabola(place: Rows, amplitude: Rows, allowed: Rows, chosen: Bool[np.ndarray, " rows"]) -> Rows:
-    """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow.
-
-    Rows far off have hardly a pull by Cauchy's loss; by that of robust fits (`fitting.infer.rows`) they would keep
-    that of a row a few errors off.
-    """
-
-    def off(factors: np.ndarray) -> np.ndarray:
-        return (amplitude - np.polyval(factors, place)) / allowed
-
-    start = np.polyfit(place[chosen], amplitude[chosen], _DEGREE)
-    return off(least_squares(lambda factors: off(factors)[chosen], start, loss="cauchy").x)

@@ -33,7 +33,6 @@ from fitting.tapping_curves.verdict import (
     NO_FUNCTIONS,
     REASONS,
     WARNINGS,
-    drift_of_free_rows,
 )
 
 if TYPE_CHECKING:
@@ -187,11 +186,6 @@ class Tapping(Result):
     def why_not_functions(self) -> str:
         """Why the energy along the branches is not determined; empty where it is."""
         return next(iter(judge([NO_FUNCTIONS], self)), "")
-
-    @property
-    def drift(self) -> list[str]:
-        """Sentences on drifts of the free tip along rows whose order in time the table does not state; empty: none."""
-        return drift_of_free_rows(self.curve, self.rows.free)
 
     @property
     def reasons(self) -> list[str]:
