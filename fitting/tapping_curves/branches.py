@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 from scipy.optimize import least_squares
 
 from fitting.instruments.lag import turned
-from fitting.tapping_curves.curve import Rows, TappingCurve, TipMotion
+from fitting.tapping_curves.curve import Mask, Rows, TappingCurve, TipMotion
 
 _FREE = 4.0
 """Standard errors within which a row counts as free."""
@@ -135,13 +134,13 @@ _TIMED_NEIGHBOURS, _TIMED_DRIFT = 5, 0.05
 have drifted by the first."""
 
 
-def free_ends(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> bool:
+def free_ends(curve: TappingCurve, free: Mask) -> bool:
     """Say whether rows of the free tip stand at both ends of a table."""
     places = np.flatnonzero(free)
     return bool(len(places) > 1 and places[-1] - places[0] >= _BOTH_ENDS * (curve.rows - 1))
 
 
-def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
+def free_rows(curve: TappingCurve) -> Mask:
     """Return the rows of the free tip: those farther away than the first that departs in amplitude or phase.
 
     A single row that departs is none; the zero of the phase is that of the rows farther away. Each row is tested by its
@@ -191,9 +190,7 @@ _JUMP_ERRORS, _JUMP_STEPS = 6.0, 4.0
 _AROUND = 4
 
 
-def repulsive_rows(
-    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], departure: Rows
-) -> Bool[np.ndarray, " rows"]:
+def repulsive_rows(curve: TappingCurve, touching: Mask, departure: Rows) -> Mask:
     """Return the rows on the repulsive branch: those whose lag is below the free tip's.
 
     Rows whose lag departs by less than three errors are as their neighbour on the side of the sample.
@@ -219,9 +216,7 @@ FEWEST_ROWS = 3
 """Of a group or a stretch of rows that gets an energy of its own."""
 
 
-def smooth_stretches(
-    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
-) -> list[np.ndarray]:
+def smooth_stretches(curve: TappingCurve, touching: Mask, repulsive: Mask) -> list[np.ndarray]:
     """Return the rows of each drive and way, cut where the lag jumps between attraction and repulsion.
 
     Along each the energy is a smooth function.
@@ -246,14 +241,12 @@ def smooth_stretches(
     return found
 
 
-def held_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
+def held_rows(curve: TappingCurve) -> Mask:
     """Return the rows in which the sample holds the tip: there is hardly an amplitude left."""
     return curve.amplitude_nm < _HELD * curve.free_amplitude_nm
 
 
-def changes(
-    curve: TappingCurve, *, free: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
-) -> list[Hysteresis]:
+def changes(curve: TappingCurve, *, free: Mask, repulsive: Mask) -> list[Hysteresis]:
     """Return the changes of each drive, as far as they show on approach or retract.
 
     Args:
@@ -261,14 +254,8 @@ def changes(
         free: from `free_rows`.
         repulsive: which of the others are on the repulsive branch.
     """
-    parts = {
-        (
-            float(curve.drive_frequency_khz[part[0]]),
-            float(curve.free_amplitude_nm[part[0]]),
-            bool(curve.retract[part[0]]),
-        ): part
-        for part in ways(curve)
-    }
+    columns = curve.drive_frequency_khz, curve.free_amplitude_nm, curve.retract
+    parts = {tuple(column[part[0]].item() for column in columns): part for part in ways(curve)}
     heights = {
         "contact": lambda part: _contact(curve, part, free),
         "half": lambda part: _half(curve, part),
@@ -283,7 +270,7 @@ def changes(
     return found
 
 
-def _turn(curve: TappingCurve, touching: np.ndarray, repulsive: Bool[np.ndarray, " rows"]) -> Height | None:
+def _turn(curve: TappingCurve, touching: np.ndarray, repulsive: Mask) -> Height | None:
     """Return where a way turns repulsive: between the last attractive row in front of the nearest repulsive one."""
     before = np.flatnonzero(~repulsive[touching])
     if not before.size or before[-1] + 1 == len(touching):
@@ -309,7 +296,7 @@ def _between(low: float, high: float) -> Height:
     return Height(float(0.5 * (low + high)), float(_UNIFORM * abs(high - low)))
 
 
-def _contact(curve: TappingCurve, part: np.ndarray, free: Bool[np.ndarray, " rows"]) -> Height | None:
+def _contact(curve: TappingCurve, part: np.ndarray, free: Mask) -> Height | None:
     """Return where the amplitude leaves that of the free tip: between two rows, or where its fall began."""
     touching = ~free[part]
     first = int(np.argmax(touching))
@@ -347,12 +334,12 @@ _BENT = 0.005
 """Of the free amplitude: what the straight line of a branch may be bent beyond a parabola."""
 
 
-def hardly_touching_rows(motion: TipMotion) -> Bool[np.ndarray, " rows"]:
+def hardly_touching_rows(motion: TipMotion) -> Mask:
     """Return rows whose motion is all but that of the free tip: where contact begins, taps may leave periods out."""
     return np.abs(motion.height + motion.free_amplitude_nm) < _HARDLY * motion.free_amplitude_nm
 
 
-def rough_rows(curve: TappingCurve, chosen: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+def rough_rows(curve: TappingCurve, chosen: Mask) -> Mask:
     """Return rows whose amplitude is off the smooth fall of the others of their drive and way.
 
     Taps that do not come once a period (every other, or irregularly) change the amplitude by some per cent: of such

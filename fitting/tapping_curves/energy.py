@@ -42,6 +42,7 @@ from fitting.tapping_curves.curve import (
     HARMONICS_FACTOR,
     Given,
     Instrument,
+    Mask,
     Rows,
     TappingCurve,
     lag_of_free_tip,
@@ -236,7 +237,7 @@ class Lever:
         minimum: of what is stated and the means of free rows.
     """
 
-    def __init__(self, curves: Sequence[TappingCurve], free: Sequence[Bool[np.ndarray, " rows"]]):
+    def __init__(self, curves: Sequence[TappingCurve], free: Sequence[Mask]):
         """Find the instrument of curves of which the same is stated of their lever."""
         self.curves = tuple(curves)
         self.free = tuple(_of_free_tip(*pair) for pair in zip(curves, free, strict=True))
@@ -367,7 +368,7 @@ def _of_logarithm(given: Given) -> Given:
     return Given(float(np.log(given.value)), max(given.error / given.value, 1e-9))
 
 
-def _of_free_tip(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+def _of_free_tip(curve: TappingCurve, free: Mask) -> Mask:
     """Return free rows with a phase where a frequency has at least three of them."""
     known = free & (np.isfinite(curve.lag_deg) | (not curve.has_phase))
     kinds = _frequencies(curve)
@@ -385,7 +386,7 @@ def _levels(curve: TappingCurve) -> Int[np.ndarray, " rows"]:
     return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _unknowns_of(number: int, curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> list[_Unknown]:
+def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]:
     """Return a curve's own unknowns: of each frequency the free tip's lag, of each drive its amplitude, and drifts."""
     zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
     given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value, zero)
@@ -410,13 +411,7 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Bool[np.ndarray, " rows
 _FEWEST_OF_MEAN, _MOST_MEANS = 4, 8
 
 
-def _means(
-    curve: TappingCurve,
-    values: Rows,
-    errors: Rows,
-    free: Bool[np.ndarray, " rows"],
-    kinds: Int[np.ndarray, " rows"],
-) -> Means:
+def _means(curve: TappingCurve, values: Rows, errors: Rows, free: Mask, kinds: np.ndarray) -> Means:
     """Return means of the free rows of each kind, their errors with what they scatter beyond their noise.
 
     Where the order of the rows is known each stretch of neighbours has means of its own, which tell a drift.
@@ -502,7 +497,8 @@ class Smoother(NamedTuple):
         middle = np.add.reduceat(weights * place, starts)
         # places of several bins may be one
         own = np.diag(1.0 / total + 1e-12 * size**2)
-        return cls(middle, starts, weights, size, np.linalg.inv(matern(middle, middle, size) + own))
+        root = np.linalg.inv(np.linalg.cholesky(matern(middle, middle, size) + own))
+        return cls(middle, starts, weights, size, root.T @ root)
 
     def average(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted averages over the bins of values of the rows, shape (rows, ...)."""
@@ -677,7 +673,7 @@ class EnergyFunctions:
     smooth: TappingCurve
     energies: Energies
     branches: tuple[TappingBranch, ...]
-    outliers: Bool[np.ndarray, " rows"]
+    outliers: Mask
     rows_chi2: float
     rows_freedom: float
     scale: float
@@ -695,7 +691,7 @@ class EnergyFunctions:
 
 
 def energies_along(
-    lever: Lever, stretches: Sequence[Sequence[np.ndarray]], repulsive: Sequence[Bool[np.ndarray, " rows"]]
+    lever: Lever, stretches: Sequence[Sequence[np.ndarray]], repulsive: Sequence[Mask]
 ) -> list[EnergyFunctions]:
     """Return the energies along the branches of the curves of a lever, with their bands.
 
@@ -725,21 +721,20 @@ def energies_along(
     ]
 
 
-def _along(
-    lever: Lever, number: int, stretches: Sequence[np.ndarray], repulsive: Bool[np.ndarray, " rows"]
-) -> EnergyFunctions:
+def _along(lever: Lever, number: int, stretches: Sequence[np.ndarray], repulsive: Mask) -> EnergyFunctions:
     """Return the energies along the branches of one curve, their bands not yet told."""
     # where the instrument's search did not settle there is no energy
     stretches = stretches if lever.minimum.settled else ()
     curve, at = lever.curves[number], lever.instrument(number)
     smooth, place, stretches = _smoothed(curve, stretches, at.free_amplitude_factor)
     found, at_smooth = energies(curve, at), energies(smooth, at)
+    by_reading = np.stack([at_smooth.amplitude_slopes, at_smooth.lag_slopes])
     by_instrument = lever.slopes(smooth, number, lever.minimum.at)
+    unknowns = [one if one.curve == number else one._replace(rows=np.zeros(curve.rows)) for one in lever.unknowns]
     outliers, branches, fits = np.zeros(curve.rows, bool), [], []
     for rows in stretches:
-        fit = _stretch(curve, rows, place, found.energy_aj, at_smooth.amplitude_slopes[0], at_smooth.lag_slopes[0])
-        by_reading = at_smooth.amplitude_slopes[1], at_smooth.lag_slopes[1]
-        of_virial = _stretch(curve, fit.rows, place, found.virial_aj, *by_reading)
+        fit = _stretch(curve, rows, place, found.energy_aj, by_reading[:, 0])
+        of_virial = _stretch(curve, fit.rows, place, found.virial_aj, by_reading[:, 1])
         outliers[rows] = ~np.isin(rows, fit.rows)
         fits.append(fit)
         for side in (False, True):
@@ -748,8 +743,8 @@ def _along(
                 continue
             ratios = 1.0 + _SHALLOW - np.exp(place[here])
             ratio = np.linspace(max(ratios.min(), 0.0), ratios.max(), _POINTS)
-            estimate, noise, by = _at(lever, number, fit, found.energy_aj, by_instrument[0], ratio)
-            virial, virial_noise, virial_by = _at(lever, number, of_virial, found.virial_aj, by_instrument[1], ratio)
+            estimate, noise, by = _at(unknowns, fit, found.energy_aj, by_instrument[0], ratio)
+            virial, virial_noise, virial_by = _at(unknowns, of_virial, found.virial_aj, by_instrument[1], ratio)
             variance = np.einsum("nu,uv,nv->n", virial_by, lever.minimum.covariance, virial_by) + virial_noise**2
             heights = fit.smoother.average(curve.offset_nm[fit.rows])
             uncertain = _ALLOWED * np.median(curve.amplitude_error_nm[here] / curve.free_amplitude_nm[here])
@@ -791,64 +786,58 @@ class _Stretch(NamedTuple):
     scale: float
 
 
-def _stretch(
-    curve: TappingCurve,
-    rows: Int[np.ndarray, " some"],
-    place: Rows,
-    values: Rows,
-    amplitude_slope: Rows,
-    lag_slope: Rows,
-) -> _Stretch:
+def _stretch(curve: TappingCurve, rows: np.ndarray, place: Rows, values: Rows, slopes: np.ndarray) -> _Stretch:
     """Return the smooth function of values along a stretch of rows, without those that are more than four errors off.
 
     An energy is one at an amplitude, which is known no better than it was read: an error dA of the reading moves it by
     E_A dA at the height, and by (E_A - E'/A0) dA at the ratio.
     """
-    steep, kept, ratios = np.zeros(len(rows)), np.ones(len(rows), bool), 1.0 + _SHALLOW - np.exp(place[rows])
+    amplitude_slope, lag_slope = (slope[rows] for slope in slopes)
+    free, ratios = curve.free_amplitude_nm[rows], 1.0 + _SHALLOW - np.exp(place[rows])
+    by_lag, steep, kept = lag_slope * curve.lag_error_deg[rows], np.zeros(len(rows)), np.ones(len(rows), bool)
     for last in (False, False, True):
-        at_ratio = amplitude_slope[rows] - steep / curve.free_amplitude_nm[rows]
-        by_amplitude = np.maximum(np.abs(amplitude_slope[rows]), np.abs(at_ratio)) * curve.amplitude_error_nm[rows]
-        here, noise = rows[kept], np.hypot(by_amplitude, lag_slope[rows] * curve.lag_error_deg[rows])[kept]
+        steepest = np.maximum(np.abs(amplitude_slope), np.abs(amplitude_slope - steep / free))
+        here, noise = rows[kept], np.hypot(steepest * curve.amplitude_error_nm[rows], by_lag)[kept]
         size = _size_of(values[here], noise)
         smoother = Smoother.of(place[here], noise, size)
         mean, taken = smoother.of_rows(place[here], values[here])
         off, freedom = (values[here] - mean) / noise, max(len(here) - taken, 1.0)
         chi2 = float(off @ off)
         scale = 1.0 if chi2_tail(chi2, max(round(freedom), 1)) > IMPROBABLE else float(np.sqrt(chi2 / freedom))
-        if last:
-            break
         ratio, first = np.unique(ratios[kept], return_index=True)
         if len(ratio) > 4:
             steep = np.interp(ratios, ratio, np.gradient(mean[first], ratio))
         far = np.abs(off) > _FAR * scale
-        if kept.all() and 0 < far.sum() <= _MOST_OUTLIERS * len(here):
+        if not last and kept.all() and far.sum() <= _MOST_OUTLIERS * len(here):
             kept[far] = False
     smoother = Smoother.of(place[here], noise * scale, size) if scale > 1.0 else smoother
     return _Stretch(here, smoother, chi2, freedom, scale)
 
 
 def _at(
-    lever: Lever,
-    number: int,
-    fit: _Stretch,
-    values: Rows,
-    slopes: Float[np.ndarray, "rows unknowns"],
-    ratio: np.ndarray,
+    unknowns: Sequence[_Unknown], fit: _Stretch, values: Rows, slopes: np.ndarray, ratio: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a smooth function at some amplitudes, its own standard error, and its change by every unknown."""
+    """Return a smooth function at some amplitudes, its own standard error, and its change by every unknown.
+
+    Args:
+        unknowns: of the instrument.
+        fit: of the function.
+        values: of it in each row of the curve.
+        slopes: changes of the values by every unknown, shape (rows, unknowns).
+        ratio: the amplitudes, of the free one.
+    """
     weights, variance = fit.smoother.at(np.log(_SHALLOW + 1.0 - ratio))
-    mean = weights @ fit.smoother.average(values[fit.rows])
-    by = weights @ fit.smoother.average(slopes[fit.rows])
+    mean, by = (weights @ fit.smoother.average(column[fit.rows]) for column in (values, slopes))
     # with more of a free amplitude the same ratio is at a larger reading; a branch may be all at one amplitude
     moved = np.gradient(mean, ratio) * ratio if np.ptp(ratio) > 0.0 else np.zeros(len(ratio))
-    for i, unknown in enumerate(lever.unknowns):
-        if unknown.curve == number and unknown.kind.startswith("free_amplitude"):
+    for i, unknown in enumerate(unknowns):
+        if unknown.kind.startswith("free_amplitude"):
             by[:, i] += moved * unknown.given.error * (weights @ fit.smoother.average(unknown.rows[fit.rows]))
     return mean, np.sqrt(variance), by
 
 
 def positive_bands(
-    estimate: Rows, noise: Rows, certain: Bool[np.ndarray, " rows"], by_instrument: Float[np.ndarray, "rows unknowns"]
+    estimate: Rows, noise: Rows, certain: Mask, by_instrument: Float[np.ndarray, "rows unknowns"]
 ) -> tuple[Rows, Rows, bool]:
     """Return bands of 95 % of energies none of which is less than nothing, and whether there may be such energies.
 
@@ -1021,7 +1010,7 @@ class OneEnergy:
     scale: float
 
     @property
-    def used(self) -> Bool[np.ndarray, " rows"]:
+    def used(self) -> Mask:
         """Rows that were fitted."""
         return np.isfinite(self.residual)
 

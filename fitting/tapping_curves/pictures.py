@@ -56,24 +56,17 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
     curve, free = result.curve, result.rows.free
     aside = np.array([note.startswith("excluded") for note in result.rows.note])
     for back, marker in ((False, "o"), (True, "s")):
-        for chosen, colour, label in (
-            (free, GRID, "free"),
-            (~free & ~aside, BLUE if not back else ACCENT, way_of(back)),
-            (~free & aside, "none", "excluded"),
+        for chosen, colour, filled, label in (
+            (free, GRID, GRID, "free"),
+            (~free & ~aside, ACCENT if back else BLUE, ACCENT if back else BLUE, way_of(back)),
+            (~free & aside, DARK, "none", "excluded"),
         ):
             here = chosen & (curve.retract == back) & np.isfinite(values)
             if here.any():
-                axes.errorbar(
-                    curve.offset_nm[here],
-                    values[here],
-                    errors[here],
-                    fmt=marker,
-                    ms=4,
-                    lw=0.8,
-                    color=DARK if colour == "none" else colour,
-                    mfc=colour,
-                    label=label if label not in axes.get_legend_handles_labels()[1] else None,
-                )
+                style = {"fmt": marker, "ms": 4, "lw": 0.8, "color": colour, "mfc": filled}
+                new = label not in axes.get_legend_handles_labels()[1]
+                style |= {"label": label if new else None}
+                axes.errorbar(curve.offset_nm[here], values[here], errors[here], **style)
 
 
 def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:

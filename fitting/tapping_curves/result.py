@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from afm_jax.outcomes import judge
 from afm_jax.results import Result, public_result
@@ -14,7 +14,7 @@ from afm_jax.units import TWO_SIDED_95, effective_mass_ng
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
-from fitting.tapping_curves.curve import Rows, TappingCurve
+from fitting.tapping_curves.curve import Mask, Rows, TappingCurve
 from fitting.tapping_curves.energy import (
     HEADLINE,
     MEASURED,
@@ -80,11 +80,11 @@ class TapRows:
     energy_of_fit_aj: Rows
     virial_aj: Rows
     largest_energy_aj: Rows
-    used: Bool[np.ndarray, " rows"]
+    used: Mask
     note: tuple[str, ...]
 
     @property
-    def free(self) -> Bool[np.ndarray, " rows"]:
+    def free(self) -> Mask:
         """Rows of the free tip."""
         return np.array([state == "free" for state in self.state])
 
@@ -110,7 +110,7 @@ class MeasuredSpeeds:
     contact_us: Rows
     pull: Rows
     in_capture_speeds: Rows
-    fast: Bool[np.ndarray, " rows"]
+    fast: Mask
     why_not: str
 
 
@@ -162,20 +162,17 @@ class Tapping(Result):
     @property
     def group_of_rows(self) -> Int[np.ndarray, " rows"]:
         """Of every row the number of the group with its drive and branch, -1 where there is none."""
-        found = np.full(self.curve.rows, -1)
-        for i, group in enumerate(self.groups):
-            here = (self.curve.drive_frequency_khz == group.drive_frequency_khz) & (
-                self.curve.free_amplitude_nm == group.free_amplitude_nm
-            )
-            found[here & (np.array(self.rows.state) == side_of(group.repulsive))] = i
-        return found
+        curve, state = self.curve, self.rows.state
+        kinds = [(g.drive_frequency_khz, g.free_amplitude_nm, side_of(g.repulsive)) for g in self.groups]
+        rows = zip(curve.drive_frequency_khz, curve.free_amplitude_nm, state, strict=True)
+        return np.array([kinds.index(row) if row in kinds else -1 for row in rows], int)
 
     def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
         """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
         assert self.fit is not None  # noqa: S101
-        value, alone = float(self.fit.energy_aj[number]), float(self.fit.error_aj[number])
-        share = self.curve.relative_error
-        return value, float(np.hypot(alone, share * value)), _interval(value, alone, share)
+        value = float(self.fit.energy_aj[number])
+        error = float(np.hypot(self.fit.error_aj[number], self.curve.relative_error * value))
+        return value, error, (value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error)
 
     @property
     def why_not_constant(self) -> str:
@@ -221,15 +218,13 @@ class Tapping(Result):
             return blank | {"kind": "none", "reason": self.why_not_constant}
         repulsive = [i for i, group in enumerate(self.groups) if group.repulsive]
         chosen = repulsive or list(range(len(self.groups)))
+        value, error, interval = self.constant(chosen[0])
         if len(chosen) > 1:
             each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
             return blank | {"kind": "several", "reason": f"each drive has its own: {each}"}
-        value, error, interval = self.constant(chosen[0])
         if not value > 0.0:
-            return blank | {
-                "kind": "none",
-                "reason": "the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong",
-            }
+            why = "the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong"
+            return blank | {"kind": "none", "reason": why}
         return {
             "value": value,
             "standard_error": error,
@@ -267,16 +262,6 @@ class Tapping(Result):
     def least_on_frequency(self) -> dict[str, Any] | None:
         """The energy that hangs least on the free frequency, and where; None where none is above nothing."""
         return least_on_frequency(self.functions)
-
-    @property
-    def energy_along_branches_aj(self) -> Rows:
-        """Energy of each row's tap by the function of its branch; NaN for rows of none."""
-        found = np.full(self.curve.rows, np.nan)
-        for branch in self.branches:
-            order = np.argsort(branch.curve.height_nm)
-            height, energy = branch.curve.height_nm[order], branch.curve.estimate_aj[order]
-            found[branch.rows] = np.interp(self.curve.offset_nm[branch.rows], height, energy)
-        return found
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:
@@ -322,11 +307,8 @@ class Tapping(Result):
     @property
     def epsilon(self) -> dict[str, Any]:
         """2 E/m in nm^2/us^2: what a tap takes, as the impact law counts it."""
-        energy, factor = self.energy, 2.0 / self.mass_ng
-        scaled = {name: None if energy[name] is None else energy[name] * factor for name in ("value", "standard_error")}
-        return scaled | {
-            "interval95": None if energy["interval95"] is None else [end * factor for end in energy["interval95"]]
-        }
+        names, factor = ("value", "standard_error", "interval95"), 2.0 / self.mass_ng
+        return {name: None if self.energy[name] is None else factor * np.array(self.energy[name]) for name in names}
 
     @property
     def law_allowed(self) -> bool:
@@ -353,48 +335,29 @@ class Tapping(Result):
             if note.startswith("excluded")
         ]
 
-    def _branches(self) -> list[dict[str, Any]]:
-        """Return what is known of each branch: its rows, its one energy if it has one, and its curve."""
-        group = self.group_of_rows
-        return [
-            {
-                "drive_frequency_khz": branch.drive_frequency_khz,
-                "free_amplitude_nm": branch.free_amplitude_nm,
-                "branch": branch.way,
-                "repulsive": branch.repulsive,
-                "rows": len(branch.rows),
-                **self._constant_of(int(group[branch.rows[0]])),
-                "curve": branch.curve.to_dict(),
-            }
-            for branch in self.branches
-        ]
+    def _constant_of(self, number: int) -> dict[str, Any]:
+        """Return whether one energy explains the rows of a group, and which."""
+        constant = number >= 0 and self.described
+        names = ("constant", "energy_aj", "standard_error_aj", "interval95_aj")
+        energy = self.constant(number) if constant else (None, None, None)
+        return dict(zip(names, (constant, *energy), strict=True))
 
     def _fits(self) -> dict[str, Any]:
         """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
-        fit, functions, smooth, statistics = self.fit, self.functions, None, {}
-        if functions.branches:
-            smooth = {
-                "valid": not self.why_not_functions,
-                "reason": self.why_not_functions or None,
-                **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
-                "nuisances": nuisances_as_dict(functions.nuisances),
-            }
-        if fit is not None:
-            statistics = {name: getattr(fit.minimum, name) for name in ("chi2", "degrees_of_freedom", "p_value")}
-            statistics |= {"scale": fit.scale}
-        return {
-            "functions": smooth,
-            **dict.fromkeys(("chi2", "degrees_of_freedom", "p_value", "scale")),
-            **statistics,
-            "nuisances_of_one_energy": {} if fit is None or not self.described else nuisances_as_dict(fit.nuisances),
+        fit, functions = self.fit, self.functions
+        smooth = {
+            "valid": not self.why_not_functions,
+            "reason": self.why_not_functions or None,
+            **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
+            "nuisances": nuisances_as_dict(functions.nuisances),
         }
-
-    def _constant_of(self, number: int) -> dict[str, Any]:
-        """Return whether one energy explains the rows of a group, and which."""
-        blank: dict[str, Any] = {"energy_aj": None, "standard_error_aj": None, "interval95_aj": None}
-        if number < 0 or self.fit is None or not self.described:
-            return {"constant": False, **blank}
-        return {"constant": True, **dict(zip(blank, self.constant(number), strict=True))}
+        names = ("chi2", "degrees_of_freedom", "p_value")
+        return {
+            "functions": smooth if functions.branches else None,
+            **{name: None if fit is None else getattr(fit.minimum, name) for name in names},
+            "scale": None if fit is None else fit.scale,
+            "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and self.described else {},
+        }
 
     def records(self) -> list[dict[str, Any]]:
         """Return a mapping per row; what is not known is None."""
@@ -433,7 +396,18 @@ class Tapping(Result):
                 "assumptions": self.assumptions,
                 "phase_sense": {**self.curve.phase._asdict(), "assumed": self.curve.phase.assumed},
                 "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
-                "branches": self._branches(),
+                "branches": [
+                    {
+                        "drive_frequency_khz": branch.drive_frequency_khz,
+                        "free_amplitude_nm": branch.free_amplitude_nm,
+                        "branch": branch.way,
+                        "repulsive": branch.repulsive,
+                        "rows": len(branch.rows),
+                        **self._constant_of(int(self.group_of_rows[branch.rows[0]])),
+                        "curve": branch.curve.to_dict(),
+                    }
+                    for branch in self.branches
+                ],
                 **self._fits(),
                 "hysteresis": [one.to_dict() for one in self.hysteresis],
                 "law": None if law is None else law["law"],
@@ -453,27 +427,6 @@ class Tapping(Result):
 
 def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
     """Return what is given and fitted of each, by name."""
-    return {
-        n.name: {
-            "given": n.given.value,
-            "given_error": n.given.error,
-            "value": n.value,
-            "standard_error": n.standard_error,
-        }
-        for n in nuisances
-    }
-
-
-def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
-    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive.
-
-    Within its errors an energy is linear in what is fitted, so that no chi2 needs to be profiled as for laws
-    (`fitting.infer.intervals`).
-    """
-    low, high = energy - TWO_SIDED_95 * error, energy + TWO_SIDED_95 * error
-    if share == 0.0 or energy <= 0.0:
-        return low, high
-    above = float(np.hypot(np.log(high / energy), TWO_SIDED_95 * share))
-    if low <= 0.0:
-        return low, float(energy * np.exp(above))
-    return float(energy * np.exp(-np.hypot(np.log(energy / low), TWO_SIDED_95 * share))), float(energy * np.exp(above))
+    values = {n.name: (n.given.value, n.given.error, n.value, n.standard_error) for n in nuisances}
+    names = ("given", "given_error", "value", "standard_error")
+    return {name: dict(zip(names, numbers, strict=True)) for name, numbers in values.items()}
