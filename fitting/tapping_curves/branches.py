@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from fitting.instruments.lag import turned
 from fitting.tapping_curves.curve import Mask, Rows, TappingCurve, TipMotion
@@ -325,43 +324,10 @@ def _hinge(curve: TappingCurve, rows: np.ndarray, step_nm: float) -> Height | No
     return Height(float(grid[best]), float(max(0.5 * (inside[-1] - inside[0]), grid[1] - grid[0])))
 
 
-_DEGREE = 2
-_FEWEST_SMOOTH = 6
-_ROUGH = 5.0
 _HARDLY = 0.2
 """Of the free amplitude: change of the motion up to which taps need not come every period."""
-_BENT = 0.005
-"""Of the free amplitude: what the straight line of a branch may be bent beyond a parabola."""
 
 
 def hardly_touching_rows(motion: TipMotion) -> Mask:
     """Return rows whose motion is all but that of the free tip: where contact begins, taps may leave periods out."""
     return np.abs(motion.height + motion.free_amplitude_nm) < _HARDLY * motion.free_amplitude_nm
-
-
-def rough_rows(curve: TappingCurve, chosen: Mask) -> Mask:
-    """Return rows whose amplitude is off the smooth fall of the others of their drive and way.
-
-    Taps that do not come once a period (every other, or irregularly) change the amplitude by some per cent: of such
-    rows amplitude and phase are no measure of a tap.
-
-    Args:
-        curve: the curve.
-        chosen: the rows that fall together, of one branch.
-    """
-    rough = np.zeros(curve.rows, bool)
-    for part in ways(curve):
-        rows = part[chosen[part]]
-        if len(rows) < _FEWEST_SMOOTH:
-            continue
-        height, amplitude, level = curve.offset_nm[rows], curve.amplitude_nm[rows], curve.free_amplitude_nm[rows[0]]
-        place = (height - height.mean()) / max(np.ptp(height), 1e-12)
-        allowed = np.maximum(curve.amplitude_error_nm[rows], _BENT * level / _ROUGH)
-
-        def off(factors: np.ndarray, place=place, amplitude=amplitude, allowed=allowed) -> np.ndarray:
-            return (amplitude - np.polyval(factors, place)) / allowed
-
-        # rows far off have hardly a pull by Cauchy's loss
-        smooth = least_squares(off, np.polyfit(place, amplitude, _DEGREE), loss="cauchy").x
-        rough[rows] = np.abs(off(smooth)) > _ROUGH
-    return rough

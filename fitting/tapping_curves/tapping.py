@@ -21,7 +21,6 @@ from fitting.tapping_curves.branches import (
     hardly_touching_rows,
     held_rows,
     repulsive_rows,
-    rough_rows,
     smooth_stretches,
     ways,
 )
@@ -265,12 +264,11 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     plain, departure = energies(curve, given), turned(curve.lag_deg - lag_of_free_tip(curve, given))
     touching = ~free & ~held & np.isfinite(curve.lag_deg)
     repulsive = ~free & repulsive_rows(curve, touching, departure)
-    rough = rough_rows(curve, touching & repulsive) | rough_rows(curve, touching & ~repulsive)
     early = touching & hardly_touching_rows(motion_of(curve, given))
-    early &= (touching & ~rough & ~early).sum() >= FEWEST_ROWS
+    early &= (touching & ~early).sum() >= FEWEST_ROWS
     stretches = smooth_stretches(curve, touching, repulsive)
     functions = energies_along(lever, [stretches], [repulsive])[0]
-    groups, alike = _groups(curve, touching & ~rough & ~early & ~functions.outliers, repulsive)
+    groups, alike = _groups(curve, touching & ~early & ~functions.outliers, repulsive)
     fitted = followed = None
     if groups:
         fitted = one_energy(lever, alike, functions.smooth)
@@ -288,7 +286,6 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         "free: fixes the zero of the phase" if curve.has_phase else "free": free,
         "excluded: the tip is held, a tenth of the free amplitude is left or less": held,
         "excluded: no phase, only a bound": silent,
-        "not in the one energy: off the smooth fall of its branch, so probably not one impact a period": rough,
         "not in the one energy: hardly touching yet, taps need not come every period": early,
         "excluded: its energy is more than 4 standard errors from the others'": functions.outliers,
         f"excluded: fewer than {FEWEST_ROWS} rows of this branch": alone,
