@@ -884,12 +884,9 @@ def _densest(mean: float, error: float, low: float, high: float) -> tuple[float,
         low, high = _densest(-mean, error, -high, -low)
         return -high, -low
     inside = 0.95 * (ndtr(above) - ndtr(below))
-    last, first, half = ndtri(ndtr(below) + inside), ndtri(ndtr(above) - inside), ndtri(0.5 + 0.5 * inside)
-    ends = -half, half
-    if last > -below:
-        ends = below, last
-    elif -first > above:
-        ends = max(first, above - 9.0), above
+    # about the mean as far as the cuts allow
+    first = np.clip(0.5 - 0.5 * inside, ndtr(below), ndtr(above) - inside)
+    ends = np.clip(ndtri([first, first + inside]), max(below, above - 9.0), above)
     return mean + error * float(ends[0]), mean + error * float(ends[1])
 
 

@@ -365,12 +365,11 @@ def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
     curve = result.curve
     instrument = fitted.instrument if result.described else result.functions.instrument
     start = speeds(curve, instrument)
-    calibration = curve.tip_calibration
     moved = [
         speeds(replace(curve, amplitude_nm=curve.amplitude_nm + curve.amplitude_error_nm), instrument),
         speeds(replace(curve, lag_deg=curve.lag_deg + curve.lag_error_deg), instrument),
-        speeds(curve, instrument, origin_nm=curve.origin_error_nm),
-        speeds(curve, instrument, calibration=calibration.value + calibration.error),
+        speeds(replace(curve, offset_nm=curve.offset_nm + curve.origin_error_nm), instrument),
+        speeds(replace(curve, tip_calibration=Given(sum(curve.tip_calibration))), instrument),
     ]
     u = start.approach_speed_nm_per_us
     changes = np.stack([one.approach_speed_nm_per_us - u for one in moved])
