@@ -886,7 +886,7 @@ def _densest(mean: float, error: float, low: float, high: float) -> tuple[float,
     inside = 0.95 * (ndtr(above) - ndtr(below))
     # about the mean as far as the cuts allow
     first = np.clip(0.5 - 0.5 * inside, ndtr(below), ndtr(above) - inside)
-    ends = np.clip(ndtri([first, first + inside]), max(below, above - 9.0), above)
+    ends = np.clip(ndtri([first, first + inside]), max(below, min(above, 0.0) - 9.0), above)
     return mean + error * float(ends[0]), mean + error * float(ends[1])
 
 

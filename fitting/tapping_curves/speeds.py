@@ -73,7 +73,8 @@ def speeds(curve: TappingCurve, instrument: Instrument) -> TapSpeeds:
         # w = Re(c exp(rate t)) = (c exp(rate t) + its conjugate)/2
         c = start - 1j * (velocity + decay * start) / ring
         grown, back = np.exp(rate * flown), np.exp(-1j * drive * flown)
-        up, down = (grown * back - 1.0) / (rate - 1j * drive), (grown.conj() * back - 1.0) / (rate.conjugate() - 1j * drive)
+        up = (grown * back - 1.0) / (rate - 1j * drive)
+        down = (grown.conj() * back - 1.0) / (rate.conjugate() - 1j * drive)
         height, speed = np.real(c * grown), np.real(rate * c * grown)
         sample, rise = sigma + level * resting.real, -level * drive * resting.imag
         of_flight = 0.5 * leaving.conj() * (c * up + np.conj(c) * down)
