@@ -203,11 +203,9 @@ def repulsive_rows(curve: TappingCurve, touching: Mask, departure: Rows) -> Mask
     for part in ways(curve):
         rows = part[touching[part]]
         clear = np.abs(departure[rows]) > _STEADY * curve.lag_error_deg[rows]
-        said = repulsive[rows]
-        for i in range(len(rows) - 2, -1, -1):
-            if not clear[i]:
-                said[i] = said[i + 1]
-        repulsive[rows] = said
+        clear[-1:] = True
+        says = np.flatnonzero(clear)[np.cumsum(clear) - clear]
+        repulsive[rows] = repulsive[rows[says]]
     return repulsive
 
 

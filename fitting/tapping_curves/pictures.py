@@ -80,7 +80,7 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
         ends += [float(curve.energy_aj.max()), *np.percentile(curve.energy_high_aj, [0.0, 90.0]).tolist()]
     if result.fit is not None and result.described:
         for i, group in enumerate(result.groups):
-            heights = result.curve.offset_nm[result.fit.used & (result.group_of_rows == i)]
+            heights = result.curve.offset_nm[result.fit.used & group.rows]
             energy, _, (low, high) = result.constant(i)
             axes.plot(
                 [heights.min(), heights.max()],

@@ -159,30 +159,24 @@ def _lines(lines: Sequence[str]) -> list[Text]:
 
 def _one_energy(result: Tapping) -> list[ReportSection]:
     """Return the one energy of all taps of each branch, where that describes the rows."""
-    fit = result.fit
+    fit, epsilon = result.fit, result.epsilon
     if fit is None or not result.described:
         return []
-    energy, epsilon = result.energy, result.epsilon
-    lines = ["If every tap of a branch took the same (assumed: along A sqrt(A0^2 - A^2) the curve cannot test it):"]
-    if energy["value"] is not None:
-        value = f"{with_error(energy['value'], energy['standard_error'])} aJ (95 %: {interval(*energy['interval95'])})"
-        pull = f"the free frequency {energy['free_frequency_pull']:+.1f} of its errors from what is given"
-        of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
-        scaled = f"{with_error(epsilon['value'], epsilon['standard_error'])} nm^2/us^2{of_mass}"
-        lines += [f"  {value}, {pull}", f"  epsilon = 2 E/m = {scaled}"]
+    assumed = "If every tap of a branch took the same (assumed: along A sqrt(A0^2 - A^2) the curve cannot test it):"
     cells = []
     for i, group in enumerate(result.groups):
         value, error, ends = result.constant(i)
-        count = int(np.sum(fit.used & (result.group_of_rows == i)))
         known = interval(*ends) if np.isfinite(ends).all() else "open"
-        cells.append([group.name, f"{count}", with_error(value, error), known])
-    least = fit.minimum
-    caption, head = "Each tap of a branch is assumed to take the same", ["branch", "rows", "energy (aJ)", "95 %"]
-    chi2 = f"  chi2/dof = {least.chi2:.1f}/{least.degrees_of_freedom}, probability {least.p_value:.2g}"
-    return [
-        ReportSection("One energy for all taps", _lines(lines), "One energy"),
-        ReportSection("Branches with one energy each", [Table(caption, head, cells), *_lines([chi2])]),
-    ]
+        cells.append([group.name, f"{np.sum(fit.used & group.rows)}", with_error(value, error), known])
+    table = Table("One energy a branch", ["branch", "rows", "energy (aJ)", "95 %"], cells)
+    least, pull = fit.minimum, fit.nuisances[0].pull
+    chi2 = f"chi2/dof = {least.chi2:.1f}/{least.degrees_of_freedom}, probability {least.p_value:.2g}"
+    lines = [f"  {chi2}, the free frequency {pull:+.1f} of its errors from what is given"]
+    if epsilon["value"] is not None:
+        scaled = with_error(epsilon["value"], epsilon["standard_error"])
+        of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
+        lines.append(f"  epsilon = 2 E/m = {scaled} nm^2/us^2{of_mass}")
+    return [ReportSection("One energy for all taps", [Text(assumed), table, *_lines(lines)], "One energy")]
 
 
 def _thresholds(result: Tapping) -> list[ReportSection]:

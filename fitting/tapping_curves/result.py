@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Int
 
 from afm_jax.outcomes import judge
 from afm_jax.results import Result, public_result
@@ -39,13 +38,14 @@ if TYPE_CHECKING:
     from fitting.infer.result import FitResult
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EnergyGroup:
-    """Rows that share an energy: of one drive and one branch."""
+    """Rows that may share an energy, those of one drive and one branch, whether or not all are in the fit."""
 
     drive_frequency_khz: float
     free_amplitude_nm: float
     repulsive: bool
+    rows: Mask
 
     @property
     def name(self) -> str:
@@ -159,14 +159,6 @@ class Tapping(Result):
         """Effective mass, from spring constant and free frequency."""
         return effective_mass_ng(self.curve.spring_constant_n_per_m.value, self.curve.free_frequency_khz.value)
 
-    @property
-    def group_of_rows(self) -> Int[np.ndarray, " rows"]:
-        """Of every row the number of the group with its drive and branch, -1 where there is none."""
-        curve, state = self.curve, self.rows.state
-        kinds = [(g.drive_frequency_khz, g.free_amplitude_nm, side_of(g.repulsive)) for g in self.groups]
-        rows = zip(curve.drive_frequency_khz, curve.free_amplitude_nm, state, strict=True)
-        return np.array([kinds.index(row) if row in kinds else -1 for row in rows], int)
-
     def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
         """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
         assert self.fit is not None  # noqa: S101
@@ -211,28 +203,25 @@ class Tapping(Result):
         It makes no curve valid: along a sqrt(1 - a^2) with a = A/A0 the curve cannot test the assumption. Where one
         energy does not explain the rows `value` is None and `reason` says why.
         """
-        blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None}
+        blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None, "kind": "none"}
         if self.fit is None and self.bound_aj is not None:
             return blank | {"interval95": (0.0, self.bound_aj), "kind": "upper bound", "reason": ""}
         if self.fit is None or self.why_not_constant:
-            return blank | {"kind": "none", "reason": self.why_not_constant}
+            return blank | {"reason": self.why_not_constant}
         repulsive = [i for i, group in enumerate(self.groups) if group.repulsive]
         chosen = repulsive or list(range(len(self.groups)))
         value, error, interval = self.constant(chosen[0])
         if len(chosen) > 1:
             each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
-            return blank | {"kind": "several", "reason": f"each drive has its own: {each}"}
+            return blank | {"reason": f"each drive has its own: {each}"}
         if not value > 0.0:
-            why = "the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong"
-            return blank | {"kind": "none", "reason": why}
+            return blank | {"reason": "the energy of a tap is not positive: frequency, Q or the phase's zero is wrong"}
         return {
             "value": value,
             "standard_error": error,
             "interval95": np.maximum(interval, 0.0),
             "kind": "bracket" if not error < MEASURED * value else "fit",
             "reason": "",
-            "assumption": "each tap of the branch takes the same energy",
-            "p_value": self.fit.minimum.p_value,
             "free_frequency_pull": self.fit.nuisances[0].pull,
         }
 
@@ -335,12 +324,11 @@ class Tapping(Result):
             if note.startswith("excluded")
         ]
 
-    def _constant_of(self, number: int) -> dict[str, Any]:
-        """Return whether one energy explains the rows of a group, and which."""
-        constant = number >= 0 and self.described
+    def _constant_of(self, branch: TappingBranch) -> dict[str, Any]:
+        """Return whether one energy explains the rows of a branch, and which."""
+        groups = [i for i, group in enumerate(self.groups) if self.described and group.rows[branch.rows[0]]]
         names = ("constant", "energy_aj", "standard_error_aj", "interval95_aj")
-        energy = self.constant(number) if constant else (None, None, None)
-        return dict(zip(names, (constant, *energy), strict=True))
+        return dict(zip(names, (True, *self.constant(groups[0])) if groups else (False, None, None, None), strict=True))
 
     def _fits(self) -> dict[str, Any]:
         """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
@@ -403,7 +391,7 @@ class Tapping(Result):
                         "branch": branch.way,
                         "repulsive": branch.repulsive,
                         "rows": len(branch.rows),
-                        **self._constant_of(int(self.group_of_rows[branch.rows[0]])),
+                        **self._constant_of(branch),
                         "curve": branch.curve.to_dict(),
                     }
                     for branch in self.branches

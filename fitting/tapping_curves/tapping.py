@@ -268,7 +268,9 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     early &= (touching & ~early).sum() >= FEWEST_ROWS
     stretches = smooth_stretches(curve, touching, repulsive)
     functions = energies_along(lever, [stretches], [repulsive])[0]
-    groups, alike = _groups(curve, touching & ~early & ~functions.outliers, repulsive)
+    usable = touching & ~early & ~functions.outliers
+    groups = _groups(curve, touching, usable, repulsive)
+    alike = [np.flatnonzero(group.rows & usable) for group in groups]
     fitted = followed = None
     if groups:
         fitted = one_energy(lever, alike, functions.smooth)
@@ -329,8 +331,8 @@ def _energies_along(result: Tapping) -> Rows:
     """Return the energy of each row's tap: the one of its kind, or where none explains the rows that of its branch."""
     curve, found = result.curve, np.full(result.curve.rows, np.nan)
     if result.described:
-        for i in range(len(result.groups)):
-            found[result.group_of_rows == i] = result.constant(i)[0]
+        for i, group in enumerate(result.groups):
+            found[group.rows] = result.constant(i)[0]
         return found
     ratio = curve.amplitude_nm / curve.free_amplitude_nm
     for branch in result.branches:
@@ -339,16 +341,15 @@ def _energies_along(result: Tapping) -> Rows:
     return found
 
 
-def _groups(curve: TappingCurve, usable: Mask, repulsive: Mask) -> tuple[list[EnergyGroup], list[np.ndarray]]:
-    """Return the kinds of rows that may share an energy (drive, attractive or repulsive), and the rows of each."""
+def _groups(curve: TappingCurve, touching: Mask, usable: Mask, repulsive: Mask) -> list[EnergyGroup]:
+    """Return the kinds of rows that may share an energy (drive, attractive or repulsive), if enough are usable."""
     kinds = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm, ~repulsive], axis=1)
-    groups, rows = [], []
-    for frequency, amplitude, attractive in np.unique(kinds[usable], axis=0).tolist():
-        here = np.flatnonzero(usable & np.all(kinds == (frequency, amplitude, attractive), axis=1))
-        if len(here) >= FEWEST_ROWS:
-            groups.append(EnergyGroup(frequency, amplitude, repulsive=not attractive))
-            rows.append(here)
-    return groups, rows
+    each = [(kind, np.all(kinds == kind, axis=1)) for kind in np.unique(kinds[usable], axis=0).tolist()]
+    return [
+        EnergyGroup(frequency, amplitude, repulsive=not attractive, rows=here & touching)
+        for (frequency, amplitude, attractive), here in each
+        if np.sum(here & usable) >= FEWEST_ROWS
+    ]
 
 
 def _bound(curve: TappingCurve, given: Instrument, touching: Mask) -> float | None:

@@ -197,11 +197,8 @@ def _scatter(members: list[tuple[Tapping, TappingBranch]]) -> CurveScatter | Non
     first, fewest = members[0][1], max(2, (len(members) + 1) // 2)
     if len(members) < 2:
         return None
-    low = sorted(b.curve.amplitude_ratio[0] for _, b in members)[fewest - 1]
-    high = sorted(b.curve.amplitude_ratio[-1] for _, b in members)[-fewest]
-    if not low < high:
-        return None
-    ratio = np.linspace(low, high, _POINTS)
+    ends = [branch.curve.amplitude_ratio[[0, -1]] for _, branch in members]
+    ratio = np.linspace(np.min(ends), np.max(ends), _POINTS)
     columns = np.array([_parts_at(ratio, one, branch) for one, branch in members])
     enough = np.isfinite(columns[:, 0]).sum(axis=0) >= fewest
     ratio, (energy, estimate, own, shared) = ratio[enough], np.moveaxis(columns[:, :, enough], 1, 0)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, TORN
 from afm_jax.outcomes import Rule, Rules
 from afm_jax.words import interval
 from fitting.instruments.lag import turned
@@ -218,13 +218,6 @@ WARNINGS: Rules[Any] = [
         _scaled,
         "the rows scatter {case[1]:.2g} times more about {case[0]} than their errors say: its errors are multiplied by "
         "that",
-    ),
-    Rule(
-        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > PULLED] if e.described else [],
-        lambda _, n: (
-            f"for one energy {ORIGINS[n.kind]} ends {n.pull:+.1f} standard errors from what was given ({n.given} to "
-            f"{n.value:.6g})"
-        ),
     ),
     Rule(
         lambda e: [len(e.set_aside)] if e.set_aside else [],
