@@ -241,15 +241,17 @@ class Lever:
         """Find the instrument of curves of which the same is stated of their lever."""
         self.curves = tuple(curves)
         self.free = tuple(_of_free_tip(*pair) for pair in zip(curves, free, strict=True))
-        lever = [_of_logarithm(getattr(self.curves[0], name)) for name in COMMON[:2]]
-        pairs = zip(COMMON, [*lever, HARMONICS_FACTOR], strict=True)
+        lever = (self.curves[0].free_frequency_khz, self.curves[0].quality_factor)
+        known = [Given(float(np.log(value)), max(error / value, 1e-9)) for value, error in lever]
+        pairs = zip(COMMON, [*known, HARMONICS_FACTOR], strict=True)
         unknowns = [_Unknown(name, None, np.ones(0), given) for name, given in pairs]
         self._means = []
         for number, (curve, here) in enumerate(zip(self.curves, self.free, strict=True)):
             unknowns += _unknowns_of(number, curve, here)
             share, error = (part / curve.free_amplitude_nm for part in (curve.amplitude_nm, curve.amplitude_error_nm))
-            lags = _means(curve, curve.lag_deg, curve.lag_error_deg, here, _frequencies(curve))
-            self._means.append((lags, _means(curve, share, error, here, _levels(curve))))
+            drives = curve.drive_frequency_khz, curve.free_amplitude_nm
+            lags = _means(curve, curve.lag_deg, curve.lag_error_deg, here, _kinds(drives[0]))
+            self._means.append((lags, _means(curve, share, error, here, _kinds(*drives))))
         self.unknowns = tuple(unknowns)
         self._start = np.array([unknown.given.value for unknown in unknowns])
         self._unit = np.array([unknown.given.error for unknown in unknowns])
@@ -282,12 +284,6 @@ class Lever:
         frequency, quality = np.exp(self.values(x)[:2]).tolist()
         lag, factor = self._of_rows(x, number)
         return Instrument(frequency, quality, lag - self._free_lag(x, number), factor, float(self.values(x)[2]))
-
-    @property
-    def stated(self) -> np.ndarray:
-        """The unknowns with frequency and Q as stated; free rows tell the zero of the phase."""
-        kinds = {"free_lag_deg"} if all(curve.time is None for curve in self.curves) else set()
-        return np.where([one.kind in kinds.union(COMMON) for one in self.unknowns], 0.0, self.minimum.at)
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Return in standard errors what is stated, the means of free rows, and stated zeros of the phase."""
@@ -326,17 +322,6 @@ class Lever:
 
         return _slopes(of, x, len(self.unknowns))
 
-    def errors_of_rows(self, number: int) -> Rows:
-        """Return the standard error of each energy from what all rows share.
-
-        With the instrument as given: frequency, Q and harmonics by what is stated of them, the rest by free rows.
-        """
-        given, errors = self.stated, np.sqrt(np.diag(self.minimum.covariance))
-        errors[: len(COMMON)] = 1.0
-        curve, found = self.curves[number], energies(self.curves[number], self.instrument(number, given))
-        by = self.slopes(curve, number, given)[0]
-        return np.hypot(np.linalg.norm(by * errors, axis=1), curve.relative_error * found.energy_aj)
-
     def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
         """Return what is stated of the instrument of a curve and where a least squares ends."""
         minimum = self.minimum if minimum is None else minimum
@@ -355,42 +340,33 @@ class Lever:
                 kind, value = "phase_zero_deg", float(self.zero_at(x, i))
                 given = curve.phase_zero_deg or Given(value, np.inf)
                 by = _slopes(lambda y, i=i: np.array([self.zero_at(y, i)]), x, count)[0]
-            name = f"{kind}_{sum(one.kind == kind for one in found)}" if kind in _NUMBERED else kind
+            name = (
+                f"{kind}_{sum(one.kind == kind for one in found)}"
+                if kind in {"phase_zero_deg", "free_amplitude"}
+                else kind
+            )
             found.append(Nuisance(name, kind, given, value, float(np.sqrt(by @ covariance @ by))))
         return tuple(found)
-
-
-_NUMBERED = ("phase_zero_deg", "free_amplitude")
-
-
-def _of_logarithm(given: Given) -> Given:
-    """Return the logarithm of a number with its error."""
-    return Given(float(np.log(given.value)), max(given.error / given.value, 1e-9))
 
 
 def _of_free_tip(curve: TappingCurve, free: Mask) -> Mask:
     """Return free rows with a phase where a frequency has at least three of them."""
     known = free & (np.isfinite(curve.lag_deg) | (not curve.has_phase))
-    kinds = _frequencies(curve)
+    kinds = _kinds(curve.drive_frequency_khz)
     return known & (np.bincount(kinds[known], minlength=curve.rows + 1)[kinds] >= FEWEST_FREE_ROWS)
 
 
-def _frequencies(curve: TappingCurve) -> Int[np.ndarray, " rows"]:
-    """Return the number of the drive's frequency of each row."""
-    return np.unique(curve.drive_frequency_khz, return_inverse=True)[1].reshape(-1)
-
-
-def _levels(curve: TappingCurve) -> Int[np.ndarray, " rows"]:
-    """Return the number of frequency and free amplitude of each row."""
-    keys = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm])
-    return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
+def _kinds(*columns: Rows) -> Int[np.ndarray, " rows"]:
+    """Return the number of each row's kind; rows of a kind are alike in all columns."""
+    return np.unique(np.stack(columns), axis=1, return_inverse=True)[1].reshape(-1)
 
 
 def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]:
     """Return a curve's own unknowns: of each frequency the free tip's lag, of each drive its amplitude, and drifts."""
     zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
     given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value, zero)
-    expected, kinds, levels = lag_of_free_tip(curve, given), _frequencies(curve), _levels(curve)
+    drives = curve.drive_frequency_khz, curve.free_amplitude_nm
+    expected, kinds, levels = lag_of_free_tip(curve, given), _kinds(drives[0]), _kinds(*drives)
     found = []
     for kind in range(kinds.max(initial=-1) + 1):
         here = kinds == kind
@@ -400,8 +376,8 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]
             lag = float(first + np.average(turned(curve.lag_deg[rows] - first), weights=weights))
         found.append(_Unknown("free_lag_deg", number, here.astype(float), Given(lag, _ANY_LAG_DEG)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
-    drives = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
-    found += [_Unknown("free_amplitude", number, rows, known) for rows in drives]
+    each = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
+    found += [_Unknown("free_amplitude", number, rows, known) for rows in each]
     if curve.time is not None:
         errors = _WIDE_DRIFTS if free_ends(curve, free) else USUAL_DRIFTS
         found += [_Unknown(name, number, curve.time, Given(0.0, error)) for name, error in errors.items()]

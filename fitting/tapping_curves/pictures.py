@@ -30,10 +30,9 @@ def curve_figure(result: Tapping) -> Figure:
         middle = between[0]
         _points(middle, result, curve.lag_deg, curve.lag_error_deg)
         label_axes(middle, x="", y="lag (degrees)")
-        _points(bottom, result, rows.energy_of_fit_aj, rows.energy_noise_aj)
-        bottom.plot(curve.offset_nm, rows.energy_aj, "+", color=GRID, ms=4, label="instrument as given")
+        _points(bottom, result, rows.energy_aj, rows.energy_noise_aj)
         drawn = _energy_bands(bottom, result)
-        touching = rows.energy_of_fit_aj[~rows.free & np.isfinite(rows.energy_of_fit_aj)]
+        touching = rows.energy_aj[~rows.free & np.isfinite(rows.energy_aj)]
         # all points in contact are in the picture
         low, high = min([drawn[0], *touching.tolist()]), max([drawn[1], *touching.tolist()])
         bottom.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))

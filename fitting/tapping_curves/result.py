@@ -60,24 +60,18 @@ class TapRows:
 
     Attributes:
         state: "free", "attractive", "repulsive", "held", or "touching" where there is no phase.
-        lag_departure_deg: lag less that of the free tip.
-        energy_aj: of a tap, with the instrument as given.
+        energy_aj: of a tap, with the instrument where statements and free rows put it.
         energy_noise_aj: its standard error from the row's own noise.
-        energy_systematic_aj: its standard error from what all rows share.
-        energy_of_fit_aj: with the instrument as fitted.
-        virial_aj: mean of force times height, of the first harmonic, with the instrument as given; positive where
-            attraction prevails, negative where repulsion does.
+        virial_aj: mean of force times height, of the first harmonic; positive where attraction prevails, negative where
+            repulsion does.
         largest_energy_aj: the most that a tap can take at this amplitude, whatever the phase.
         used: whether it is in the fit of one energy.
         note: why not; or what it is for.
     """
 
     state: tuple[str, ...]
-    lag_departure_deg: Rows
     energy_aj: Rows
     energy_noise_aj: Rows
-    energy_systematic_aj: Rows
-    energy_of_fit_aj: Rows
     virial_aj: Rows
     largest_energy_aj: Rows
     used: Mask

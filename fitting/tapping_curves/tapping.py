@@ -39,7 +39,6 @@ from fitting.tapping_curves.energy import (
     FEWEST_FREE_ROWS,
     Lever,
     OneEnergy,
-    energies,
     energies_along,
     largest_energies,
     noise_of,
@@ -260,11 +259,11 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     """Return everything but the law."""
     free, held = free_rows(curve), held_rows(curve)
     lever = Lever([curve], [free])
-    given = lever.instrument(0, lever.stated)
-    plain, departure = energies(curve, given), turned(curve.lag_deg - lag_of_free_tip(curve, given))
+    instrument = lever.instrument(0)
+    departure = turned(curve.lag_deg - lag_of_free_tip(curve, instrument))
     touching = ~free & ~held & np.isfinite(curve.lag_deg)
     repulsive = ~free & repulsive_rows(curve, touching, departure)
-    early = touching & hardly_touching_rows(motion_of(curve, given))
+    early = touching & hardly_touching_rows(motion_of(curve, instrument))
     early &= (touching & ~early).sum() >= FEWEST_ROWS
     stretches = smooth_stretches(curve, touching, repulsive)
     functions = energies_along(lever, [stretches], [repulsive])[0]
@@ -295,13 +294,10 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     states = {"free": free, "held": held, "touching": silent, "repulsive": repulsive}
     rows = TapRows(
         state=_named(states, "attractive"),
-        lag_departure_deg=departure,
-        energy_aj=plain.energy_aj,
-        energy_noise_aj=noise_of(curve, plain)[0],
-        energy_systematic_aj=lever.errors_of_rows(0),
-        energy_of_fit_aj=functions.energies.energy_aj,
-        virial_aj=plain.virial_aj,
-        largest_energy_aj=largest_energies(curve, given),
+        energy_aj=functions.energies.energy_aj,
+        energy_noise_aj=noise_of(curve, functions.energies)[0],
+        virial_aj=functions.energies.virial_aj,
+        largest_energy_aj=largest_energies(curve, instrument),
         used=np.zeros(curve.rows, bool) if fitted is None else fitted.used,
         note=_named(notes, ""),
     )
@@ -314,7 +310,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         functions=functions,
         scale_errors=scale_errors,
         followed=followed,
-        bound_aj=None if curve.has_phase else _bound(curve, given, ~free & ~held),
+        bound_aj=None if curve.has_phase else _bound(curve, instrument, ~free & ~held),
         hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
         speeds=None,
         versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
@@ -352,13 +348,13 @@ def _groups(curve: TappingCurve, touching: Mask, usable: Mask, repulsive: Mask) 
     ]
 
 
-def _bound(curve: TappingCurve, given: Instrument, touching: Mask) -> float | None:
+def _bound(curve: TappingCurve, instrument: Instrument, touching: Mask) -> float | None:
     """Return the least of the rows' largest energies that hold for every tap of the curve, with 95 % for its errors."""
     if not touching.any():
         return None
     quality = curve.quality_factor
     share = np.hypot(curve.relative_error, quality.error / quality.value)
-    return float(np.max(largest_energies(curve, given)[touching]) * np.exp(1.645 * share))
+    return float(np.max(largest_energies(curve, instrument)[touching]) * np.exp(1.645 * share))
 
 
 def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
@@ -404,9 +400,7 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
             "the speed of its impacts cannot be determined from this curve: it depends on the origin of heights and "
             "on the calibration more finely than these are known"
         )
-    elif not largest:
-        what = "its capture speed is not known, for no energy of a tap is"
-    elif largest < _SLOWEST:
+    elif 0.0 < largest < _SLOWEST:
         what = f"its impacts are slow, {largest:.2g} times the capture speed at most"
     advice = f"drive 3 to 10 % above resonance ({1.03 * f0:.4g} to {1.1 * f0:.4g} kHz)"
     return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}"

@@ -152,7 +152,7 @@ def together(curves: Sequence[Tapping]) -> TappingTogether:
     touching = [(state == "attractive") | (state == "repulsive") for state in states]
     stretches = list(map(smooth_stretches, lever.curves, touching, repulsive))
     for i, functions in zip(chosen, energies_along(lever, stretches, repulsive), strict=True):
-        rows = replace(curves[i].rows, energy_of_fit_aj=functions.energies.energy_aj)
+        rows = replace(curves[i].rows, energy_aj=functions.energies.energy_aj)
         moved[i] = replace(curves[i], functions=functions, rows=rows)
     return TappingTogether(curves=tuple(moved), lever=lever, scatter=_scatters(moved))
 
