@@ -35,7 +35,7 @@ from scipy.special import ndtr, ndtri
 
 from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, covariance_of, descended, distance
 from afm_jax.units import TWO_SIDED_95
-from fitting.instruments.lag import free_lag_deg, turned
+from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS
 from fitting.tapping_curves.branches import FEWEST_ROWS, CurveBranch, free_ends, ways
 from fitting.tapping_curves.curve import (
@@ -123,8 +123,8 @@ def noise_of(curve: TappingCurve, found: Energies) -> Pairs:
 
 FEWEST_FREE_ROWS = 3
 """Rows that are off the sample; fewer may be those of first contact, and are not taken for the free tip's."""
-_ANY_LAG_DEG = 90.0
-"""Error of a free tip's lag of which nothing is known."""
+_ANY_ZERO_DEG = 90.0
+"""Error of a zero of the phase of which nothing is known."""
 _WIDE_DRIFTS = {"phase_drift_deg": 30.0, "free_amplitude_drift": 0.3}
 """Errors of drifts that rows of the free tip at both ends determine."""
 _STEP = 1e-3
@@ -233,7 +233,7 @@ class Lever:
         curves: the curves.
         free: the rows of the free tip of each.
         unknowns: of the instrument.
-        lags: places among them of the free tip's lags, and their curves' numbers.
+        zeros: places among them of the phases' zeros, and their curves' numbers.
         minimum: of what is stated and the means of free rows.
     """
 
@@ -255,7 +255,7 @@ class Lever:
         self.unknowns = tuple(unknowns)
         self._start = np.array([unknown.given.value for unknown in unknowns])
         self._unit = np.array([unknown.given.error for unknown in unknowns])
-        self.lags = [(i, one.curve or 0) for i, one in enumerate(unknowns) if one.kind == "free_lag_deg"]
+        self.zeros = [(i, one.curve or 0) for i, one in enumerate(unknowns) if one.kind == "phase_zero_deg"]
         # all but linear: a few steps more are as good as none
         self.minimum = _minimum(self.residual, self.jacobian, np.zeros(len(unknowns)), until=1e-20)
 
@@ -264,44 +264,32 @@ class Lever:
         return self._start + self._unit * x[: len(self._unit)]
 
     def _of_rows(self, x: np.ndarray, number: int) -> tuple[Rows, Rows]:
-        """Return the lag of the free tip as read, and the true over the stated free amplitude, in a curve's rows."""
-        lag, factor = np.zeros(self.curves[number].rows), np.zeros(self.curves[number].rows)
+        """Return the zero of the phase, and the true over the stated free amplitude, in a curve's rows."""
+        zero, factor = np.zeros(self.curves[number].rows), np.zeros(self.curves[number].rows)
         for unknown, value in zip(self.unknowns, self.values(x).tolist(), strict=True):
             if unknown.curve == number:
-                column = lag if unknown.kind in {"free_lag_deg", "phase_drift_deg"} else factor
+                column = zero if unknown.kind.startswith("phase") else factor
                 column += value * unknown.rows
-        return lag, factor
-
-    def _free_lag(self, x: np.ndarray, number: int) -> Rows:
-        """Return the lag of the free tip by frequency and Q, in a curve's rows."""
-        frequency, quality = np.exp(self.values(x)[:2]).tolist()
-        curve = self.curves[number]
-        return free_lag_deg(curve.drive, curve.drive_frequency_khz / frequency, quality)
+        return zero, factor
 
     def instrument(self, number: int, x: np.ndarray | None = None) -> Instrument:
         """Return the instrument of a curve, at the minimum if no unknowns are given."""
         x = self.minimum.at if x is None else x
         frequency, quality = np.exp(self.values(x)[:2]).tolist()
-        lag, factor = self._of_rows(x, number)
-        return Instrument(frequency, quality, lag - self._free_lag(x, number), factor, float(self.values(x)[2]))
+        return Instrument(frequency, quality, *self._of_rows(x, number), float(self.values(x)[2]))
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Return in standard errors what is stated, the means of free rows, and stated zeros of the phase."""
         left = [x[: len(self.unknowns)]]
         for number, (lags, shares) in enumerate(self._means):
-            lag, factor = self._of_rows(x, number)
-            for (weights, mean, error), column in ((lags, lag), (shares, factor)):
+            at = self.instrument(number, x)
+            columns = lag_of_free_tip(self.curves[number], at), at.free_amplitude_factor
+            for (weights, mean, error), column in zip((lags, shares), columns, strict=True):
                 left.append(turned(weights @ column - mean) / error)
-        zeros = [(i, zero) for i, number in self.lags if (zero := self.curves[number].phase_zero_deg)]
-        off = [turned(self.zero_at(x, i) - zero.value) / max(zero.error, 1e-4) for i, zero in zeros]
+        zeros = [(i, zero) for i, number in self.zeros if (zero := self.curves[number].phase_zero_deg)]
+        off = [turned(self.values(x)[i] - zero.value) / max(zero.error, 1e-4) for i, zero in zeros]
         # the zero that several curves or frequencies state is one and the same, and counts once
         return np.concatenate([*left, np.array(off) / np.sqrt(max(len(off), 1))])
-
-    def zero_at(self, x: np.ndarray, place: int) -> Any:
-        """Return the zero of the phase of a frequency of a curve, from its free tip's lag, whose place is given."""
-        number = self.unknowns[place].curve or 0
-        row = int(np.argmax(self.unknowns[place].rows))
-        return self.values(x)[place] - self._free_lag(x, number)[row]
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the changes of the residuals by the unknowns."""
@@ -325,27 +313,24 @@ class Lever:
     def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
         """Return what is stated of the instrument of a curve and where a least squares ends."""
         minimum = self.minimum if minimum is None else minimum
-        x, count, curve = minimum.at, len(self.unknowns), self.curves[number]
-        covariance, values = minimum.covariance[:count, :count], self.values(x)
+        curve, values, errors = self.curves[number], self.values(minimum.at), np.sqrt(np.diag(minimum.covariance))
         found: list[Nuisance] = []
         for i, unknown in enumerate(self.unknowns):
             if unknown.curve not in {None, number}:
                 continue
             kind, given, value = unknown.kind, unknown.given, float(values[i])
-            by = unknown.given.error * np.eye(count)[i]
+            error = float(given.error * errors[i])
             if kind in {"free_frequency_khz", "quality_factor"}:
                 given, value = getattr(curve, kind), float(np.exp(value))
-                by = value * by
-            elif kind == "free_lag_deg":
-                kind, value = "phase_zero_deg", float(self.zero_at(x, i))
+                error *= value
+            elif kind == "phase_zero_deg":
                 given = curve.phase_zero_deg or Given(value, np.inf)
-                by = _slopes(lambda y, i=i: np.array([self.zero_at(y, i)]), x, count)[0]
             name = (
                 f"{kind}_{sum(one.kind == kind for one in found)}"
                 if kind in {"phase_zero_deg", "free_amplitude"}
                 else kind
             )
-            found.append(Nuisance(name, kind, given, value, float(np.sqrt(by @ covariance @ by))))
+            found.append(Nuisance(name, kind, given, value, error))
         return tuple(found)
 
 
@@ -364,17 +349,17 @@ def _kinds(*columns: Rows) -> Int[np.ndarray, " rows"]:
 def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]:
     """Return a curve's own unknowns: of each frequency the free tip's lag, of each drive its amplitude, and drifts."""
     zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
-    given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value, zero)
+    off = curve.lag_deg - lag_of_free_tip(curve, Instrument(curve.free_frequency_khz.value, curve.quality_factor.value))
     drives = curve.drive_frequency_khz, curve.free_amplitude_nm
-    expected, kinds, levels = lag_of_free_tip(curve, given), _kinds(drives[0]), _kinds(*drives)
+    kinds, levels = _kinds(drives[0]), _kinds(*drives)
     found = []
     for kind in range(kinds.max(initial=-1) + 1):
         here = kinds == kind
-        rows, lag = np.flatnonzero(here & free & np.isfinite(curve.lag_deg)), float(expected[here][0])
+        rows, start = np.flatnonzero(here & free & np.isfinite(off)), zero
         if len(rows):
-            first, weights = curve.lag_deg[rows[0]], curve.lag_error_deg[rows] ** -2.0
-            lag = float(first + np.average(turned(curve.lag_deg[rows] - first), weights=weights))
-        found.append(_Unknown("free_lag_deg", number, here.astype(float), Given(lag, _ANY_LAG_DEG)))
+            first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
+            start = float(first + np.average(turned(off[rows] - first), weights=weights))
+        found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, _ANY_ZERO_DEG)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
     each = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
     found += [_Unknown("free_amplitude", number, rows, known) for rows in each]
@@ -872,14 +857,14 @@ def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
     It is the middle of its band, beside how much of it a standard error of the frequency, as known, is; None where no
     energy is above nothing.
     """
-    known = np.sqrt(functions.lever.minimum.covariance[0, 0])
+    with_frequency = functions.lever.minimum.covariance[0]
     found = [
         {
             "branch": number,
             "amplitude_ratio": float(c.amplitude_ratio[n]),
             "energy_aj": float(c.energy_aj[n]),
             "interval95_aj": (float(c.energy_low_aj[n]), float(c.energy_high_aj[n])),
-            "by_frequency_aj": float(known * abs(c.by_instrument[n, 0])),
+            "by_frequency_aj": float(abs(c.by_instrument[n] @ with_frequency) / np.sqrt(with_frequency[0])),
         }
         for number, c in enumerate(branch.curve for branch in functions.branches)
         for n in np.flatnonzero(c.certain & (c.energy_low_aj > 0.0))
@@ -906,9 +891,8 @@ def what_narrows(functions: EnergyFunctions) -> str:
     branch, point = largest_of(functions.branches)
     lever, c, row = functions.lever, functions.branches[branch].curve, functions.branches[branch].rows[0]
     x, covariance, by = lever.minimum.at, lever.minimum.covariance, c.by_instrument[point]
-    lag = next(i for i, n in lever.lags if n == functions.number and lever.unknowns[i].rows[row])
-    of_zero = _slopes(lambda y: np.array([lever.zero_at(y, lag)]), x, len(x))[0]
-    of_frequency = lever.unknowns[0].given.error * np.eye(len(x))[0]
+    zero = next(i for i, n in lever.zeros if n == functions.number and lever.unknowns[i].rows[row])
+    of_frequency, of_zero = (lever.unknowns[i].given.error * np.eye(len(x))[i] for i in (0, zero))
 
     def half_of_band(g: np.ndarray, e: float) -> float:
         narrower = (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g)
