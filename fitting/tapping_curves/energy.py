@@ -263,20 +263,16 @@ class Lever:
         """Return the unknowns in their own units."""
         return self._start + self._unit * x[: len(self._unit)]
 
-    def _of_rows(self, x: np.ndarray, number: int) -> tuple[Rows, Rows]:
-        """Return the zero of the phase, and the true over the stated free amplitude, in a curve's rows."""
-        zero, factor = np.zeros(self.curves[number].rows), np.zeros(self.curves[number].rows)
-        for unknown, value in zip(self.unknowns, self.values(x).tolist(), strict=True):
+    def instrument(self, number: int, x: np.ndarray | None = None) -> Instrument:
+        """Return the instrument of a curve, at the minimum if no unknowns are given."""
+        values, rows = self.values(self.minimum.at if x is None else x), self.curves[number].rows
+        zero, factor = np.zeros(rows), np.zeros(rows)
+        for unknown, value in zip(self.unknowns, values.tolist(), strict=True):
             if unknown.curve == number:
                 column = zero if unknown.kind.startswith("phase") else factor
                 column += value * unknown.rows
-        return zero, factor
-
-    def instrument(self, number: int, x: np.ndarray | None = None) -> Instrument:
-        """Return the instrument of a curve, at the minimum if no unknowns are given."""
-        x = self.minimum.at if x is None else x
-        frequency, quality = np.exp(self.values(x)[:2]).tolist()
-        return Instrument(frequency, quality, *self._of_rows(x, number), float(self.values(x)[2]))
+        frequency, quality = np.exp(values[:2]).tolist()
+        return Instrument(frequency, quality, zero, factor, float(values[2]))
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Return in standard errors what is stated, the means of free rows, and stated zeros of the phase."""
@@ -886,27 +882,24 @@ _NARROWS = 0.7
 def what_narrows(functions: EnergyFunctions) -> str:
     """Return what to state to narrow the band where the energy is largest: zero of the phase, or free frequency.
 
-    What is known of a combination g of the unknowns to an error e takes (S C g)^2/(e^2 + g C g) off the variance S C S.
+    What is known of an unknown i to an error e takes (S C)_i^2/(e^2 + C_ii) off the variance S C S.
     """
     branch, point = largest_of(functions.branches)
     lever, c, row = functions.lever, functions.branches[branch].curve, functions.branches[branch].rows[0]
-    x, covariance, by = lever.minimum.at, lever.minimum.covariance, c.by_instrument[point]
+    covariance, by = lever.minimum.covariance, c.by_instrument[point]
     zero = next(i for i, n in lever.zeros if n == functions.number and lever.unknowns[i].rows[row])
-    of_frequency, of_zero = (lever.unknowns[i].given.error * np.eye(len(x))[i] for i in (0, zero))
 
-    def half_of_band(g: np.ndarray, e: float) -> float:
-        narrower = (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g)
-        return TWO_SIDED_95 * float(np.sqrt(max(by @ covariance @ by - narrower, 0.0) + c.noise_aj[point] ** 2))
+    def half_of_band(i: int, error: float) -> float:
+        known = (error / lever.unknowns[i].given.error) ** 2
+        left = by @ covariance @ by - (by @ covariance[i]) ** 2 / (known + covariance[i, i])
+        return TWO_SIDED_95 * float(np.sqrt(max(left, 0.0) + c.noise_aj[point] ** 2))
 
-    frequency = f"{1e-5 * np.exp(lever.values(x)[0]):.1g}"
+    frequency = f"'# free_frequency_khz = VALUE +- {1e-5 * functions.instrument.free_frequency_khz:.1g}'"
     half, words = min(
-        (half_of_band(of_zero, 0.2), "the zero of the phase to 0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')"),
-        (
-            half_of_band(of_frequency, 1e-5),
-            f"the free frequency to 1e-5 of itself ('# free_frequency_khz = VALUE +- {frequency}')",
-        ),
+        (half_of_band(zero, 0.2), "the zero of the phase to 0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')"),
+        (half_of_band(0, 1e-5), f"the free frequency to 1e-5 of itself ({frequency})"),
     )
-    if half > _NARROWS * half_of_band(of_zero, np.inf):
+    if half > _NARROWS * half_of_band(zero, np.inf):
         return "zero of the phase and free frequency would not narrow that; less noise or more rows would"
     return f"state {words}, which would leave +- {half:.2g} aJ"
 
@@ -952,7 +945,6 @@ class OneEnergy:
         energy_aj: of each group.
         error_aj: its standard error but for spring constant and calibration.
         nuisances: of the instrument.
-        instrument: at the minimum.
         residual: of the rows fitted, in standard errors; NaN elsewhere.
         minimum: chi2 of rows, free rows and what is stated, its degrees of freedom.
         scale: what the rows' own errors were multiplied by.
@@ -961,7 +953,6 @@ class OneEnergy:
     energy_aj: Float[np.ndarray, " groups"]
     error_aj: Float[np.ndarray, " groups"]
     nuisances: tuple[Nuisance, ...]
-    instrument: Instrument
     residual: Rows
     minimum: Solution
     scale: float
@@ -1018,7 +1009,6 @@ def one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve,
         energy_aj=minimum.at[count:],
         error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
         nuisances=lever.nuisances(0, minimum),
-        instrument=lever.instrument(0, minimum.at),
         residual=residuals,
         minimum=minimum,
         scale=scale,

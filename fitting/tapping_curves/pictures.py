@@ -114,7 +114,7 @@ def together_figure(result: TappingTogether) -> Figure:
                 ):
                     axes.fill_between(ratio, mean - width, mean + width, color=colour, alpha=shade, lw=0)
         axes.set_title(side_of(state), fontsize=_SMALL + 1)
-        label_axes(axes, x="amplitude over the free one", y=result.curves[0].in_unit("energy of a tap (aJ)"))
+        label_axes(axes, x="amplitude over the free one", y=result.in_unit("energy of a tap (aJ)"))
         axes.grid(color=GRID, alpha=0.25)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=_SMALL)

@@ -227,7 +227,7 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
         "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch with "
         "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free."
     )
-    written = _write(folder, "tapping", result, result.in_unit, tapping_report(result), shows)
+    written = _write(folder, "tapping", result, tapping_report(result), shows)
     records = result.keyed(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
     if result.law is None:
@@ -237,14 +237,7 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     return [*written, *write_report(result.law, folder, write_table)]
 
 
-def _write(
-    folder: Path,
-    name: str,
-    result: Tapping | TappingTogether,
-    in_unit: Callable[[str], str],
-    report: Report,
-    shows: str,
-) -> list[Path]:
+def _write(folder: Path, name: str, result: Tapping | TappingTogether, report: Report, shows: str) -> list[Path]:
     """Write page, text, JSON and picture of a report; texts in the unit that energies have."""
     # a call without --out needs neither matplotlib nor JAX
     from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
@@ -252,10 +245,12 @@ def _write(
     # SVG files have the layout of the PNG drawn before
     picture = png_of(figure := result.plot())
     seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
-    page = in_unit(page_of(replace(report, sections=[seen, *report.sections])))
+    page = result.in_unit(page_of(replace(report, sections=[seen, *report.sections])))
     kind = "tapping" if name == "tapping" else f"tapping {name}"
     data = {"format": f"afm-jax {kind}", "format_version": 1, **result.to_dict()}
-    return write_report_files(folder, name, text=_printed(report, in_unit), data=data, picture=picture, page=page)
+    return write_report_files(
+        folder, name, text=_printed(report, result.in_unit), data=data, picture=picture, page=page
+    )
 
 
 def together_report(result: TappingTogether) -> Report:
@@ -287,7 +282,7 @@ def together_report(result: TappingTogether) -> Report:
 
 def together_summary(result: TappingTogether) -> str:
     """Return what several curves of one lever say together as text."""
-    return _printed(together_report(result), result.curves[0].in_unit)
+    return _printed(together_report(result), result.in_unit)
 
 
 def write_together(result: TappingTogether, folder: Path) -> list[Path]:
@@ -306,4 +301,4 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
     shows = (
         "Energy over the amplitude, each curve and their mean, with the scatter and the error that all have in common."
     )
-    return _write(folder, "together", result, result.curves[0].in_unit, together_report(result), shows)
+    return _write(folder, "together", result, together_report(result), shows)

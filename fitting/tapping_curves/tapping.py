@@ -324,12 +324,8 @@ def _named(rows: dict[str, Mask], others: str) -> tuple[str, ...]:
 
 
 def _energies_along(result: Tapping) -> Rows:
-    """Return the energy of each row's tap: the one of its kind, or where none explains the rows that of its branch."""
+    """Return the energy of each row's tap, that of its branch."""
     curve, found = result.curve, np.full(result.curve.rows, np.nan)
-    if result.described:
-        for i, group in enumerate(result.groups):
-            found[group.rows] = result.constant(i)[0]
-        return found
     ratio = curve.amplitude_nm / curve.free_amplitude_nm
     for branch in result.branches:
         along = branch.curve
@@ -360,7 +356,7 @@ def _bound(curve: TappingCurve, instrument: Instrument, touching: Mask) -> float
 def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
     """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
     curve = result.curve
-    instrument = fitted.instrument if result.described else result.functions.instrument
+    instrument = result.functions.instrument
     start = speeds(curve, instrument)
     moved = [
         speeds(replace(curve, amplitude_nm=curve.amplitude_nm + curve.amplitude_error_nm), instrument),
@@ -413,8 +409,8 @@ def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
     if result.speeds is None:
         return result
     chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
-    table, source = part_of(result.table, chosen), (result.described and result.fit) or result.functions
+    table = part_of(result.table, chosen)
     # the zero of the phase, which free rows fixed that are left out; of several drives that of the first
-    zeros = [(one.value, one.standard_error) for one in source.nuisances if one.kind == "phase_zero_deg"]
+    zeros = [(one.value, one.standard_error) for one in result.functions.nuisances if one.kind == "phase_zero_deg"]
     calibration = {"phase_zero_deg": zeros[0]} if zeros else {}
     return replace(result, law=fit(replace(table, calibration=table.calibration | calibration), model))

@@ -107,6 +107,10 @@ class TappingTogether(Result):
         """Whether every curve is, and they agree on what they have in common."""
         return not self.reasons
 
+    def in_unit(self, text: str) -> str:
+        """Return a text about energies in aJ with the unit that they have, that of the first curve."""
+        return self.curves[0].in_unit(text)
+
     def to_dict(self) -> dict[str, Any]:
         """Return what all curves say together as plain lists, numbers and strings; each curve's own is in `curves`."""
         payload = plain(
