@@ -123,11 +123,11 @@ def noise_of(curve: TappingCurve, found: Energies) -> Pairs:
 
 FEWEST_FREE_ROWS = 3
 """Rows that are off the sample; fewer may be those of first contact, and are not taken for the free tip's."""
-_ANY_ZERO_DEG = 90.0
-"""Error of a zero of the phase of which nothing is known."""
+_ANY_ZERO_DEG, _WIDE_ZERO_DEG = 90.0, 1000.0
+"""Errors of a zero of the phase of which nothing is known, and of one that free rows tell: theirs is far smaller."""
 _WIDE_DRIFTS = {"phase_drift_deg": 30.0, "free_amplitude_drift": 0.3}
 """Errors of drifts that rows of the free tip at both ends determine."""
-_STEP = 1e-3
+_STEP = 1e-4
 """Of differences by the unknowns, in their units."""
 _SETTLED, _ROUNDS, _RISE = 1e-6, 40, 0.1
 """Estimated distance of chi2 to its minimum, steps at most, and by how much a step may raise chi2: slopes of rows in
@@ -351,11 +351,11 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]
     found = []
     for kind in range(kinds.max(initial=-1) + 1):
         here = kinds == kind
-        rows, start = np.flatnonzero(here & free & np.isfinite(off)), zero
+        rows, start, error = np.flatnonzero(here & free & np.isfinite(off)), zero, _ANY_ZERO_DEG
         if len(rows):
             first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
-            start = float(first + np.average(turned(off[rows] - first), weights=weights))
-        found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, _ANY_ZERO_DEG)))
+            start, error = float(first + np.average(turned(off[rows] - first), weights=weights)), _WIDE_ZERO_DEG
+        found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, error)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
     each = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
     found += [_Unknown("free_amplitude", number, rows, known) for rows in each]
