@@ -56,12 +56,15 @@ def recorded(tip: Tip, table: AmplitudeTable, folder: Path, **options: Any) -> A
 
 
 def rows_off(result: Tapping, truth: Truth) -> np.ndarray:
-    """Return by how many of their errors the energies of rows of taps are off, with the instrument as given."""
+    """Return by how many of their errors the energies of rows of taps are off."""
     rows, heights = result.rows, result.curve.offset_nm - result.curve.offset_nm[-1]
     off = heights[:, None] - (truth.height_nm - truth.height_nm[-1])
     near = np.argmin(np.abs(off), axis=1)
     here = (np.min(np.abs(off), axis=1) < 1e-3) & ~rows.free & np.isfinite(rows.energy_aj)
-    error = np.hypot(rows.energy_noise_aj, rows.energy_systematic_aj)
+    lever = result.functions.lever
+    by, covariance = lever.slopes(result.curve, 0, lever.minimum.at)[0], lever.minimum.covariance
+    shared = np.einsum("nu,uv,nv->n", by, covariance, by) + (result.curve.relative_error * rows.energy_aj) ** 2
+    error = np.sqrt(rows.energy_noise_aj**2 + shared)
     return ((rows.energy_aj - truth.energy_aj[near]) / error)[here]
 
 

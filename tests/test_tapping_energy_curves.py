@@ -315,7 +315,7 @@ def test_each_free_amplitude_has_an_energy_of_its_own_and_the_picture_shows_all_
         assert low < true < high
     bottom = curve_figure(result).axes[-1]
     low, high = bottom.get_ylim()
-    touching = result.rows.energy_of_fit_aj[~result.rows.free]
+    touching = result.rows.energy_aj[~result.rows.free]
     assert low <= touching.min() <= touching.max() <= high
 
 

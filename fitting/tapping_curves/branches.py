@@ -9,11 +9,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
-from scipy.optimize import least_squares
 
 from fitting.instruments.lag import turned
-from fitting.tapping_curves.curve import Rows, TappingCurve, TipMotion
+from fitting.tapping_curves.curve import Mask, Rows, TappingCurve, TipMotion
 
 _FREE = 4.0
 """Standard errors within which a row counts as free."""
@@ -84,7 +82,7 @@ def side_of(repulsive: bool | np.bool_) -> str:  # noqa: FBT001
     return "repulsive" if repulsive else "attractive"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class CurveBranch:
     """What tells one branch of a curve from the others.
 
@@ -135,13 +133,13 @@ _TIMED_NEIGHBOURS, _TIMED_DRIFT = 5, 0.05
 have drifted by the first."""
 
 
-def free_ends(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> bool:
+def free_ends(curve: TappingCurve, free: Mask) -> bool:
     """Say whether rows of the free tip stand at both ends of a table."""
     places = np.flatnonzero(free)
     return bool(len(places) > 1 and places[-1] - places[0] >= _BOTH_ENDS * (curve.rows - 1))
 
 
-def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
+def free_rows(curve: TappingCurve) -> Mask:
     """Return the rows of the free tip: those farther away than the first that departs in amplitude or phase.
 
     A single row that departs is none; the zero of the phase is that of the rows farther away. Each row is tested by its
@@ -191,9 +189,7 @@ _JUMP_ERRORS, _JUMP_STEPS = 6.0, 4.0
 _AROUND = 4
 
 
-def repulsive_rows(
-    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], departure: Rows
-) -> Bool[np.ndarray, " rows"]:
+def repulsive_rows(curve: TappingCurve, touching: Mask, departure: Rows) -> Mask:
     """Return the rows on the repulsive branch: those whose lag is below the free tip's.
 
     Rows whose lag departs by less than three errors are as their neighbour on the side of the sample.
@@ -207,17 +203,17 @@ def repulsive_rows(
     for part in ways(curve):
         rows = part[touching[part]]
         clear = np.abs(departure[rows]) > _STEADY * curve.lag_error_deg[rows]
-        said = repulsive[rows]
-        for i in range(len(rows) - 2, -1, -1):
-            if not clear[i]:
-                said[i] = said[i + 1]
-        repulsive[rows] = said
+        clear[-1:] = True
+        says = np.flatnonzero(clear)[np.cumsum(clear) - clear]
+        repulsive[rows] = repulsive[rows[says]]
     return repulsive
 
 
-def smooth_stretches(
-    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
-) -> list[np.ndarray]:
+FEWEST_ROWS = 3
+"""Of a group or a stretch of rows that gets an energy of its own."""
+
+
+def smooth_stretches(curve: TappingCurve, touching: Mask, repulsive: Mask) -> list[np.ndarray]:
     """Return the rows of each drive and way, cut where the lag jumps between attraction and repulsion.
 
     Along each the energy is a smooth function.
@@ -238,18 +234,16 @@ def smooth_stretches(
             usual = float(np.median(others)) if len(others) else 0.0
             if steps[i] > max(_JUMP_ERRORS * np.hypot(error[i], error[i + 1]), _JUMP_STEPS * usual):
                 cuts.append(i + 1)
-        found += [stretch for stretch in np.split(rows, cuts) if len(stretch)]
+        found += [stretch for stretch in np.split(rows, cuts) if len(stretch) >= FEWEST_ROWS]
     return found
 
 
-def held_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
+def held_rows(curve: TappingCurve) -> Mask:
     """Return the rows in which the sample holds the tip: there is hardly an amplitude left."""
     return curve.amplitude_nm < _HELD * curve.free_amplitude_nm
 
 
-def changes(
-    curve: TappingCurve, *, free: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
-) -> list[Hysteresis]:
+def changes(curve: TappingCurve, *, free: Mask, repulsive: Mask) -> list[Hysteresis]:
     """Return the changes of each drive, as far as they show on approach or retract.
 
     Args:
@@ -257,37 +251,25 @@ def changes(
         free: from `free_rows`.
         repulsive: which of the others are on the repulsive branch.
     """
-    parts: dict[tuple[float, float], dict[bool, np.ndarray]] = {}
-    for part in ways(curve):
-        drive = float(curve.drive_frequency_khz[part[0]]), float(curve.free_amplitude_nm[part[0]])
-        parts.setdefault(drive, {})[bool(curve.retract[part[0]])] = part
+    columns = curve.drive_frequency_khz, curve.free_amplitude_nm, curve.retract
+    parts = {tuple(column[part[0]].item() for column in columns): part for part in ways(curve)}
+    heights = {
+        "contact": lambda part: _contact(curve, part, free),
+        "half": lambda part: _half(curve, part),
+        "branch": lambda part: _turn(curve, part[~free[part]], repulsive),
+    }
     found = []
-    for drive, here in parts.items():
-        into, back = here.get(False), here.get(True)
-        for change in ("contact", "half", "branch"):
-            ends = [
-                None if p is None else _height(change, curve, p, free=free, repulsive=repulsive) for p in (into, back)
-            ]
-            if ends != [None, None]:
-                found.append(Hysteresis(change, *drive, approach=ends[0], retract=ends[1]))
+    for drive in dict.fromkeys(key[:2] for key in parts):
+        for change, height in heights.items():
+            into, back = (height(parts[*drive, way]) if (*drive, way) in parts else None for way in (False, True))
+            if into or back:
+                found.append(Hysteresis(change, *drive, approach=into, retract=back))
     return found
 
 
-def _height(
-    change: str,
-    curve: TappingCurve,
-    part: np.ndarray,
-    *,
-    free: Bool[np.ndarray, " rows"],
-    repulsive: Bool[np.ndarray, " rows"],
-) -> Height | None:
-    if change == "contact":
-        return _contact(curve, part, free)
-    if change == "half":
-        return _half(curve, part)
-    touching = part[~free[part]]
+def _turn(curve: TappingCurve, touching: np.ndarray, repulsive: Mask) -> Height | None:
+    """Return where a way turns repulsive: between the last attractive row in front of the nearest repulsive one."""
     before = np.flatnonzero(~repulsive[touching])
-    # the last attractive row in front of the nearest repulsive one
     if not before.size or before[-1] + 1 == len(touching):
         return None
     return _between(*curve.offset_nm[touching[before[-1] : before[-1] + 2]].tolist())
@@ -311,104 +293,39 @@ def _between(low: float, high: float) -> Height:
     return Height(float(0.5 * (low + high)), float(_UNIFORM * abs(high - low)))
 
 
-def _contact(curve: TappingCurve, part: np.ndarray, free: Bool[np.ndarray, " rows"]) -> Height | None:
+def _contact(curve: TappingCurve, part: np.ndarray, free: Mask) -> Height | None:
     """Return where the amplitude leaves that of the free tip: between two rows, or where its fall began."""
     touching = ~free[part]
-    if not touching.any() or touching[0]:
+    first = int(np.argmax(touching))
+    if not touching.any() or first == 0:
         return None
-    first = int(np.flatnonzero(touching)[0])
-    bracket = _between(float(curve.offset_nm[part[first - 1]]), float(curve.offset_nm[part[first]]))
+    bracket = _between(*curve.offset_nm[part[first - 1 : first + 1]].tolist())
     below = np.flatnonzero(curve.amplitude_nm[part] < _WINDOW * curve.free_amplitude_nm[part])
     until = min(below[0] if below.size else len(part), first + _MOST_ROWS)
-    if until - first < 4:
-        return bracket
-    rows = part[:until]
-    height, amplitude = curve.offset_nm[rows], curve.amplitude_nm[rows]
-    error, level = curve.amplitude_error_nm[rows], curve.free_amplitude_nm[rows[0]]
-    fit = _hinge(height, amplitude, error, float(level))
+    fit = _hinge(curve, part[:until], bracket.offset_nm) if until - first >= 4 else None
     return fit if fit is not None and fit.standard_error < bracket.standard_error else bracket
 
 
-def _hinge(height: np.ndarray, amplitude: np.ndarray, error: np.ndarray, level: float) -> Height | None:
-    """Return where a straight fall from a level began, by least squares; None where a step explains it better."""
-    target = (amplitude - level) / error
-
-    def chi2(at: np.ndarray, *, step: bool) -> np.ndarray:
-        """Return the least sum of squares of each place, in closed form."""
-        beyond = np.maximum(height - at[:, None], 0.0)
-        fall, jump = beyond / error, (beyond > 0.0) / error
-        ff, ft = np.sum(fall**2, axis=1), fall @ target
-        if not step:
-            return target @ target - ft**2 / ff
-        jj, fj, jt = np.sum(jump**2, axis=1), np.sum(fall * jump, axis=1), jump @ target
-        determinant = ff * jj - fj**2
-        # one row beyond tells a step only
-        both = determinant > 1e-9 * ff * jj
-        explained = (jj * ft**2 - 2.0 * fj * ft * jt + ff * jt**2) / np.where(both, determinant, 1.0)
-        return target @ target - np.where(both, explained, jt**2 / jj)
-
+def _hinge(curve: TappingCurve, rows: np.ndarray, step_nm: float) -> Height | None:
+    """Return where a straight fall from the free amplitude began; None where a step explains it better."""
+    height, error = curve.offset_nm[rows], curve.amplitude_error_nm[rows]
+    target = (curve.amplitude_nm[rows] - curve.free_amplitude_nm[rows]) / error
     grid = np.linspace(height[0], height[-2], min(_STEPS * len(height), _MOST_STEPS))
-    hinges = chi2(grid, step=False)
-    best = int(np.argmin(hinges))
-    if chi2(0.5 * (height[1:-1] + height[:-2]), step=True).min() < hinges[best] - 2.0 * _FREE:
+    fall = np.maximum(height - grid[:, None], 0.0) / error
+    # the least squares of the slope, in closed form
+    chi2 = target @ target - (fall @ target) ** 2 / np.sum(fall**2, axis=1)
+    best = int(np.argmin(chi2))
+    step = np.stack([np.maximum(height - step_nm, 0.0), height > step_nm], axis=1) / error[:, None]
+    if np.sum((target - step @ np.linalg.lstsq(step, target)[0]) ** 2) < chi2[best] - 2.0 * _FREE:
         return None
-    inside = grid[hinges < hinges[best] + max(1.0, hinges[best] / len(height))]
+    inside = grid[chi2 < chi2[best] + max(1.0, chi2[best] / len(height))]
     return Height(float(grid[best]), float(max(0.5 * (inside[-1] - inside[0]), grid[1] - grid[0])))
 
 
-_DEGREE = 2
-_FEWEST_SMOOTH = 6
-_ROUGH = 5.0
 _HARDLY = 0.2
 """Of the free amplitude: change of the motion up to which taps need not come every period."""
-_ROUNDS = 8
-_BENT = 0.005
-"""Of the free amplitude: what the straight line of a branch may be bent beyond a parabola."""
 
 
-def hardly_touching_rows(motion: TipMotion) -> Bool[np.ndarray, " rows"]:
+def hardly_touching_rows(motion: TipMotion) -> Mask:
     """Return rows whose motion is all but that of the free tip: where contact begins, taps may leave periods out."""
     return np.abs(motion.height + motion.free_amplitude_nm) < _HARDLY * motion.free_amplitude_nm
-
-
-def rough_rows(curve: TappingCurve, chosen: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
-    """Return rows whose amplitude is off the smooth fall of the others of their drive and way.
-
-    Taps that do not come once a period (every other, or irregularly) change the amplitude by some per cent: of such
-    rows amplitude and phase are no measure of a tap.
-
-    Args:
-        curve: the curve.
-        chosen: the rows that fall together, of one branch.
-    """
-    rough = np.zeros(curve.rows, bool)
-    for part in ways(curve):
-        rows = part[chosen[part]]
-        if len(rows) < _FEWEST_SMOOTH:
-            continue
-        height, level = curve.offset_nm[rows], curve.free_amplitude_nm[rows[0]]
-        place = (height - height.mean()) / max(np.ptp(height), 1e-12)
-        allowed = np.maximum(curve.amplitude_error_nm[rows], _BENT * level / _ROUGH)
-        smooth = np.ones(len(rows), bool)
-        for _ in range(_ROUNDS):
-            off = _off_parabola(place, curve.amplitude_nm[rows], allowed, smooth)
-            again = np.abs(off) <= _ROUGH
-            if again.sum() < _FEWEST_SMOOTH or (again == smooth).all():
-                break
-            smooth = again
-        rough[rows] = ~smooth
-    return rough
-
-
-def _off_parabola(place: Rows, amplitude: Rows, allowed: Rows, chosen: Bool[np.ndarray, " rows"]) -> Rows:
-    """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow.
-
-    Rows far off have hardly a pull by Cauchy's loss; by that of robust fits (`fitting.infer.rows`) they would keep
-    that of a row a few errors off.
-    """
-
-    def off(factors: np.ndarray) -> np.ndarray:
-        return (amplitude - np.polyval(factors, place)) / allowed
-
-    start = np.polyfit(place[chosen], amplitude[chosen], _DEGREE)
-    return off(least_squares(lambda factors: off(factors)[chosen], start, loss="cauchy").x)

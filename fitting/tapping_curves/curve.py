@@ -8,17 +8,18 @@ first harmonic of the sample's force. Free, Z = -A0: that sets the time. Measure
   and A0 = A_free/|1 - gamma| with A_free the amplitude of the free deflection.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
-from fitting.instruments.lag import AS_STATED, PhaseSense, free_lag_deg
-from fitting.parameters import USUAL_ERRORS
+from fitting.instruments.lag import AS_STATED, PhaseReadings, PhaseSense, free_lag_deg
 from fitting.tables.table import AmplitudeTable
 
 Rows = Float[np.ndarray, " rows"]
+Mask = Bool[np.ndarray, " rows"]
 Phasors = Complex[np.ndarray, " rows"]
 R = TypeVar("R", "TappingCurve", AmplitudeTable)
 
@@ -31,14 +32,6 @@ class Given(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.value:g} +- {float(f'{self.error:.2g}'):g}" if self.error else f"{self.value:g}"
-
-
-EXACTLY_ONE = Given(1.0)
-
-
-def given_or_usual(name: str, value: float, error: float | None) -> Given:
-    """Return a number with its error, or with the usual one of `USUAL_ERRORS` where none is given."""
-    return Given(value, error or USUAL_ERRORS[name] * value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +73,12 @@ class TappingCurve:
     free_amplitude_nm: Rows
     free_amplitude_error: float = 0.0
     drive_frequency_khz: Rows
-    retract: Bool[np.ndarray, " rows"]
+    retract: Mask
     free_frequency_khz: Given
     quality_factor: Given
     spring_constant_n_per_m: Given
     over_spring_constant: bool = False
-    tip_calibration: Given = EXACTLY_ONE
+    tip_calibration: Given = Given(1.0)  # noqa: RUF009 (never changed)
     phase_zero_deg: Given | None = None
     origin_error_nm: float = 0.3
     lines: Int[np.ndarray, " rows"]
@@ -110,7 +103,7 @@ class TappingCurve:
         return float(np.hypot(2.0 * calibration.error / calibration.value, spring.error / spring.value))
 
 
-def part_of(rows: R, chosen: Bool[np.ndarray, " rows"]) -> R:
+def part_of(rows: R, chosen: Mask) -> R:
     """Return the rows chosen of a curve or a table, of every array that has a number for each row."""
     own: dict[str, Any] = {
         name: value[chosen]
@@ -175,3 +168,28 @@ def lag_of_free_tip(curve: TappingCurve, instrument: Instrument) -> Rows:
     """Return the lag that the free tip shows on the instrument in every row, in degrees."""
     ratio = curve.drive_frequency_khz / instrument.free_frequency_khz
     return free_lag_deg(curve.drive, ratio, instrument.quality_factor) + instrument.phase_zero_deg
+
+
+def phase_readings(curve: TappingCurve, free: Mask, ways: Sequence[np.ndarray] = ()) -> PhaseReadings:
+    """Return what of a curve says which sense its phase has.
+
+    Args:
+        curve: the curve, its phase as read.
+        free: rows of the free tip.
+        ways: rows of each drive and way, the farthest first; empty where heights are not known.
+    """
+    frequency, quality, level = curve.free_frequency_khz, curve.quality_factor, curve.free_amplitude_nm
+    return PhaseReadings(
+        drive=curve.drive,
+        frequency_ratio=curve.drive_frequency_khz / frequency.value,
+        frequency_error=frequency.error / frequency.value,
+        quality_factor=quality.value,
+        quality_error=quality.error / quality.value,
+        ratio=curve.amplitude_nm / level,
+        ratio_error=np.hypot(curve.amplitude_error_nm / level, curve.free_amplitude_error),
+        phase_deg=curve.lag_deg,
+        phase_error_deg=curve.lag_error_deg,
+        free=free,
+        ways=ways,
+        zero=curve.phase_zero_deg,
+    )

@@ -23,25 +23,26 @@ energy. What is left says of a point that it is measured, bracketed, or below a 
 *One energy for all taps* is an assumption that narrows the instrument. It stands apart and makes no curve valid.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, covariance_of, descended, distance
 from afm_jax.units import TWO_SIDED_95
-from fitting.instruments.lag import free_lag_deg, turned
+from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS
-from fitting.tapping_curves.branches import CurveBranch, free_ends, ways
+from fitting.tapping_curves.branches import FEWEST_ROWS, CurveBranch, free_ends, ways
 from fitting.tapping_curves.curve import (
     HARMONICS_FACTOR,
     Given,
     Instrument,
+    Mask,
     Rows,
     TappingCurve,
     lag_of_free_tip,
@@ -50,7 +51,7 @@ from fitting.tapping_curves.curve import (
 
 _HARMONICS = 40
 """The sum of those of a brief impact converges like 1/n; beyond them a contact lasts too long to excite them."""
-(_inverse_triangle,) = get_lapack_funcs(("trtri",), dtype=float)
+Pairs = Float[np.ndarray, "2 rows"]
 
 
 class Energies(NamedTuple):
@@ -60,19 +61,15 @@ class Energies(NamedTuple):
         energy_aj: E.
         harmonics_aj: what the air takes of it at the harmonics.
         virial_aj: mean of force times height, of the first harmonic.
-        amplitude_slope: change with the amplitude read, in aJ/nm.
-        lag_slope: change with the lag, in aJ/degree.
-        virial_amplitude_slope: change of the virial with the amplitude read, in aJ/nm.
-        virial_lag_slope: change of the virial with the lag, in aJ/degree.
+        amplitude_slopes: changes of energy and virial with the amplitude read, in aJ/nm, shape (2, rows).
+        lag_slopes: changes of energy and virial with the lag, in aJ/degree, shape (2, rows).
     """
 
     energy_aj: Rows
     harmonics_aj: Rows
     virial_aj: Rows
-    amplitude_slope: Rows
-    lag_slope: Rows
-    virial_amplitude_slope: Rows
-    virial_lag_slope: Rows
+    amplitude_slopes: Pairs
+    lag_slopes: Pairs
 
 
 def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
@@ -83,27 +80,20 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
         instrument: what turns its readings into motion.
     """
     motion = motion_of(curve, instrument)
-    gamma, z, free = motion.gamma, motion.height, motion.free_amplitude_nm
     scale = curve.spring_constant_n_per_m.value * curve.tip_calibration.value**2
-    force = gamma * (z + free)
-    first = -np.pi * np.imag(force * np.conj(z))
+    force, z = motion.gamma * (motion.height + motion.free_amplitude_nm), motion.height
 
-    def change(dz):
-        return scale * (gamma * dz * np.conj(z) + force * np.conj(dz))
+    def energy_and_virial(work):
+        return scale * np.stack([-np.pi * np.imag(work), 0.5 * np.real(work)])
 
-    with np.errstate(invalid="ignore", divide="ignore"):
-        by_amplitude = change(motion.reading / curve.amplitude_nm)
-    by_lag = change(-1j * motion.reading) * np.pi / 180.0
+    def slopes(dz):
+        return energy_and_virial(motion.gamma * dz * np.conj(z) + force * np.conj(dz))
+
+    energy, virial = energy_and_virial(force * np.conj(z))
     harmonics = scale * _lost_at_harmonics(curve, instrument, np.abs(force))
-    return Energies(
-        energy_aj=scale * first - harmonics,
-        harmonics_aj=harmonics,
-        virial_aj=0.5 * scale * np.real(force * np.conj(z)),
-        amplitude_slope=-np.pi * by_amplitude.imag,
-        lag_slope=-np.pi * by_lag.imag,
-        virial_amplitude_slope=0.5 * by_amplitude.real,
-        virial_lag_slope=0.5 * by_lag.real,
-    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        by_amplitude = slopes(motion.reading / curve.amplitude_nm)
+    return Energies(energy - harmonics, harmonics, virial, by_amplitude, slopes(-1j * np.pi / 180.0 * motion.reading))
 
 
 def _lost_at_harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> Rows:
@@ -126,20 +116,18 @@ def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:
     return middle + np.hypot(first[1] - middle, 0.5 * (first[0] - first[2]))
 
 
-def noise_of(curve: TappingCurve, found: Energies) -> tuple[Rows, Rows]:
+def noise_of(curve: TappingCurve, found: Energies) -> Pairs:
     """Return the standard error of each energy and each virial from the noise of its own row, in aJ."""
-    amplitude, lag = curve.amplitude_error_nm, curve.lag_error_deg
-    energy = np.hypot(found.amplitude_slope * amplitude, found.lag_slope * lag)
-    return energy, np.hypot(found.virial_amplitude_slope * amplitude, found.virial_lag_slope * lag)
+    return np.hypot(found.amplitude_slopes * curve.amplitude_error_nm, found.lag_slopes * curve.lag_error_deg)
 
 
 FEWEST_FREE_ROWS = 3
 """Rows that are off the sample; fewer may be those of first contact, and are not taken for the free tip's."""
-_ANY_LAG_DEG = 90.0
-"""Error of a free tip's lag of which nothing is known."""
+_ANY_ZERO_DEG, _WIDE_ZERO_DEG = 90.0, 1000.0
+"""Errors of a zero of the phase of which nothing is known, and of one that free rows tell: theirs is far smaller."""
 _WIDE_DRIFTS = {"phase_drift_deg": 30.0, "free_amplitude_drift": 0.3}
 """Errors of drifts that rows of the free tip at both ends determine."""
-_STEP = 1e-3
+_STEP = 1e-4
 """Of differences by the unknowns, in their units."""
 _SETTLED, _ROUNDS, _RISE = 1e-6, 40, 0.1
 """Estimated distance of chi2 to its minimum, steps at most, and by how much a step may raise chi2: slopes of rows in
@@ -185,12 +173,8 @@ class _Unknown(NamedTuple):
     given: Given
 
 
-class _Means(NamedTuple):
-    """Means of free rows: the weights of the rows in each, its value and its error."""
-
-    weights: Float[np.ndarray, "means rows"]
-    mean: Float[np.ndarray, " means"]
-    error: Float[np.ndarray, " means"]
+Means = tuple[Float[np.ndarray, "means rows"], Float[np.ndarray, " means"], Float[np.ndarray, " means"]]
+"""Means of free rows: the weights of the rows in each, its value and its error."""
 
 
 class Solution(NamedTuple):
@@ -249,31 +233,29 @@ class Lever:
         curves: the curves.
         free: the rows of the free tip of each.
         unknowns: of the instrument.
+        zeros: places among them of the phases' zeros, and their curves' numbers.
         minimum: of what is stated and the means of free rows.
     """
 
-    def __init__(self, curves: Sequence[TappingCurve], free: Sequence[Bool[np.ndarray, " rows"]]):
+    def __init__(self, curves: Sequence[TappingCurve], free: Sequence[Mask]):
         """Find the instrument of curves of which the same is stated of their lever."""
         self.curves = tuple(curves)
         self.free = tuple(_of_free_tip(*pair) for pair in zip(curves, free, strict=True))
-        lever = [_of_logarithm(getattr(self.curves[0], name)) for name in COMMON[:2]]
-        pairs = zip(COMMON, [*lever, HARMONICS_FACTOR], strict=True)
+        lever = (self.curves[0].free_frequency_khz, self.curves[0].quality_factor)
+        known = [Given(float(np.log(value)), max(error / value, 1e-9)) for value, error in lever]
+        pairs = zip(COMMON, [*known, HARMONICS_FACTOR], strict=True)
         unknowns = [_Unknown(name, None, np.ones(0), given) for name, given in pairs]
         self._means = []
         for number, (curve, here) in enumerate(zip(self.curves, self.free, strict=True)):
             unknowns += _unknowns_of(number, curve, here)
             share, error = (part / curve.free_amplitude_nm for part in (curve.amplitude_nm, curve.amplitude_error_nm))
-            lags = _means(curve, curve.lag_deg, curve.lag_error_deg, here, _frequencies(curve), turning=True)
-            self._means.append((lags, _means(curve, share, error, here, _levels(curve))))
+            drives = curve.drive_frequency_khz, curve.free_amplitude_nm
+            lags = _means(curve, curve.lag_deg, curve.lag_error_deg, here, _kinds(drives[0]))
+            self._means.append((lags, _means(curve, share, error, here, _kinds(*drives))))
         self.unknowns = tuple(unknowns)
         self._start = np.array([unknown.given.value for unknown in unknowns])
         self._unit = np.array([unknown.given.error for unknown in unknowns])
-        # the zero that several curves or frequencies state is one and the same, and counts once
-        self._zeros = [
-            (i, zero)
-            for i, one in enumerate(unknowns)
-            if one.kind == "free_lag_deg" and (zero := self.curves[one.curve or 0].phase_zero_deg)
-        ]
+        self.zeros = [(i, one.curve or 0) for i, one in enumerate(unknowns) if one.kind == "phase_zero_deg"]
         # all but linear: a few steps more are as good as none
         self.minimum = _minimum(self.residual, self.jacobian, np.zeros(len(unknowns)), until=1e-20)
 
@@ -281,56 +263,36 @@ class Lever:
         """Return the unknowns in their own units."""
         return self._start + self._unit * x[: len(self._unit)]
 
-    def _of_rows(self, x: np.ndarray, number: int) -> tuple[Rows, Rows]:
-        """Return the lag of the free tip as read, and the true over the stated free amplitude, in a curve's rows."""
-        lag, factor = np.zeros(self.curves[number].rows), np.zeros(self.curves[number].rows)
-        for unknown, value in zip(self.unknowns, self.values(x).tolist(), strict=True):
-            if unknown.curve == number:
-                column = lag if unknown.kind in {"free_lag_deg", "phase_drift_deg"} else factor
-                column += value * unknown.rows
-        return lag, factor
-
-    def _free_lag(self, x: np.ndarray, number: int) -> Rows:
-        """Return the lag of the free tip by frequency and Q, in a curve's rows."""
-        frequency, quality = np.exp(self.values(x)[:2]).tolist()
-        curve = self.curves[number]
-        return free_lag_deg(curve.drive, curve.drive_frequency_khz / frequency, quality)
-
     def instrument(self, number: int, x: np.ndarray | None = None) -> Instrument:
         """Return the instrument of a curve, at the minimum if no unknowns are given."""
-        x = self.minimum.at if x is None else x
-        frequency, quality = np.exp(self.values(x)[:2]).tolist()
-        lag, factor = self._of_rows(x, number)
-        return Instrument(frequency, quality, lag - self._free_lag(x, number), factor, float(self.values(x)[2]))
-
-    @property
-    def stated(self) -> np.ndarray:
-        """The unknowns with frequency and Q as stated; free rows tell the zero of the phase."""
-        kinds = {"free_lag_deg"} if all(curve.time is None for curve in self.curves) else set()
-        return np.where([one.kind in kinds.union(COMMON) for one in self.unknowns], 0.0, self.minimum.at)
+        values, rows = self.values(self.minimum.at if x is None else x), self.curves[number].rows
+        zero, factor = np.zeros(rows), np.zeros(rows)
+        for unknown, value in zip(self.unknowns, values.tolist(), strict=True):
+            if unknown.curve == number:
+                column = zero if unknown.kind.startswith("phase") else factor
+                column += value * unknown.rows
+        frequency, quality = np.exp(values[:2]).tolist()
+        return Instrument(frequency, quality, zero, factor, float(values[2]))
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Return in standard errors what is stated, the means of free rows, and stated zeros of the phase."""
         left = [x[: len(self.unknowns)]]
         for number, (lags, shares) in enumerate(self._means):
-            lag, factor = self._of_rows(x, number)
-            left.append(turned(lags.weights @ lag - lags.mean) / lags.error)
-            left.append((shares.weights @ factor - shares.mean) / shares.error)
-        off = [turned(self.zero_at(x, i) - zero.value) / max(zero.error, 1e-4) for i, zero in self._zeros]
+            at = self.instrument(number, x)
+            columns = lag_of_free_tip(self.curves[number], at), at.free_amplitude_factor
+            for (weights, mean, error), column in zip((lags, shares), columns, strict=True):
+                left.append(turned(weights @ column - mean) / error)
+        zeros = [(i, zero) for i, number in self.zeros if (zero := self.curves[number].phase_zero_deg)]
+        off = [turned(self.values(x)[i] - zero.value) / max(zero.error, 1e-4) for i, zero in zeros]
+        # the zero that several curves or frequencies state is one and the same, and counts once
         return np.concatenate([*left, np.array(off) / np.sqrt(max(len(off), 1))])
-
-    def zero_at(self, x: np.ndarray, place: int) -> Any:
-        """Return the zero of the phase of a frequency of a curve, from its free tip's lag, whose place is given."""
-        number = self.unknowns[place].curve or 0
-        row = int(np.argmax(self.unknowns[place].rows))
-        return self.values(x)[place] - self._free_lag(x, number)[row]
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the changes of the residuals by the unknowns."""
         return _slopes(self.residual, x, len(self.unknowns))
 
-    def slopes(self, curve: TappingCurve, number: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the changes of each row's energy and virial by every unknown, shape (rows, unknowns).
+    def slopes(self, curve: TappingCurve, number: int, x: np.ndarray) -> Float[np.ndarray, "2 rows unknowns"]:
+        """Return the changes of each row's energy and virial by every unknown.
 
         Args:
             curve: readings at which they are taken.
@@ -342,85 +304,61 @@ class Lever:
             found = energies(curve, self.instrument(number, y))
             return np.stack([found.energy_aj, found.virial_aj])
 
-        energy, virial = _slopes(of, x, len(self.unknowns))
-        return energy, virial
-
-    def errors_of_rows(self, number: int) -> Rows:
-        """Return the standard error of each energy from what all rows share.
-
-        With the instrument as given: frequency, Q and harmonics by what is stated of them, the rest by free rows.
-        """
-        given, errors = self.stated, np.sqrt(np.diag(self.minimum.covariance))
-        errors[: len(COMMON)] = 1.0
-        curve, found = self.curves[number], energies(self.curves[number], self.instrument(number, given))
-        by, _ = self.slopes(curve, number, given)
-        return np.hypot(np.linalg.norm(by * errors, axis=1), curve.relative_error * found.energy_aj)
+        return _slopes(of, x, len(self.unknowns))
 
     def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
         """Return what is stated of the instrument of a curve and where a least squares ends."""
         minimum = self.minimum if minimum is None else minimum
-        x, count, curve = minimum.at, len(self.unknowns), self.curves[number]
-        covariance, values = minimum.covariance[:count, :count], self.values(x)
+        curve, values, errors = self.curves[number], self.values(minimum.at), np.sqrt(np.diag(minimum.covariance))
         found: list[Nuisance] = []
         for i, unknown in enumerate(self.unknowns):
             if unknown.curve not in {None, number}:
                 continue
             kind, given, value = unknown.kind, unknown.given, float(values[i])
-            by = unknown.given.error * np.eye(count)[i]
+            error = float(given.error * errors[i])
             if kind in {"free_frequency_khz", "quality_factor"}:
                 given, value = getattr(curve, kind), float(np.exp(value))
-                by = value * by
-            elif kind == "free_lag_deg":
-                kind, value = "phase_zero_deg", float(self.zero_at(x, i))
+                error *= value
+            elif kind == "phase_zero_deg":
                 given = curve.phase_zero_deg or Given(value, np.inf)
-                by = _slopes(lambda y, i=i: np.array([self.zero_at(y, i)]), x, count)[0]
-            name = f"{kind}_{sum(one.kind == kind for one in found)}" if kind in _NUMBERED else kind
-            found.append(Nuisance(name, kind, given, value, float(np.sqrt(by @ covariance @ by))))
+            name = (
+                f"{kind}_{sum(one.kind == kind for one in found)}"
+                if kind in {"phase_zero_deg", "free_amplitude"}
+                else kind
+            )
+            found.append(Nuisance(name, kind, given, value, error))
         return tuple(found)
 
 
-_NUMBERED = ("phase_zero_deg", "free_amplitude")
-
-
-def _of_logarithm(given: Given) -> Given:
-    """Return the logarithm of a number with its error."""
-    return Given(float(np.log(given.value)), max(given.error / given.value, 1e-9))
-
-
-def _of_free_tip(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+def _of_free_tip(curve: TappingCurve, free: Mask) -> Mask:
     """Return free rows with a phase where a frequency has at least three of them."""
     known = free & (np.isfinite(curve.lag_deg) | (not curve.has_phase))
-    kinds = _frequencies(curve)
+    kinds = _kinds(curve.drive_frequency_khz)
     return known & (np.bincount(kinds[known], minlength=curve.rows + 1)[kinds] >= FEWEST_FREE_ROWS)
 
 
-def _frequencies(curve: TappingCurve) -> Int[np.ndarray, " rows"]:
-    """Return the number of the drive's frequency of each row."""
-    return np.unique(curve.drive_frequency_khz, return_inverse=True)[1].reshape(-1)
+def _kinds(*columns: Rows) -> Int[np.ndarray, " rows"]:
+    """Return the number of each row's kind; rows of a kind are alike in all columns."""
+    return np.unique(np.stack(columns), axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _levels(curve: TappingCurve) -> Int[np.ndarray, " rows"]:
-    """Return the number of frequency and free amplitude of each row."""
-    keys = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm])
-    return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
-
-
-def _unknowns_of(number: int, curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> list[_Unknown]:
+def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]:
     """Return a curve's own unknowns: of each frequency the free tip's lag, of each drive its amplitude, and drifts."""
     zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
-    given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value, zero)
-    expected, kinds, levels = lag_of_free_tip(curve, given), _frequencies(curve), _levels(curve)
+    off = curve.lag_deg - lag_of_free_tip(curve, Instrument(curve.free_frequency_khz.value, curve.quality_factor.value))
+    drives = curve.drive_frequency_khz, curve.free_amplitude_nm
+    kinds, levels = _kinds(drives[0]), _kinds(*drives)
     found = []
     for kind in range(kinds.max(initial=-1) + 1):
         here = kinds == kind
-        rows, lag = np.flatnonzero(here & free & np.isfinite(curve.lag_deg)), float(expected[here][0])
+        rows, start, error = np.flatnonzero(here & free & np.isfinite(off)), zero, _ANY_ZERO_DEG
         if len(rows):
-            first, weights = curve.lag_deg[rows[0]], curve.lag_error_deg[rows] ** -2.0
-            lag = float(first + np.average(turned(curve.lag_deg[rows] - first), weights=weights))
-        found.append(_Unknown("free_lag_deg", number, here.astype(float), Given(lag, _ANY_LAG_DEG)))
+            first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
+            start, error = float(first + np.average(turned(off[rows] - first), weights=weights)), _WIDE_ZERO_DEG
+        found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, error)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
-    drives = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
-    found += [_Unknown("free_amplitude", number, rows, known) for rows in drives]
+    each = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
+    found += [_Unknown("free_amplitude", number, rows, known) for rows in each]
     if curve.time is not None:
         errors = _WIDE_DRIFTS if free_ends(curve, free) else USUAL_DRIFTS
         found += [_Unknown(name, number, curve.time, Given(0.0, error)) for name, error in errors.items()]
@@ -430,47 +368,36 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Bool[np.ndarray, " rows
 _FEWEST_OF_MEAN, _MOST_MEANS = 4, 8
 
 
-def _means(
-    curve: TappingCurve,
-    values: Rows,
-    errors: Rows,
-    free: Bool[np.ndarray, " rows"],
-    kinds: Int[np.ndarray, " rows"],
-    *,
-    turning: bool = False,
-) -> _Means:
+def _means(curve: TappingCurve, values: Rows, errors: Rows, free: Mask, kinds: np.ndarray) -> Means:
     """Return means of the free rows of each kind, their errors with what they scatter beyond their noise.
 
     Where the order of the rows is known each stretch of neighbours has means of its own, which tell a drift.
+
+    Args:
+        curve: the curve.
+        values: of its rows, degrees or parts of one, which are far from a turn.
+        errors: theirs.
+        free: rows of the free tip.
+        kinds: number of each row's kind.
     """
-    found = []
-    for kind in np.unique(kinds).tolist():
+    weights, means, mean_errors = [], [], []
+    for kind in np.unique(kinds):
         rows = np.flatnonzero(free & (kinds == kind) & np.isfinite(values))
-        for part in _stretches(curve, rows):
-            off = values[part] - values[part[0]]
-            off = turned(off) if turning else off
-            information = errors[part] ** -2.0
+        parts = [rows]
+        if curve.time is not None:
+            runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+            parts = [
+                part for run in runs for part in np.array_split(run, min(len(run) // _FEWEST_OF_MEAN, _MOST_MEANS) or 1)
+            ]
+        for part in parts:
+            if not len(part):
+                continue
+            off, information = turned(values[part] - values[part[0]]), errors[part] ** -2.0
             excess = np.sqrt(max(np.var(off) - 1.0 / information.mean(), 0.0))
-            weights = np.zeros(curve.rows)
-            weights[part] = information / information.sum()
-            mean = values[part[0]] + np.average(off, weights=information)
-            found.append((weights, mean, np.hypot(information.sum() ** -0.5, excess)))
-    if not found:
-        return _Means(np.zeros((0, curve.rows)), np.zeros(0), np.zeros(0))
-    return _Means(*(np.array(column) for column in zip(*found, strict=True)))
-
-
-def _stretches(curve: TappingCurve, rows: Int[np.ndarray, " some"]) -> list[np.ndarray]:
-    """Return the rows in one piece, or where their order in time is known those that follow each other in several."""
-    if not len(rows) or curve.time is None:
-        return [rows] if len(rows) else []
-    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
-    return [
-        part
-        for run in runs
-        for part in np.array_split(run, max(1, min(len(run) // _FEWEST_OF_MEAN, _MOST_MEANS)))
-        if len(part)
-    ]
+            weights.append(np.bincount(part, information / information.sum(), curve.rows))
+            means.append(values[part[0]] + weights[-1][part] @ off)
+            mean_errors.append(np.hypot(information.sum() ** -0.5, excess))
+    return np.reshape(weights, (-1, curve.rows)), np.array(means), np.array(mean_errors)
 
 
 _SHALLOW = 0.03
@@ -506,7 +433,6 @@ class Smoother(NamedTuple):
         place: of the bins.
         starts: where each begins.
         weights: of the rows in their bins.
-        variance: of the bins' averages.
         size: standard deviation of the process.
         inverse: of the averages' covariance, noise and process.
     """
@@ -514,7 +440,6 @@ class Smoother(NamedTuple):
     place: Float[np.ndarray, " bins"]
     starts: Int[np.ndarray, " bins"]
     weights: Float[np.ndarray, " rows"]
-    variance: Float[np.ndarray, " bins"]
     size: float
     inverse: Float[np.ndarray, "bins bins"]
 
@@ -529,9 +454,8 @@ class Smoother(NamedTuple):
         middle = np.add.reduceat(weights * place, starts)
         # places of several bins may be one
         own = np.diag(1.0 / total + 1e-12 * size**2)
-        factor = np.linalg.cholesky(matern(middle, middle, size) + own)
-        root = _inverse_triangle(factor.T)[0]
-        return cls(middle, starts, weights, 1.0 / total, size, root @ root.T)
+        root = np.linalg.inv(np.linalg.cholesky(matern(middle, middle, size) + own))
+        return cls(middle, starts, weights, size, root.T @ root)
 
     def average(self, values: np.ndarray) -> np.ndarray:
         """Return the weighted averages over the bins of values of the rows, shape (rows, ...)."""
@@ -585,8 +509,6 @@ def _smoothed(
     return replace(curve, amplitude_nm=amplitude, lag_deg=lag), place, stretches
 
 
-FEWEST_ROWS = 3
-"""Of a group of rows that gets an energy of its own."""
 _FAR, _MOST_OUTLIERS = 4.0, 0.2
 """Residual in standard errors from which a row is excluded, and share of rows that may be."""
 _ALLOWED = 3.0
@@ -673,7 +595,7 @@ def within(ratio: float, measured: np.ndarray, *columns: np.ndarray) -> tuple[fl
     return tuple(float(np.interp(ratio, measured, column)) for column in columns)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class TappingBranch(CurveBranch):
     """Rows of one drive, one way and one side of the phase, and the energy along them.
 
@@ -693,6 +615,7 @@ class EnergyFunctions:
     Attributes:
         lever: the curves of its lever, and their instrument.
         number: of the curve among them.
+        smooth: the curve with smooth readings, at which errors of energies are taken.
         energies: of every row, with the instrument where statements and free rows put it.
         branches: energy and virial along each.
         outliers: rows too far from the others.
@@ -704,9 +627,10 @@ class EnergyFunctions:
 
     lever: Lever
     number: int
+    smooth: TappingCurve
     energies: Energies
     branches: tuple[TappingBranch, ...]
-    outliers: Bool[np.ndarray, " rows"]
+    outliers: Mask
     rows_chi2: float
     rows_freedom: float
     scale: float
@@ -724,7 +648,7 @@ class EnergyFunctions:
 
 
 def energies_along(
-    lever: Lever, stretches: Sequence[Sequence[np.ndarray]], repulsive: Sequence[Bool[np.ndarray, " rows"]]
+    lever: Lever, stretches: Sequence[Sequence[np.ndarray]], repulsive: Sequence[Mask]
 ) -> list[EnergyFunctions]:
     """Return the energies along the branches of the curves of a lever, with their bands.
 
@@ -743,84 +667,68 @@ def energies_along(
     root = axes * np.sqrt(np.maximum(size, 0.0))
     by_instrument = np.concatenate([c.by_instrument for c in curves]) @ root
     low, high, possible = positive_bands(estimate, noise, certain, by_instrument)
-    share = lever.curves[0].relative_error
-    middle, common = 0.5 * (low + high), TWO_SIDED_95 * share * 0.5 * (low + high)
+    middle = 0.5 * (low + high)
+    common = TWO_SIDED_95 * lever.curves[0].relative_error * middle
     low, high = np.maximum(middle - np.hypot(middle - low, common), 0.0), middle + np.hypot(high - middle, common)
-    ends = np.cumsum([len(c.noise_aj) for c in curves])[:-1]
-    bands = zip(np.split(low, ends), np.split(high, ends), strict=True)
+    bands = zip(curves, low.reshape(-1, _POINTS), high.reshape(-1, _POINTS), strict=True)
+    curves = iter([replace(curve, energy_low_aj=below, energy_high_aj=above) for curve, below, above in bands])
     return [
-        replace(
-            one,
-            possible=possible,
-            branches=tuple(
-                replace(branch, curve=replace(branch.curve, energy_low_aj=below, energy_high_aj=above))
-                for branch, (below, above) in zip(one.branches, bands, strict=False)
-            ),
-        )
+        replace(one, possible=possible, branches=tuple(replace(branch, curve=next(curves)) for branch in one.branches))
         for one in each
     ]
 
 
-def _along(
-    lever: Lever, number: int, stretches: Sequence[np.ndarray], repulsive: Bool[np.ndarray, " rows"]
-) -> EnergyFunctions:
+def _along(lever: Lever, number: int, stretches: Sequence[np.ndarray], repulsive: Mask) -> EnergyFunctions:
     """Return the energies along the branches of one curve, their bands not yet told."""
     # where the instrument's search did not settle there is no energy
     stretches = stretches if lever.minimum.settled else ()
-    curve, x, at = lever.curves[number], lever.minimum.at, lever.instrument(number)
+    curve, at = lever.curves[number], lever.instrument(number)
     smooth, place, stretches = _smoothed(curve, stretches, at.free_amplitude_factor)
     found, at_smooth = energies(curve, at), energies(smooth, at)
-    energy_slopes, virial_slopes = lever.slopes(smooth, number, x)
-    outliers, branches, chi2, freedom, scales = np.zeros(curve.rows, bool), [], 0.0, 0.0, [1.0]
-    share = curve.relative_error
+    by_reading = np.stack([at_smooth.amplitude_slopes, at_smooth.lag_slopes])
+    by_instrument = lever.slopes(smooth, number, lever.minimum.at)
+    unknowns = [one if one.curve == number else one._replace(rows=np.zeros(curve.rows)) for one in lever.unknowns]
+    outliers, branches, fits = np.zeros(curve.rows, bool), [], []
     for rows in stretches:
-        fit = _stretch(curve, rows, place, found.energy_aj, at_smooth.amplitude_slope, at_smooth.lag_slope)
-        by_reading = at_smooth.virial_amplitude_slope, at_smooth.virial_lag_slope
-        of_virial = _stretch(curve, fit.rows, place, found.virial_aj, *by_reading)
+        fit = _stretch(curve, rows, place, found.energy_aj, by_reading[:, 0])
+        of_virial = _stretch(curve, fit.rows, place, found.virial_aj, by_reading[:, 1])
         outliers[rows] = ~np.isin(rows, fit.rows)
-        chi2, freedom, scales = chi2 + fit.chi2, freedom + fit.freedom, [*scales, fit.scale]
+        fits.append(fit)
         for side in (False, True):
             here = fit.rows[repulsive[fit.rows] == side]
             if len(here) < FEWEST_ROWS:
                 continue
             ratios = 1.0 + _SHALLOW - np.exp(place[here])
             ratio = np.linspace(max(ratios.min(), 0.0), ratios.max(), _POINTS)
-            estimate, noise, by = _at(lever, number, fit, found.energy_aj, energy_slopes, ratio)
-            virial, virial_noise, virial_by = _at(lever, number, of_virial, found.virial_aj, virial_slopes, ratio)
-            virial_variance = virial_noise**2 + (share * virial) ** 2
-            virial_variance += np.einsum("nu,uv,nv->n", virial_by, lever.minimum.covariance, virial_by)
-            heights = np.interp(_place_of(ratio), fit.smoother.place, fit.smoother.average(curve.offset_nm[fit.rows]))
+            estimate, noise, by = _at(unknowns, fit, found.energy_aj, by_instrument[0], ratio)
+            virial, virial_noise, virial_by = _at(unknowns, of_virial, found.virial_aj, by_instrument[1], ratio)
+            variance = np.einsum("nu,uv,nv->n", virial_by, lever.minimum.covariance, virial_by) + virial_noise**2
+            heights = fit.smoother.average(curve.offset_nm[fit.rows])
             uncertain = _ALLOWED * np.median(curve.amplitude_error_nm[here] / curve.free_amplitude_nm[here])
-            branches.append(
-                TappingBranch(
-                    drive_frequency_khz=float(curve.drive_frequency_khz[here[0]]),
-                    free_amplitude_nm=float(curve.free_amplitude_nm[here[0]]),
-                    retract=bool(curve.retract[here[0]]),
-                    repulsive=side,
-                    rows=np.sort(here),
-                    curve=EnergyCurve(
-                        amplitude_ratio=ratio,
-                        height_nm=heights,
-                        energy_low_aj=estimate,
-                        energy_high_aj=estimate,
-                        virial_aj=virial,
-                        virial_error_aj=np.sqrt(virial_variance),
-                        estimate_aj=estimate,
-                        noise_aj=noise,
-                        by_instrument=by,
-                        certain=1.0 - ratio > uncertain,
-                    ),
-                )
+            along = EnergyCurve(
+                amplitude_ratio=ratio,
+                height_nm=np.interp(np.log(_SHALLOW + 1.0 - ratio), fit.smoother.place, heights),
+                energy_low_aj=estimate,
+                energy_high_aj=estimate,
+                virial_aj=virial,
+                virial_error_aj=np.sqrt(variance + (curve.relative_error * virial) ** 2),
+                estimate_aj=estimate,
+                noise_aj=noise,
+                by_instrument=by,
+                certain=1.0 - ratio > uncertain,
             )
+            drive = float(curve.drive_frequency_khz[here[0]]), float(curve.free_amplitude_nm[here[0]])
+            branches.append(TappingBranch(*drive, bool(curve.retract[here[0]]), side, rows=np.sort(here), curve=along))
     return EnergyFunctions(
         lever=lever,
         number=number,
+        smooth=smooth,
         energies=found,
         branches=tuple(sorted(branches, key=lambda b: (b.drive, b.retract, b.repulsive))),
         outliers=outliers,
-        rows_chi2=chi2,
-        rows_freedom=freedom,
-        scale=max(scales),
+        rows_chi2=sum((fit.chi2 for fit in fits), 0.0),
+        rows_freedom=sum((fit.freedom for fit in fits), 0.0),
+        scale=max([1.0, *(fit.scale for fit in fits)]),
         possible=True,
     )
 
@@ -835,69 +743,58 @@ class _Stretch(NamedTuple):
     scale: float
 
 
-def _stretch(
-    curve: TappingCurve,
-    rows: Int[np.ndarray, " some"],
-    place: Rows,
-    values: Rows,
-    amplitude_slope: Rows,
-    lag_slope: Rows,
-) -> _Stretch:
+def _stretch(curve: TappingCurve, rows: np.ndarray, place: Rows, values: Rows, slopes: np.ndarray) -> _Stretch:
     """Return the smooth function of values along a stretch of rows, without those that are more than four errors off.
 
     An energy is one at an amplitude, which is known no better than it was read: an error dA of the reading moves it by
     E_A dA at the height, and by (E_A - E'/A0) dA at the ratio.
     """
-    steep, kept, ratios = np.zeros(len(rows)), np.ones(len(rows), bool), 1.0 + _SHALLOW - np.exp(place[rows])
+    amplitude_slope, lag_slope = (slope[rows] for slope in slopes)
+    free, ratios = curve.free_amplitude_nm[rows], 1.0 + _SHALLOW - np.exp(place[rows])
+    by_lag, steep, kept = lag_slope * curve.lag_error_deg[rows], np.zeros(len(rows)), np.ones(len(rows), bool)
     for last in (False, False, True):
-        at_ratio = amplitude_slope[rows] - steep / curve.free_amplitude_nm[rows]
-        by_amplitude = np.maximum(np.abs(amplitude_slope[rows]), np.abs(at_ratio)) * curve.amplitude_error_nm[rows]
-        here, noise = rows[kept], np.hypot(by_amplitude, lag_slope[rows] * curve.lag_error_deg[rows])[kept]
+        steepest = np.maximum(np.abs(amplitude_slope), np.abs(amplitude_slope - steep / free))
+        here, noise = rows[kept], np.hypot(steepest * curve.amplitude_error_nm[rows], by_lag)[kept]
         size = _size_of(values[here], noise)
         smoother = Smoother.of(place[here], noise, size)
         mean, taken = smoother.of_rows(place[here], values[here])
         off, freedom = (values[here] - mean) / noise, max(len(here) - taken, 1.0)
         chi2 = float(off @ off)
         scale = 1.0 if chi2_tail(chi2, max(round(freedom), 1)) > IMPROBABLE else float(np.sqrt(chi2 / freedom))
-        if last:
-            break
         ratio, first = np.unique(ratios[kept], return_index=True)
         if len(ratio) > 4:
             steep = np.interp(ratios, ratio, np.gradient(mean[first], ratio))
         far = np.abs(off) > _FAR * scale
-        if kept.all() and 0 < far.sum() <= _MOST_OUTLIERS * len(here):
+        if not last and kept.all() and far.sum() <= _MOST_OUTLIERS * len(here):
             kept[far] = False
     smoother = Smoother.of(place[here], noise * scale, size) if scale > 1.0 else smoother
     return _Stretch(here, smoother, chi2, freedom, scale)
 
 
-def _place_of(ratio: np.ndarray) -> np.ndarray:
-    """Return the places of amplitudes, of the free one, as of `losses`."""
-    return np.log(_SHALLOW + 1.0 - ratio)
-
-
 def _at(
-    lever: Lever,
-    number: int,
-    fit: _Stretch,
-    values: Rows,
-    slopes: Float[np.ndarray, "rows unknowns"],
-    ratio: np.ndarray,
+    unknowns: Sequence[_Unknown], fit: _Stretch, values: Rows, slopes: np.ndarray, ratio: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a smooth function at some amplitudes, its own standard error, and its change by every unknown."""
-    weights, variance = fit.smoother.at(_place_of(ratio))
-    mean = weights @ fit.smoother.average(values[fit.rows])
-    by = weights @ fit.smoother.average(slopes[fit.rows])
+    """Return a smooth function at some amplitudes, its own standard error, and its change by every unknown.
+
+    Args:
+        unknowns: of the instrument.
+        fit: of the function.
+        values: of it in each row of the curve.
+        slopes: changes of the values by every unknown, shape (rows, unknowns).
+        ratio: the amplitudes, of the free one.
+    """
+    weights, variance = fit.smoother.at(np.log(_SHALLOW + 1.0 - ratio))
+    mean, by = (weights @ fit.smoother.average(column[fit.rows]) for column in (values, slopes))
     # with more of a free amplitude the same ratio is at a larger reading; a branch may be all at one amplitude
     moved = np.gradient(mean, ratio) * ratio if np.ptp(ratio) > 0.0 else np.zeros(len(ratio))
-    for i, unknown in enumerate(lever.unknowns):
-        if unknown.curve == number and unknown.kind.startswith("free_amplitude"):
+    for i, unknown in enumerate(unknowns):
+        if unknown.kind.startswith("free_amplitude"):
             by[:, i] += moved * unknown.given.error * (weights @ fit.smoother.average(unknown.rows[fit.rows]))
     return mean, np.sqrt(variance), by
 
 
 def positive_bands(
-    estimate: Rows, noise: Rows, certain: Bool[np.ndarray, " rows"], by_instrument: Float[np.ndarray, "rows unknowns"]
+    estimate: Rows, noise: Rows, certain: Mask, by_instrument: Float[np.ndarray, "rows unknowns"]
 ) -> tuple[Rows, Rows, bool]:
     """Return bands of 95 % of energies none of which is less than nothing, and whether there may be such energies.
 
@@ -939,21 +836,15 @@ def _densest(mean: float, error: float, low: float, high: float) -> tuple[float,
     Equal tails would never hold a truth that is next to nothing.
     """
     below, above = (low - mean) / error, (high - mean) / error
-    flip = below > 0.0
-    if flip:
+    if below > 0.0:
         # the tail that is left, without cancellation
-        below, above = -above, -below
-
-    def inside(half: float) -> float:
-        return float(ndtr(min(above, half)) - ndtr(max(below, -half))) if max(below, -half) < min(above, half) else 0.0
-
-    near, far, wanted = 0.0, 40.0, 0.95 * float(ndtr(above) - ndtr(below))
-    for _ in range(60):
-        half = 0.5 * (near + far)
-        near, far = (near, half) if inside(half) > wanted else (half, far)
-    ends = max(below, -far), min(above, far)
-    ends = (-ends[1], -ends[0]) if flip else ends
-    return mean + error * ends[0], mean + error * ends[1]
+        low, high = _densest(-mean, error, -high, -low)
+        return -high, -low
+    inside = 0.95 * (ndtr(above) - ndtr(below))
+    # about the mean as far as the cuts allow
+    first = np.clip(0.5 - 0.5 * inside, ndtr(below), ndtr(above) - inside)
+    ends = np.clip(ndtri([first, first + inside]), max(below, min(above, 0.0) - 9.0), above)
+    return mean + error * float(ends[0]), mean + error * float(ends[1])
 
 
 def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
@@ -962,19 +853,18 @@ def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
     It is the middle of its band, beside how much of it a standard error of the frequency, as known, is; None where no
     energy is above nothing.
     """
-    known, found = float(np.sqrt(functions.lever.minimum.covariance[0, 0])), []
-    for number, branch in enumerate(functions.branches):
-        c = branch.curve
-        by = known * np.abs(c.by_instrument[:, 0])
-        for n in np.flatnonzero(c.certain & (c.energy_low_aj > 0.0)):
-            at = {
-                "branch": number,
-                "amplitude_ratio": float(c.amplitude_ratio[n]),
-                "energy_aj": float(c.energy_aj[n]),
-                "interval95_aj": (float(c.energy_low_aj[n]), float(c.energy_high_aj[n])),
-                "by_frequency_aj": float(by[n]),
-            }
-            found.append(at)
+    with_frequency = functions.lever.minimum.covariance[0]
+    found = [
+        {
+            "branch": number,
+            "amplitude_ratio": float(c.amplitude_ratio[n]),
+            "energy_aj": float(c.energy_aj[n]),
+            "interval95_aj": (float(c.energy_low_aj[n]), float(c.energy_high_aj[n])),
+            "by_frequency_aj": float(abs(c.by_instrument[n] @ with_frequency) / np.sqrt(with_frequency[0])),
+        }
+        for number, c in enumerate(branch.curve for branch in functions.branches)
+        for n in np.flatnonzero(c.certain & (c.energy_low_aj > 0.0))
+    ]
     return min(found, key=lambda at: at["by_frequency_aj"] / at["energy_aj"], default=None)
 
 
@@ -992,31 +882,26 @@ _NARROWS = 0.7
 def what_narrows(functions: EnergyFunctions) -> str:
     """Return what to state to narrow the band where the energy is largest: zero of the phase, or free frequency.
 
-    What is known of a combination g of the unknowns to an error e takes (S C g)^2/(e^2 + g C g) off the variance S C S.
+    What is known of an unknown i to an error e takes (S C)_i^2/(e^2 + C_ii) off the variance S C S.
     """
     branch, point = largest_of(functions.branches)
-    lever, c = functions.lever, functions.branches[branch].curve
-    rows, x, covariance = functions.branches[branch].rows, lever.minimum.at, lever.minimum.covariance
-    by, noise = c.by_instrument[point], float(c.noise_aj[point])
-    places = [i for i, one in enumerate(lever.unknowns) if one.curve == functions.number and one.rows[rows[0]]]
-    lag = next(i for i in places if lever.unknowns[i].kind == "free_lag_deg")
-    of_zero = _slopes(lambda y: np.array([lever.zero_at(y, lag)]), x, len(x))[0]
-    of_frequency = lever.unknowns[0].given.error * np.eye(len(x))[0]
-    zero = "the zero of the phase to 0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')"
-    error = f"{1e-5 * np.exp(lever.values(x)[0]):.1g}"
-    free = f"the free frequency to 1e-5 of itself ('# free_frequency_khz = VALUE +- {error}')"
-    more = {zero: (of_zero, 0.2), free: (of_frequency, 1e-5)}
-    today = float(by @ covariance @ by)
-    half = {
-        words: TWO_SIDED_95
-        * np.sqrt(max(today - (by @ covariance @ g) ** 2 / (e**2 + g @ covariance @ g), 0.0) + noise**2)
-        for words, (g, e) in more.items()
-    }
-    words = min(half, key=lambda name: half[name])
-    now = TWO_SIDED_95 * np.sqrt(today + noise**2)
-    if half[words] > _NARROWS * now:
+    lever, c, row = functions.lever, functions.branches[branch].curve, functions.branches[branch].rows[0]
+    covariance, by = lever.minimum.covariance, c.by_instrument[point]
+    zero = next(i for i, n in lever.zeros if n == functions.number and lever.unknowns[i].rows[row])
+
+    def half_of_band(i: int, error: float) -> float:
+        known = (error / lever.unknowns[i].given.error) ** 2
+        left = by @ covariance @ by - (by @ covariance[i]) ** 2 / (known + covariance[i, i])
+        return TWO_SIDED_95 * float(np.sqrt(max(left, 0.0) + c.noise_aj[point] ** 2))
+
+    frequency = f"'# free_frequency_khz = VALUE +- {1e-5 * functions.instrument.free_frequency_khz:.1g}'"
+    half, words = min(
+        (half_of_band(zero, 0.2), "the zero of the phase to 0.2 degrees ('# phase_zero_deg = VALUE +- 0.2')"),
+        (half_of_band(0, 1e-5), f"the free frequency to 1e-5 of itself ({frequency})"),
+    )
+    if half > _NARROWS * half_of_band(zero, np.inf):
         return "zero of the phase and free frequency would not narrow that; less noise or more rows would"
-    return f"state {words}, which would leave +- {half[words]:.2g} aJ"
+    return f"state {words}, which would leave +- {half:.2g} aJ"
 
 
 def differences_of_ways(functions: EnergyFunctions) -> list[dict[str, Any]]:
@@ -1026,23 +911,19 @@ def differences_of_ways(functions: EnergyFunctions) -> list[dict[str, Any]]:
     """
     found, covariance = [], functions.lever.minimum.covariance
     share = functions.lever.curves[functions.number].relative_error
-    for i, one in enumerate(functions.branches):
-        for j, other in enumerate(functions.branches):
-            if one.retract or not other.retract or (one.drive, one.repulsive) != (other.drive, other.repulsive):
-                continue
-            low, high = (
-                end(b.curve.amplitude_ratio[place] for b in (one, other)) for end, place in ((max, 0), (min, -1))
-            )
-            if not low < high:
-                continue
-            ratio = np.linspace(low, high, _POINTS)
-            (a, of_a, by_a), (b, of_b, by_b) = (estimates_at(branch.curve, ratio) for branch in (one, other))
-            off, by = b - a, by_b - by_a
-            variance = of_a**2 + of_b**2 + np.einsum("nu,uv,nv->n", by, covariance, by) + (share * off) ** 2
-            error = np.sqrt(variance)
-            most = int(np.argmax(np.abs(off) / error))
-            at = {"amplitude_ratio": ratio[most], "energy_aj": off[most], "standard_error": error[most]}
-            found.append({"approach": i, "retract": j} | at)
+    for (i, one), (j, other) in itertools.product(enumerate(functions.branches), repeat=2):
+        low = max(b.curve.amplitude_ratio[0] for b in (one, other))
+        high = min(b.curve.amplitude_ratio[-1] for b in (one, other))
+        same = (one.drive, one.repulsive) == (other.drive, other.repulsive)
+        if one.retract or not other.retract or not same or not low < high:
+            continue
+        ratio = np.linspace(low, high, _POINTS)
+        (a, of_a, by_a), (b, of_b, by_b) = (estimates_at(branch.curve, ratio) for branch in (one, other))
+        off, by = b - a, by_b - by_a
+        error = np.sqrt(of_a**2 + of_b**2 + np.einsum("nu,uv,nv->n", by, covariance, by) + (share * off) ** 2)
+        most = int(np.argmax(np.abs(off) / error))
+        at = {"amplitude_ratio": ratio[most], "energy_aj": off[most], "standard_error": error[most]}
+        found.append({"approach": i, "retract": j} | at)
     return found
 
 
@@ -1064,9 +945,6 @@ class OneEnergy:
         energy_aj: of each group.
         error_aj: its standard error but for spring constant and calibration.
         nuisances: of the instrument.
-        instrument: at the minimum.
-        used: rows that were fitted.
-        outliers: rows too far from the others.
         residual: of the rows fitted, in standard errors; NaN elsewhere.
         minimum: chi2 of rows, free rows and what is stated, its degrees of freedom.
         scale: what the rows' own errors were multiplied by.
@@ -1075,44 +953,25 @@ class OneEnergy:
     energy_aj: Float[np.ndarray, " groups"]
     error_aj: Float[np.ndarray, " groups"]
     nuisances: tuple[Nuisance, ...]
-    instrument: Instrument
-    used: Bool[np.ndarray, " rows"]
-    outliers: Bool[np.ndarray, " rows"]
     residual: Rows
     minimum: Solution
     scale: float
 
+    @property
+    def used(self) -> Mask:
+        """Rows that were fitted."""
+        return np.isfinite(self.residual)
 
-def one_energy(
-    lever: Lever,
-    groups: Sequence[np.ndarray],
-    stretches: Sequence[np.ndarray],
-    *,
-    scale_errors: bool = False,
-) -> OneEnergy:
+
+def one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve, scale: float = 1.0) -> OneEnergy:
     """Return one energy for each group of rows of a lever's only curve, the instrument free within what is stated.
 
     Args:
         lever: the curve, and its instrument.
         groups: rows that share an energy.
-        stretches: rows along which readings are smooth.
-        scale_errors: multiply the rows' own errors such that chi2 is as large as its degrees of freedom, if larger.
+        smooth: the curve with smooth readings, at which errors of energies are taken.
+        scale: what the rows' own errors are multiplied by.
     """
-    curve = lever.curves[0]
-    smooth, _, _ = _smoothed(curve, stretches, lever.instrument(0).free_amplitude_factor)
-    found = _one_energy(lever, groups, smooth, 1.0)
-    far = np.abs(np.nan_to_num(found.residual)) > _FAR
-    kept = [rows[~far[rows]] for rows in groups]
-    if 0 < far.sum() <= _MOST_OUTLIERS * found.used.sum() and all(len(rows) for rows in kept):
-        found = replace(_one_energy(lever, kept, smooth, 1.0), outliers=far)
-        groups = kept
-    minimum = found.minimum
-    scale = float(np.sqrt(max(minimum.chi2, 0.0) / max(minimum.degrees_of_freedom, 1))) if scale_errors else 1.0
-    return replace(_one_energy(lever, groups, smooth, scale), outliers=found.outliers) if scale > 1.0 else found
-
-
-def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve, scale: float) -> OneEnergy:
-    """Return the least squares of the instrument with the rows of groups, each of one energy."""
     curve, count = lever.curves[0], len(lever.unknowns)
     rows, group = np.concatenate(groups), np.repeat(np.arange(len(groups)), [len(part) for part in groups])
     own = (group[:, None] == np.arange(len(groups))).astype(float)
@@ -1135,8 +994,8 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
         noise, there = off(x)[1], energies(smooth, lever.instrument(0, x))
         missing = (x[count:][group] - there.energy_aj[rows]) / (noise / scale) ** 2
         moved = replace(smooth, amplitude_nm=smooth.amplitude_nm.copy(), lag_deg=smooth.lag_deg.copy())
-        moved.amplitude_nm[rows] += missing * (there.amplitude_slope * smooth.amplitude_error_nm**2)[rows]
-        moved.lag_deg[rows] += missing * (there.lag_slope * smooth.lag_error_deg**2)[rows]
+        moved.amplitude_nm[rows] += missing * (there.amplitude_slopes[0] * smooth.amplitude_error_nm**2)[rows]
+        moved.lag_deg[rows] += missing * (there.lag_slopes[0] * smooth.lag_error_deg**2)[rows]
         by = lever.slopes(moved, 0, x)[0][rows]
         of_free = np.pad(lever.jacobian(x), ((0, 0), (0, len(groups))))
         return np.concatenate([of_free, np.concatenate([by, -own], axis=1) / noise[:, None]])
@@ -1144,16 +1003,12 @@ def _one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve
     start = energies(curve, lever.instrument(0)).energy_aj
     x = np.concatenate([lever.minimum.at, [float(np.mean(start[part])) for part in groups]])
     minimum = _minimum(residual, jacobian, x)
-    left, noise = off(minimum.at)
-    residuals, used = np.full(curve.rows, np.nan), np.zeros(curve.rows, bool)
-    residuals[rows], used[rows] = left / noise, True
+    residuals = np.full(curve.rows, np.nan)
+    residuals[rows] = np.divide(*off(minimum.at))
     return OneEnergy(
         energy_aj=minimum.at[count:],
         error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
         nuisances=lever.nuisances(0, minimum),
-        instrument=lever.instrument(0, minimum.at),
-        used=used,
-        outliers=np.zeros(curve.rows, bool),
         residual=residuals,
         minimum=minimum,
         scale=scale,

@@ -17,11 +17,11 @@ from afm_jax.results import Result, public_result, words_of
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.images import AmplitudeAndPhase, read_images
-from fitting.instruments.lag import PhaseReadings, free_lag_deg, sense_of_phase, turned
+from fitting.instruments.lag import free_lag_deg, sense_of_phase, turned
 from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
-from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve
+from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, phase_readings
 from fitting.tapping_curves.energy import energies, noise_of
 
 _BEYOND = 3.0
@@ -44,6 +44,7 @@ _UNITS = {
     "nm_per_volt": "nm/V",
     "tip_calibration": "",
 }
+_OVER_IT = "not known: energies are over it, in nm^2"
 _NEEDED = {"free_frequency_khz": "KHZ", "quality_factor": "Q", "free_amplitude_nm": "NM", "free_phase_deg": "DEGREES"}
 ARRAYS = ("energy", "energy_error", "virial", "virial_error")
 
@@ -153,54 +154,69 @@ def tapping_map(
         images = read_images(images, columns=columns)
     notes = [images.note]
     known = _known(images, given)
-    value = {key: float(one.value) for key, one in known.items()} | {"harmonics_factor": HARMONICS_FACTOR.value}
-    amplitude = images.amplitude * (value["nm_per_volt"] if images.in_volts else 1.0)
+    common = _with_errors(known)
+    amplitude = images.amplitude * (common["nm_per_volt"].value if images.in_volts else 1.0)
     measured = np.isfinite(amplitude) & (amplitude > 0.0) & np.isfinite(images.phase_deg)
     if not measured.any():
         raise TableError(f"{images.source}: no pixel has both an amplitude above 0 and a phase")
-    behind = turned(images.phase_deg - value["free_phase_deg"])
-    noise = [
+    behind = turned(images.phase_deg - common["free_phase_deg"].value)
+    noise = (
         _roughness(amplitude, images.source) if amplitude_error_nm is None else amplitude_error_nm,
         _roughness(behind, images.source) if phase_error_deg is None else phase_error_deg,
-    ]
+    )
     if amplitude_error_nm is None or phase_error_deg is None:
         notes.append(
             f"Noise: {noise[0]:.3g} nm and {noise[1]:.3g} degrees a pixel, from the roughness along the lines "
             "(`amplitude_error_nm=...`, `phase_error_deg=...`)."
         )
-    errors = _errors(known, value)
-    readings = _readings(drive, value, errors, amplitude[measured], images.phase_deg[measured], noise)
+    pixels = np.flatnonzero(measured)
+    # of pixels evenly chosen, the free tip in front
+    some = pixels[np.linspace(0, len(pixels) - 1, min(len(pixels), _DECIDING)).astype(int)]
+    free, free_phase = common["free_amplitude_nm"], common["free_phase_deg"]
+    seen = map(np.append, (free.value, free_phase.value), (amplitude.ravel()[some], images.phase_deg.ravel()[some]))
+    rows = _rows_of(drive, common, (noise[0], float(np.hypot(noise[1], free_phase.error))), *seen)
+    readings = phase_readings(rows, np.arange(rows.rows) == 0)
     sense = sense_of_phase(readings, phase_sense or {1.0: "lag", -1.0: "lead"}.get(images.sense, ""))
     notes += sense.notes
     if sense.origin == "assumed":
         # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
-        errors["free_frequency_khz"] += readings.detuning * value["free_frequency_khz"]
-    pixels = np.flatnonzero(measured)
-    amplitudes, lags = amplitude.ravel(), sense.sign * behind.ravel()
+        f0, error = common["free_frequency_khz"]
+        common["free_frequency_khz"] = Given(f0, error + readings.detuning * f0)
+
+    def energies_of(chosen: np.ndarray, at: dict[str, Given]) -> Float[np.ndarray, "2 2 pixels"]:
+        """Return energies and virials of pixels and their errors from noise."""
+        f0, q = at["free_frequency_khz"].value, at["quality_factor"].value
+        lag = sense.sign * turned(images.phase_deg.ravel()[chosen] - at["free_phase_deg"].value)
+        lag += free_lag_deg(drive, at["drive_frequency_khz"].value / f0, q)
+        curve = _rows_of(drive, at, noise, amplitude.ravel()[chosen], lag)
+        found = energies(curve, Instrument(f0, q, harmonics_factor=at["harmonics_factor"].value))
+        return np.array([(found.energy_aj, found.virial_aj), noise_of(curve, found)])
+
     blocks = [pixels[first : first + _BLOCK] for first in range(0, len(pixels), _BLOCK)]
-    found = [_of_rows(drive, value, amplitudes[block], lags[block], noise) for block in blocks]
-    values, own = np.concatenate(found, axis=2)
+    values, own = np.concatenate([energies_of(block, common) for block in blocks], axis=2)
     median = int(np.argsort(values[0])[(values.shape[1] - 1) // 2])
     there = pixels[[median]]
-    changes = {}
-    for name, error in errors.items():
-        lag = lags[there] - (sense.sign * error if name == "free_phase_deg" else 0.0)
-        changed = _of_rows(drive, value | {name: value[name] + error}, amplitudes[there], lag, noise)
-        changes[name] = changed[0, :, 0] - values[:, median]
+    changes = {
+        name: energies_of(there, common | {name: Given(sum(one))})[0, :, 0] - values[:, median]
+        for name, one in common.items()
+        if one.error
+    }
     energy_error, virial_error = np.linalg.norm(list(changes.values()), axis=0).tolist()
     total = np.hypot(own[0], energy_error)
     state = np.full(amplitude.shape, PixelState.NOT_MEASURED, dtype=np.int8)
     state[measured] = np.where(
-        amplitude[measured] > value["free_amplitude_nm"] + _BEYOND * noise[0],
+        amplitude[measured] > free.value + _BEYOND * noise[0],
         PixelState.AMPLITUDE_ABOVE_FREE,
         np.where(values[0] < -_BEYOND * total, PixelState.ENERGY_BELOW_ZERO, PixelState.USED),
     )
     arrays = np.full((4, *amplitude.shape), np.nan)
     arrays[:, measured] = np.stack([values[0], own[0], values[1], own[1]])
     arrays[:, state != PixelState.USED] = np.nan
-    unit = "aJ" if _spring_is_known(known) else "nm^2"
-    common = {name: float(change[0]) for name, change in changes.items()}
-    parts = {words_of(name): abs(part) for name, part in common.items()} | {"noise of a pixel": float(own[0, median])}
+    unit = "aJ" if common["spring_constant_n_per_m"].error else "nm^2"
+    parts = {name: float(change[0]) for name, change in changes.items()}
+    why = _reasons(
+        float(values[0, median]), energy_error, parts | {"noise_of_a_pixel": float(own[0, median])}, state, unit
+    )
     return TappingMap(
         source=images.source,
         drive=drive,
@@ -209,8 +225,8 @@ def tapping_map(
         state=state,
         energy_common_error=energy_error,
         virial_common_error=virial_error,
-        common=common,
-        reasons=(*filter(None, [sense.reason]), *_reasons(float(values[0, median]), energy_error, parts, state, unit)),
+        common=parts,
+        reasons=(*filter(None, [sense.reason]), *why),
         size_m=images.size_m,
         known=known,
         notes=tuple(notes),
@@ -234,27 +250,26 @@ def _known(images: AmplitudeAndPhase, given: dict[str, Any]) -> dict[str, Known]
     if "drive_frequency_khz" not in known:
         known["drive_frequency_khz"] = Known(known["free_frequency_khz"].value, "kHz", ASSUMED_RESONANCE)
     if "spring_constant_n_per_m" not in known:
-        known["spring_constant_n_per_m"] = Known(1.0, "N/m", "not known: energies are over it, in nm^2")
+        known["spring_constant_n_per_m"] = Known(1.0, "N/m", _OVER_IT)
     known.setdefault("tip_calibration", Known(1.0, "", "assumed"))
     return known
 
 
-def _spring_is_known(known: dict[str, Known]) -> bool:
-    return not known["spring_constant_n_per_m"].origin.startswith("not known")
-
-
-def _errors(known: dict[str, Known], value: dict[str, float]) -> dict[str, float]:
-    """Return the standard errors of what all pixels have in common."""
-    errors = {key: known[key].error or usual * value[key] for key, usual in _USUAL.items()}
-    errors |= {"free_phase_deg": known["free_phase_deg"].error or _USUAL_ZERO_DEG}
-    errors |= {"harmonics_factor": HARMONICS_FACTOR.error}
-    if not _spring_is_known(known):
-        del errors["spring_constant_n_per_m"]
+def _with_errors(known: dict[str, Known]) -> dict[str, Given]:
+    """Return what all pixels have in common, with usual errors where none is given; 0: it does not count."""
+    usual = {key: share * abs(float(known[key].value)) for key, share in _USUAL.items()}
+    usual |= {"free_phase_deg": _USUAL_ZERO_DEG}
+    common = {
+        key: Given(float(one.value), (one.error or usual[key]) if key in usual else 0.0) for key, one in known.items()
+    }
+    if known["spring_constant_n_per_m"].origin == _OVER_IT:
+        common["spring_constant_n_per_m"] = Given(1.0)
     scale = known.get("nm_per_volt")
     if scale is not None and scale.error:
         # free amplitude and amplitudes go with it, as with the calibration
-        errors["tip_calibration"] = float(np.hypot(errors["tip_calibration"], scale.error / float(scale.value)))
-    return errors
+        value, error = common["tip_calibration"]
+        common["tip_calibration"] = Given(value, float(np.hypot(error, scale.error / float(scale.value))))
+    return common | {"harmonics_factor": HARMONICS_FACTOR}
 
 
 def _roughness(image: Float[np.ndarray, "rows columns"], source: str) -> float:
@@ -271,61 +286,29 @@ def _roughness(image: Float[np.ndarray, "rows columns"], source: str) -> float:
     return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
 
 
-def _readings(
-    drive: str,
-    value: dict[str, float],
-    errors: dict[str, float],
-    amplitude: Float[np.ndarray, " pixels"],
-    phase: Float[np.ndarray, " pixels"],
-    noise: list[float],
-) -> PhaseReadings:
-    """Return what of pixels says which sense their phase has, the free tip in front."""
-    chosen = np.linspace(0, len(amplitude) - 1, min(len(amplitude), _DECIDING)).astype(int)
-    ratio, ones = amplitude[chosen] / value["free_amplitude_nm"], np.ones(len(chosen) + 1)
-    relative = {key: errors[key] / value[key] for key in _USUAL if key in errors}
-    return PhaseReadings(
-        drive=drive,
-        frequency_ratio=value["drive_frequency_khz"] / value["free_frequency_khz"] * ones,
-        frequency_error=relative["free_frequency_khz"],
-        quality_factor=value["quality_factor"],
-        quality_error=relative["quality_factor"],
-        ratio=np.append(1.0, ratio),
-        ratio_error=np.hypot(noise[0] / value["free_amplitude_nm"], relative["free_amplitude_nm"]) * ones,
-        phase_deg=np.append(value["free_phase_deg"], phase[chosen]),
-        phase_error_deg=np.hypot(noise[1], errors["free_phase_deg"]) * ones,
-        free=np.arange(len(ones)) == 0,
-    )
-
-
-def _of_rows(
-    drive: Literal["base", "force"],
-    value: dict[str, float],
-    amplitude: Float[np.ndarray, " pixels"],
-    behind: Float[np.ndarray, " pixels"],
-    noise: list[float],
-) -> Float[np.ndarray, "2 2 pixels"]:
-    """Return energies and virials of pixels and their errors from noise, as those of rows of a tapping curve."""
-    ones, f0, q = np.ones(len(amplitude)), value["free_frequency_khz"], value["quality_factor"]
-    drive_frequency = value["drive_frequency_khz"]
-    curve = TappingCurve(
+def _rows_of(
+    drive: Literal["base", "force"], at: dict[str, Given], noise: tuple[float, float], amplitude: Rows, lag: Rows
+) -> TappingCurve:
+    """Return pixels as the rows of a tapping curve."""
+    ones, free = np.ones(len(amplitude)), at["free_amplitude_nm"]
+    return TappingCurve(
         source="",
         drive=drive,
         offset_nm=ones,
         amplitude_nm=amplitude,
         amplitude_error_nm=noise[0] * ones,
-        lag_deg=free_lag_deg(drive, drive_frequency / f0, q) + behind,
+        lag_deg=lag,
         lag_error_deg=noise[1] * ones,
-        free_amplitude_nm=value["free_amplitude_nm"] * ones,
-        drive_frequency_khz=drive_frequency * ones,
+        free_amplitude_nm=free.value * ones,
+        free_amplitude_error=free.error / free.value,
+        drive_frequency_khz=at["drive_frequency_khz"].value * ones,
         retract=ones < 0.0,
-        free_frequency_khz=Given(f0),
-        quality_factor=Given(q),
-        spring_constant_n_per_m=Given(value["spring_constant_n_per_m"]),
-        tip_calibration=Given(value["tip_calibration"]),
+        free_frequency_khz=at["free_frequency_khz"],
+        quality_factor=at["quality_factor"],
+        spring_constant_n_per_m=at["spring_constant_n_per_m"],
+        tip_calibration=at["tip_calibration"],
         lines=np.arange(len(amplitude)),
     )
-    found = energies(curve, Instrument(f0, q, harmonics_factor=value["harmonics_factor"]))
-    return np.array([(found.energy_aj, found.virial_aj), noise_of(curve, found)])
 
 
 def _reasons(
@@ -336,25 +319,24 @@ def _reasons(
     Args:
         energy: of the median pixel.
         common: its standard error that all pixels have in common.
-        parts: standard errors of that energy by what they come from, in words.
+        parts: errors of that energy by what they come from.
         state: of all pixels.
         unit: of energies.
     """
     used, above, below = (int(np.sum(state == one)) for one in list(PixelState)[:3])
     doubt = "free amplitude, its phase, quality factor or units do not belong to this image"
-    total = float(np.hypot(common, parts["noise of a pixel"]))
-    reasons = []
+    total, reasons = float(np.hypot(common, parts["noise_of_a_pixel"])), []
+    low, high = max(energy - TWO_SIDED_95 * total, 0.0), energy + TWO_SIDED_95 * total
     if used < above + below:
         why = f"{above} with an amplitude above the free one, {below} with an energy below zero"
-        reasons.append(f"only {used} of {used + above + below} pixels are in range ({why}): {doubt}")
+        reasons = [f"only {used} of {used + above + below} pixels are in range ({why}): {doubt}"]
     if energy + TWO_SIDED_95 * common < 0.0:
-        reasons.append(
-            f"the median energy is below zero beyond its errors ({energy:.3g} +- {common:.2g} {unit}): {doubt}"
-        )
+        beyond = f"{energy:.3g} +- {common:.2g} {unit}"
+        reasons.append(f"the median energy is below zero beyond its errors ({beyond}): {doubt}")
     elif TWO_SIDED_95 * total > 0.5 * energy:
-        low, high = max(energy - TWO_SIDED_95 * total, 0.0), energy + TWO_SIDED_95 * total
+        most = max(parts, key=lambda name: abs(parts[name]))
         reasons.append(
             f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} {unit} in the median pixel "
-            f"({energy:.3g} +- {total:.2g}); most of its error comes from {max(parts, key=lambda name: parts[name])}"
+            f"({energy:.3g} +- {total:.2g}); most of its error comes from {words_of(most)}"
         )
     return reasons

@@ -30,10 +30,9 @@ def curve_figure(result: Tapping) -> Figure:
         middle = between[0]
         _points(middle, result, curve.lag_deg, curve.lag_error_deg)
         label_axes(middle, x="", y="lag (degrees)")
-        _points(bottom, result, rows.energy_of_fit_aj, rows.energy_noise_aj)
-        bottom.plot(curve.offset_nm, rows.energy_aj, "+", color=GRID, ms=4, label="instrument as given")
+        _points(bottom, result, rows.energy_aj, rows.energy_noise_aj)
         drawn = _energy_bands(bottom, result)
-        touching = rows.energy_of_fit_aj[~rows.free & np.isfinite(rows.energy_of_fit_aj)]
+        touching = rows.energy_aj[~rows.free & np.isfinite(rows.energy_aj)]
         # all points in contact are in the picture
         low, high = min([drawn[0], *touching.tolist()]), max([drawn[1], *touching.tolist()])
         bottom.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
@@ -56,24 +55,17 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
     curve, free = result.curve, result.rows.free
     aside = np.array([note.startswith("excluded") for note in result.rows.note])
     for back, marker in ((False, "o"), (True, "s")):
-        for chosen, colour, label in (
-            (free, GRID, "free"),
-            (~free & ~aside, BLUE if not back else ACCENT, way_of(back)),
-            (~free & aside, "none", "excluded"),
+        for chosen, colour, filled, label in (
+            (free, GRID, GRID, "free"),
+            (~free & ~aside, ACCENT if back else BLUE, ACCENT if back else BLUE, way_of(back)),
+            (~free & aside, DARK, "none", "excluded"),
         ):
             here = chosen & (curve.retract == back) & np.isfinite(values)
             if here.any():
-                axes.errorbar(
-                    curve.offset_nm[here],
-                    values[here],
-                    errors[here],
-                    fmt=marker,
-                    ms=4,
-                    lw=0.8,
-                    color=DARK if colour == "none" else colour,
-                    mfc=colour,
-                    label=label if label not in axes.get_legend_handles_labels()[1] else None,
-                )
+                style = {"fmt": marker, "ms": 4, "lw": 0.8, "color": colour, "mfc": filled}
+                new = label not in axes.get_legend_handles_labels()[1]
+                style |= {"label": label if new else None}
+                axes.errorbar(curve.offset_nm[here], values[here], errors[here], **style)
 
 
 def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
@@ -87,7 +79,7 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
         ends += [float(curve.energy_aj.max()), *np.percentile(curve.energy_high_aj, [0.0, 90.0]).tolist()]
     if result.fit is not None and result.described:
         for i, group in enumerate(result.groups):
-            heights = result.curve.offset_nm[result.fit.used & (result.group_of_rows == i)]
+            heights = result.curve.offset_nm[result.fit.used & group.rows]
             energy, _, (low, high) = result.constant(i)
             axes.plot(
                 [heights.min(), heights.max()],
@@ -122,7 +114,7 @@ def together_figure(result: TappingTogether) -> Figure:
                 ):
                     axes.fill_between(ratio, mean - width, mean + width, color=colour, alpha=shade, lw=0)
         axes.set_title(side_of(state), fontsize=_SMALL + 1)
-        label_axes(axes, x="amplitude over the free one", y=result.curves[0].in_unit("energy of a tap (aJ)"))
+        label_axes(axes, x="amplitude over the free one", y=result.in_unit("energy of a tap (aJ)"))
         axes.grid(color=GRID, alpha=0.25)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=_SMALL)

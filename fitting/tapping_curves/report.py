@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,13 +20,10 @@ from fitting.report.sections import (
     pictures_of,
     text_of,
 )
-from fitting.tapping_curves.branches import Height
+from fitting.tapping_curves.branches import CurveBranch, Hysteresis
 from fitting.tapping_curves.energy import HEADLINE, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _WIDTH = 150
 _CHANGES = {
@@ -58,23 +55,23 @@ def tapping_report(result: Tapping) -> Report:
         from fitting.report.report import summary  # noqa: PLC0415 - fits import JAX, energies need none
 
         law = summary(result.law)
+    sections = [
+        *_along_the_branches(result),
+        *_one_energy(result),
+        *_thresholds(result),
+        *_speeds(result),
+        ReportSection("Impact law", [Text(law, "lines" if result.law else "")], "Impact law"),
+        ReportSection("What the numbers take for granted", [Bullets(result.assumptions, "Assumed:")], "Assumptions"),
+    ]
+    if result.warnings:
+        sections.append(ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"))
     return Report(
         title=f"Tapping curve {result.table.source}: {len(states)} rows, {counts}",
         about=[f"Energy of a tap: {energy_in_words(result)}"],
         valid=result.valid,
         verdict="VALID" if result.valid else "NOT VALID",
         reasons=result.reasons,
-        sections=[
-            *_along_the_branches(result),
-            *_one_energy(result),
-            *_thresholds(result),
-            *_speeds(result),
-            ReportSection("Impact law", [Text(law, "lines" if result.law else "")], "Impact law"),
-            ReportSection(
-                "What the numbers take for granted", [Bullets(result.assumptions, "Assumed:")], "Assumptions"
-            ),
-            *([ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes")] if result.warnings else []),
-        ],
+        sections=sections,
     )
 
 
@@ -102,23 +99,17 @@ def _band_in_words(low: float, high: float) -> str:
 def _along_the_branches(result: Tapping) -> list[ReportSection]:
     """Return the energy of each branch at some amplitudes, and what is known of the instrument."""
     functions = result.functions
-    if functions is None or not result.branches:
+    if not result.branches:
         return []
     head = ["energy (aJ) at A/A0 =", "measured", *(f"{ratio:g}" for ratio in HEADLINE), "largest"]
-    several = len({branch.drive for branch in result.branches}) > 1
     cells = []
     for branch in result.branches:
         curve, top = branch.curve, int(np.argmax(branch.curve.energy_aj))
-        drive = f", {branch.drive_frequency_khz:g} kHz, {branch.free_amplitude_nm:.4g} nm" if several else ""
-        largest = _band_in_words(float(curve.energy_low_aj[top]), float(curve.energy_high_aj[top]))
-        cells.append(
-            [
-                branch.name + drive,
-                f"{curve.amplitude_ratio[0]:.2f} to {curve.amplitude_ratio[-1]:.2f}",
-                *("-" if (at := curve.at(ratio)) is None else _band_in_words(*at) for ratio in HEADLINE),
-                f"{largest} at {curve.amplitude_ratio[top]:.2f}",
-            ]
-        )
+        ratio, largest = curve.amplitude_ratio, (float(curve.energy_low_aj[top]), float(curve.energy_high_aj[top]))
+        at = ("-" if (band := curve.at(ratio)) is None else _band_in_words(*band) for ratio in HEADLINE)
+        name = branch.name + _of_drive(branch, result.branches)
+        at = (*at, f"{_band_in_words(*largest)} at {ratio[top]:.2f}")
+        cells.append([name, f"{ratio[0]:.2f} to {ratio[-1]:.2f}", *at])
     lines = [
         f"  retract less approach, {result.branches[one['approach']].side}: "
         f"{with_error(one['energy_aj'], one['standard_error'])} aJ at A/A0 = {one['amplitude_ratio']:.2f}, where the "
@@ -132,15 +123,14 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
             f"({result.branches[least['branch']].name}): {_band_in_words(*least['interval95_aj'])} aJ, of which the "
             f"error of the frequency is {least['by_frequency_aj']:.2g}"
         )
-    caption = (
+    energy = Table(
         "Energy of a tap by the amplitude over the free one: value and standard error where measured, else the band of "
-        "95 %"
+        "95 %",
+        head,
+        cells,
     )
     scaled = "" if functions.scale == 1.0 else f", errors of the rows times {functions.scale:.2f}"
-    chi2 = (
-        f"  rows about smooth energies: chi2 {functions.rows_chi2:.1f} for {functions.rows_freedom:.0f} degrees of "
-        f"freedom{scaled}"
-    )
+    chi2 = f"chi2 {functions.rows_chi2:.1f} for {functions.rows_freedom:.0f} degrees of freedom{scaled}"
     known = [
         [
             one.name.removesuffix("_0"),
@@ -149,12 +139,18 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
         ]
         for one in functions.nuisances
     ]
-    caption_of_known = "What is known of the instrument beforehand, and with its free rows"
-    instrument = Table(caption_of_known, ["instrument, from what is stated and free rows", "given", "fitted"], known)
+    caption = "What is known of the instrument beforehand, and with its free rows"
+    instrument = Table(caption, ["instrument, from what is stated and free rows", "given", "fitted"], known)
     return [
-        ReportSection("Energy along the branches", [Table(caption, head, cells), *_lines(lines)], "Energy"),
-        ReportSection("Instrument", [instrument, *_lines([chi2])]),
+        ReportSection("Energy along the branches", [energy, *_lines(lines)], "Energy"),
+        ReportSection("Instrument", [instrument, *_lines([f"  rows about smooth energies: {chi2}"])]),
     ]
+
+
+def _of_drive(one: CurveBranch | Hysteresis, others: Sequence[CurveBranch | Hysteresis]) -> str:
+    """Return frequency and free amplitude as the end of a name, where others have different ones."""
+    several = len({(other.drive_frequency_khz, other.free_amplitude_nm) for other in others}) > 1
+    return f", {one.drive_frequency_khz:g} kHz, {one.free_amplitude_nm:.4g} nm" if several else ""
 
 
 def _lines(lines: Sequence[str]) -> list[Text]:
@@ -163,45 +159,34 @@ def _lines(lines: Sequence[str]) -> list[Text]:
 
 def _one_energy(result: Tapping) -> list[ReportSection]:
     """Return the one energy of all taps of each branch, where that describes the rows."""
-    fit = result.fit
+    fit, epsilon = result.fit, result.epsilon
     if fit is None or not result.described:
         return []
-    energy, epsilon = result.energy, result.epsilon
-    lines = ["If every tap of a branch took the same (assumed: along A sqrt(A0^2 - A^2) the curve cannot test it):"]
-    if energy["value"] is not None:
-        pull = f"the free frequency {energy['free_frequency_pull']:+.1f} of its errors from what is given"
-        value = with_error(energy["value"], energy["standard_error"])
-        lines.append(f"  {value} aJ (95 %: {interval(*energy['interval95'])}), {pull}")
-        value = with_error(epsilon["value"], epsilon["standard_error"])
-        of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
-        lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2" + of_mass)
+    assumed = "If every tap of a branch took the same (assumed: along A sqrt(A0^2 - A^2) the curve cannot test it):"
     cells = []
     for i, group in enumerate(result.groups):
         value, error, ends = result.constant(i)
-        count = int(np.sum(fit.used & (result.group_of_rows == i)))
         known = interval(*ends) if np.isfinite(ends).all() else "open"
-        cells.append([group.name, f"{count}", with_error(value, error), known])
-    least = fit.minimum
-    caption, head = "Each tap of a branch is assumed to take the same", ["branch", "rows", "energy (aJ)", "95 %"]
-    chi2 = f"  chi2/dof = {least.chi2:.1f}/{least.degrees_of_freedom}, probability {least.p_value:.2g}"
-    return [
-        ReportSection("One energy for all taps", _lines(lines), "One energy"),
-        ReportSection("Branches with one energy each", [Table(caption, head, cells), *_lines([chi2])]),
-    ]
+        cells.append([group.name, f"{np.sum(fit.used & group.rows)}", with_error(value, error), known])
+    table = Table("One energy a branch", ["branch", "rows", "energy (aJ)", "95 %"], cells)
+    least, pull = fit.minimum, fit.nuisances[0].pull
+    chi2 = f"chi2/dof = {least.chi2:.1f}/{least.degrees_of_freedom}, probability {least.p_value:.2g}"
+    lines = [f"  {chi2}, the free frequency {pull:+.1f} of its errors from what is given"]
+    if epsilon["value"] is not None:
+        scaled = with_error(epsilon["value"], epsilon["standard_error"])
+        of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
+        lines.append(f"  epsilon = 2 E/m = {scaled} nm^2/us^2{of_mass}")
+    return [ReportSection("One energy for all taps", [Text(assumed), table, *_lines(lines)], "One energy")]
 
 
 def _thresholds(result: Tapping) -> list[ReportSection]:
     """Return the heights at which the curve changes, a row for each change."""
     if not result.hysteresis:
         return []
-    several = len({(one.drive_frequency_khz, one.free_amplitude_nm) for one in result.hysteresis}) > 1
     cells = [
         [
-            _CHANGES[one.change]
-            + (f", {one.drive_frequency_khz:g} kHz, {one.free_amplitude_nm:.4g} nm" if several else ""),
-            _height(one.approach),
-            _height(one.retract),
-            "-" if one.width_nm is None else with_error(*one.width_nm),
+            _CHANGES[one.change] + _of_drive(one, result.hysteresis),
+            *("-" if found is None else with_error(*found) for found in (one.approach, one.retract, one.width_nm)),
         ]
         for one in result.hysteresis
     ]
@@ -210,22 +195,17 @@ def _thresholds(result: Tapping) -> list[ReportSection]:
     return [ReportSection("Thresholds", [table], "Thresholds")]
 
 
-def _height(found: Height | None) -> str:
-    return "-" if found is None else with_error(*found)
-
-
 def _speeds(result: Tapping) -> list[ReportSection]:
     """Return the speeds of the impacts."""
     found = result.speeds
     if found is None:
         return []
-    u = found.approach_speed_nm_per_us
-    here = np.isfinite(u)
+    here = np.isfinite(found.approach_speed_nm_per_us)
+    u, error = found.approach_speed_nm_per_us[here], found.approach_speed_error_nm_per_us[here]
     if not here.any():
         return [ReportSection("Speeds of the impacts", [Text("Impact speeds: known to 25 % or better in no row.")])]
-    known = percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))
-    speeds = f"{u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows"
-    words = f"Impact speeds: {speeds}, known to {known} in the median"
+    known = f"known to {percent(float(np.median(error / u)))} in the median"
+    words = f"Impact speeds: {u.min():.3g} to {u.max():.3g} nm/us in {len(u)} rows, {known}"
     return [ReportSection("Speeds of the impacts", [Text(words)], "Speeds")]
 
 
@@ -247,8 +227,7 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
         "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch with "
         "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free."
     )
-    data = {"format": "afm-jax tapping", "format_version": 1, **result.to_dict()}
-    written = _write(folder, "tapping", result.in_unit, tapping_report(result), result.plot(), shows, data)
+    written = _write(folder, "tapping", result, tapping_report(result), shows)
     records = result.keyed(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
     if result.law is None:
@@ -258,41 +237,37 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
     return [*written, *write_report(result.law, folder, write_table)]
 
 
-def _write(
-    folder: Path,
-    name: str,
-    in_unit: Callable[[str], str],
-    report: Report,
-    figure: "Figure",
-    shows: str,
-    data: dict[str, Any],
-) -> list[Path]:
+def _write(folder: Path, name: str, result: Tapping | TappingTogether, report: Report, shows: str) -> list[Path]:
     """Write page, text, JSON and picture of a report; texts in the unit that energies have."""
     # a call without --out needs neither matplotlib nor JAX
     from afm_jax.plots.picture_style import png_of, svg_of  # noqa: PLC0415
 
     # SVG files have the layout of the PNG drawn before
-    picture = png_of(figure)
+    picture = png_of(figure := result.plot())
     seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
-    page = in_unit(page_of(replace(report, sections=[seen, *report.sections])))
-    return write_report_files(folder, name, text=_printed(report, in_unit), data=data, picture=picture, page=page)
+    page = result.in_unit(page_of(replace(report, sections=[seen, *report.sections])))
+    kind = "tapping" if name == "tapping" else f"tapping {name}"
+    data = {"format": f"afm-jax {kind}", "format_version": 1, **result.to_dict()}
+    return write_report_files(
+        folder, name, text=_printed(report, result.in_unit), data=data, picture=picture, page=page
+    )
 
 
 def together_report(result: TappingTogether) -> Report:
     """Return what several curves of one lever say together: mean and scatter of each branch, the instrument."""
     cells = [
-        [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", f"{at[1]:.2g}", f"{at[2]:.2g}", f"{at[3]:.2g}"]
+        [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", *(f"{error:.2g}" for error in at[1:])]
         for one in result.scatter
         for ratio in HEADLINE
         if (at := one.at(ratio)) is not None
     ]
     head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
+    caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"
     common = [
         f"  {one.name}: {with_error(one.value, one.standard_error)} ({one.given})" for one in result.common_nuisances
     ]
     if result.agreement_p_value is not None:
         common.append(f"  probability that curves of one instrument disagree more: {result.agreement_p_value:.2g}")
-    caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"
     return Report(
         title=f"{len(result.curves)} curves of one lever",
         valid=result.valid,
@@ -307,7 +282,7 @@ def together_report(result: TappingTogether) -> Report:
 
 def together_summary(result: TappingTogether) -> str:
     """Return what several curves of one lever say together as text."""
-    return _printed(together_report(result), result.curves[0].in_unit)
+    return _printed(together_report(result), result.in_unit)
 
 
 def write_together(result: TappingTogether, folder: Path) -> list[Path]:
@@ -326,6 +301,4 @@ def write_together(result: TappingTogether, folder: Path) -> list[Path]:
     shows = (
         "Energy over the amplitude, each curve and their mean, with the scatter and the error that all have in common."
     )
-    data = {"format": "afm-jax tapping together", "format_version": 1, **result.to_dict()}
-    report = together_report(result)
-    return _write(folder, "together", result.curves[0].in_unit, report, result.plot(), shows, data)
+    return _write(folder, "together", result, together_report(result), shows)

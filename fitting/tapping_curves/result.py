@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Int
 
 from afm_jax.outcomes import judge
 from afm_jax.results import Result, public_result
@@ -14,7 +13,7 @@ from afm_jax.units import TWO_SIDED_95, effective_mass_ng
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
-from fitting.tapping_curves.curve import Rows, TappingCurve
+from fitting.tapping_curves.curve import Mask, Rows, TappingCurve
 from fitting.tapping_curves.energy import (
     HEADLINE,
     MEASURED,
@@ -33,20 +32,20 @@ from fitting.tapping_curves.verdict import (
     NO_FUNCTIONS,
     REASONS,
     WARNINGS,
-    drift_of_free_rows,
 )
 
 if TYPE_CHECKING:
     from fitting.infer.result import FitResult
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class EnergyGroup:
-    """Rows that share an energy: of one drive and one branch."""
+    """Rows that may share an energy, those of one drive and one branch, whether or not all are in the fit."""
 
     drive_frequency_khz: float
     free_amplitude_nm: float
     repulsive: bool
+    rows: Mask
 
     @property
     def name(self) -> str:
@@ -61,31 +60,25 @@ class TapRows:
 
     Attributes:
         state: "free", "attractive", "repulsive", "held", or "touching" where there is no phase.
-        lag_departure_deg: lag less that of the free tip.
-        energy_aj: of a tap, with the instrument as given.
+        energy_aj: of a tap, with the instrument where statements and free rows put it.
         energy_noise_aj: its standard error from the row's own noise.
-        energy_systematic_aj: its standard error from what all rows share.
-        energy_of_fit_aj: with the instrument as fitted.
-        virial_aj: mean of force times height, of the first harmonic, with the instrument as given; positive where
-            attraction prevails, negative where repulsion does.
+        virial_aj: mean of force times height, of the first harmonic; positive where attraction prevails, negative where
+            repulsion does.
         largest_energy_aj: the most that a tap can take at this amplitude, whatever the phase.
         used: whether it is in the fit of one energy.
         note: why not; or what it is for.
     """
 
     state: tuple[str, ...]
-    lag_departure_deg: Rows
     energy_aj: Rows
     energy_noise_aj: Rows
-    energy_systematic_aj: Rows
-    energy_of_fit_aj: Rows
     virial_aj: Rows
     largest_energy_aj: Rows
-    used: Bool[np.ndarray, " rows"]
+    used: Mask
     note: tuple[str, ...]
 
     @property
-    def free(self) -> Bool[np.ndarray, " rows"]:
+    def free(self) -> Mask:
         """Rows of the free tip."""
         return np.array([state == "free" for state in self.state])
 
@@ -111,7 +104,7 @@ class MeasuredSpeeds:
     contact_us: Rows
     pull: Rows
     in_capture_speeds: Rows
-    fast: Bool[np.ndarray, " rows"]
+    fast: Mask
     why_not: str
 
 
@@ -126,7 +119,7 @@ class Tapping(Result):
         rows: state, energy and virial of each row of the table.
         groups: the kinds of rows that may share an energy.
         fit: one energy for each group, fitted with the instrument; None without a phase or rows.
-        functions: the energy as a smooth function along each branch, the instrument cut off from it; or None.
+        functions: the energy as a smooth function along each branch, the instrument cut off from it.
         scale_errors: whether errors are multiplied where the rows scatter more.
         followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: energy that a tap takes at most, where only the amplitude was recorded; else None.
@@ -141,7 +134,7 @@ class Tapping(Result):
     rows: TapRows
     groups: tuple[EnergyGroup, ...]
     fit: OneEnergy | None
-    functions: EnergyFunctions | None
+    functions: EnergyFunctions
     scale_errors: bool
     followed: OneEnergy | None
     bound_aj: float | None
@@ -153,30 +146,19 @@ class Tapping(Result):
     @property
     def branches(self) -> tuple[TappingBranch, ...]:
         """Each with its energy and virial over the amplitude."""
-        return () if self.functions is None else self.functions.branches
+        return self.functions.branches
 
     @property
     def mass_ng(self) -> float:
         """Effective mass, from spring constant and free frequency."""
         return effective_mass_ng(self.curve.spring_constant_n_per_m.value, self.curve.free_frequency_khz.value)
 
-    @property
-    def group_of_rows(self) -> Int[np.ndarray, " rows"]:
-        """Of every row the number of the group with its drive and branch, -1 where there is none."""
-        found = np.full(self.curve.rows, -1)
-        for i, group in enumerate(self.groups):
-            here = (self.curve.drive_frequency_khz == group.drive_frequency_khz) & (
-                self.curve.free_amplitude_nm == group.free_amplitude_nm
-            )
-            found[here & (np.array(self.rows.state) == side_of(group.repulsive))] = i
-        return found
-
     def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
         """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
         assert self.fit is not None  # noqa: S101
-        value, alone = float(self.fit.energy_aj[number]), float(self.fit.error_aj[number])
-        share = self.curve.relative_error
-        return value, float(np.hypot(alone, share * value)), _interval(value, alone, share)
+        value = float(self.fit.energy_aj[number])
+        error = float(np.hypot(self.fit.error_aj[number], self.curve.relative_error * value))
+        return value, error, (value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error)
 
     @property
     def why_not_constant(self) -> str:
@@ -187,11 +169,6 @@ class Tapping(Result):
     def why_not_functions(self) -> str:
         """Why the energy along the branches is not determined; empty where it is."""
         return next(iter(judge([NO_FUNCTIONS], self)), "")
-
-    @property
-    def drift(self) -> list[str]:
-        """Sentences on drifts of the free tip along rows whose order in time the table does not state; empty: none."""
-        return drift_of_free_rows(self.curve, self.rows.free)
 
     @property
     def reasons(self) -> list[str]:
@@ -220,30 +197,25 @@ class Tapping(Result):
         It makes no curve valid: along a sqrt(1 - a^2) with a = A/A0 the curve cannot test the assumption. Where one
         energy does not explain the rows `value` is None and `reason` says why.
         """
-        blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None}
+        blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None, "kind": "none"}
         if self.fit is None and self.bound_aj is not None:
             return blank | {"interval95": (0.0, self.bound_aj), "kind": "upper bound", "reason": ""}
         if self.fit is None or self.why_not_constant:
-            return blank | {"kind": "none", "reason": self.why_not_constant}
+            return blank | {"reason": self.why_not_constant}
         repulsive = [i for i, group in enumerate(self.groups) if group.repulsive]
         chosen = repulsive or list(range(len(self.groups)))
+        value, error, interval = self.constant(chosen[0])
         if len(chosen) > 1:
             each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
-            return blank | {"kind": "several", "reason": f"each drive has its own: {each}"}
-        value, error, interval = self.constant(chosen[0])
+            return blank | {"reason": f"each drive has its own: {each}"}
         if not value > 0.0:
-            return blank | {
-                "kind": "none",
-                "reason": "the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong",
-            }
+            return blank | {"reason": "the energy of a tap is not positive: frequency, Q or the phase's zero is wrong"}
         return {
             "value": value,
             "standard_error": error,
             "interval95": np.maximum(interval, 0.0),
             "kind": "bracket" if not error < MEASURED * value else "fit",
             "reason": "",
-            "assumption": "each tap of the branch takes the same energy",
-            "p_value": self.fit.minimum.p_value,
             "free_frequency_pull": self.fit.nuisances[0].pull,
         }
 
@@ -272,17 +244,7 @@ class Tapping(Result):
     @property
     def least_on_frequency(self) -> dict[str, Any] | None:
         """The energy that hangs least on the free frequency, and where; None where none is above nothing."""
-        return None if self.functions is None else least_on_frequency(self.functions)
-
-    @property
-    def energy_along_branches_aj(self) -> Rows:
-        """Energy of each row's tap by the function of its branch; NaN for rows of none."""
-        found = np.full(self.curve.rows, np.nan)
-        for branch in self.branches:
-            order = np.argsort(branch.curve.height_nm)
-            height, energy = branch.curve.height_nm[order], branch.curve.estimate_aj[order]
-            found[branch.rows] = np.interp(self.curve.offset_nm[branch.rows], height, energy)
-        return found
+        return least_on_frequency(self.functions)
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:
@@ -304,7 +266,7 @@ class Tapping(Result):
     @property
     def way_differences(self) -> list[dict[str, Any]]:
         """By how much the energy differs between approach and retract, by the numbers of the branches."""
-        return [] if self.functions is None else differences_of_ways(self.functions)
+        return differences_of_ways(self.functions)
 
     def in_unit(self, text: str) -> str:
         """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant.
@@ -328,11 +290,8 @@ class Tapping(Result):
     @property
     def epsilon(self) -> dict[str, Any]:
         """2 E/m in nm^2/us^2: what a tap takes, as the impact law counts it."""
-        energy, factor = self.energy, 2.0 / self.mass_ng
-        scaled = {name: None if energy[name] is None else energy[name] * factor for name in ("value", "standard_error")}
-        return scaled | {
-            "interval95": None if energy["interval95"] is None else [end * factor for end in energy["interval95"]]
-        }
+        names, factor = ("value", "standard_error", "interval95"), 2.0 / self.mass_ng
+        return {name: None if self.energy[name] is None else factor * np.array(self.energy[name]) for name in names}
 
     @property
     def law_allowed(self) -> bool:
@@ -359,48 +318,28 @@ class Tapping(Result):
             if note.startswith("excluded")
         ]
 
-    def _branches(self) -> list[dict[str, Any]]:
-        """Return what is known of each branch: its rows, its one energy if it has one, and its curve."""
-        group = self.group_of_rows
-        return [
-            {
-                "drive_frequency_khz": branch.drive_frequency_khz,
-                "free_amplitude_nm": branch.free_amplitude_nm,
-                "branch": branch.way,
-                "repulsive": branch.repulsive,
-                "rows": len(branch.rows),
-                **self._constant_of(int(group[branch.rows[0]])),
-                "curve": branch.curve.to_dict(),
-            }
-            for branch in self.branches
-        ]
+    def _constant_of(self, branch: TappingBranch) -> dict[str, Any]:
+        """Return whether one energy explains the rows of a branch, and which."""
+        groups = [i for i, group in enumerate(self.groups) if self.described and group.rows[branch.rows[0]]]
+        names = ("constant", "energy_aj", "standard_error_aj", "interval95_aj")
+        return dict(zip(names, (True, *self.constant(groups[0])) if groups else (False, None, None, None), strict=True))
 
     def _fits(self) -> dict[str, Any]:
         """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
-        fit, functions, smooth, statistics = self.fit, self.functions, None, {}
-        if functions is not None:
-            smooth = {
-                "valid": not self.why_not_functions,
-                "reason": self.why_not_functions or None,
-                **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
-                "nuisances": nuisances_as_dict(functions.nuisances),
-            }
-        if fit is not None:
-            statistics = {name: getattr(fit.minimum, name) for name in ("chi2", "degrees_of_freedom", "p_value")}
-            statistics |= {"scale": fit.scale}
-        return {
-            "functions": smooth,
-            **dict.fromkeys(("chi2", "degrees_of_freedom", "p_value", "scale")),
-            **statistics,
-            "nuisances_of_one_energy": {} if fit is None or not self.described else nuisances_as_dict(fit.nuisances),
+        fit, functions = self.fit, self.functions
+        smooth = {
+            "valid": not self.why_not_functions,
+            "reason": self.why_not_functions or None,
+            **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
+            "nuisances": nuisances_as_dict(functions.nuisances),
         }
-
-    def _constant_of(self, number: int) -> dict[str, Any]:
-        """Return whether one energy explains the rows of a group, and which."""
-        blank: dict[str, Any] = {"energy_aj": None, "standard_error_aj": None, "interval95_aj": None}
-        if number < 0 or self.fit is None or not self.described:
-            return {"constant": False, **blank}
-        return {"constant": True, **dict(zip(blank, self.constant(number), strict=True))}
+        names = ("chi2", "degrees_of_freedom", "p_value")
+        return {
+            "functions": smooth if functions.branches else None,
+            **{name: None if fit is None else getattr(fit.minimum, name) for name in names},
+            "scale": None if fit is None else fit.scale,
+            "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and self.described else {},
+        }
 
     def records(self) -> list[dict[str, Any]]:
         """Return a mapping per row; what is not known is None."""
@@ -439,7 +378,18 @@ class Tapping(Result):
                 "assumptions": self.assumptions,
                 "phase_sense": {**self.curve.phase._asdict(), "assumed": self.curve.phase.assumed},
                 "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
-                "branches": self._branches(),
+                "branches": [
+                    {
+                        "drive_frequency_khz": branch.drive_frequency_khz,
+                        "free_amplitude_nm": branch.free_amplitude_nm,
+                        "branch": branch.way,
+                        "repulsive": branch.repulsive,
+                        "rows": len(branch.rows),
+                        **self._constant_of(branch),
+                        "curve": branch.curve.to_dict(),
+                    }
+                    for branch in self.branches
+                ],
                 **self._fits(),
                 "hysteresis": [one.to_dict() for one in self.hysteresis],
                 "law": None if law is None else law["law"],
@@ -459,27 +409,6 @@ class Tapping(Result):
 
 def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
     """Return what is given and fitted of each, by name."""
-    return {
-        n.name: {
-            "given": n.given.value,
-            "given_error": n.given.error,
-            "value": n.value,
-            "standard_error": n.standard_error,
-        }
-        for n in nuisances
-    }
-
-
-def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
-    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive.
-
-    Within its errors an energy is linear in what is fitted, so that no chi2 needs to be profiled as for laws
-    (`fitting.infer.intervals`).
-    """
-    low, high = energy - TWO_SIDED_95 * error, energy + TWO_SIDED_95 * error
-    if share == 0.0 or energy <= 0.0:
-        return low, high
-    above = float(np.hypot(np.log(high / energy), TWO_SIDED_95 * share))
-    if low <= 0.0:
-        return low, float(energy * np.exp(above))
-    return float(energy * np.exp(-np.hypot(np.log(energy / low), TWO_SIDED_95 * share))), float(energy * np.exp(above))
+    values = {n.name: (n.given.value, n.given.error, n.value, n.standard_error) for n in nuisances}
+    names = ("given", "given_error", "value", "standard_error")
+    return {name: dict(zip(names, numbers, strict=True)) for name, numbers in values.items()}

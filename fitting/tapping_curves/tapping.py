@@ -1,10 +1,9 @@
 """`tapping`: what a tapping curve says of a tap, and where its drive allows it of the impact law."""
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from afm_jax.checks import checked
 from afm_jax.scenefile.tables import printable
@@ -12,34 +11,34 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
 from fitting.instruments.curve import zero_of_free_rows
 from fitting.instruments.lag import AS_STATED, PhaseReadings, PhaseSense, sense_of_phase, turned
+from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
 from fitting.tapping_curves.branches import (
+    FEWEST_ROWS,
     changes,
     free_rows,
     hardly_touching_rows,
     held_rows,
     repulsive_rows,
-    rough_rows,
     smooth_stretches,
     ways,
 )
 from fitting.tapping_curves.curve import (
     Given,
     Instrument,
+    Mask,
     Rows,
     TappingCurve,
-    given_or_usual,
     lag_of_free_tip,
     motion_of,
     part_of,
+    phase_readings,
 )
 from fitting.tapping_curves.energy import (
     FEWEST_FREE_ROWS,
-    FEWEST_ROWS,
     Lever,
     OneEnergy,
-    energies,
     energies_along,
     largest_energies,
     noise_of,
@@ -81,19 +80,12 @@ def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale
     table, sense = with_sense_of_phase(table)
     curve = _with_zero_of_free_rows(replace(curve_of(table), phase=sense), table.remarks)
     if sense.origin == "assumed":
-        curve = replace(curve, free_frequency_khz=_for_both_signs(curve))
+        # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
+        frequency, detuning = curve.free_frequency_khz, phase_readings(curve, np.zeros(curve.rows, bool)).detuning
+        error = float(np.hypot(frequency.error, detuning * frequency.value))
+        curve = replace(curve, free_frequency_khz=Given(frequency.value, error))
     result = _energies(table, curve, scale_errors=scale_errors)
     return with_law(result, model) if law and result.law_allowed else result
-
-
-def _for_both_signs(curve: TappingCurve) -> Given:
-    """Return the free frequency with an error that holds the energies of both signs of the phase.
-
-    They differ as by a change of f0 that takes 1 - s^2 to its opposite.
-    """
-    frequency = curve.free_frequency_khz
-    detuning = _phase_readings(curve, np.zeros(curve.rows, bool)).detuning
-    return frequency._replace(error=float(np.hypot(frequency.error, detuning * frequency.value)))
 
 
 def curve_of(table: AmplitudeTable) -> TappingCurve:
@@ -159,11 +151,12 @@ def _lever_of(table: AmplitudeTable, quality_factor: float) -> dict[str, Any]:
         "spring_constant_n_per_m": (spring, table.spring_constant_error_n_per_m),
         "tip_calibration": table.calibration.get("tip_calibration", (1.0, None)),
     }
-    return {
-        **{name: Given(1.0) if pair[0] is None else given_or_usual(name, *pair) for name, pair in given.items()},
-        "over_spring_constant": spring is None,
-        "assumed": tuple(name for name, (value, error) in given.items() if value is not None and not error),
+    usual = {
+        name: Given(1.0 if value is None else value, error or USUAL_ERRORS[name] * (value or 0.0))
+        for name, (value, error) in given.items()
     }
+    assumed = tuple(name for name, (value, error) in given.items() if value is not None and not error)
+    return {**usual, "over_spring_constant": spring is None, "assumed": assumed}
 
 
 _FARTHEST = 2.0
@@ -174,55 +167,35 @@ _OFF_DEG = 30.0
 """What the free tip's lag may be off by: zeros and frequencies are known better."""
 
 
-def _phase_readings(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> PhaseReadings:
-    """Return what of a curve says which sense its phase has."""
-    frequency, quality, level = curve.free_frequency_khz, curve.quality_factor, curve.free_amplitude_nm
-    zero = curve.phase_zero_deg
-    return PhaseReadings(
-        drive=curve.drive,
-        frequency_ratio=curve.drive_frequency_khz / frequency.value,
-        frequency_error=frequency.error / frequency.value,
-        quality_factor=quality.value,
-        quality_error=quality.error / quality.value,
-        ratio=curve.amplitude_nm / level,
-        ratio_error=np.hypot(curve.amplitude_error_nm / level, curve.free_amplitude_error),
-        phase_deg=curve.lag_deg,
-        phase_error_deg=curve.lag_error_deg,
-        free=free,
-        ways=ways(curve),
-        zero=None if zero is None else (zero.value, zero.error),
-    )
-
-
 def with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, PhaseSense]:
     """Return a table whose phases are lags, which of the free tip are those of frequency and Q up to a small zero.
 
     Raises:
         TableError: if the phases are radians, or the zero that is stated is none of the free rows.
     """
-    curve = curve_of(table)
-    lag, name = table.phase_lag_deg, printable(table.source)
+    curve, lag = curve_of(table), table.phase_lag_deg
     if lag is None or not curve.has_phase:
         return table, AS_STATED
-    readings = _phase_readings(curve, free_rows(curve))
+    readings = phase_readings(curve, free_rows(curve), ways(curve))
     if table.phase_sense == "either":
         # a zero that was set by the free tip says nothing of the sign
         readings = readings._replace(zero=None)
-    sense = sense_of_phase(readings, table.phase_sense)
-    stated = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
-    off = float(turned(np.array([sense.zero_deg - stated]))[0])
-    far = abs(off) > _OFF_DEG
-    if far:
+    sense, zero = sense_of_phase(readings, table.phase_sense), curve.phase_zero_deg
+    stated = 0.0 if zero is None else zero.value
+    off = float(turned(sense.zero_deg - stated))
+    calibration = {key: pair for key, pair in table.calibration.items() if key != "phase_zero_deg"}
+    if abs(off) > _OFF_DEG:
         _check_zero(curve, readings, stated, off)
-    zero = sense.zero_deg if far else 0.0
-    known = {key: pair for key, pair in table.calibration.items() if key != "phase_zero_deg"}
-    if curve.phase_zero_deg is not None and not far and not sense.assumed:
-        # of a phase that leads the zero turns, too
-        known["phase_zero_deg"] = (sense.sign * stated, curve.phase_zero_deg.error)
+        lag, left = lag - sense.zero_deg, 0.0
+    else:
+        left = sense.sign * sense.zero_deg
+        if zero is not None and not sense.assumed:
+            # of a phase that leads the zero turns, too
+            calibration["phase_zero_deg"] = (sense.sign * stated, zero.error)
     word = "either" if sense.assumed else "lag"
-    table = replace(table, phase_lag_deg=sense.sign * (lag - zero), calibration=known, phase_sense=word)
+    table = replace(table, phase_lag_deg=sense.sign * lag, calibration=calibration, phase_sense=word)
     if not sense.reason:
-        _check_range(curve_of(table), 0.0 if far else sense.sign * sense.zero_deg, name)
+        _check_range(curve_of(table), left)
     return table, sense
 
 
@@ -265,56 +238,68 @@ def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> Ta
     return replace(curve, phase_zero_deg=None) if own else curve
 
 
-def _check_range(curve: TappingCurve, zero: float, name: str) -> None:
+def _check_range(curve: TappingCurve, zero: float) -> None:
     """Check that no row of a force on the tip lags by what no tap that takes energy does.
 
     Raises:
         TableError: naming the first row that lags by less than 0 or more than 180 degrees, by more than 20.
     """
-    if curve.drive != "force":
-        return
     beyond = np.abs(turned(curve.lag_deg - zero - 90.0)) > 90.0 + _BEYOND_DEG
     beyond &= curve.amplitude_nm > 0.5 * curve.free_amplitude_nm
-    if beyond.any():
-        row = int(np.flatnonzero(beyond)[0])
+    if curve.drive == "force" and beyond.any():
+        row = int(np.argmax(beyond))
         raise TableError(
-            f"{name}, line {curve.lines[row]}: lags by {curve.lag_deg[row]:.1f} degrees (free tip's zero {zero:.1f}), "
-            f"outside 0 to 180, as {beyond.sum()} of {curve.rows} rows do: no tap that takes energy does; mend the "
-            "phase or leave its cell blank"
+            f"{printable(curve.source)}, line {curve.lines[row]}: lags by {curve.lag_deg[row]:.1f} degrees (free tip's "
+            f"zero {zero:.1f}), outside 0 to 180, as {beyond.sum()} of {curve.rows} rows do: no tap that takes energy "
+            "does; mend the phase or leave its cell blank"
         )
 
 
 def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool) -> Tapping:
     """Return everything but the law."""
-    free = free_rows(curve)
+    free, held = free_rows(curve), held_rows(curve)
     lever = Lever([curve], [free])
-    given, found = lever.instrument(0, lever.stated), energies(curve, lever.instrument(0))
-    plain, kind = energies(curve, given), _kinds_of_rows(curve, given, free)
-    groups, alike = _groups(curve, kind.touching & ~kind.rough & ~kind.early, kind.repulsive)
-    stretches = [rows for rows in smooth_stretches(curve, kind.touching, kind.repulsive) if len(rows) >= FEWEST_ROWS]
-    fitted = one_energy(lever, alike, stretches, scale_errors=scale_errors) if groups else None
-    functions = energies_along(lever, [stretches], [kind.repulsive])[0] if stretches else None
-    followed = None
+    instrument = lever.instrument(0)
+    departure = turned(curve.lag_deg - lag_of_free_tip(curve, instrument))
+    touching = ~free & ~held & np.isfinite(curve.lag_deg)
+    repulsive = ~free & repulsive_rows(curve, touching, departure)
+    early = touching & hardly_touching_rows(motion_of(curve, instrument))
+    early &= (touching & ~early).sum() >= FEWEST_ROWS
+    stretches = smooth_stretches(curve, touching, repulsive)
+    functions = energies_along(lever, [stretches], [repulsive])[0]
+    usable = touching & ~early & ~functions.outliers
+    groups = _groups(curve, touching, usable, repulsive)
+    alike = [np.flatnonzero(group.rows & usable) for group in groups]
+    fitted = followed = None
+    if groups:
+        fitted = one_energy(lever, alike, functions.smooth)
+        scale = np.sqrt(fitted.minimum.chi2 / max(fitted.minimum.degrees_of_freedom, 1))
+        if scale_errors and scale > 1.0:
+            fitted = one_energy(lever, alike, functions.smooth, float(scale))
     if curve.time is None and sum(map(len, alike)) >= _FEWEST_TO_FOLLOW:
         # with drifts, as if the rows stood in the order of time
         in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
-        followed = one_energy(Lever([in_order], [free]), alike, stretches)
-    believed = functions or fitted
-    alone = kind.touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
-    nothing = np.zeros(curve.rows, bool)
-    states = [kind.free, kind.held, np.isnan(kind.lag_departure_deg), kind.repulsive]
-    state = np.select(states, ["free", "held", "touching", "repulsive"], "attractive")
+        followed = one_energy(Lever([in_order], [free]), alike, functions.smooth)
+    silent = np.isnan(curve.lag_deg)
+    alone = touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
+    # why a row is not in the fit, or what it is for: the first that holds
+    notes = {
+        "free: fixes the zero of the phase" if curve.has_phase else "free": free,
+        "excluded: the tip is held, a tenth of the free amplitude is left or less": held,
+        "excluded: no phase, only a bound": silent,
+        "not in the one energy: hardly touching yet, taps need not come every period": early,
+        "excluded: its energy is more than 4 standard errors from the others'": functions.outliers,
+        f"excluded: fewer than {FEWEST_ROWS} rows of this branch": alone,
+    }
+    states = {"free": free, "held": held, "touching": silent, "repulsive": repulsive}
     rows = TapRows(
-        state=tuple(state.tolist()),
-        lag_departure_deg=kind.lag_departure_deg,
-        energy_aj=plain.energy_aj,
-        energy_noise_aj=noise_of(curve, plain)[0],
-        energy_systematic_aj=lever.errors_of_rows(0),
-        energy_of_fit_aj=found.energy_aj,
-        virial_aj=plain.virial_aj,
-        largest_energy_aj=largest_energies(curve, given),
-        used=nothing if fitted is None else fitted.used,
-        note=_notes(curve, kind, far=nothing if believed is None else believed.outliers, alone=alone),
+        state=_named(states, "attractive"),
+        energy_aj=functions.energies.energy_aj,
+        energy_noise_aj=noise_of(curve, functions.energies)[0],
+        virial_aj=functions.energies.virial_aj,
+        largest_energy_aj=largest_energies(curve, instrument),
+        used=np.zeros(curve.rows, bool) if fitted is None else fitted.used,
+        note=_named(notes, ""),
     )
     result = Tapping(
         table=table,
@@ -325,110 +310,59 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         functions=functions,
         scale_errors=scale_errors,
         followed=followed,
-        bound_aj=None if curve.has_phase else _bound(curve, given, free),
-        hysteresis=tuple(changes(curve, free=free, repulsive=kind.repulsive)),
+        bound_aj=None if curve.has_phase else _bound(curve, instrument, ~free & ~held),
+        hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
         speeds=None,
         versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
     )
     return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
 
 
-class _KindsOfRows(NamedTuple):
-    """What the rows of a curve are.
-
-    Attributes:
-        free: of the free tip.
-        held: the sample holds the tip.
-        touching: neither, with a phase.
-        repulsive: on the repulsive branch.
-        rough: off the smooth fall of their branch.
-        early: hardly touching yet.
-        lag_departure_deg: lag less that of the free tip.
-    """
-
-    free: Bool[np.ndarray, " rows"]
-    held: Bool[np.ndarray, " rows"]
-    touching: Bool[np.ndarray, " rows"]
-    repulsive: Bool[np.ndarray, " rows"]
-    rough: Bool[np.ndarray, " rows"]
-    early: Bool[np.ndarray, " rows"]
-    lag_departure_deg: Rows
+def _named(rows: dict[str, Mask], others: str) -> tuple[str, ...]:
+    """Return of each row the name of the first rows that it is among."""
+    return tuple(np.select(list(rows.values()), list(rows), others).tolist())
 
 
-def _kinds_of_rows(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> _KindsOfRows:
-    """Return what the rows of a curve are, the instrument as given."""
-    held = held_rows(curve)
-    departure = turned(curve.lag_deg - lag_of_free_tip(curve, given))
-    touching = ~free & ~held & np.isfinite(curve.lag_deg)
-    repulsive = ~free & repulsive_rows(curve, touching, departure)
-    rough = rough_rows(curve, touching & repulsive) | rough_rows(curve, touching & ~repulsive)
-    early = touching & hardly_touching_rows(motion_of(curve, given))
-    if (touching & ~rough & ~early).sum() < FEWEST_ROWS:
-        early = np.zeros(curve.rows, bool)
-    return _KindsOfRows(free, held, touching, repulsive, rough, early, departure)
+def _energies_along(result: Tapping) -> Rows:
+    """Return the energy of each row's tap, that of its branch."""
+    curve, found = result.curve, np.full(result.curve.rows, np.nan)
+    ratio = curve.amplitude_nm / curve.free_amplitude_nm
+    for branch in result.branches:
+        along = branch.curve
+        found[branch.rows] = np.interp(ratio[branch.rows], along.amplitude_ratio, along.estimate_aj)
+    return found
 
 
-def _energies_along(result: Tapping) -> np.ndarray:
-    """Return the energy of each row's tap: the one of its kind, or where none explains the rows that of its branch."""
-    if not result.described:
-        return result.energy_along_branches_aj
-    constants = np.array([result.constant(i)[0] for i in range(len(result.groups))])
-    return np.where(result.group_of_rows >= 0, constants[np.maximum(result.group_of_rows, 0)], np.nan)
+def _groups(curve: TappingCurve, touching: Mask, usable: Mask, repulsive: Mask) -> list[EnergyGroup]:
+    """Return the kinds of rows that may share an energy (drive, attractive or repulsive), if enough are usable."""
+    kinds = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm, ~repulsive], axis=1)
+    each = [(kind, np.all(kinds == kind, axis=1)) for kind in np.unique(kinds[usable], axis=0).tolist()]
+    return [
+        EnergyGroup(frequency, amplitude, repulsive=not attractive, rows=here & touching)
+        for (frequency, amplitude, attractive), here in each
+        if np.sum(here & usable) >= FEWEST_ROWS
+    ]
 
 
-def _groups(
-    curve: TappingCurve, usable: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
-) -> tuple[list[EnergyGroup], list[np.ndarray]]:
-    """Return the kinds of rows that may share an energy (drive, attractive or repulsive), and the rows of each."""
-    groups, rows = [], []
-    drives = sorted(set(zip(curve.drive_frequency_khz.tolist(), curve.free_amplitude_nm.tolist(), strict=True)))
-    for drive in drives:
-        of_drive = (curve.drive_frequency_khz == drive[0]) & (curve.free_amplitude_nm == drive[1])
-        for side in (True, False):
-            here = np.flatnonzero(usable & of_drive & (repulsive == side))
-            if len(here) >= FEWEST_ROWS:
-                groups.append(EnergyGroup(*drive, repulsive=side))
-                rows.append(here)
-    return groups, rows
-
-
-def _notes(curve: TappingCurve, kind: _KindsOfRows, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
-    """Return why each row is not in the fit, or what it is for; the first reason that holds."""
-    said = {
-        "free": "free: fixes the zero of the phase" if curve.has_phase else "free",
-        "held": "excluded: the tip is held, a tenth of the free amplitude is left or less",
-        "silent": "excluded: no phase, only a bound",
-        "rough": "not in the one energy: off the smooth fall of its branch, so probably not one impact a period",
-        "early": "not in the one energy: hardly touching yet, taps need not come every period",
-        "far": "excluded: its energy is more than 4 standard errors from the others'",
-        "alone": f"excluded: fewer than {FEWEST_ROWS} rows of this branch",
-    }
-    which |= kind._asdict() | {"silent": np.isnan(curve.lag_deg)}
-    return tuple(np.select([which[name] for name in said], list(said.values()), "").tolist())
-
-
-def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> float | None:
+def _bound(curve: TappingCurve, instrument: Instrument, touching: Mask) -> float | None:
     """Return the least of the rows' largest energies that hold for every tap of the curve, with 95 % for its errors."""
-    touching = ~free & ~held_rows(curve)
     if not touching.any():
         return None
-    largest = largest_energies(curve, given)[touching]
     quality = curve.quality_factor
     share = np.hypot(curve.relative_error, quality.error / quality.value)
-    return float(np.max(largest) * np.exp(1.645 * share))
+    return float(np.max(largest_energies(curve, instrument)[touching]) * np.exp(1.645 * share))
 
 
 def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
     """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
     curve = result.curve
-    instrument = fitted.instrument if result.described or result.functions is None else result.functions.instrument
+    instrument = result.functions.instrument
     start = speeds(curve, instrument)
-    calibration = curve.tip_calibration
     moved = [
         speeds(replace(curve, amplitude_nm=curve.amplitude_nm + curve.amplitude_error_nm), instrument),
         speeds(replace(curve, lag_deg=curve.lag_deg + curve.lag_error_deg), instrument),
-        speeds(curve, instrument, origin_nm=curve.origin_error_nm),
-        speeds(curve, instrument, calibration=calibration.value + calibration.error),
+        speeds(replace(curve, offset_nm=curve.offset_nm + curve.origin_error_nm), instrument),
+        speeds(replace(curve, tip_calibration=Given(sum(curve.tip_calibration))), instrument),
     ]
     u = start.approach_speed_nm_per_us
     changes = np.stack([one.approach_speed_nm_per_us - u for one in moved])
@@ -453,23 +387,18 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
     """Return why the rows do not allow a law, and what to record instead; empty where they do."""
     if fast.sum() >= _FEWEST_FOR_LAW:
         return ""
-    s = curve.drive_frequency_khz / curve.free_frequency_khz.value
-    where = f"{s.min():.3f}" if np.ptp(s) < 5e-4 else f"{s.min():.3f} to {s.max():.3f}"
     f0 = curve.free_frequency_khz.value
-    advice = f"drive 3 to 10 % above resonance ({1.03 * f0:.4g} to {1.1 * f0:.4g} kHz)"
+    s, largest = curve.drive_frequency_khz / f0, np.max(in_capture, where=np.isfinite(in_capture), initial=0.0)
+    where = f"{s.min():.3f}" if np.ptp(s) < 5e-4 else f"{s.min():.3f} to {s.max():.3f}"
+    what = f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
     if not known.any():
         what = (
             "the speed of its impacts cannot be determined from this curve: it depends on the origin of heights and "
             "on the calibration more finely than these are known"
         )
-    elif not np.isfinite(in_capture).any():
-        what = "its capture speed is not known, for no energy of a tap is"
-    elif np.nanmax(in_capture) < _SLOWEST:
-        what = f"its impacts are slow, {np.nanmax(in_capture):.2g} times the capture speed at most"
-    else:
-        what = (
-            f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
-        )
+    elif 0.0 < largest < _SLOWEST:
+        what = f"its impacts are slow, {largest:.2g} times the capture speed at most"
+    advice = f"drive 3 to 10 % above resonance ({1.03 * f0:.4g} to {1.1 * f0:.4g} kHz)"
     return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}"
 
 
@@ -480,17 +409,8 @@ def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
     if result.speeds is None:
         return result
     chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
-    return replace(result, law=fit(_with_zero_of_phase(result, part_of(result.table, chosen)), model))
-
-
-def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTable:
-    """Return a table that knows the zero of the phase, which the free rows fixed that it lacks.
-
-    With several drives its own is that of the first.
-    """
-    fit = result.fit if result.described else result.functions
-    found = [] if fit is None else [one for one in fit.nuisances if one.kind == "phase_zero_deg"]
-    if not found:
-        return table
-    calibration = table.calibration | {"phase_zero_deg": (float(found[0].value), float(found[0].standard_error))}
-    return replace(table, calibration=calibration)
+    table = part_of(result.table, chosen)
+    # the zero of the phase, which free rows fixed that are left out; of several drives that of the first
+    zeros = [(one.value, one.standard_error) for one in result.functions.nuisances if one.kind == "phase_zero_deg"]
+    calibration = {"phase_zero_deg": zeros[0]} if zeros else {}
+    return replace(result, law=fit(replace(table, calibration=table.calibration | calibration), model))

@@ -16,7 +16,6 @@ from fitting.tables.table import TableLike, as_table
 from fitting.tapping_curves.branches import CurveBranch, smooth_stretches
 from fitting.tapping_curves.energy import (
     COMMON,
-    FEWEST_ROWS,
     Lever,
     Nuisance,
     TappingBranch,
@@ -26,13 +25,14 @@ from fitting.tapping_curves.energy import (
 )
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
 from fitting.tapping_curves.tapping import tapping
+from fitting.tapping_curves.verdict import ORIGINS
 
 _SAME = 0.03
 """Relative difference of free amplitudes up to which branches of several curves are compared."""
 _POINTS = 41
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class CurveScatter(CurveBranch):
     """A branch in several curves: mean energy, and its scatter from curve to curve beside what errors explain.
 
@@ -107,6 +107,10 @@ class TappingTogether(Result):
         """Whether every curve is, and they agree on what they have in common."""
         return not self.reasons
 
+    def in_unit(self, text: str) -> str:
+        """Return a text about energies in aJ with the unit that they have, that of the first curve."""
+        return self.curves[0].in_unit(text)
+
     def to_dict(self) -> dict[str, Any]:
         """Return what all curves say together as plain lists, numbers and strings; each curve's own is in `curves`."""
         payload = plain(
@@ -143,22 +147,16 @@ def together(curves: Sequence[Tapping]) -> TappingTogether:
         TableError: if not the same is stated of their lever.
     """
     _same_lever(curves)
-    moved, chosen = list(curves), [i for i, one in enumerate(curves) if one.functions is not None]
+    moved, chosen = list(curves), [i for i, one in enumerate(curves) if one.branches]
     if len(chosen) < 2:
         return TappingTogether(curves=tuple(moved), lever=None, scatter=())
     lever = Lever([curves[i].curve for i in chosen], [curves[i].rows.free for i in chosen])
     states = [np.array(curves[i].rows.state) for i in chosen]
     repulsive = [state == "repulsive" for state in states]
-    stretches = [
-        [
-            rows
-            for rows in smooth_stretches(curve, (state == "attractive") | (state == "repulsive"), side)
-            if len(rows) >= FEWEST_ROWS
-        ]
-        for curve, state, side in zip(lever.curves, states, repulsive, strict=True)
-    ]
+    touching = [(state == "attractive") | (state == "repulsive") for state in states]
+    stretches = list(map(smooth_stretches, lever.curves, touching, repulsive))
     for i, functions in zip(chosen, energies_along(lever, stretches, repulsive), strict=True):
-        rows = replace(curves[i].rows, energy_of_fit_aj=functions.energies.energy_aj)
+        rows = replace(curves[i].rows, energy_aj=functions.energies.energy_aj)
         moved[i] = replace(curves[i], functions=functions, rows=rows)
     return TappingTogether(curves=tuple(moved), lever=lever, scatter=_scatters(moved))
 
@@ -169,34 +167,27 @@ def _same_lever(curves: Sequence[Tapping]) -> None:
     Raises:
         TableError: naming the first that differs.
     """
-    names = {
-        "free_frequency_khz": "free frequency",
-        "quality_factor": "Q",
-        "spring_constant_n_per_m": "spring constant",
-        "drive": "drive",
-    }
     for one in curves[1:]:
-        for name, words in names.items():
+        for name in ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m", "drive"):
             first, other = getattr(curves[0].curve, name), getattr(one.curve, name)
             if first != other:
+                said = f"states the {ORIGINS.get(name, name)} as {other}, {curves[0].table.source} as {first}"
                 raise TableError(
-                    f"{one.table.source}: states the {words} as {other}, {curves[0].table.source} as {first}; several "
-                    "curves are taken as of one lever: state the same in all, or analyse them one by one"
+                    f"{one.table.source}: {said}; several curves are taken as of one lever: state the same in all, or "
+                    "analyse them one by one"
                 )
 
 
 def _scatters(curves: Sequence[Tapping]) -> tuple[CurveScatter, ...]:
     """Return the scatter of each branch that two curves have."""
-    kinds: list[tuple[TappingBranch, list[tuple[Tapping, TappingBranch]]]] = []
-    for one in curves:
-        for branch in one.branches:
-            for first, members in kinds:
-                if _alike(first, branch):
-                    members.append((one, branch))
-                    break
-            else:
-                kinds.append((branch, [(one, branch)]))
-    return tuple(scatter for first, members in kinds if (scatter := _scatter(first, members)) is not None)
+    kinds: list[list[tuple[Tapping, TappingBranch]]] = []
+    for curve in curves:
+        for branch in curve.branches:
+            members = next((found for found in kinds if _alike(found[0][1], branch)), [])
+            if not members:
+                kinds.append(members)
+            members.append((curve, branch))
+    return tuple(scatter for members in kinds if (scatter := _scatter(members)) is not None)
 
 
 def _alike(one: TappingBranch, other: TappingBranch) -> bool:
@@ -205,26 +196,23 @@ def _alike(one: TappingBranch, other: TappingBranch) -> bool:
     return sides[0] == sides[1] and apart < _SAME * one.free_amplitude_nm
 
 
-def _scatter(first: TappingBranch, members: list[tuple[Tapping, TappingBranch]]) -> CurveScatter | None:
+def _scatter(members: list[tuple[Tapping, TappingBranch]]) -> CurveScatter | None:
     """Return mean, scatter and errors of a branch over the amplitudes that half of the curves have, and two."""
-    ends = [(b.curve.amplitude_ratio[0], b.curve.amplitude_ratio[-1]) for _, b in members]
-    fewest = max(2, (len(members) + 1) // 2)
+    first, fewest = members[0][1], max(2, (len(members) + 1) // 2)
     if len(members) < 2:
         return None
-    low, high = sorted(e[0] for e in ends)[fewest - 1], sorted((e[1] for e in ends), reverse=True)[fewest - 1]
-    if not low < high:
-        return None
-    ratio = np.linspace(low, high, _POINTS)
+    ends = [branch.curve.amplitude_ratio[[0, -1]] for _, branch in members]
+    ratio = np.linspace(np.min(ends), np.max(ends), _POINTS)
     columns = np.array([_parts_at(ratio, one, branch) for one, branch in members])
     enough = np.isfinite(columns[:, 0]).sum(axis=0) >= fewest
     ratio, (energy, estimate, own, shared) = ratio[enough], np.moveaxis(columns[:, :, enough], 1, 0)
     if not len(ratio):
         return None
     return CurveScatter(
-        drive_frequency_khz=first.drive_frequency_khz,
-        free_amplitude_nm=float(np.mean([b.free_amplitude_nm for _, b in members])),
-        retract=first.retract,
-        repulsive=first.repulsive,
+        first.drive_frequency_khz,
+        float(np.mean([b.free_amplitude_nm for _, b in members])),
+        first.retract,
+        first.repulsive,
         curves=len(members),
         amplitude_ratio=ratio,
         energy_aj=np.nanmean(energy, axis=0),
@@ -234,20 +222,15 @@ def _scatter(first: TappingBranch, members: list[tuple[Tapping, TappingBranch]])
     )
 
 
-def _parts_at(
-    ratio: Float[np.ndarray, " points"], one: Tapping, branch: TappingBranch
-) -> Float[np.ndarray, "4 points"]:
+def _parts_at(ratio: np.ndarray, one: Tapping, branch: TappingBranch) -> Float[np.ndarray, "4 points"]:
     """Return the middle of the band, the estimate, its own variance and that by what all curves have in common.
 
     The curve's own is what its errors leave open if what all have in common were known. NaN where not measured.
     """
-    assert one.functions is not None  # noqa: S101
     curve, covariance, common = branch.curve, one.functions.lever.minimum.covariance, len(COMMON)
     gain = np.linalg.solve(covariance[:common, :common], covariance[:common])
     estimate, noise, by = estimates_at(curve, ratio)
     own = np.maximum(np.einsum("nu,uv,nv->n", by, covariance - gain.T @ covariance[:common], by), 0.0) + noise**2
-    middle, error = (
-        np.interp(ratio, curve.amplitude_ratio, column, np.nan, np.nan)
-        for column in (curve.energy_aj, curve.energy_error_aj)
-    )
+    columns = np.stack([curve.energy_aj, curve.energy_error_aj])
+    middle, error = (np.interp(ratio, curve.amplitude_ratio, column, np.nan, np.nan) for column in columns)
     return np.stack([middle, estimate, own, np.maximum(error**2 - own, 0.0)])

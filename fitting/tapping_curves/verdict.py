@@ -4,23 +4,21 @@ The rules look at a `Tapping`. Its energy is given in two ways, as one number fo
 it; `NO_CONSTANT` and `NO_FUNCTIONS` say why one of them is not given, `REASONS` why neither is.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
-from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN
+from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, TORN
 from afm_jax.outcomes import Rule, Rules
 from afm_jax.words import interval
 from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS, USUAL_ERRORS
-from fitting.tapping_curves.branches import free_ends, ways
-from fitting.tapping_curves.curve import TappingCurve, lag_of_free_tip
+from fitting.tapping_curves.branches import FEWEST_ROWS, free_ends, ways
+from fitting.tapping_curves.curve import lag_of_free_tip
 from fitting.tapping_curves.energy import (
     FEWEST_FREE_ROWS,
-    FEWEST_ROWS,
     EnergyFunctions,
-    Nuisance,
     OneEnergy,
     what_narrows,
 )
@@ -59,13 +57,12 @@ def _followed(e: Any) -> list[str]:
     if e.followed is None or not e.followed.minimum.p_value > IMPROBABLE:
         return []
     units = {"phase_drift_deg": (1.0, "degrees"), "free_amplitude_drift": (100.0, "%")}
-
-    def said(one: Nuisance) -> str:
-        factor, unit = units[one.kind]
-        return f"{ORIGINS[one.kind]} of {factor * one.value:+.2g} +- {factor * one.standard_error:.1g} {unit}"
-
-    drifts = (one for one in e.followed.nuisances if one.kind in units)
-    return [said(one) for one in drifts if abs(one.value) > _FOLLOWING * one.standard_error][:1]
+    return [
+        f"{ORIGINS[one.kind]} of {units[one.kind][0] * one.value:+.2g} +- "
+        f"{units[one.kind][0] * one.standard_error:.1g} {units[one.kind][1]}"
+        for one in e.followed.nuisances
+        if one.kind in units and abs(one.value) > _FOLLOWING * one.standard_error
+    ][:1]
 
 
 NO_CONSTANT: tuple[Rule[Any], ...] = (
@@ -89,34 +86,43 @@ NO_CONSTANT: tuple[Rule[Any], ...] = (
 """Why one energy a branch does not explain the rows; the first that applies."""
 
 
-def drift_of_free_rows(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> list[str]:
+def _changes_of_free_tip(e: Any, rows: np.ndarray, along: np.ndarray) -> Iterator[tuple[str, float, float, float, str]]:
+    """Yield what changes of the free tip along its rows, by how much, the error, what is no change yet, and the unit.
+
+    Args:
+        e: a `Tapping`.
+        rows: numbers of the free rows.
+        along: what a straight line is fitted over; the change is that over 1 of it.
+    """
+    curve, at, percent = e.curve, e.functions.instrument, 100.0 / e.curve.free_amplitude_nm
+    of_amplitude = percent * curve.amplitude_nm - 100.0 * at.free_amplitude_factor
+    for name, values, errors, none, unit in (
+        ("phase", turned(curve.lag_deg - lag_of_free_tip(curve, at)), curve.lag_error_deg, _BENT_DEG, "degrees"),
+        ("amplitude", of_amplitude, percent * curve.amplitude_error_nm, 100.0 * _BENT, "%"),
+    ):
+        here = np.isfinite(values[rows])
+        x, y, weights = along[here], values[rows][here], 1.0 / errors[rows][here]
+        if len(x) >= FEWEST_FREE_ROWS and np.ptp(x) > 0.0:
+            (slope, start), covariance = np.polyfit(x, y, 1, w=weights, cov="unscaled")
+            chi2 = float(np.sum((weights * (y - slope * x - start)) ** 2))
+            yield name, slope, float(np.sqrt(max(1.0, chi2 / (len(x) - 2)) * covariance[0, 0])), none, unit
+
+
+def _drifting(e: Any) -> list[str]:
     """Return by what the free tip drifted along rows whose order in time the table does not state, in words."""
-    places = np.flatnonzero(free)
-    if curve.time is not None or len(places) < 2 * FEWEST_ROWS or not free_ends(curve, free):
+    places = np.flatnonzero(e.rows.free)
+    if e.curve.time is not None or len(places) < 2 * FEWEST_ROWS or not free_ends(e.curve, e.rows.free):
         return []
     if np.diff(places).max() <= FEWEST_ROWS:
         # one way only: along it the free tip may feel the sample
         return []
-    share = 100.0 / curve.free_amplitude_nm
-    columns = {
-        "phase": (curve.lag_deg, curve.lag_error_deg, "degrees"),
-        "amplitude": (share * curve.amplitude_nm, share * curve.amplitude_error_nm, "%"),
-    }
-    found = []
-    for name, (values, errors, unit) in columns.items():
-        here = free & np.isfinite(values)
-        if here.sum() < 2 * FEWEST_ROWS:
-            continue
-        x, y, weights = np.flatnonzero(here) / (curve.rows - 1.0), values[here], 1.0 / errors[here]
-        (slope, start), covariance = np.polyfit(x, y, 1, w=weights, cov="unscaled")
-        chi2 = float(np.sum((weights * (y - slope * x - start)) ** 2))
-        error = float(np.sqrt(max(1.0, chi2 / (len(x) - 2)) * covariance[0, 0]))
-        if abs(slope) > _DRIFTING * error:
-            drift = f"{slope:+.2g} +- {error:.1g} {unit}"
-            found.append(
-                f"the {name} of the free tip follows the order of the rows, by {drift} over the table: {_SAY_SO}"
-            )
-    return found[:1]
+    changes = _changes_of_free_tip(e, places, places / (e.curve.rows - 1.0))
+    return [
+        f"the {name} of the free tip follows the order of the rows, by {change:+.2g} +- {error:.1g} {unit} over the "
+        f"table: {_SAY_SO}"
+        for name, change, error, _, unit in changes
+        if abs(change) > _DRIFTING * error
+    ][:1]
 
 
 _LONG = 10.0
@@ -127,34 +133,19 @@ _BENT_DEG, _BENT = 0.3, 0.005
 
 def _not_flat(e: Any) -> list[str]:
     """Return why rows that count as the free tip's may be those of first contact, which depart by two, in words."""
-    curve, lever, number = e.curve, e.functions.lever, e.functions.number
-    at, free = lever.instrument(number), lever.free[number]
-    columns = {
-        "lag": (turned(curve.lag_deg - lag_of_free_tip(curve, at)), curve.lag_error_deg, _BENT_DEG, "degrees"),
-        "amplitude": (
-            100.0 * (curve.amplitude_nm / curve.free_amplitude_nm - at.free_amplitude_factor),
-            100.0 * curve.amplitude_error_nm / curve.free_amplitude_nm,
-            100.0 * _BENT,
-            "%",
-        ),
-    }
+    curve, free = e.curve, e.functions.lever.free[e.functions.number]
     for way in ways(curve):
         rows, nearer = way[free[way]], way[~free[way]]
         if len(rows) < FEWEST_FREE_ROWS or not len(nearer):
             continue
-        reach = curve.offset_nm[nearer].min() - curve.offset_nm[rows].min()
+        height = curve.offset_nm[rows]
+        reach = curve.offset_nm[nearer].min() - height.min()
         if reach < _LONG * np.median(curve.amplitude_error_nm[rows]):
             return [f"the free part is {reach:.2g} nm long, too short to tell it from first contact: {_MORE_FREE}"]
-        height = (curve.offset_nm[rows] - curve.offset_nm[rows].mean()) / max(np.ptp(curve.offset_nm[rows]), 1e-9)
-        for name, (values, errors, least, unit) in columns.items():
-            # weighted by the error of a row, which is one for all
-            change = float(height @ values[rows] / max(height @ height, 1e-9))
-            left = values[rows] - values[rows].mean() - change * height
-            noise = max(float(np.median(errors[rows])), float(np.sqrt(left @ left / max(len(rows) - 2, 1))))
-            error = noise / np.sqrt(max(height @ height, 1e-9))
-            if abs(change) > max(_DRIFTING * error, least):
-                change_in_words = f"{change:+.2g} +- {error:.1g} {unit}"
-                return [f"the free part is not flat: its {name} changes by {change_in_words} along it: {_MORE_FREE}"]
+        for name, change, error, none, unit in _changes_of_free_tip(e, rows, height / max(np.ptp(height), 1e-9)):
+            if abs(change) > max(_DRIFTING * error, none):
+                by = f"{change:+.2g} +- {error:.1g} {unit}"
+                return [f"the free part is not flat: its {name} changes by {by} along it: {_MORE_FREE}"]
     return []
 
 
@@ -164,20 +155,19 @@ _MORE_FREE = "record more heights off the sample"
 def _bracketed(e: Any) -> list[str]:
     """Return what is known of the energy where it is largest, if that is no measurement, and what would narrow it."""
     top = e.largest
-    if top["said"] == "measured":
-        return []
     low, high = top["interval95"]
     words = f"{interval(low, high)} aJ" if top["said"] == "bracket" else f"below {high:.3g} aJ"
-    return [f"{words} at {top['amplitude_ratio']:.2f} of the free amplitude; {what_narrows(e.functions)}"]
+    said = f"{words} at {top['amplitude_ratio']:.2f} of the free amplitude; {what_narrows(e.functions)}"
+    return [] if top["said"] == "measured" else [said]
 
 
 NO_FUNCTIONS: tuple[Rule[Any], ...] = (
     Rule(
-        lambda e: e.functions is not None and not e.functions.lever.minimum.settled,
+        lambda e: not e.functions.lever.minimum.settled,
         "the least squares of the instrument, from what is stated and free rows, does not settle",
     ),
     Rule(
-        lambda e: e.functions is None or e.largest is None,
+        lambda e: e.largest is None,
         "no branch has enough rows in contact for an energy of a tap",
     ),
     Rule(lambda e: _torn(e.functions), "the energy along the branches has no instrument as given: {case}"),
@@ -185,7 +175,7 @@ NO_FUNCTIONS: tuple[Rule[Any], ...] = (
         lambda e: e.functions.scale > (LARGEST_SCALE if e.scale_errors else _LARGEST_UNASKED_SCALE),
         "the rows scatter {e.functions.scale:.1f} times as much about a smooth energy as their errors say",
     ),
-    Rule(lambda e: e.drift, "{case}"),
+    Rule(_drifting, "{case}"),
     Rule(_not_flat, "{case}"),
     Rule(
         lambda e: not e.functions.possible,
@@ -214,31 +204,20 @@ REASONS: Rules[Any] = [
 """What makes the energy no measurement."""
 
 
-def _given(e: Any) -> bool:
-    return e.valid and e.curve.has_phase
-
-
 def _scaled(e: Any) -> list[tuple[str, float]]:
     fits = {"one energy a branch": e.fit, "a smooth energy": e.functions}
-    return [(what, fit.scale) for what, fit in fits.items() if _given(e) and fit is not None and fit.scale > 1.0]
+    return [(what, fit.scale) for what, fit in fits.items() if fit and fit.scale > 1.0] if e.valid else []
 
 
 WARNINGS: Rules[Any] = [
     Rule(
-        lambda e: _given(e) and e.fit is not None and not e.described,
+        lambda e: e.valid and e.fit is not None and not e.described,
         "one energy for all taps is not given: {e.why_not_constant}",
     ),
     Rule(
         _scaled,
         "the rows scatter {case[1]:.2g} times more about {case[0]} than their errors say: its errors are multiplied by "
         "that",
-    ),
-    Rule(
-        lambda e: [n for n in e.fit.nuisances if abs(n.pull) > PULLED] if e.described else [],
-        lambda _, n: (
-            f"for one energy {ORIGINS[n.kind]} ends {n.pull:+.1f} standard errors from what was given ({n.given} to "
-            f"{n.value:.6g})"
-        ),
     ),
     Rule(
         lambda e: [len(e.set_aside)] if e.set_aside else [],
@@ -248,28 +227,29 @@ WARNINGS: Rules[Any] = [
 """What a reader should know besides."""
 
 
-def _spring_constant(e: Any) -> str:
+def _spring_constant(e: Any) -> list[str]:
     if e.curve.over_spring_constant:
-        return "spring constant not known: energies and virials are over it, in nm^2 (aJ over N/m)"
-    return f"spring constant {e.curve.spring_constant_n_per_m} N/m"
+        return ["spring constant not known: energies and virials are over it, in nm^2 (aJ over N/m)"]
+    return [f"spring constant {e.curve.spring_constant_n_per_m} N/m"]
 
 
-def _lag(e: Any) -> str:
+def _lag(e: Any) -> list[str]:
     behind = "the base" if e.curve.drive == "base" else "the force on the tip"
-    known = "from the free rows" if e.rows.free.any() else "not known"
-    zero = f"zero of the phase {known if e.curve.phase_zero_deg is None else f'{e.curve.phase_zero_deg} degrees'}"
-    return f"lag behind {behind}, {zero}; heights upward, virial positive where attraction prevails"
+    zero = "from the free rows" if e.rows.free.any() else "not known"
+    if e.curve.phase_zero_deg is not None:
+        zero = f"{e.curve.phase_zero_deg} degrees"
+    lag = f"lag behind {behind}, zero of the phase {zero}; heights upward, virial positive where attraction prevails"
+    return [lag] if e.curve.has_phase else []
 
 
 def _usual(e: Any) -> list[str]:
-    articles = {name: ORIGINS[name] if name == "quality_factor" else f"the {ORIGINS[name]}" for name in USUAL_ERRORS}
-    usual = ", ".join(f"{articles[name]} to {100.0 * USUAL_ERRORS[name]:g} %" for name in e.curve.assumed)
+    usual = ", ".join(f"{ORIGINS[name]} to {100.0 * USUAL_ERRORS[name]:g} %" for name in e.curve.assumed)
     return [usual] if usual else []
 
 
 ASSUMPTIONS: Rules[Any] = [
     Rule(
-        lambda e: [_spring_constant(e)],
+        _spring_constant,
         "free frequency {e.curve.free_frequency_khz} kHz, Q {e.curve.quality_factor}, {case}, calibration "
         "{e.curve.tip_calibration}",
     ),
@@ -287,7 +267,7 @@ ASSUMPTIONS: Rules[Any] = [
         ),
     ),
     Rule(lambda e: list(e.curve.phase.notes), "{case}"),
-    Rule(lambda e: [_lag(e)] if e.curve.has_phase else [], "{case}"),
+    Rule(_lag, "{case}"),
     Rule(lambda _: True, "harmonics were not measured: those of one brief impact a period, to 10 %"),
 ]
 """What the numbers take for granted."""
