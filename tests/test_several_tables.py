@@ -120,8 +120,8 @@ def made_joint() -> FitResult:
     """Return a fit of two tables."""
     both = SeveralTables((made_table(source="a.csv"), made_table(source="b.csv", mass_ng=1.001)))
     own = {"quality_factor": made_parameter("quality_factor", 40.0)}
-    one = FittedTable("a.csv", "a.csv", 4, 4, 3.0, 7, 1.25, 0.2, own)
-    other = dataclasses.replace(one, source="b.csv", name="b.csv", pull=np.nan, p_value=np.nan)
+    one = FittedTable("a.csv", 4, 4, 3.0, 7, 1.25, 0.2, own)
+    other = dataclasses.replace(one, name="b.csv", pull=np.nan, p_value=np.nan)
     all_rows = dataclasses.replace(made_rows(made_table(8)), reasons=("",) * 8)
     found = made_fit("law", rows=all_rows)
     return dataclasses.replace(found, table=both, tables=(one, other))

@@ -127,7 +127,6 @@ class FittedTable:
     """One of several tables that were fitted together.
 
     Attributes:
-        source: its file.
         name: what it is called.
         rows: how many it has.
         used: how many of them count.
@@ -139,7 +138,6 @@ class FittedTable:
         nuisances: its own, as `FitResult.parameters`.
     """
 
-    source: str
     name: str
     rows: int
     used: int

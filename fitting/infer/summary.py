@@ -308,7 +308,6 @@ def _fitted_tables(evidence: Evidence, pulls: list[Pull]) -> tuple[FittedTable, 
         names = {name: name_of_table(name, label) for name in NUISANCE_NAMES}
         fitted.append(
             FittedTable(
-                source=member.source,
                 name=label,
                 rows=member.rows,
                 used=int(rows.used[mine].sum()),

@@ -345,7 +345,7 @@ def _converted(
     held = np.flatnonzero(np.any([np.isfinite(numbers) & (numbers != 0.0) for numbers in raw.values()], axis=0))
     columns = {}
     for role, source in sources.items():
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             numbers = raw[role] * (UNITS[source.unit][1] * (source.factor or 1.0))
         columns[role] = numbers[: held[-1] + 1] if held.size else numbers
         bad = np.flatnonzero(~(np.abs(columns[role]) < 1e9))
@@ -424,12 +424,12 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
-    looks, lag = {}, curve.phase_lag_deg
-    for branch in dict.fromkeys(curve.branch.tolist()):
-        mask = curve.branch == branch
-        lag_there = None if lag is None else lag[mask]
-        looks[branch] = look_at(curve.offset_nm[mask], np.asarray(curve.amplitude)[mask], lag_there)
-    return looks
+    offset, amplitude, lag = curve.offset_nm, np.asarray(curve.amplitude), curve.phase_lag_deg
+    rows = {branch: curve.branch == branch for branch in dict.fromkeys(curve.branch.tolist())}
+    return {
+        branch: look_at(offset[here], amplitude[here], None if lag is None else lag[here])
+        for branch, here in rows.items()
+    }
 
 
 _LEAST_ERROR = 1e-9

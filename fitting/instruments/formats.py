@@ -207,7 +207,7 @@ def parse_wsxm(data: bytes, name: str) -> Recording:
         own, place = _wsxm_header(data, start, name)
         points = [int(v) for k, v in sorted(own.items()) if re.fullmatch(r"Number of Points \d+", k)]
         points = points or [int(own["Number of points"])] * int(own.get("Number of lines", "1"))
-        if not 0 < sum(points) <= (len(data) - place) // 16:
+        if min(points) < 1 or sum(points) > (len(data) - place) // 16:
             raise cut_off(name, f"curve {len(segments) // 2 + 1} announces {sum(points)} points that are not there")
         pairs = np.frombuffer(data, "<f8", 2 * sum(points), place).reshape(-1, 2).astype(float)
         axes = [printable(own.get(f"{axis} axis text", axis).split("[")[0].strip()) for axis in "XY"]
@@ -354,8 +354,6 @@ def parse_igor(data: bytes, name: str) -> Recording:
     if numbers.ndim != 2:
         what = "images; their energies: afm-jax tapping-map" if numbers.ndim == 3 else "no ramp of channels"
         raise TableError(f"{name}: holds an array of {numbers.ndim} dimensions, {what}")
-    if len(labels) != numbers.shape[1]:
-        raise cut_off(name, f"{numbers.shape[1]} channels, but {len(labels)} names")
     units = {label: _IGOR_UNITS.get(label.lower(), "") for label in labels}
     columns = dict(zip(labels, numbers.T.copy(), strict=True))
     # the row of an index is the last of its segment
