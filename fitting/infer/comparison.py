@@ -142,12 +142,8 @@ def _by_distance(
 
 
 def _row(model: str, result: FitResult) -> dict[str, Any]:
-    return {
-        "model": model,
-        "chi2": result.chi2,
-        "degrees_of_freedom": result.degrees_of_freedom,
-        "valid": result.valid,
-    }
+    names = ("chi2", "degrees_of_freedom", "valid")
+    return {"model": model} | {name: getattr(result, name) for name in names}
 
 
 def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:

@@ -306,7 +306,7 @@ class Model:
         }
         for i, quantity in enumerate(self.instrument):
             size = quantity.slope(float(theta[first + i])) * of_time.get(quantity.kind, np.ones_like(self.data.time))
-            moved = by_local[:, :, _column(_MOVES[quantity.kind])]
+            moved = by_local[:, :, Local._fields.index(_MOVES[quantity.kind])]
             along[:, :, i] = np.where(quantity.rows[:, None], moved * size[:, None], 0.0)
         return along
 
@@ -314,11 +314,12 @@ class Model:
         self, theta: Float[np.ndarray, " k"], x: Float[np.ndarray, "rows 3"], *, most: int = 14, judge: bool = False
     ) -> Orbits:
         """Return the orbits of all rows from where they were, NaN where there was none."""
-        local, table = self.local(theta), self.table(theta)
-        return _gathered(
-            (some, followed(x[some], local[some], self.data.row.take(some), table, drive, most=most, judge=judge))
-            for drive, some in self.data.groups
-        )
+        local, table, whole = self.local(theta), self.table(theta), no_orbits(self.data.time.size)
+        for drive, some in self.data.groups:
+            found = followed(x[some], local[some], self.data.row.take(some), table, drive, most=most, judge=judge)
+            for column, part in zip(whole, found, strict=True):
+                column[some] = part
+        return whole
 
     def candidates(
         self, theta: Float[np.ndarray, " k"], rows: np.ndarray, *, most: int = 14, judge: bool = True
@@ -340,24 +341,11 @@ class Model:
         )
 
 
-def _column(name: str) -> int:
-    return Local._fields.index(name)
-
-
 def no_orbits(count: int) -> Orbits:
     """Return room for the orbits of so many rows."""
     shapes = {"x": (3,), "readings": (READINGS,), "slopes": (READINGS, COUNT)}
     kinds: dict[str, type] = dict.fromkeys(("closes", "steady", "growing"), bool)
     return Orbits(*(np.zeros((count, *shapes.get(name, ())), kinds.get(name, float)) for name in Orbits._fields))
-
-
-def _gathered(parts) -> Orbits:
-    parts = list(parts)
-    whole = no_orbits(sum(some.size for some, _ in parts))
-    for some, orbits in parts:
-        for column, part in zip(whole, orbits, strict=True):
-            column[some] = part
-    return whole
 
 
 def quantities_of(data: Data, task: Task, labels: tuple[str, ...]) -> tuple[Quantity, ...]:

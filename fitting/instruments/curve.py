@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.checks import checked
-from afm_jax.results import Result, public_result
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.scenefile.tables import printable
 from afm_jax.strict_json import plain
 from fitting.instruments.bins import binned, error_of, faults_of_order, usual_width, ways_of
@@ -67,7 +67,7 @@ _NO_AMPLITUDE = "There is no lock-in amplitude"
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MeasuredCurve(Result):
+class MeasuredCurve(JudgedResult):
     """One curve of a file, approach and retract together; the arrays have the shape (rows,).
 
     Attributes:
@@ -109,11 +109,6 @@ class MeasuredCurve(Result):
     missing: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     reasons: tuple[str, ...] = ()
-
-    @property
-    def valid(self) -> bool:
-        """Whether the curve may be used."""
-        return not self.reasons
 
     def number(self, key: str) -> float | None:
         """Return a known number, None where it is not known."""

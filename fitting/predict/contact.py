@@ -86,15 +86,11 @@ class ContactLawModel(LawModel):
             linear = np.array([(PARAMETERS[name].reference, PARAMETERS[name].width) for name in self.own])
             ends = [(PARAMETERS[one.name].lowest, PARAMETERS[one.name].highest) for one in self.held]
             held = np.array([(one.value, one.error, *end) for one, end in zip(self.held, ends, strict=True)])
-            fixed = {name: np.asarray(float(value)) for name, value in self.fixed.items() if name not in self._of_held}
             names = self.own, tuple(one.name for one in self.held), tuple(self.effects)
+            fixed = {name: np.asarray(float(value)) for name, value in self.fixed.items() if name not in names[1]}
             found = _law(theta, speeds, linear, held.reshape(-1, 4), fixed, np.asarray(self.mass_ng), names=names)
             self._kept[key] = jax.tree.map(np.asarray, found)
         return self._kept[key]
-
-    @cached_property
-    def _of_held(self) -> set[str]:
-        return {one.name for one in self.held}
 
     def at(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> LawAt:
         """Return the law at approach speeds in nm/us."""
@@ -133,9 +129,7 @@ class ContactLawModel(LawModel):
         return np.isfinite(approach) & ~((speed <= SPEED_ERROR) & (delay <= DELAY_ERROR_US))
 
 
-@compiled_quickly()
-def _errors(impact: TabulatedImpact, approach: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    return impact.errors(approach)
+_errors = compiled_quickly()(TabulatedImpact.errors)
 
 
 @compiled_quickly(static_argnames="names", level=0)

@@ -214,7 +214,6 @@ class FileSetting:
     Attributes:
         key: its name.
         example: how its value may be written, for messages.
-        unit: its unit in words of a message, where the name might be taken for another one.
         lowest: how small it may be.
         error: whether a standard error stands behind it: "never", "maybe" or "always".
         choices: of a word in place of a number: which there are.
@@ -223,7 +222,6 @@ class FileSetting:
 
     key: str
     example: str = "1"
-    unit: str = ""
     lowest: float = 1.0 / FARTHEST
     error: Literal["never", "maybe", "always"] = "never"
     choices: tuple[str, ...] = ()
@@ -389,8 +387,7 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
     """
     match, key = _KEY_AND_VALUE.fullmatch(text), setting.key
     if match is None or match["key"] != key or match["sign"] is None:
-        unit = f" (in {setting.unit})" if setting.unit else ""
-        raise ValueError(f"{quoted(text)} is no known setting; the key is {key}{unit}, as in '{setting.line}'")
+        raise ValueError(f"{quoted(text)} is no known setting; the key is {key}, as in '{setting.line}'")
     # Spreadsheets fill every line up with commas.
     value = match["value"].rstrip(",; \t").strip()
     if value in setting.choices:

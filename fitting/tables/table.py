@@ -83,14 +83,14 @@ SETTINGS = {
         FileSetting("drive", "force", choices=("sample", "force", "base")),
         FileSetting("rows", "in order of time", choices=("in order of time",)),
         FileSetting("phase_sense", "lag", choices=("lag", "lead", "either")),
-        FileSetting("free_frequency_khz", "90", unit="kHz", error="maybe"),
+        FileSetting("free_frequency_khz", "90", error="maybe"),
         FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe", none=True),
-        FileSetting("mass_ng", unit="ng"),
-        FileSetting("spring_constant_n_per_m", "5.4 (or 5.4 +- 0.5)", unit="N/m", error="maybe"),
+        FileSetting("mass_ng"),
+        FileSetting("spring_constant_n_per_m", "5.4 (or 5.4 +- 0.5)", error="maybe"),
         FileSetting("tip_calibration", "1 +- 0.02", error="always"),
         FileSetting("drive_calibration", "1 +- 0.02", error="always"),
         FileSetting("offset_origin_nm", "0 +- 0.3", lowest=-LARGEST, error="always"),
-        FileSetting("phase_zero_deg", "0 +- 0.2", unit="degrees", lowest=-LARGEST, error="always"),
+        FileSetting("phase_zero_deg", "0 +- 0.2", lowest=-LARGEST, error="always"),
     )
 }
 DRIVES = SETTINGS["drive"].choices

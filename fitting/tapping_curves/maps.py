@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.checks import checked
-from afm_jax.results import Result, public_result, words_of
+from afm_jax.results import JudgedResult, public_result, words_of
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.images import AmplitudeAndPhase, read_images
@@ -60,7 +60,7 @@ class PixelState(enum.IntEnum):
 
 @public_result(picture="fitting.tapping_curves.map_report:map_figure", state=PixelState)
 @dataclass(frozen=True, eq=False, kw_only=True)
-class TappingMap(Result):
+class TappingMap(JudgedResult):
     """Energy and virial of a tap in every pixel, NaN where a pixel is out of range or nothing was measured.
 
     Attributes:
@@ -96,11 +96,6 @@ class TappingMap(Result):
     size_m: tuple[float, float] | None = None
     known: dict[str, Known] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
-
-    @property
-    def valid(self) -> bool:
-        """Whether the energies may be used."""
-        return not self.reasons
 
     @property
     def counts(self) -> dict[str, int]:

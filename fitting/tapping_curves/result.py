@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from afm_jax.outcomes import judge
-from afm_jax.results import Result, public_result
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95, effective_mass_ng
 from fitting.parameters import USUAL_ERRORS
@@ -110,7 +110,7 @@ class MeasuredSpeeds:
 
 @public_result(picture="fitting.tapping_curves.pictures:curve_figure")
 @dataclass(frozen=True, kw_only=True)
-class Tapping(Result):
+class Tapping(JudgedResult):
     """Energy and virial of a tap along the branches of a tapping curve, and the impact law: what `tapping` returns.
 
     Attributes:
@@ -174,11 +174,6 @@ class Tapping(Result):
     def reasons(self) -> list[str]:
         """What makes the energy no measurement: where it is largest along the branches it is not measured."""
         return judge(REASONS, self)
-
-    @property
-    def valid(self) -> bool:
-        """Whether the energy of a tap is measured where it is largest."""
-        return not self.reasons
 
     @property
     def warnings(self) -> list[str]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from afm_jax.checks import checked
 from afm_jax.least_squares import IMPROBABLE
-from afm_jax.results import Result, public_result
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TableLike, as_table
@@ -60,7 +60,7 @@ class CurveScatter(CurveBranch):
 
 @public_result(picture="fitting.tapping_curves.pictures:together_figure", rows="rows")
 @dataclass(frozen=True, kw_only=True)
-class TappingTogether(Result):
+class TappingTogether(JudgedResult):
     """Energies of a tap from several curves of one lever: what `tapping_together` returns.
 
     Attributes:
@@ -101,11 +101,6 @@ class TappingTogether(Result):
                 "one lever, and was its drive left alone between them?"
             )
         return found
-
-    @property
-    def valid(self) -> bool:
-        """Whether every curve is, and they agree on what they have in common."""
-        return not self.reasons
 
     def in_unit(self, text: str) -> str:
         """Return a text about energies in aJ with the unit that they have, that of the first curve."""

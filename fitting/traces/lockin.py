@@ -16,7 +16,7 @@ from jaxtyping import Complex, Float, Int
 
 from afm_jax.checks import checked
 from afm_jax.columns import printed_table, rows_of
-from afm_jax.results import Result, ResultTuple, public_result
+from afm_jax.results import JudgedResult, ResultTuple, public_result
 from afm_jax.units import within_turn
 from afm_jax.words import bullets
 from fitting.tables.csv_text import Column, Faults, FileSetting, Form, TableError, read_columns, read_text
@@ -51,7 +51,7 @@ class Trace(ResultTuple):
 
 @public_result(picture="fitting.traces.picture:lockin_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LockinResult(Result):
+class LockinResult(JudgedResult):
     """What `lockin` reads, named like the columns of an amplitude table.
 
     Attributes:
@@ -69,8 +69,7 @@ class LockinResult(Result):
         phases_deg: their phases, modulo 360 over the order.
         largest_share: what the amplitude at another order may be of that at the order asked for: 2 %, or what few
             samples a period make of the harmonics.
-        valid: whether the trace is periodic at the order asked for.
-        reasons: why it is not; a sentence each.
+        reasons: why the trace is not periodic at the order asked for; a sentence each.
         warnings: what a reader should know besides.
     """
 
@@ -87,18 +86,12 @@ class LockinResult(Result):
     amplitude_errors_nm: Float[np.ndarray, " lines"]
     phases_deg: Float[np.ndarray, " lines"]
     largest_share: float
-    valid: bool = True
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
-    @property
-    def reason(self) -> str | None:
-        """Why the trace is not periodic at the order; None if it is."""
-        return next(iter(self.reasons), None)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax lockin`."""
-        return {"format": "afm-jax lockin", "format_version": 2} | vars(self)
+        return {"format": "afm-jax lockin", "format_version": 2, "valid": self.valid} | vars(self)
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of lockin.csv, a row an order."""
@@ -114,8 +107,9 @@ class LockinResult(Result):
             "+-": "lockin_amplitude_error_nm:.2g",
             "phase\ndegrees": "phase_deg:.2f",
         }
-        verdict = "VALID" if self.valid else "NOT VALID"
-        head = f"{verdict}: order {self.order} of {self.drive_frequency_khz:g} kHz, {self.response_periods} periods"
+        head = (
+            f"{self.verdict}: order {self.order} of {self.drive_frequency_khz:g} kHz, {self.response_periods} periods"
+        )
         lines = [*bullets("Reasons:", self.reasons), *bullets("Notes:", self.warnings)]
         return [head, printed_table("", cells, rows_of(self.tables()["lockin.csv"])), *lines]
 
@@ -179,7 +173,7 @@ def lockin(
         warnings.append(f"Few phases are sampled (error {sampling:.1%}): sample faster, or not in step with the drive.")
     why = _why_not_periodic(found)
     reasons = () if why is None else (f"not periodic at order {order}: {why}",)
-    return replace(found, valid=why is None, reasons=reasons, warnings=tuple(warnings))
+    return replace(found, reasons=reasons, warnings=tuple(warnings))
 
 
 def _whole(time: Float[np.ndarray, " samples"], period_us: float) -> int:
@@ -296,7 +290,7 @@ TRACE = Form(
     open=True,
     separator="",
 )
-SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180", unit="kHz")}
+SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180")}
 
 
 @checked
