@@ -173,7 +173,7 @@ def calibrate(
     """
     if not isinstance(sweep, ResonanceSweep):
         sweep = read_sweep(Path(os.fspath(sweep)))
-    check_parameter("averages", averages, "positive", optional=True)
+    check_parameter("averages", averages, "above 0.5", optional=True)
     check_parameter("scale_error", scale_error, "positive")
     warm = temperature_k or (sweep.instrument.get("temperature_k", 296.0), 3.0)
     given = {"length_um": length_um, "width_um": width_um, "temperature_k": warm}

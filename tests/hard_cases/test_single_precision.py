@@ -77,7 +77,8 @@ LEFT: dict[str, Callable[[Any], Any]] = {
 
 NO_NUMBERS = {
     # read, write, remember; NumPy alone; or what one of the above hands to them
-    *("load", "load_law", "load_scene", "save_law", "save_scene", "scene_family", "use_cache", "trajectory"),
+    *("dimensionless_scene", "load", "load_law", "load_scene", "save_law", "save_scene", "scene_family"),
+    *("use_cache", "trajectory"),
     *("prior_of_values", "design", "drive_grid", "calibrate", "lockin", "posterior", "read_curve"),
     *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "tapping_map"),
     *("tapping_together", "table_of_curve", "write_table"),
