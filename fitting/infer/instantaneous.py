@@ -17,14 +17,14 @@ from fitting.infer.rows import Weights, plain_weights
 from fitting.infer.search import CENSORED, Descent, Found, orbits_at, starts
 from fitting.infer.unknowns import Model
 
-STARTS, _POLISHED = 64, 8
+STARTS, _POLISHED = 32, 8
 """Starts that are screened, and polished at most."""
-_BY_OPTAX, _SAME = 3, 1e-3
+_BY_OPTAX, _SAME = 2, 1e-3
 """Of these by Optax, the others by damped steps, and by Optax where one of those ends at a lower chi2."""
 _SOFT = 5.0
 """Residual of a reading from which it counts linearly in the screening."""
-_FINE, _STEPS = 1e-12, 60
-"""Estimated distance of chi2 to its minimum at the end, and damped steps to it at most."""
+_FINE, _NEAR, _STEPS = 1e-16, 1e-6, 60
+"""Estimated distance of chi2 to its minimum at the end, and where only chi2 is compared; damped steps at most."""
 _APART, _HARDLY_WORSE = 5.0, 4.0
 """Errors by which another minimum differs, and the rise of chi2 up to which it may be the true one."""
 _OUTLIER_ROUNDS = 3
@@ -79,7 +79,9 @@ class Chi2(NamedTuple):
         end = minimised(evaluate, y, jacobian.T @ jacobian, settled=1e-8)
         return end._replace(place=np.where(own, end.place**2, end.place))
 
-    def descended(self, theta: Float[np.ndarray, " k"], fixed: Bool[np.ndarray, " k"] | None = None) -> Searches:
+    def descended(
+        self, theta: Float[np.ndarray, " k"], fixed: Bool[np.ndarray, " k"] | None = None, settled: float = _FINE
+    ) -> Searches:
         """Return where damped steps go: no loss is negative, and some unknowns may be held."""
         lowest, highest = np.full(theta.size, -np.inf), np.full(theta.size, np.inf)
         lowest[: len(self.model.law.own)] = 0.0
@@ -93,7 +95,7 @@ class Chi2(NamedTuple):
 
         held = np.zeros((1, theta.size), bool) if fixed is None else fixed[None]
         start = evaluate(np.clip(theta, lowest, highest)[None], None)
-        return descended(evaluate, start, Box(lowest, highest, held), settled=_FINE, most=_STEPS)
+        return descended(evaluate, start, Box(lowest, highest, held), settled=settled, most=_STEPS)
 
     def explained(self, end: Searches) -> Explained:
         """Return the rows as the law at an end explains them."""
@@ -108,7 +110,7 @@ def profile(explained: Explained, place: int, value: float) -> float:
     fixed = np.zeros(explained.end.theta.size, bool)
     fixed[place] = True
     chi2 = Chi2(explained.model, explained.weights)
-    return float(chi2.descended(explained.beside(place, value), fixed).chi2[0])
+    return float(chi2.descended(explained.beside(place, value), fixed, _NEAR).chi2[0])
 
 
 def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained, Minimised, Explained | None]:
@@ -122,10 +124,10 @@ def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained,
     chi2 = Chi2(model, plain_weights(model.data, 0.0, out), ROBUST if robust else np.inf)
     points = starts(model, STARTS)
     with np.errstate(all="ignore"):
-        cost = [_softened(chi2.at(point)[1]) for point in points]
+        cost = [float(np.sum(chi2._replace(soft=_SOFT).at(point)[1] ** 2)) for point in points]
     order = np.argsort(np.nan_to_num(cost, nan=np.inf), kind="stable")[:_POLISHED]
     ends = [chi2.minimised(points[i]) for i in order[:_BY_OPTAX]]
-    others = [chi2.descended(points[i]) for i in order[_BY_OPTAX:]]
+    others = [chi2.descended(points[i], settled=_NEAR) for i in order[_BY_OPTAX:]]
     elsewhere = [(float(end.chi2[0]), end.place[0]) for end in others]
     least, place = min(elsewhere, key=lambda end: end[0], default=(np.inf, points[0]))
     best = min(ends, key=lambda end: end.value)
@@ -160,7 +162,3 @@ def _other_minimum(
             hardly_worse = there.end.chi2 < explained.end.chi2 + _HARDLY_WORSE
             return there if hardly_worse and apart(there.end.theta) else None
     return None
-
-
-def _softened(residual: Float[np.ndarray, " n"]) -> float:
-    return float(np.sum(2.0 * _SOFT**2 * (np.sqrt(1.0 + (residual / _SOFT) ** 2) - 1.0)))

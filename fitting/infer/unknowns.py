@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.contact.parameters import PAPER
-from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.law_table import LawTable
 from fitting.models import Reach, Task, drifts, reach_of, readings_of
 from fitting.parameters import CONTACT_NAMES, PARAMETERS, is_nuisance, name_of_table
 from fitting.predict.law import LawModel
@@ -247,10 +245,6 @@ class Model:
         """Return the unknowns of the law."""
         return theta[: len(self.law.names)]
 
-    def table(self, theta: Float[np.ndarray, " k"]) -> LawTable | ImpactLaw:
-        """Return the law as orbits are computed from it."""
-        return self.law.table(self.of_law(theta))
-
     def _instrument_at(self, theta: Any, numpy: Any = np) -> dict[str, Any]:
         """Return every quantity of the instrument for each row, by its kind."""
         data, first = self.data, len(self.names) - len(self.instrument)
@@ -314,7 +308,8 @@ class Model:
         self, theta: Float[np.ndarray, " k"], x: Float[np.ndarray, "rows 3"], *, most: int = 14, judge: bool = False
     ) -> Orbits:
         """Return the orbits of all rows from where they were, NaN where there was none."""
-        local, table, whole = self.local(theta), self.table(theta), no_orbits(self.data.time.size)
+        local, table = self.local(theta), self.law.table(self.of_law(theta))
+        whole = no_orbits(self.data.time.size)
         for drive, some in self.data.groups:
             found = followed(x[some], local[some], self.data.row.take(some), table, drive, most=most, judge=judge)
             for column, part in zip(whole, found, strict=True):
@@ -325,7 +320,7 @@ class Model:
         self, theta: Float[np.ndarray, " k"], rows: np.ndarray, *, most: int = 14, judge: bool = True
     ) -> tuple[np.ndarray, Orbits]:
         """Return all orbits of some rows at unknowns, searched for, and the row of each."""
-        local, table, parts = self.local(theta), self.table(theta), []
+        local, table, parts = self.local(theta), self.law.table(self.of_law(theta)), []
         for drive, some in self.data.groups:
             mine = np.intersect1d(some, rows)
             if not mine.size:

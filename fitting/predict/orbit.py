@@ -29,7 +29,7 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 READINGS = 3
 """Peak and lock-in amplitude in nm, phase in degrees."""
 BLOCK = 32
-"""Rows that one call of a program takes."""
+"""Rows that one call of a program takes; of instantaneous laws, which need no search, twice as many."""
 _PLACES = np.linspace(0.02, KNOTS - 1.5, 4 * KNOTS)
 """Coordinates at which the closing condition is scanned."""
 _CROSSINGS = 6
@@ -320,25 +320,25 @@ def starts_of(
     local = local.copy()
     local[:, :2] = 0.0
     search = _scanned if isinstance(table, LawTable) else _rooted
-    x, there = _in_blocks(lambda *block: search.outside(*block, table, drive), local, row)
+    x, there = _in_blocks(search, table, drive, local, row)
     which, slot = np.nonzero(there)
     return which, x[which, slot]
 
 
-def _in_blocks(work, *trees):
+def _in_blocks(program, table: AnyLaw, drive: str, *trees):
     """Return what a program makes of rows, a fixed number at a time."""
-    count = len(jax.tree.leaves(trees)[0])
+    count, block = len(jax.tree.leaves(trees)[0]), BLOCK if isinstance(table, LawTable) else 2 * BLOCK
     parts = []
-    for first in range(0, count, BLOCK):
-        some = np.minimum(np.arange(first, first + BLOCK), count - 1)
-        part = work(*jax.tree.map(lambda column, some=some: np.asarray(column)[some], trees))
+    for first in range(0, count, block):
+        some = np.minimum(np.arange(first, first + block), count - 1)
+        part = program.outside(*jax.tree.map(lambda column, some=some: np.asarray(column)[some], trees), table, drive)
         parts.append([np.asarray(array)[: count - first] for array in part])
     return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 
 
 def evaluated(x: Float[np.ndarray, "rows 3"], local: Float[np.ndarray, "rows local"], row: Row, table, drive: str):
     """Return what `_evaluated` makes of any number of rows, as arrays of NumPy."""
-    return _in_blocks(lambda *block: _evaluated.outside(*block, table, drive), x, local, row)
+    return _in_blocks(_evaluated, table, drive, x, local, row)
 
 
 def followed(
