@@ -18,8 +18,7 @@ NO_LIMIT = "the data set no limit on this side"
 """Why an end of an interval is open, why it is not known, and why there is no interval."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
-_TRIALS, _NEARLY = 20, 0.9
-"""Points of a search at most, and the part of the rise from which the next point is where a straight line leads."""
+_TRIALS = 20
 _CLOSE, _NEAREST = 5e-4, 1e-2
 """Relative error of an end's distance in chi2's root; distance in errors within which an orbit is lost at the end."""
 
@@ -100,9 +99,7 @@ def _end(rise: Callable[[float], float], unknown: Unknown, side: float, most: fl
         else:
             high, above = trial, root
         if not np.isfinite(high):
-            # nearly there: as far as a straight line says
-            farther = 1.0 if root > _NEARLY * wanted else 1.5
-            trial = min(trial * max(wanted / max(root, 0.65), farther), most, _FARTHEST * error)
+            trial = min(trial * max(wanted / max(root, 0.65), 1.5), most, _FARTHEST * error)
             continue
         # an orbit that was seen must be there: where it is lost the interval ends
         if high - low < (1e-5 * high if np.isfinite(above) else _NEAREST * error):
