@@ -22,7 +22,7 @@ STARTS, _POLISHED = 32, 8
 _BY_OPTAX, _SAME = 2, 1e-3
 """Of these by Optax, the others by damped steps, and by Optax where one of those ends at a lower chi2."""
 _SOFT = 5.0
-"""Residual of a reading from which it counts linearly in the screening."""
+"""Residual of a row from which it counts linearly in the screening."""
 _FINE, _NEAR, _STEPS = 1e-16, 1e-6, 60
 """Estimated distance of chi2 to its minimum at the end, and where only chi2 is compared; damped steps at most."""
 _APART, _HARDLY_WORSE = 5.0, 4.0

@@ -23,12 +23,11 @@ _ARMIJO, _SHORTEST = 1e-4, 1e-9
 
 
 class Minimised(NamedTuple):
-    """Where an optimiser has ended: place, value, steps taken, and the gradient's norm in units of standard errors."""
+    """Where an optimiser has ended: place, value and steps taken."""
 
     place: Float[np.ndarray, " p"]
     value: float
     steps: int
-    gradient_norm: float
 
 
 def minimised(
@@ -71,7 +70,7 @@ def minimised(
                 continue
             z, value, gradient, share = z + share * move, there, slope, 1.0
             step, state = _update(gradient, state, z)
-    return Minimised(start + scale @ z, value, count, float(np.linalg.norm(gradient)))
+    return Minimised(start + scale @ z, value, count)
 
 
 def _downhill(step: Float[np.ndarray, " p"], gradient: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:

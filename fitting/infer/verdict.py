@@ -144,9 +144,9 @@ def correlation_excess(residual: Float[np.ndarray, "rows k"]) -> float:
 
 
 def _one_sided(evidence: Evidence) -> str:
-    """Return that some rows are off to one side: chance gives as large residuals of either sign.
+    """Return which rows are far off to one side, in words; nothing where residuals of either sign are as large.
 
-    A robust fit is for such rows.
+    A robust fit leaves such rows out, and is not asked.
     """
     residual = evidence.rows.residual if evidence.unwidened is None else evidence.unwidened
     count = np.isfinite(residual).sum(axis=1)

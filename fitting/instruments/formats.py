@@ -75,11 +75,6 @@ def is_igor(head: bytes, path: str = "") -> bool:
     return head[:2] in {b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"} or path.lower().endswith(".ibw")
 
 
-def holds_curves(head: bytes, path: str) -> bool:
-    """Say whether a file that begins so is of a format that holds nothing but curves against height."""
-    return is_igor(head, path) or head.startswith((b"WSxM file", b"GWYP")) or b"neaspec" in head.lower()
-
-
 # ---- text
 
 

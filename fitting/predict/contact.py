@@ -108,7 +108,7 @@ class ContactLawModel(LawModel):
         return float(self._evaluated(theta, np.zeros(0))[0][2][4])
 
     def capture_slope(self, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
-        """Return its derivatives by the unknowns."""
+        """Return the derivatives of the capture speed by the unknowns."""
         return self._evaluated(theta, np.zeros(0))[1][2][4]
 
     def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
