@@ -1,5 +1,6 @@
 """The posterior of a fit's parameters: samples, their means and intervals, and whether they are enough."""
 
+import importlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,7 +78,7 @@ class Posterior(Result):
             ModuleNotFoundError: if ArviZ is not installed.
         """
         try:
-            import arviz  # noqa: PLC0415
+            arviz = importlib.import_module("arviz")
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError("ArviZ is not installed: pip install arviz", name="arviz") from error
         columns = np.moveaxis(self.chains.samples, -1, 0)
