@@ -108,6 +108,15 @@ def coordinate_of(approach_speed: Float[np.ndarray, "..."], capture: float) -> F
     return np.arcsinh(np.sqrt(np.maximum(approach_speed**2 - capture**2, 0.0)) / _SCALE) / _STEP
 
 
+def weights_at(coordinate: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n knots"]:
+    """Return what the splines of a table weigh the values at the knots with, at coordinates."""
+    left = np.clip(np.floor(coordinate), 0, KNOTS - 2).astype(int)
+    x = (coordinate - left)[:, None]
+    to_right, values = x * x * (3.0 - 2.0 * x), np.eye(KNOTS)
+    found = (1.0 - to_right) * values[left] + to_right * values[left + 1]
+    return found + x * (1.0 - x) ** 2 * _SLOPES[left] - x * x * (1.0 - x) * _SLOPES[left + 1]
+
+
 def table_of(
     capture: float,
     square: Float[np.ndarray, " knots"],

@@ -85,7 +85,7 @@ def _end(rise: Callable[[float], float], unknown: Unknown, side: float, most: fl
     error = unknown.error
     wanted = float(np.sqrt(CHI2_95))
     (low, below), (high, above) = (0.0, 0.0), (np.inf, np.inf)
-    trial = min(wanted * error, most)
+    trial, farther = min(wanted * error, most), np.inf
     for _ in range(_TRIALS):
         root = float(np.sqrt(max(rise(unknown.place + side * trial), 0.0)))
         if abs(root - wanted) < _CLOSE * wanted:
@@ -95,11 +95,14 @@ def _end(rise: Callable[[float], float], unknown: Unknown, side: float, most: fl
                 return None, END_OF_RANGE
             if trial >= _FARTHEST * error:
                 return None, NO_LIMIT
+            # where a straight line leads; where chi2 hardly rises any more three times as far
+            slope = (root - below) / (trial - low)
+            farther = min(trial + (wanted - root) / slope if slope > 0.0 else np.inf, 3.0 * trial)
             low, below = trial, root
         else:
             high, above = trial, root
         if not np.isfinite(high):
-            trial = min(trial * max(wanted / max(root, 0.65), 1.5), most, _FARTHEST * error)
+            trial = min(farther, most, _FARTHEST * error)
             continue
         # an orbit that was seen must be there: where it is lost the interval ends
         if high - low < (1e-5 * high if np.isfinite(above) else _NEAREST * error):

@@ -159,15 +159,12 @@ class Followed:
         self, place: Float[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows k"]]:
         """Return d w^2/d u^2 at every row's approach speed, of which the determinant grows, and its derivatives."""
-        law, theta, (slow, fast) = (
-            self.model.law,
-            self.model.of_law(place),
-            np.outer([1.0 - _APART, 1.0 + _APART], self.speeds),
-        )
-        here, there, apart = law.at(theta, slow), law.at(theta, fast), fast**2 - slow**2
-        slope = np.zeros((slow.size, place.size))
-        slope[:, : theta.size] = (there.square_slope - here.square_slope) / apart[:, None]
-        return (there.square - here.square) / apart, slope
+        theta, speeds = self.model.of_law(place), np.outer([1.0 - _APART, 1.0 + _APART], self.speeds)
+        # at once: a contact's law takes as long for many speeds as for few
+        found, (apart,) = self.model.law.at(theta, speeds.ravel()), np.diff(speeds**2, axis=0)
+        slope = np.zeros((apart.size, place.size))
+        slope[:, : theta.size] = np.subtract(*np.split(found.square_slope, 2)[::-1]) / apart[:, None]
+        return np.subtract(*np.split(found.square, 2)[::-1]) / apart, slope
 
     def sum(self, place: Float[np.ndarray, " k"]) -> Sum:
         """Return the sum of squares at unknowns, outliers softened; infinite where an orbit is lost."""

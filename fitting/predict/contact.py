@@ -17,14 +17,11 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR, tabulated
 from afm_jax.contact.parameters import EFFECTS, PAPER
 from afm_jax.impact.lasting_impact import TabulatedImpact
-from afm_jax.impact.law_table import EXCESS, LawTable, table_of
+from afm_jax.impact.law_table import EXCESS, LawTable, coordinate_of, table_of, weights_at
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.models import Held
 from fitting.parameters import PARAMETERS
 from fitting.predict.law import LawAt, LawModel
-
-_SPEEDS = 160
-"""Approach speeds beside the knots that one call takes at most, or a multiple."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,11 +72,9 @@ class ContactLawModel(LawModel):
         """Return the parameters that are fitted, by name."""
         return {name: float(self.value_of(name, y)) for name, y in zip(self.own, theta.tolist(), strict=False)}
 
-    def _evaluated(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> Any:
-        """Return the law at the knots and at speeds in nm/us, its coefficients, all derivatives; kept for a while."""
-        size = -(-max(u.size, 1) // _SPEEDS) * _SPEEDS
-        speeds = np.concatenate([u, np.full(size - u.size, 50.0)])
-        key = theta.tobytes() + speeds.tobytes()
+    def _evaluated(self, theta: Float[np.ndarray, " k"]) -> Any:
+        """Return w^2, T and the coefficients of the law at the knots, and all derivatives; kept for a while."""
+        key = theta.tobytes()
         if key not in self._kept:
             while len(self._kept) > 3:
                 del self._kept[next(iter(self._kept))]
@@ -88,36 +83,36 @@ class ContactLawModel(LawModel):
             held = np.array([(one.value, one.error, *end) for one, end in zip(self.held, ends, strict=True)])
             names = self.own, tuple(one.name for one in self.held), tuple(self.effects)
             fixed = {name: np.asarray(float(value)) for name, value in self.fixed.items() if name not in names[1]}
-            found = _law(theta, speeds, linear, held.reshape(-1, 4), fixed, np.asarray(self.mass_ng), names=names)
+            found = _law(theta, linear, held.reshape(-1, 4), fixed, np.asarray(self.mass_ng), names=names)
             self._kept[key] = jax.tree.map(np.asarray, found)
         return self._kept[key]
 
     def at(self, theta: Float[np.ndarray, " k"], u: Float[np.ndarray, " n"]) -> LawAt:
-        """Return the law at approach speeds in nm/us."""
-        (square, time, _), (square_slope, time_slope, _) = self._evaluated(theta, u)
-        some = slice(EXCESS.size - 1, EXCESS.size - 1 + u.size)
-        return LawAt(square[some], time[some], square_slope[some], time_slope[some])
+        """Return the law at approach speeds in nm/us: its table there, and what that changes by."""
+        (square, time, found), (square_slope, time_slope, _) = self._evaluated(theta)
+        weights = weights_at(coordinate_of(u, float(found[4])))
+        excess = np.maximum(u**2 - found[4] ** 2, 0.0)
+        return LawAt(
+            excess - weights @ (EXCESS**2 - square), weights @ time, weights @ square_slope, weights @ time_slope
+        )
 
     def coefficients(self, theta: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " 4"], Float[np.ndarray, "4 k"]]:
         """Return a, b, d and f of the delay, and their derivatives by the unknowns."""
-        (_, _, found), (_, _, slope) = self._evaluated(theta, np.zeros(0))
+        (_, _, found), (_, _, slope) = self._evaluated(theta)
         return found[:4], slope[:4]
 
     def capture(self, theta: Float[np.ndarray, " k"]) -> float:
         """Return the capture speed in nm/us."""
-        return float(self._evaluated(theta, np.zeros(0))[0][2][4])
+        return float(self._evaluated(theta)[0][2][4])
 
     def capture_slope(self, theta: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"]:
         """Return the derivatives of the capture speed by the unknowns."""
-        return self._evaluated(theta, np.zeros(0))[1][2][4]
+        return self._evaluated(theta)[1][2][4]
 
     def table(self, theta: Float[np.ndarray, " k"]) -> LawTable:
         """Return the table."""
-        (square, time, found), _ = self._evaluated(theta, np.zeros(0))
-        count = EXCESS.size - 1
-        return table_of(
-            float(found[4]), np.append(0.0, square[:count]), np.append(time[0], time[:count]), found[:4], self.length_nm
-        )
+        (square, time, found), _ = self._evaluated(theta)
+        return table_of(float(found[4]), square, time, found[:4], self.length_nm)
 
     def misses_accuracy(
         self, theta: Float[np.ndarray, " k"], approach: Float[np.ndarray, " rows"]
@@ -135,7 +130,6 @@ _errors = compiled_quickly()(TabulatedImpact.errors)
 @compiled_quickly(static_argnames="names", level=0)
 def _law(
     theta: Float[Array, " k"],
-    speeds: Float[Array, " n"],
     linear: Float[Array, "own 2"],
     held: Float[Array, "held 4"],
     fixed: dict[str, Float[Array, ""]],
@@ -143,7 +137,7 @@ def _law(
     *,
     names: tuple[tuple[str, ...], ...],
 ):
-    """Return w^2 and T at the knots and at speeds, a, b, d, f and the capture speed; and their derivatives.
+    """Return w^2 and T at the knots, a, b, d, f and the capture speed; and their derivatives, those of w^2 at a speed.
 
     ``linear``: reference and width of parameters of any sign (width 0: logarithms); ``held``: values, errors, ranges.
     """
@@ -156,12 +150,15 @@ def _law(
         known = dict(zip(own, free, strict=True)) | dict(zip(of_held, stays, strict=True))
         impact = tabulated(Contact.paper(effects=effects, **(fixed | known)), mass_ng)
         capture = impact.capture
-        knots = jnp.sqrt(jax.lax.stop_gradient(capture) ** 2 + jnp.asarray(EXCESS[1:]) ** 2)
-        u = jnp.concatenate([knots, speeds])
+        u = jnp.sqrt(jax.lax.stop_gradient(capture) ** 2 + jnp.asarray(EXCESS[1:]) ** 2)
         at = jax.vmap(impact.speeds)(u)
         closest = impact.closest
         time = at.delay + closest.lead_nm * (1.0 / at.rebound - 1.0 / u)
         found = jnp.stack([closest.hertz, closest.lead_nm, 2.0 * closest.raised_nm, 0.0 * capture, capture])
-        return at.rebound**2, time, found
+        square = at.rebound**2
+        # even in the coordinate at capture, where only the derivative of w^2 does not vanish
+        first = (4.0 * square[0] - square[1]) / 3.0
+        first = first - jax.lax.stop_gradient(first)
+        return jnp.append(first, square), jnp.append((4.0 * time[0] - time[1]) / 3.0, time), found
 
     return columns(theta), jax.jacfwd(columns)(theta)
