@@ -159,6 +159,8 @@ def _law(
         # even in the coordinate at capture, where only the derivative of w^2 does not vanish
         first = (4.0 * square[0] - square[1]) / 3.0
         first = first - jax.lax.stop_gradient(first)
-        return jnp.append(first, square), jnp.append((4.0 * time[0] - time[1]) / 3.0, time), found
+        law = jnp.append(first, square), jnp.append((4.0 * time[0] - time[1]) / 3.0, time), found
+        return law, law
 
-    return columns(theta), jax.jacfwd(columns)(theta)
+    slopes, law = jax.jacfwd(columns, has_aux=True)(theta)
+    return law, slopes
