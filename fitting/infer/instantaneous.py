@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import Box, Searches, descended
+from afm_jax.solve.least_squares import Sum
 from fitting.infer.explain import MOST_OUTLIERS, OUTLIER, ROBUST, Explained
 from fitting.infer.optimiser import Minimised, minimised
 from fitting.infer.rows import Weights, plain_weights
@@ -68,15 +69,14 @@ class Chi2(NamedTuple):
         """Return where Optax's L-BFGS goes in coordinates whose squares are the losses."""
         own = np.arange(start.size) < len(self.model.law.own)
 
-        def evaluate(y: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
+        def evaluate(y: Float[np.ndarray, " k"]) -> Sum:
             with np.errstate(all="ignore"):
                 _, residual, jacobian = self.at(np.where(own, y**2, y))
-                value, gradient = float(residual @ residual), 2.0 * (residual @ jacobian) * np.where(own, 2.0 * y, 1.0)
-            return (value, gradient) if np.isfinite(gradient).all() else (np.inf, np.zeros_like(y))
+            jacobian = jacobian * np.where(own, 2.0 * y, 1.0)
+            sound = np.isfinite(residual @ jacobian).all()
+            return Sum(float(residual @ residual) if sound else np.inf, residual, jacobian)
 
-        y = np.where(own, np.sqrt(np.maximum(start, 0.0)), start)
-        jacobian = self.at(start)[2] * np.where(own, 2.0 * y, 1.0)
-        end = minimised(evaluate, y, jacobian.T @ jacobian, settled=1e-8)
+        end = minimised(evaluate, np.where(own, np.sqrt(np.maximum(start, 0.0)), start), settled=1e-8)
         return end._replace(place=np.where(own, end.place**2, end.place))
 
     def descended(

@@ -1,4 +1,4 @@
-"""Optax's L-BFGS around a function of NumPy: values and gradients come from the caller, steps are halved.
+"""Optax's L-BFGS around a function of NumPy: the caller gives residuals and their Jacobian, steps are halved.
 
 The start's Gauss-Newton curvature makes steps of one standard error each the unit, so that steep valleys look round.
 """
@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Float
 
 from afm_jax.solve.lanes import compiled_quickly
+from afm_jax.solve.least_squares import Sum
 
 OPTIMISER = f"optax.lbfgs {optax.__version__}"
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
@@ -31,9 +32,8 @@ class Minimised(NamedTuple):
 
 
 def minimised(
-    evaluate: Callable[[Float[np.ndarray, " p"]], tuple[float, Float[np.ndarray, " p"]]],
+    evaluate: Callable[[Float[np.ndarray, " p"]], Sum],
     start: Float[np.ndarray, " p"],
-    curvature: Float[np.ndarray, "p p"],
     *,
     settled: float,
     most: int = 60,
@@ -41,22 +41,17 @@ def minimised(
     """Return a minimum.
 
     Args:
-        evaluate: gives value and gradient at a place; an infinite value refuses a step.
+        evaluate: gives the sum at a place, whose gradient is 2 J^T r; an infinite value refuses a step.
         start: where to begin.
-        curvature: half the Hessian there, about: J^T J of a sum of squares.
         settled: estimated distance of the value to its minimum at which it has arrived.
         most: steps at most.
     """
+    first = evaluate(start)
+    curvature = first.jacobian.T @ first.jacobian
     sound = np.isfinite(curvature).all()
     strength, axes = np.linalg.eigh(curvature if sound else np.eye(start.size))
     scale = axes / np.sqrt(np.maximum(strength, 1e-8 * max(float(strength[-1]), 1e-12)))
-
-    def at(z: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
-        value, gradient = evaluate(start + scale @ z)
-        return value, 0.5 * gradient @ scale
-
-    z = np.zeros_like(start)
-    value, gradient = at(z)
+    z, value, gradient = np.zeros_like(start), first.value, (first.residual @ first.jacobian) @ scale
     # optax mixes integers of 32 and 64 bits, which strict promotion would refuse
     with jax.numpy_dtype_promotion("standard"):
         step, state = _update(gradient, _init(z), z)
@@ -64,11 +59,12 @@ def minimised(
         while count < most and gradient @ gradient > settled and share > _SHORTEST:
             count += 1
             move = _downhill(np.asarray(step), gradient)
-            there, slope = at(z + share * move)
-            if not there <= value + 2.0 * _ARMIJO * share * float(gradient @ move):
+            there = evaluate(start + scale @ (z + share * move))
+            if not there.value <= value + 2.0 * _ARMIJO * share * float(gradient @ move):
                 share *= 0.5
                 continue
-            z, value, gradient, share = z + share * move, there, slope, 1.0
+            z, value, gradient = z + share * move, there.value, (there.residual @ there.jacobian) @ scale
+            share = 1.0
             step, state = _update(gradient, state, z)
     return Minimised(start + scale @ z, value, count)
 

@@ -192,11 +192,6 @@ class Followed:
             self.least, self.orbits = chi2, orbits
         return Sum(chi2, residual, jacobian)
 
-    def value_and_gradient(self, place: Float[np.ndarray, " k"]) -> tuple[float, Float[np.ndarray, " k"]]:
-        """Return the sum and its gradient 2 J^T r."""
-        here = self.sum(place)
-        return here.value, 2.0 * here.jacobian.T @ here.residual
-
     def descent(self, place: Float[np.ndarray, " k"], here: Sum, steps: int) -> Descent:
         """Return where a descent has ended, its best unknowns."""
         gone = ~self.orbits.closes & ~self.model.data.row.free
@@ -209,9 +204,7 @@ def polished_by_optax(
     model: Model, theta: Float[np.ndarray, " k"], begin: Orbits, weights: Weights
 ) -> Float[np.ndarray, " k"]:
     """Return where Optax's L-BFGS takes unknowns on the soft loss; arguments as of `descend`."""
-    rows = Followed(model, theta, begin, weights, _SOFT)
-    jacobian = rows.sum(theta).jacobian
-    return minimised(rows.value_and_gradient, theta, jacobian.T @ jacobian, settled=1.0, most=25).place
+    return minimised(Followed(model, theta, begin, weights, _SOFT).sum, theta, settled=1.0, most=25).place
 
 
 def starts(model: Model, count: int = STARTS) -> Float[np.ndarray, "starts k"]:
