@@ -343,6 +343,19 @@ def require_float64(*models: Any) -> None:
     refuse_float32(*models)
 
 
+def in_float64(function: Function) -> Function:
+    """Let a function compute in 64 bits, whatever JAX is set to."""
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        import jax  # noqa: PLC0415
+
+        with jax.enable_x64(new_val=True):
+            return function(*arguments, **named)
+
+    return cast("Function", call)
+
+
 def refuse_float32(*models: Any) -> None:
     """Check that models hold 64-bit floats, where JAX computes in them.
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import checked, in_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import Result, public_result
 from afm_jax.solve.lanes import compiled_quickly
@@ -49,6 +49,7 @@ class AmplitudeGradients(Result):
 
 
 @checked
+@in_float64
 def amplitude_gradients(
     table: TableLike,
     model: str,
@@ -71,10 +72,8 @@ def amplitude_gradients(
 
     Raises:
         ValueError: if there is no such model or parameter, or one is missing or outside its range.
-        RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
-    require_float64()
     held = dict(fixed or {})
     own = _own_parameters(model, values, held)
     task = task_of(table, model, free=own, fixed=held, effects=effects)

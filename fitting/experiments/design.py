@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.checks import check_count, check_parameter, checked, require_float64
+from afm_jax.checks import check_count, check_parameter, checked, in_float64
 from afm_jax.columns import rows_of
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.results import JudgedResult, public_result
@@ -164,6 +164,7 @@ class Design(JudgedResult):
 
 
 @checked
+@in_float64
 def design(  # noqa: PLR0913
     prior: Prior | FitResult,
     drives: Drives,
@@ -199,9 +200,7 @@ def design(  # noqa: PLR0913
 
     Raises:
         ValueError: if an option is impossible.
-        RuntimeError: if JAX is not set to 64-bit floats.
     """
-    require_float64()
     prior = prior_of_fit(prior) if isinstance(prior, FitResult) else prior
     names = prior.problem.names
     if interest is None:

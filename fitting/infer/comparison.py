@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import checked, in_float64
 from afm_jax.results import Result, public_result
 from fitting.infer.fit import fit, tables_of
 from fitting.infer.law import closest_loss, rebound_by_formula
@@ -61,6 +61,7 @@ def rivals(model: str, fixed: Mapping[str, float] | None = None) -> tuple[str, .
 
 
 @checked
+@in_float64
 def compare(
     table: TableLike | SeveralTables | Sequence[TableLike],
     models: Sequence[str] = ("law+delay", "viscous+delay"),
@@ -81,7 +82,6 @@ def compare(
         ValueError: if fewer than two different models are named, or one of them there is not; as `fit`, if a model
             cannot be fitted.
     """
-    require_float64()
     if len(set(models)) < 2:
         raise ValueError("comparing needs at least two different models")
     for model in models:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import checked, in_float64
 from afm_jax.contact.parameters import EFFECTS
 from fitting.infer.explain import ROBUST, Explained, fit_lasting
 from fitting.infer.instantaneous import fit_instantaneous, profile
@@ -29,6 +29,7 @@ from fitting.tables.table import AmplitudeTable, as_table
 
 
 @checked
+@in_float64
 def fit(  # noqa: PLR0913
     table: AmplitudeTable | Sequence[AmplitudeTable] | Any,
     model: str = "law",
@@ -72,9 +73,7 @@ def fit(  # noqa: PLR0913
     Raises:
         ValueError: if there is no such model or parameter, a constraint is impossible or degenerate with the model,
             there are fewer measured amplitudes than parameters, or tables have no law in common.
-        RuntimeError: if JAX is not set to 64-bit floats.
     """
-    require_float64()
     whole = tables_of(table)
     errors: dict[str, float] = {}
     if model == "contact":

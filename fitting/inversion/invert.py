@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import checked, in_float64
 from afm_jax.columns import printed_table, rows_of
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from afm_jax.results import JudgedResult, public_result
@@ -136,6 +136,7 @@ class Inversion(JudgedResult):
 
 
 @checked
+@in_float64
 def invert(table: TableLike) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and lines through the losses.
 
@@ -152,10 +153,8 @@ def invert(table: TableLike) -> Inversion:
 
     Raises:
         TableError: if the table has no phase, or does not say its quality factor.
-        RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
-    require_float64()
     if table.tapping:
         raise TableError(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "

@@ -289,7 +289,8 @@ class FormulaLaw(LawModel):
         low, high = grid[stays[-1]], grid[stays[-1] + 1]
         while high - low > 1e-13 * high:
             grid = np.linspace(low, high, 33)
-            leaves = int(np.flatnonzero(self.at(theta, grid).square > 0.0)[0])
+            # in the last digit the end may be a root itself
+            leaves = int(np.append(np.flatnonzero(self.at(theta, grid).square > 0.0), grid.size - 1)[0])
             low, high = grid[max(leaves - 1, 0)], grid[leaves]
         return float(high)
 

@@ -17,7 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from afm_jax.checks import check_count, checked, require_float64
+from afm_jax.checks import check_count, checked, in_float64
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.solve.lanes import compiled_quickly
 from fitting.infer.closest import closest_parameters, covariance_of_unknowns
@@ -36,6 +36,7 @@ CHAINS = 4
 
 
 @checked
+@in_float64
 def posterior(result: FitResult, *, samples: int = 1000, seed: int = 0) -> Posterior:
     """Return samples of the posterior of all parameters, nuisances included.
 
@@ -53,7 +54,6 @@ def posterior(result: FitResult, *, samples: int = 1000, seed: int = 0) -> Poste
             every parameter.
         ModuleNotFoundError: if blackjax is needed and not installed (extra `nuts`).
     """
-    require_float64()
     if not result.valid:
         raise ValueError(f"the fit of the model {result.model!r} is not valid ({result.reasons[0]}); mend it first")
     if isinstance(result.table, SeveralTables):

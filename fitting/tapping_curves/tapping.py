@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.checks import checked
+from afm_jax.checks import checked, in_float64
 from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
@@ -63,6 +63,7 @@ _ORIGIN_NM = 0.3
 
 
 @checked
+@in_float64
 def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale_errors: bool = False) -> Tapping:
     """Return the energy of a tap along a tapping curve, its branches and hysteresis, and the law if rows allow it.
 

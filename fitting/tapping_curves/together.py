@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.checks import checked
+from afm_jax.checks import checked, in_float64
 from afm_jax.least_squares import IMPROBABLE
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
@@ -122,6 +122,7 @@ class TappingTogether(JudgedResult):
 
 
 @checked
+@in_float64
 def tapping_together(tables: Sequence[TableLike], *, scale_errors: bool = False) -> TappingTogether:
     """Return the energies of several curves of one lever, frequency and Q fitted to all of them.
 

@@ -31,18 +31,12 @@ def _contact() -> Any:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "amplitude_gradients": lambda: fitting.amplitude_gradients(
-        fitting.read_table(TABLE), "law", {"r": 0.9, "epsilon": 60.0}
-    ),
     "basins_of_attraction": lambda: afm.basins_of_attraction(bouncing(), columns=2, rows=2),
     "bifurcation_diagram": lambda: afm.bifurcation_diagram(bouncing(), "platform.amplitude_nm", np.array([1.0, 2.0])),
-    "compare": lambda: fitting.compare(fitting.read_table(TABLE)),
     "contact_orbits": lambda: afm.contact_orbits(_contact(), 1, 1),
     "continue_orbits": lambda: afm.continue_orbits(bouncing(), 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0)),
-    "fit": lambda: fitting.fit(fitting.read_table(TABLE)),
     "fit_delay": lambda: fitting.fit_delay(afm.Contact.paper()),
     "fit_law": lambda: fitting.fit_law(afm.Contact.paper()),
-    "invert": lambda: fitting.invert(fitting.read_table(TABLE)),
     "iterate_batch": lambda: afm.iterate_batch(bouncing(), np.array([4.0]), np.array([60.0]), 2),
     "iterate_map": lambda: afm.iterate_map(bouncing(), 4.0, 60.0, 2),
     "lyapunov_spectrum": lambda: afm.lyapunov_spectrum(bouncing()),
@@ -63,7 +57,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "sweep": lambda: afm.sweep(bouncing(), [{"parameter": "platform.amplitude_nm", "linear": [1, 2, 2]}], "orbits"),
     "approach_curve": lambda: afm.approach_curve(bouncing(), [10.0]),
-    "tapping": lambda: fitting.tapping(fitting.read_table(EXAMPLES / "tapping_contact.csv")),
 }
 """What says that it needs 64 bits."""
 
@@ -74,6 +67,15 @@ LEFT: dict[str, Callable[[Any], Any]] = {
     "time_course": lambda contact: jax.tree.leaves(afm.time_course(contact, 30.0))[1:3],
 }
 """What computes all the same, from the contact of the paper."""
+
+SAME: dict[str, Callable[[], dict[str, Any]]] = {
+    "amplitude_gradients": lambda: vars(fitting.amplitude_gradients(TABLE, "law", {"r": 0.9, "epsilon": 60.0})),
+    "compare": lambda: fitting.compare(TABLE, ("law", "restitution")).to_dict(),
+    "fit": lambda: fitting.fit(TABLE).to_dict(),
+    "invert": lambda: fitting.invert(TABLE).to_dict(),
+    "tapping": lambda: fitting.tapping(EXAMPLES / "tapping_contact.csv").to_dict(),
+}
+"""What computes in 64 bits by itself."""
 
 NO_NUMBERS = {
     # read, write, remember; NumPy alone; or what one of the above hands to them
@@ -92,7 +94,7 @@ def test_every_public_function_is_here():
         for name in dir(package)
         if callable(getattr(package, name)) and not isinstance(getattr(package, name), type)
     }
-    assert functions == {*REFUSED, *LEFT, *NO_NUMBERS}
+    assert functions == {*REFUSED, *LEFT, *SAME, *NO_NUMBERS}
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -100,6 +102,15 @@ def test_refusals(name: str):
     with jax.enable_x64(new_val=False), pytest.raises(RuntimeError, match=r"64-bit floats: add .*x64', True") as error:
         REFUSED[name]()
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SAME)
+def test_digits_that_all_are_there(name: str):
+    wide = SAME[name]()
+    with jax.enable_x64(new_val=False):
+        narrow = SAME[name]()
+    np.testing.assert_equal(narrow, wide)
 
 
 @pytest.mark.slow
