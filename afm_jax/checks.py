@@ -343,11 +343,18 @@ def require_float64(*models: Any) -> None:
     refuse_float32(*models)
 
 
-def in_float64(function: Function) -> Function:
-    """Let a function compute in 64 bits, whatever JAX is set to."""
+def in_float64(function: Function, *, loaded: bool = False) -> Function:
+    """Let a function compute in 64 bits, whatever JAX is set to.
+
+    Args:
+        function: what computes.
+        loaded: only where JAX is loaded: what does not load it needs none.
+    """
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
+        if loaded and "jax" not in sys.modules:
+            return function(*arguments, **named)
         import jax  # noqa: PLC0415
 
         with jax.enable_x64(new_val=True):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, data
 
 import numpy as np
 
-from afm_jax.checks import is_array
+from afm_jax.checks import in_float64, is_array
 from afm_jax.saved import fields_of, is_abstract, is_record, save
 
 if TYPE_CHECKING:
@@ -146,6 +146,9 @@ def public_result(
 
     def decorate(kind: Kind) -> Kind:
         methods = {name: method for name, method in vars(Result).items() if callable(method)}
+        if "to_dict" in vars(kind):
+            methods["to_dict"] = vars(kind)["to_dict"]
+        methods = {name: in_float64(method, loaded=True) for name, method in methods.items()}
         for name, value in {**methods, "_picture": picture, "_rows": rows, "_words": words}.items():
             setattr(kind, name, value)
         return kind
