@@ -1,9 +1,7 @@
 """A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides."""
 
 import math
-import os
-from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -11,7 +9,7 @@ import numpy as np
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.platform import Platform
-from afm_jax.checks import check_kind, in_a_word, is_traced, readable
+from afm_jax.checks import in_a_word, is_traced, readable
 
 
 def _for_scene(interaction: Any) -> Any:
@@ -32,6 +30,8 @@ class Scene(eqx.Module):
         base: a motion of the cantilever's base; None: it rests.
         force: a force on the tip; None: there is none.
     """
+
+    made_of_text: ClassVar[str] = "`afm_jax.load_scene` makes one of the path of a scene file or the name of a preset"
 
     cantilever: Cantilever
     platform: Platform
@@ -56,24 +56,6 @@ class Scene(eqx.Module):
             raise TypeError(f"the scene's `interaction` must be an ImpactLaw, a Contact or None, but is {what}")
         _check_frequencies(self)
         check_mass(self.interaction, self.cantilever)
-
-
-SceneLike = Scene | str | os.PathLike[str]
-"""A scene, the path of a scene file, or the name of one of the paper's scenes."""
-
-
-def as_scene(given: SceneLike) -> Scene:
-    """Return a scene that was given, or is read from its file, or has its name.
-
-    Raises:
-        TypeError: if it is something else.
-        ValueError: if there is no such file or name, or the file is no valid scene file.
-    """
-    if isinstance(given, Scene):
-        return given
-    check_kind("scene", given, SceneLike)
-    # what reads files is built on scenes
-    return import_module("afm_jax.scenefile.presets").read_named_scene(os.fspath(given)).scene
 
 
 _SAME_MASS = 1e-3

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Record, Tips, follow
@@ -185,7 +185,7 @@ class Ramps(NamedTuple):
 
 @checked
 def bifurcation_diagram(  # noqa: PLR0913
-    scene: SceneLike,
+    scene: Scene,
     parameter: str,
     values: Float[np.ndarray, " values"],
     *,
@@ -212,7 +212,6 @@ def bifurcation_diagram(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene lacks the parameter or does not repeat with one drive period, or values do not rise.
     """
-    scene = as_scene(scene)
     ordered = np.asarray(values, float)
     if ordered.ndim != 1 or len(ordered) < 1 or np.any(np.diff(ordered) <= 0.0):
         raise ValueError("`values` must be rising numbers, one at least")

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.table import Table
 
-from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene, SceneLike, as_scene, drive_of
+from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene, drive_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.contact.contact import Contact
@@ -231,7 +231,7 @@ class Continuation(ResultTuple):
 
 @checked
 def continue_orbits(
-    scene: SceneLike, order: int, given: ParameterRange, *, impacts: int = 1, second: ParameterRange | None = None
+    scene: Scene, order: int, given: ParameterRange, *, impacts: int = 1, second: ParameterRange | None = None
 ) -> Continuation:
     """Follow the (m, N) orbits of a scene through a parameter, and their special points through a second one.
 
@@ -253,7 +253,6 @@ def continue_orbits(
         ValueError: if the drive does not repeat, a parameter or a range is none of the scene's, or order and impacts
             are no numbers of impacts and periods.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     ranges = (given,) if second is None else (given, second)
     driven = driven_part(scene)

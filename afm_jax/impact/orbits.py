@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame, Surface, Wave, free_frame, size_and_lag
 from afm_jax.checks import as_argument, checked, is_traced, require_float64
 from afm_jax.impact.closure import (
@@ -110,7 +110,7 @@ class SingleImpactOrbits(Result, eqx.Module):
 
 
 @checked
-def single_impact_orbits(scene: SceneLike, order: ArrayLike) -> SingleImpactOrbits:
+def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     """Return every single-impact orbit of an order (eq. 9; damped, with viscous loss and delay).
 
     Args:
@@ -129,7 +129,6 @@ def single_impact_orbits(scene: SceneLike, order: ArrayLike) -> SingleImpactOrbi
         ValueError: if the order is not a positive integer, the platform's offset ramps, the drive has several
             frequencies, or an undamped cantilever is driven at its free one.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     _check_order(order)

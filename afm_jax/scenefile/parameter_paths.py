@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import drive_per_free_height
 from afm_jax.checks import checked, is_traced
 from afm_jax.scenefile.scenefile import scene_of_tables, scene_tables
@@ -147,7 +147,7 @@ def _tables_with(scene: Scene, path: str, value: float) -> dict[str, Any]:
 
 
 @checked
-def scene_family(scene: SceneLike, *paths: str) -> Callable[..., Scene]:
+def scene_family(scene: Scene, *paths: str) -> Callable[..., Scene]:
     """Return the function from values of some parameters to the scene that has them, differentiable and for `vmap`.
 
     >>> from afm_jax import Cantilever, ImpactLaw, Platform
@@ -163,7 +163,6 @@ def scene_family(scene: SceneLike, *paths: str) -> Callable[..., Scene]:
     Raises:
         ValueError: if the scene lacks one, with what it has.
     """
-    scene = as_scene(scene)
     existing = parameter_values(scene)
     for path in paths:
         if path not in existing:

@@ -47,7 +47,7 @@ from afm_jax.motion.contact_motion import follow_contacts
 from afm_jax.motion.record import ContactKind, State, to_gap
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
-from afm_jax.scenefile.presets import preset, read_named_scene
+from afm_jax.scenefile.scenefile import load_scene, read_scene
 from afm_jax.studies.timing import compiled_for, progress, time_compiled
 
 Row = dict[str, Any]
@@ -483,7 +483,7 @@ _ROOT_TOLERANCES_US = (1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-13)
 
 def impact_times(tips: int) -> AccuracyProblem:
     """Return the time of the next impact, by the time and the velocity of departures around figure 2's (1,1) orbit."""
-    scene = preset("figure2")
+    scene = load_scene("figure2")
     orbits = jax.jit(single_impact_orbits)(scene, 1)
     stable = int(np.argmax(np.asarray(orbits.exists & orbits.admissible & orbits.stable)))
     first, second = evenly_spread(tips).T - 0.5
@@ -623,7 +623,7 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     Raises:
         ValueError: if the tip is free, or has fewer contacts.
     """
-    read = read_named_scene(name)
+    read = read_scene(name)
     scene = read.scene
     if scene.interaction is None:
         raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")

@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
+from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import free_frame
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, open_cache, silence_xla
@@ -849,7 +849,7 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
 
 @checked
 def sweep(  # noqa: PLR0913
-    scene: SceneLike,
+    scene: Scene,
     axes: Sequence[Mapping[str, Any]],
     record: str | Mapping[str, Any],
     *,
@@ -891,7 +891,6 @@ def sweep(  # noqa: PLR0913
     """
     import xarray  # noqa: PLC0415 (an extra package)
 
-    scene = as_scene(scene)
     require_float64(scene)
     check_count("workers", workers)
     table = {"what": record} if isinstance(record, str) else dict(record)
