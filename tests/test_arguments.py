@@ -169,10 +169,8 @@ def test_scenes_are_loaded_from_paths_and_presets_and_tables_read_from_paths(tmp
     for given in ("figure3", path, str(path)):
         found = afm.single_impact_orbits(afm.load_scene(given), 1)
         np.testing.assert_array_equal(found.phase_rad, wanted.phase_rad)
-        # as every function checks its arguments; here annotations are checked by the tests' own means first
-        with pytest.raises(
-            TypeError, match=r"`scene` must be a Scene, but is .*: `afm_jax\.load_scene` makes one of the"
-        ):
+        # as functions check their arguments; here annotations are checked by the tests' own means first
+        with pytest.raises(TypeError, match=r"`scene` must be a Scene, but is .*: `afm_jax\.load_scene` makes one"):
             check_kind("scene", given, afm.Scene)
     with pytest.raises(ValueError, match="nothing: there is no such file or preset; presets are figure2, figure3"):
         afm.load_scene("nothing")

@@ -44,19 +44,21 @@ class ParameterRange(NamedTuple):
         return f"{self.path}={self.low:g}:{self.high:g}{counted}"
 
 
-def parse_range(text: str, *, counted: bool) -> ParameterRange:
-    """Return the range that a text says.
+def parse_range(text: str | ParameterRange, *, counted: bool) -> ParameterRange:
+    """Return the range that a text says, the same for options of commands and arguments of functions.
 
     >>> parse_range("platform.offset_nm=-2:2:5", counted=True).values.tolist()
     [-2.0, -1.0, 0.0, 1.0, 2.0]
 
     Args:
-        text: `path=low:high`, with `:count` behind it if counted.
+        text: `path=low:high`, with `:count` behind it if counted; or a range already.
         counted: whether the range is that of a number of values, or everything between its ends.
 
     Raises:
         ValueError: if it says no rising range, or less than two values of one.
     """
+    if isinstance(text, ParameterRange):
+        return text
     shape = "PARAMETER=low:high:count" if counted else "PARAMETER=low:high"
     example = f"platform.reduced_frequency=0.9:1.1{':100' if counted else ''}"
     path, _, rest = text.partition("=")
