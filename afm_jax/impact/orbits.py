@@ -283,10 +283,7 @@ def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) ->
     readings_of_height = {"peak_amplitude_nm": peak, "phase_lag_deg": lag} | dict(zip(names, readings, strict=True))
     if frame.base is None:
         return readings_of_height
-    response, base = frame.response, frame.base
-    peak, *readings, lag = read(
-        Wave(response.cosine - base.cosine, response.sine - base.sine, response.angular_frequency)
-    )
+    peak, *readings, lag = read(frame.response + -frame.base)
     of_deflection = {f"deflection_{name}": value for name, value in zip(names, readings, strict=True)}
     return readings_of_height | {"peak_deflection_nm": peak, "phase_lag_deg": lag} | of_deflection
 

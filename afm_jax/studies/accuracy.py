@@ -34,7 +34,7 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip, waves_of
+from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip
 from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.contact.parameters import PAPER
 from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting, Setting
@@ -375,7 +375,7 @@ def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
     cantilever, surface = motion.cantilever, motion.surface
     assert cantilever is not None  # it flies  # noqa: S101
     assert surface is not None  # noqa: S101
-    waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in waves_of(surface)])
+    waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in surface.waves])
     own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, Phase.DRY)
     return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
 
