@@ -409,28 +409,12 @@ def is_stable(
 def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
     """Return the steady motion of the greatest approach speed, without derivatives, and whether there is one.
 
-    The roots are those of `steady_orbits`; of the stable ones flights are followed only until one is admissible.
+    The roots are those of `steady_orbits`.
     """
-    problem = lax.stop_gradient(problem)
-    roots = find_roots(problem, COARSE)
-    states = jax.vmap(orbit_state, in_axes=(0, None))(roots.place, problem)
-
-    def goes_on(search):
-        untried, _, steady = search
-        return jnp.any(untried > -jnp.inf) & ~steady
-
-    def try_fastest(search):
-        untried, _, _ = search
-        slot = jnp.argmax(untried)
-        state = jax.tree.map(lambda leaf: leaf[slot], states)
-        # of a batch, a search that has ended follows no flight
-        admissible = is_admissible(goes_on(search), state, problem)
-        return untried.at[slot].set(-jnp.inf), slot, admissible
-
-    stable = jax.vmap(is_stable, in_axes=(0, 0, 0, None))(roots.place, roots.slopes, states, problem)
-    untried = jnp.where(roots.found & stable, states.speeds.approach, -jnp.inf)
-    _, slot, steady = lax.while_loop(goes_on, try_fastest, (untried, jnp.argmax(untried), jnp.zeros((), bool)))
-    return jax.tree.map(lambda leaf: leaf[slot], states), steady
+    orbits = steady_orbits(problem)
+    states = jax.vmap(orbit_state, in_axes=(0, None))(orbits.place, lax.stop_gradient(problem))
+    fastest = jnp.argmax(jnp.where(orbits.steady, states.speeds.approach, -jnp.inf))
+    return jax.tree.map(lambda leaf: leaf[fastest], states), jnp.any(orbits.steady)
 
 
 def amplitudes(
