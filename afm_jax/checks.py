@@ -194,7 +194,10 @@ def check_kind(name: str, value: Any, kind: Any) -> None:
     """
     must = _misfit(kind, value)
     if must:
-        raise (ValueError if _is_nan(value) else TypeError)(f"`{name}` must be {must}, but is {in_a_word(value)}")
+        # a text or a path may mean an object that somebody has to load
+        advice = getattr(kind, "made_of_text", "") if isinstance(value, str | os.PathLike) else ""
+        message = f"`{name}` must be {must}, but is {in_a_word(value)}" + f": {advice}" * bool(advice)
+        raise (ValueError if _is_nan(value) else TypeError)(message)
 
 
 def _resolved(annotation: Any, function: Callable[..., Any]) -> Any:

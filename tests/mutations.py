@@ -55,9 +55,9 @@ MUTATIONS = {
     ),
     "damped velocity leans the wrong way": Mutation("decay * (cosine {- => +} lag)", FLIGHT),
     "damped frequency with 1/2Q^2": Mutation("1.0 - {0.25 => 0.5} / self", FLIGHT),
-    "platform velocity turned round": Mutation("{- => +}self.amplitude_nm * omega * sine", PLATFORM),
+    "platform velocity turned round": Mutation("self.sine * omega * cosine {- => +} self.cosine", PLATFORM),
     "platform acceleration without an omega": Mutation(
-        "{-(part.angular_frequency**2) => -part.angular_frequency} * part.position", PLATFORM
+        "acceleration - {square => wave.angular_frequency} * height", PLATFORM
     ),
     "cosine's sign in the wrong quadrants": Mutation(
         "(turn == {1.0 => 2.0}) | (turn == {2.0 => 3.0})",

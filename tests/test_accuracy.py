@@ -14,8 +14,8 @@ from afm_jax.contact.junction import Phase
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import start_of
-from afm_jax.scenefile.presets import contact_scene, preset
-from afm_jax.scenefile.scenefile import save_scene
+from afm_jax.scenefile.presets import contact_scene
+from afm_jax.scenefile.scenefile import load_scene, save_scene
 from afm_jax.studies import accuracy
 from afm_jax.studies import timing as own_process
 from tests import reference_contact as exact
@@ -38,7 +38,7 @@ def course():
 
 def test_the_reference_of_the_map_is_the_closed_form():
     problem = accuracy.impact_times(6)
-    scene = preset("figure2")
+    scene = load_scene("figure2")
     _, tips = problem.begin(problem.at)
     speeds = tips.rate + scene.platform.velocity(tips.time_us)
     slopes = jax.vmap(lambda time, speed: map_jacobian(scene, time, speed)[0])(tips.time_us, speeds)

@@ -9,9 +9,10 @@ import pytest
 
 import afm_jax as afm
 import fitting
+from afm_jax.checks import check_kind
 from afm_jax.contact.forces import Capillary, Dmt, Hertz, VanDerWaals
 from afm_jax.scenefile.parameter_paths import ParameterRange
-from afm_jax.scenefile.presets import preset
+from afm_jax.scenefile.scenefile import load_scene
 from tests.fresh_python import python
 from tests.writing_commands import EXAMPLES
 
@@ -20,10 +21,10 @@ PROGRAM = """
 import inspect, re, warnings
 import jax; jax.config.update("jax_enable_x64", True)
 import numpy as np, afm_jax as afm, fitting
-from afm_jax.scenefile.presets import preset
+from afm_jax.scenefile.scenefile import load_scene
 from fitting.examples import __path__ as examples
 warnings.simplefilter("error")
-scene, contact, values = preset("figure3"), afm.Contact.paper(), np.array([3.0, 4.0])
+scene, contact, values = load_scene("figure3"), afm.Contact.paper(), np.array([3.0, 4.0])
 good = dict(scene=scene, cantilever=scene.cantilever, platform=scene.platform, interaction=scene.interaction)
 good |= dict(contact=contact, table=fitting.read_table(examples[0] + "/amplitudes_law.csv"), model="law", path="none")
 good |= dict(order=1, impacts=2, time_us=0.0, velocity_nm_per_us=30.0, start=afm.State(0.0, 5.0, 80.0), last_order=1)
@@ -60,7 +61,7 @@ print(count)
 """
 
 
-SCENE = preset("figure3")
+SCENE = load_scene("figure3")
 START = afm.State(jnp.asarray(0.0), jnp.asarray(5.0), jnp.asarray(80.0))
 TWO = np.array([1.0, 2.0])
 PAPER, NO_JUNCTION = afm.Contact.paper(), afm.Contact.paper(adhesion_energy_j_per_m2=0.05)
@@ -160,15 +161,19 @@ def test_arguments_of_another_kind_are_named():
     assert int(count) > 960
 
 
-def test_paths_and_presets_work_where_scenes_and_tables_do(tmp_path: Path):
-    scene = preset("figure3")
+def test_scenes_are_loaded_from_paths_and_presets_and_tables_read_from_paths(tmp_path: Path):
+    scene = load_scene("figure3")
     path = tmp_path / "scene.toml"
     afm.save_scene(scene, path)
     wanted = afm.single_impact_orbits(scene, 1)
     for given in ("figure3", path, str(path)):
-        np.testing.assert_array_equal(afm.single_impact_orbits(given, 1).phase_rad, wanted.phase_rad)
+        found = afm.single_impact_orbits(afm.load_scene(given), 1)
+        np.testing.assert_array_equal(found.phase_rad, wanted.phase_rad)
+        # as functions check their arguments; here annotations are checked by the tests' own means first
+        with pytest.raises(TypeError, match=r"`scene` must be a Scene, but is .*: `afm_jax\.load_scene` makes one"):
+            check_kind("scene", given, afm.Scene)
     with pytest.raises(ValueError, match="nothing: there is no such file or preset; presets are figure2, figure3"):
-        afm.single_impact_orbits("nothing", 1)
+        afm.load_scene("nothing")
     for function in (fitting.fit, fitting.calibrate, fitting.read_trace):
         with pytest.raises(fitting.TableError, match="there is no such file"):
             function(tmp_path / "none.csv")

@@ -11,7 +11,7 @@ import pytest
 from afm_jax import Scene, iterate_map
 from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.map import iterate_batch
-from afm_jax.scenefile.presets import preset
+from afm_jax.scenefile.scenefile import load_scene
 from tests.reference_flight import Parameters, high_precision, mp
 from tests.reference_map import iterate
 
@@ -32,7 +32,7 @@ def scattered_starts(scene: Scene, batch: int) -> tuple[jax.Array, jax.Array]:
 @pytest.mark.parametrize(("batch", "block"), [(1, 500), (7, 3), (8, 4)])
 def test_blocks_change_nothing(batch: int, block: int):
     """The restitution differs from row to row."""
-    scene, r = preset("figure2"), jnp.linspace(0.3, 0.8, batch)
+    scene, r = load_scene("figure2"), jnp.linspace(0.3, 0.8, batch)
     time, velocity = (np.asarray(part)[:batch] for part in scattered_starts(scene, 8))
     rows = iterate_batch(with_r(scene, r), time, velocity, IMPACTS, block=block)
     alone = [iterate_map(with_r(scene, r[row]), time[row], velocity[row], IMPACTS) for row in range(batch)]
@@ -62,7 +62,7 @@ def derivatives_by_r(scene: Scene, time_us: float, velocity: float) -> list[floa
 
 
 def test_forward_and_reverse_derivatives_agree_with_50_digits():
-    scene = preset("figure2")
+    scene = load_scene("figure2")
     starts = scattered_starts(scene, 3)
 
     def times(r: jax.Array) -> jax.Array:
@@ -76,6 +76,6 @@ def test_forward_and_reverse_derivatives_agree_with_50_digits():
 
 
 def test_a_parameter_of_another_length_is_named():
-    scene = with_r(preset("figure2"), jnp.full(3, 0.5))
+    scene = with_r(load_scene("figure2"), jnp.full(3, 0.5))
     with pytest.raises(ValueError, match=r"shape \(3,\).*match \(2,\)"):
         iterate_batch(scene, jnp.zeros(2), jnp.full(2, 6.0), 1)

@@ -205,7 +205,7 @@ def test_with_adhesion_a_branch_turns_at_a_fold_and_ends_at_capture():
 
 @pytest.mark.slow
 def test_a_resting_and_a_driven_tip_graze_where_they_must():
-    rest = continue_orbits(scene(), 1, ParameterRange("platform.amplitude_nm", 0.2, 4.0), impacts=0)
+    rest = continue_orbits(scene(), 1, "platform.amplitude_nm=0.2:4", impacts=0)
     assert only(rest, "grazing") == pytest.approx([1.0], abs=1e-8)
     assert np.array_equal(rest.branches[0].reading.admissible, rest.branches[0].parameter <= 1.0)
     # A tip driven by a force of 0.08 nN over a resting sample: the free amplitude of a damped oscillator of 1 ng.

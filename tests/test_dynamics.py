@@ -127,6 +127,20 @@ def test_a_chart_is_that_of_plain_numpy_at_random_points():
 
 
 @pytest.mark.slow
+def test_ranges_as_texts_are_those_of_the_command():
+    scene, ranges = law_scene(1.0), (f"{FREQUENCY}=0.9:1.1:3", "platform.amplitude_nm=1:4:2")
+    x, y = np.linspace(0.9, 1.1, 3), np.linspace(1.0, 4.0, 2)
+    plane = scene_family(scene, FREQUENCY, "platform.amplitude_nm")
+    chart = stability_chart(scene, x_values=ranges[0], y_values=ranges[1], last_order=2)
+    wanted = stability_chart(plane, x_values=x, y_values=y, last_order=2)
+    assert np.array_equal(chart.verdicts.stable, wanted.verdicts.stable)
+    assert (str(chart.x), str(chart.y)) == ranges
+    found, same = bifurcation_diagram(scene, ranges[1]), bifurcation_diagram(scene, "platform.amplitude_nm", y)
+    assert np.array_equal(found.values, same.values)
+    assert np.array_equal(found.phase_rad, same.phase_rad, equal_nan=True)
+
+
+@pytest.mark.slow
 def test_many_tips_begin_on_the_fastest_stable_orbit_of_the_full_search():
     delay = afm.CollisionDelay(0.20774, 5.3795, 0.79532)
     law = afm.ImpactLaw(1.0, 111.5, 0.55, delay)

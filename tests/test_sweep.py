@@ -19,8 +19,7 @@ import afm_jax
 from afm_jax.cli.main import main
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.scenefile.parameter_paths import scene_batch
-from afm_jax.scenefile.presets import preset
-from afm_jax.scenefile.scenefile import Start, scene_tables
+from afm_jax.scenefile.scenefile import Start, load_scene, scene_tables
 from afm_jax.solve.lanes import LANES, filled
 from afm_jax.studies.sweep import STORE, plan_of, run_plan, sweep
 from tests.kills import ROOT, chunks_done, survive
@@ -39,7 +38,7 @@ def same_flags_after(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.slow
 def test_orbits_are_those_of_single_impact_orbits():
-    scene = preset("figure2")
+    scene = load_scene("figure2")
     found = sweep(scene, PLANE, {"what": "orbits", "orders": [1, 2]})
     places = {AMPLITUDE: "platform_amplitude_nm", FREQUENCY: "platform_reduced_frequency"}
     found = found.stack(point=list(places.values())).isel(point=slice(None, None, 5))
@@ -63,8 +62,9 @@ def test_orbits_are_those_of_single_impact_orbits():
 @pytest.mark.slow
 def test_orbits_of_a_contact_are_those_that_simulations_end_in():
     axes = [{"parameter": FREQUENCY, "list": [2.1]}, {"parameter": AMPLITUDE, "list": [0.0, 8.0]}]
-    found = sweep(preset("figure8"), axes, {"what": "orbits", "orders": [1, 2]}).isel(platform_reduced_frequency=0)
-    ends = sweep(preset("figure8"), axes, {"what": "simulation", "periods": 1000.0}).isel(platform_reduced_frequency=0)
+    scene = load_scene("figure8")
+    found = sweep(scene, axes, {"what": "orbits", "orders": [1, 2]}).isel(platform_reduced_frequency=0)
+    ends = sweep(scene, axes, {"what": "simulation", "periods": 1000.0}).isel(platform_reduced_frequency=0)
     assert found["stable"].values.tolist() == [[False, False], [False, True]]
     assert (bool(ends["settled"][1]), int(ends["order"][1]), int(ends["contacts_per_response"][1])) == (True, 2, 1)
     # the accuracy of contacts in search of orbits
@@ -80,12 +80,12 @@ def test_collisions_and_exponents_are_those_of_their_functions():
         {"parameter": "approach_speed_nm_per_us", "list": [12.0, 30.0, 100.0]},
         {"parameter": "interaction.relative_humidity", "linear": [0.3, 0.5, 2]},
     ]
-    found = sweep(preset("figure8"), axes, "collide")
+    found = sweep(load_scene("figure8"), axes, "collide")
     alone = afm_jax.collide(afm_jax.Contact.paper(relative_humidity=0.5), np.array([12.0, 30.0, 100.0]))
     for name in ("rebound_speed_nm_per_us", "collision_delay_us", "viscous_loss_aj"):
         np.testing.assert_allclose(found[name].values[:, 1], getattr(alone, name), rtol=1e-9)
     assert not found["captured"].any()
-    scene, frequency = preset("figure2"), {"parameter": FREQUENCY, "linear": [1.2, 1.6, 3]}
+    scene, frequency = load_scene("figure2"), {"parameter": FREQUENCY, "linear": [1.2, 1.6, 3]}
     found = sweep(scene, [frequency], {"what": "lyapunov", "impacts": 100, "transient": 50})
     # one of them is chaotic: a program of another width ends elsewhere, by rounding
     many = filled(np.array([1.2, 1.4, 1.6]), LANES)
@@ -99,7 +99,7 @@ def test_workers_give_what_one_process_does(tmp_path: Path, monkeypatch: pytest.
     # as JAX leaves it behind
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
     axes = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 200]}]
-    scene = scene_tables(preset("figure2"))
+    scene = scene_tables(load_scene("figure2"))
     wanted = plan_of({"scene": scene, "axes": axes, "record": {"what": "orbits"}, "chunk": 30})
     for folder, workers in (("one", 1), ("two", 2)):
         assert run_plan(wanted, tmp_path / folder, workers=workers).computed == 7
@@ -139,7 +139,7 @@ def test_the_command_says_why_points_have_no_result(tmp_path: Path, monkeypatch:
         raise ValueError("too wide" if scene.platform.amplitude_nm > 1.8 else "it will not go")
 
     monkeypatch.setattr("afm_jax.studies.sweep.follow_long", follow)
-    afm_jax.save_scene(preset("figure2"), tmp_path / "scene.toml", start=Start(0.0, 1.0, 0.0))
+    afm_jax.save_scene(load_scene("figure2"), tmp_path / "scene.toml", start=Start(0.0, 1.0, 0.0))
     (tmp_path / "sweep.toml").write_text(
         'scene = "scene.toml"\nchunk = 2\n[record]\nwhat = "simulation"\n'
         f'[[axes]]\nparameter = "{AMPLITUDE}"\nlinear = [1, 2, 3]\n'

@@ -12,8 +12,7 @@ import pytest
 import xarray
 
 from afm_jax.plots.sweeps import sweep_figure
-from afm_jax.scenefile.presets import preset
-from afm_jax.scenefile.scenefile import scene_tables
+from afm_jax.scenefile.scenefile import load_scene, scene_tables
 from afm_jax.studies import sweep as sweeps
 from afm_jax.studies.sweep import (
     FORMAT_VERSION,
@@ -192,7 +191,7 @@ def test_a_worker_with_other_versions_is_refused(monkeypatch: pytest.MonkeyPatch
     for name in ("open_cache", "silence_xla"):
         monkeypatch.setattr(sweeps, name, lambda: None)
     axes = [{"parameter": "platform.amplitude_nm", "list": [1.0]}]
-    given = plan_of({"scene": scene_tables(preset("figure2")), "axes": axes, "record": {"what": "orbits"}}).given
+    given = plan_of({"scene": scene_tables(load_scene("figure2")), "axes": axes, "record": {"what": "orbits"}}).given
     other = given | {"versions": given["versions"] | {"jax": "0.0.1"}}
     with pytest.raises(RuntimeError, match=r"a worker would compute otherwise than the others: jax is .*, not 0.0.1"):
         compute_chunk(json.dumps(other), (slice(0, 1),))

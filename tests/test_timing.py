@@ -5,7 +5,7 @@ import os
 import pytest
 
 from afm_jax.compilation_cache import available_cores
-from afm_jax.scenefile.presets import preset
+from afm_jax.scenefile.scenefile import load_scene
 from afm_jax.studies.timing import run_in_own_process
 
 
@@ -15,8 +15,8 @@ def test_one_core_really_is_one():
 
 
 def test_what_a_measurement_refuses_is_said_in_its_own_words():
-    with pytest.raises(ValueError, match=r"^there is no preset 'nowhere'"):
-        run_in_own_process(preset, name="nowhere")
+    with pytest.raises(ValueError, match=r"^nowhere: there is no such file or preset"):
+        run_in_own_process(load_scene, path="nowhere")
 
 
 def test_a_process_that_fails_is_an_error():

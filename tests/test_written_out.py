@@ -14,7 +14,7 @@ from afm_jax.contact.collide import batch_of
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.settings import METHODS, SETTINGS
 from afm_jax.motion.simulate import State
-from afm_jax.scenefile.presets import preset
+from afm_jax.scenefile.scenefile import load_scene
 from tests.fresh_python import outputs
 from tests.written_out import MOST, written_out
 
@@ -56,7 +56,7 @@ def test_chains_with_one_way_through_them_are_none():
 
 
 def motion(method: str) -> Callable[[Any], Any]:
-    scene = preset("figure8")
+    scene = load_scene("figure8")
     return lambda velocity: simulate(scene, State(0.0, 10.0, velocity), 40.0, max_contacts=8, method=method)
 
 
@@ -65,7 +65,7 @@ def impacts(scene: Scene) -> Any:
 
 
 # a contact that spends energy: without, the bridge is one quadrature
-CONTACT, LAW = Contact.paper(viscosity_pa_s=1e-3), preset("figure2")
+CONTACT, LAW = Contact.paper(viscosity_pa_s=1e-3), load_scene("figure2")
 LASTING = eqx.tree_at(lambda scene: scene.interaction, LAW, ImpactLaw(0.5, delay=CollisionDelay(0.05, 0.1, 0.1)))
 PROGRAMS: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "a law": (impacts, LAW),

@@ -47,16 +47,11 @@ def mass_of(frequency_khz: Any, mass_ng: Any, spring_constant_n_per_m: Any) -> A
     check_parameter("spring_constant_n_per_m", spring_constant_n_per_m, "positive")
     check_parameter("frequency_khz", frequency_khz, "positive")
     if mass_ng is None:
-        if is_traced(frequency_khz) or is_traced(spring_constant_n_per_m):
-            return effective_mass_ng(spring_constant_n_per_m, frequency_khz)
-        with np.errstate(divide="ignore", over="ignore"):
-            mass = effective_mass_ng(*(np.asarray(part, float) for part in (spring_constant_n_per_m, frequency_khz)))
-        check_parameter("mass_ng", mass, "positive")
-        return mass
-    if not any(is_traced(value) for value in (frequency_khz, mass_ng, spring_constant_n_per_m)):
-        parts = np.broadcast_arrays(*map(np.asarray, (mass_ng, spring_constant_n_per_m, frequency_khz)))
-        for one in zip(*(part.ravel().tolist() for part in parts), strict=True):
-            wrong = contradicting_mass(*one)
+        return effective_mass_ng(as_parameter(spring_constant_n_per_m), as_parameter(frequency_khz))
+    numbers = mass_ng, spring_constant_n_per_m, frequency_khz
+    if not any(map(is_traced, numbers)):
+        for one in np.broadcast(*map(np.asarray, numbers)):
+            wrong = contradicting_mass(*map(float, one))
             if wrong:
                 raise ValueError(wrong)
     return mass_ng

@@ -13,6 +13,46 @@ from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
+SAME_FREQUENCY = 1e-12
+"""Relative distance below which two frequencies are one."""
+
+
+class Wave(eqx.Module):
+    """A wave c cos(omega t) + s sin(omega t): the one form in which every motion is evaluated.
+
+    Args:
+        cosine: c, of a motion in nm, of a force in nN.
+        sine: s.
+        angular_frequency: omega in rad/us.
+    """
+
+    cosine: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    sine: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    angular_frequency: Float[Array, "..."] = eqx.field(converter=as_parameter)
+
+    __repr__ = readable
+
+    def __add__(self, other: "Wave") -> "Wave":
+        """Return the sum of two waves of one frequency."""
+        return Wave(self.cosine + other.cosine, self.sine + other.sine, self.angular_frequency)
+
+    def __neg__(self) -> "Wave":
+        """Return the wave turned round."""
+        return Wave(-self.cosine, -self.sine, self.angular_frequency)
+
+    @property
+    def amplitude_nm(self) -> Float[Array, "..."]:
+        """sqrt(c^2 + s^2), with slope 0 where both vanish."""
+        square = self.cosine**2 + self.sine**2
+        moves = square > 0.0
+        return jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0)
+
+    def value_and_rate(self, time_us: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the wave at a time in us and its rate per us."""
+        omega = self.angular_frequency
+        sine, cosine = sine_cosine(omega * time_us)
+        return self.cosine * cosine + self.sine * sine, self.sine * omega * cosine - self.cosine * omega * sine
+
 
 class Tone(eqx.Module):
     """One cosine of a drive, amplitude cos(omega t + phase): a motion in nm or a force in nN.
@@ -47,10 +87,11 @@ class Tone(eqx.Module):
         """Phase at time 0 in rad."""
         return jnp.deg2rad(self.phase_deg)
 
-    def value_and_rate(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the cosine at a time in us, in the amplitude's unit, and its rate per us."""
-        sine, cosine = sine_cosine(self.angular_frequency * as_argument(time_us) + self.phase_rad)
-        return self.amplitude * cosine, -self.amplitude * self.angular_frequency * sine
+    @property
+    def wave(self) -> Wave:
+        """The tone as a cos(phi) cos(omega t) - a sin(phi) sin(omega t)."""
+        phase = self.phase_rad
+        return Wave(self.amplitude * jnp.cos(phase), -self.amplitude * jnp.sin(phase), self.angular_frequency)
 
 
 class BaseDrive(eqx.Module):
@@ -133,9 +174,6 @@ def _tones(drive: BaseDrive | ForceDrive, amplitude: Float[Array, "..."]) -> tup
 
 
 def _sum_of_tones(tones: tuple[Tone, ...], time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    time = as_argument(time_us)
-    value, rate = tones[0].value_and_rate(time)
-    for tone in tones[1:]:
-        more, faster = tone.value_and_rate(time)
-        value, rate = value + more, rate + faster
-    return value, rate
+    values, rates = zip(*(tone.wave.value_and_rate(as_argument(time_us)) for tone in tones), strict=True)
+    still = jnp.zeros_like(values[0])
+    return sum(values, start=still), sum(rates, start=still)

@@ -1,66 +1,102 @@
 """The moving platform that carries the sample: offset + ramp + cosine, and a second cosine where there is one."""
 
+from abc import abstractmethod
 from collections.abc import Iterable
+from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.apparatus.drives import Tone
-from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, readable
+from afm_jax.apparatus.drives import Tone, Wave
+from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, is_traced, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 
-class Oscillation(NamedTuple):
-    """A harmonic part of a motion at one time: angular frequency in rad/us, position in nm and velocity in nm/us."""
+class SurfaceMotion(NamedTuple):
+    """The height of a surface at one time in nm, and its derivatives by the time in us."""
 
-    angular_frequency: Float[Array, "..."]
     position: Float[Array, "..."]
     velocity: Float[Array, "..."]
+    acceleration: Float[Array, "..."]
+    jerk: Float[Array, "..."]
 
 
-class SurfaceMotion(NamedTuple):
-    """The motion of a surface at one time: a ramp and oscillations, whose derivatives all follow from the first two."""
+class MovingSurface(eqx.Module):
+    """A surface at offset + rate t + a sum of waves: the platform, or what a driven tip sees of it (`Surface`)."""
 
-    ramped_nm: Float[Array, "..."]
-    """The offset at that time."""
-    rate_nm_per_us: Float[Array, "..."]
-    oscillations: tuple[Oscillation, ...]
-
-    @property
-    def position(self) -> Float[Array, "..."]:
-        """Height in nm."""
-        return sum((part.position for part in self.oscillations), start=self.ramped_nm)
+    offset_nm: eqx.AbstractVar[Float[Array, "..."]]
+    offset_rate_nm_per_us: eqx.AbstractVar[Float[Array, "..."]]
 
     @property
-    def velocity(self) -> Float[Array, "..."]:
-        """First derivative of the height by time, in nm/us."""
-        still = jnp.broadcast_to(self.rate_nm_per_us, self.ramped_nm.shape)
-        return sum((part.velocity for part in self.oscillations), start=still)
+    @abstractmethod
+    def waves(self) -> tuple[Wave, ...]:
+        """What the motion is the sum of."""
 
     @property
-    def acceleration(self) -> Float[Array, "..."]:
-        """Second derivative of the height by time, in nm/us^2."""
-        return self._sum(-(part.angular_frequency**2) * part.position for part in self.oscillations)
+    def reach_nm(self) -> Float[Array, "..."]:
+        """A bound of the distance from the ramped offset in nm; sharp for a single wave."""
+        return self._total(wave.amplitude_nm for wave in self.waves)
 
     @property
-    def jerk(self) -> Float[Array, "..."]:
-        """Third derivative of the height by time, in nm/us^3."""
-        return self._sum(-(part.angular_frequency**2) * part.velocity for part in self.oscillations)
+    def top_speed_nm_per_us(self) -> Float[Array, "..."]:
+        """A bound of the speed against the ramp in nm/us, beta omega; sharp for a single wave."""
+        return self._total(wave.amplitude_nm * wave.angular_frequency for wave in self.waves)
 
-    def _sum(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
-        first, *others = [*parts] or [jnp.zeros_like(self.ramped_nm)]
-        return sum(others, start=first)
+    @property
+    def largest_acceleration_nm_per_us2(self) -> Float[Array, "..."]:
+        """A bound of the acceleration in nm/us^2, beta omega^2; sharp for a single wave."""
+        return self._total(wave.amplitude_nm * wave.angular_frequency**2 for wave in self.waves)
+
+    @property
+    def fastest_angular_frequency(self) -> Float[Array, "..."]:
+        """The largest angular frequency of the motion in rad/us; 0 without waves."""
+        still = jnp.zeros_like(self.offset_nm)
+        return reduce(jnp.maximum, (wave.angular_frequency for wave in self.waves), still)
+
+    def motion(self, time_us: ArrayLike) -> SurfaceMotion:
+        """Return the height with its derivatives at a time in us, from one sine-cosine pair a wave."""
+        time = as_argument(time_us)
+        position = self.offset_nm + self.offset_rate_nm_per_us * time
+        velocity = jnp.broadcast_to(self.offset_rate_nm_per_us, position.shape)
+        acceleration = jerk = jnp.zeros_like(position)
+        for wave in self.waves:
+            height, rate = wave.value_and_rate(time)
+            square = wave.angular_frequency**2
+            position, velocity = position + height, velocity + rate
+            acceleration, jerk = acceleration - square * height, jerk - square * rate
+        return SurfaceMotion(position, velocity, acceleration, jerk)
+
+    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return height in nm and velocity in nm/us at a time in us."""
+        motion = self.motion(time_us)
+        return motion.position, motion.velocity
+
+    def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return the height in nm at a time in us."""
+        return self.motion(time_us).position
+
+    def velocity(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return the velocity in nm/us at a time in us."""
+        return self.motion(time_us).velocity
+
+    def acceleration(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return the acceleration in nm/us^2 at a time in us."""
+        return self.motion(time_us).acceleration
+
+    def _total(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
+        return sum(parts, start=jnp.zeros_like(self.offset_nm))
 
 
-class Platform(eqx.Module):
+class Platform(MovingSurface):
     """A platform at z_p(t) = offset + rate t + amplitude cos(omega t) [+ second].
 
     Args:
         amplitude_nm: drive amplitude (beta in the paper).
-        frequency_khz: drive frequency, omega / 2 pi.
+        frequency_khz: drive frequency, omega / 2 pi. A platform without amplitude needs none: in a scene it has that of
+            base or force, or else the cantilever's, in which phases count.
         offset_nm: mean height above the tip's rest position (sigma in the paper).
         offset_rate_nm_per_us: slow ramp of the offset.
         second: a second frequency of the drive, its amplitude in nm; None leaves it out of the program.
@@ -69,8 +105,8 @@ class Platform(eqx.Module):
         ValueError: if the frequency is not positive, the amplitude negative or a value not finite.
     """
 
-    amplitude_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
-    frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    amplitude_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
+    frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     offset_rate_nm_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     second: Tone | None = None
@@ -79,10 +115,17 @@ class Platform(eqx.Module):
 
     def __check_init__(self):
         check_parameter("amplitude_nm", self.amplitude_nm, "not negative")
-        check_parameter("frequency_khz", self.frequency_khz, "positive")
+        if not self.takes_any_frequency:
+            check_parameter("frequency_khz", self.frequency_khz, "positive")
         check_parameter("offset_nm", self.offset_nm, "finite")
         check_parameter("offset_rate_nm_per_us", self.offset_rate_nm_per_us, "finite")
         check_kind("second", self.second, Tone | None)
+
+    @property
+    def takes_any_frequency(self) -> bool:
+        """Whether it is known to rest and has no frequency of its own yet."""
+        numbers = self.amplitude_nm, self.frequency_khz
+        return self.second is None and not any(is_traced(number) or np.any(np.asarray(number)) for number in numbers)
 
     @property
     def angular_frequency(self) -> Float[Array, "..."]:
@@ -95,56 +138,7 @@ class Platform(eqx.Module):
         return 2.0 * jnp.pi / self.angular_frequency
 
     @property
-    def top_speed_nm_per_us(self) -> Float[Array, "..."]:
-        """Largest speed against the ramp, beta omega, in nm/us; a bound where there are two cosines."""
-        first = self.amplitude_nm * self.angular_frequency
-        return first if self.second is None else first + self.second.amplitude * self.second.angular_frequency
-
-    @property
-    def reach_nm(self) -> Float[Array, "..."]:
-        """Largest distance from the ramped offset in nm; a bound where there are two cosines."""
-        return self.amplitude_nm if self.second is None else self.amplitude_nm + self.second.amplitude
-
-    @property
-    def largest_acceleration_nm_per_us2(self) -> Float[Array, "..."]:
-        """Largest acceleration, beta omega^2, in nm/us^2; a bound where there are two cosines."""
-        first = self.amplitude_nm * self.angular_frequency**2
-        return first if self.second is None else first + self.second.amplitude * self.second.angular_frequency**2
-
-    @property
-    def fastest_angular_frequency(self) -> Float[Array, "..."]:
-        """The largest angular frequency of the motion in rad/us."""
-        first = self.angular_frequency
-        return first if self.second is None else jnp.maximum(first, self.second.angular_frequency)
-
-    def motion(self, time_us: ArrayLike) -> SurfaceMotion:
-        """Return z_p with its derivatives at a time in us, from one sine-cosine pair a frequency."""
-        time = as_argument(time_us)
-        sine, cosine = sine_cosine(self.angular_frequency * time)
-        omega = self.angular_frequency
-        first = Oscillation(omega, self.amplitude_nm * cosine, -self.amplitude_nm * omega * sine)
-        others = [] if self.second is None else [_of_tone(self.second, time)]
-        return SurfaceMotion(
-            self.offset_nm + self.offset_rate_nm_per_us * time, self.offset_rate_nm_per_us, (first, *others)
-        )
-
-    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return z_p in nm and its rate in nm/us at a time in us."""
-        motion = self.motion(time_us)
-        return motion.position, motion.velocity
-
-    def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return z_p in nm at a time in us."""
-        return self.position_and_velocity(time_us)[0]
-
-    def velocity(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return dz_p/dt in nm/us at a time in us."""
-        return self.position_and_velocity(time_us)[1]
-
-    def acceleration(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return d^2z_p/dt^2 in nm/us^2 at a time in us."""
-        return self.motion(time_us).acceleration
-
-
-def _of_tone(tone: Tone, time_us: Float[Array, "..."]) -> Oscillation:
-    return Oscillation(tone.angular_frequency, *tone.value_and_rate(time_us))
+    def waves(self) -> tuple[Wave, ...]:
+        """The cosine, and that of the second frequency where there is one."""
+        first = Wave(self.amplitude_nm, jnp.zeros_like(self.amplitude_nm), self.angular_frequency)
+        return (first,) if self.second is None else (first, self.second.wave)

@@ -1,22 +1,15 @@
 """A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides."""
 
 import math
-import os
-from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import SAME_FREQUENCY, BaseDrive, ForceDrive
 from afm_jax.apparatus.platform import Platform
-from afm_jax.checks import check_kind, in_a_word, is_traced, readable
-
-
-def _for_scene(interaction: Any) -> Any:
-    """Return what a scene holds of an interaction: of the law of a fit the law alone."""
-    return interaction.for_scene() if hasattr(interaction, "for_scene") else interaction
+from afm_jax.checks import in_a_word, is_traced, readable
 
 
 class Scene(eqx.Module):
@@ -33,14 +26,32 @@ class Scene(eqx.Module):
         force: a force on the tip; None: there is none.
     """
 
+    made_of_text: ClassVar[str] = "`afm_jax.load_scene` makes one of the path of a scene file or the name of a preset"
+
     cantilever: Cantilever
     platform: Platform
     # the modules of the interactions import this one, not the other way round
-    interaction: Any = eqx.field(converter=_for_scene, default=None)
+    interaction: Any = None
     base: BaseDrive | None = None
     force: ForceDrive | None = None
 
     __repr__ = readable
+
+    def __init__(
+        self,
+        cantilever: Cantilever,
+        platform: Platform,
+        interaction: Any = None,
+        base: BaseDrive | None = None,
+        force: ForceDrive | None = None,
+    ) -> None:
+        """Keep the parts; a platform at rest without a frequency has that of base, force or cantilever."""
+        if isinstance(platform, Platform) and platform.takes_any_frequency:
+            frequency = getattr(base or force or cantilever, "frequency_khz", platform.frequency_khz)
+            platform = eqx.tree_at(lambda part: part.frequency_khz, platform, frequency)
+        self.cantilever, self.platform, self.base, self.force = cantilever, platform, base, force
+        # of the law of a fit the law alone
+        self.interaction = interaction.for_scene() if hasattr(interaction, "for_scene") else interaction
 
     def __check_init__(self):
         kinds = {"cantilever": Cantilever, "platform": Platform, "base": BaseDrive, "force": ForceDrive}
@@ -56,24 +67,6 @@ class Scene(eqx.Module):
             raise TypeError(f"the scene's `interaction` must be an ImpactLaw, a Contact or None, but is {what}")
         _check_frequencies(self)
         check_mass(self.interaction, self.cantilever)
-
-
-SceneLike = Scene | str | os.PathLike[str]
-"""A scene, the path of a scene file, or the name of one of the paper's scenes."""
-
-
-def as_scene(given: SceneLike) -> Scene:
-    """Return a scene that was given, or is read from its file, or has its name.
-
-    Raises:
-        TypeError: if it is something else.
-        ValueError: if there is no such file or name, or the file is no valid scene file.
-    """
-    if isinstance(given, Scene):
-        return given
-    check_kind("scene", given, SceneLike)
-    # what reads files is built on scenes
-    return import_module("afm_jax.scenefile.presets").read_named_scene(os.fspath(given)).scene
 
 
 _SAME_MASS = 1e-3
@@ -140,10 +133,6 @@ def require_one_frequency(scene: Scene) -> None:
             )
 
 
-_SAME = 1e-12
-"""Relative distance below which two frequencies are one."""
-
-
 RANGE_OF_ONE = "a range of a frequency moves one part's alone: give the others that move an amplitude of 0"
 """Why base and sample of one frequency cannot be taken through it together."""
 
@@ -164,17 +153,13 @@ def drive_of(scene: Scene) -> DrivePeriod:
     Args:
         scene: one scene, its numbers known.
     """
-    moving = []
     platform = scene.platform
-    if float(platform.amplitude_nm) != 0.0:
-        moving.append(float(platform.angular_frequency))
-    tones = () if platform.second is None else (platform.second,)
-    for part in (scene.base, scene.force):
-        tones += () if part is None else part.tones
-    moving += [float(tone.angular_frequency) for tone in tones if float(tone.amplitude) != 0.0]
+    excitations = [tone.wave for part in (scene.base, scene.force) if part is not None for tone in part.tones]
+    waves = [wave for wave in (*platform.waves, *excitations) if float(wave.amplitude_nm) != 0.0]
+    moving = [float(wave.angular_frequency) for wave in waves]
     omega = moving[0] if moving else float(platform.angular_frequency)
     aperiodic = None
-    if any(abs(other - omega) > _SAME * omega for other in moving):
+    if any(abs(other - omega) > SAME_FREQUENCY * omega for other in moving):
         aperiodic = "the drive has several frequencies, so that no period of the drive repeats"
     elif float(platform.offset_rate_nm_per_us) != 0.0:
         aperiodic = "the offset ramps, so that no period of the drive repeats"

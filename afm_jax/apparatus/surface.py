@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.apparatus.platform import Oscillation, Platform, SurfaceMotion
+from afm_jax.apparatus.drives import SAME_FREQUENCY, BaseDrive, ForceDrive, Tone, Wave
+from afm_jax.apparatus.platform import MovingSurface, Platform
 from afm_jax.apparatus.scene import Scene, require_one_frequency
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.checks import as_argument, as_parameter, is_traced, readable
@@ -24,43 +24,10 @@ from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 _AT_RESONANCE = 1e-9
 """Relative distance from the free frequency below which an undamped cantilever has no steady response."""
-_ONE_FREQUENCY = 1e-12
-"""Relative distance below which two frequencies are one."""
 
 
-class Wave(eqx.Module):
-    """A wave c cos(omega t) + s sin(omega t).
-
-    Args:
-        cosine: c in nm.
-        sine: s in nm.
-        angular_frequency: omega in rad/us.
-    """
-
-    cosine: Float[Array, "..."] = eqx.field(converter=as_parameter)
-    sine: Float[Array, "..."] = eqx.field(converter=as_parameter)
-    angular_frequency: Float[Array, "..."] = eqx.field(converter=as_parameter)
-
-    __repr__ = readable
-
-    @property
-    def amplitude_nm(self) -> Float[Array, "..."]:
-        """sqrt(c^2 + s^2) in nm, with slope 0 where both vanish."""
-        square = self.cosine**2 + self.sine**2
-        moves = square > 0.0
-        return jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0)
-
-    def at(self, time_us: Float[Array, "..."]) -> Oscillation:
-        """Return the wave at a time in us."""
-        sine, cosine = sine_cosine(self.angular_frequency * time_us)
-        position = self.cosine * cosine + self.sine * sine
-        return Oscillation(
-            self.angular_frequency, position, self.angular_frequency * (self.sine * cosine - self.cosine * sine)
-        )
-
-
-class Surface(eqx.Module):
-    """A surface at offset + rate t + a sum of waves; what is asked of a `Platform` can be asked of it.
+class Surface(MovingSurface):
+    """A surface at offset + rate t + a sum of waves.
 
     Args:
         offset_nm: mean height at time 0.
@@ -75,53 +42,9 @@ class Surface(eqx.Module):
     __repr__ = readable
 
     @property
-    def reach_nm(self) -> Float[Array, "..."]:
-        """A bound of the distance from the ramped offset in nm; sharp for a single wave."""
-        return self._total(wave.amplitude_nm for wave in self.tones)
-
-    @property
-    def top_speed_nm_per_us(self) -> Float[Array, "..."]:
-        """A bound of the speed against the ramp in nm/us; sharp for a single wave."""
-        return self._total(wave.amplitude_nm * wave.angular_frequency for wave in self.tones)
-
-    @property
-    def largest_acceleration_nm_per_us2(self) -> Float[Array, "..."]:
-        """A bound of the acceleration in nm/us^2; sharp for a single wave."""
-        return self._total(wave.amplitude_nm * wave.angular_frequency**2 for wave in self.tones)
-
-    @property
-    def fastest_angular_frequency(self) -> Float[Array, "..."]:
-        """The largest angular frequency of the motion in rad/us; 0 without waves."""
-        fastest = jnp.zeros_like(self.offset_nm)
-        for wave in self.tones:
-            fastest = jnp.maximum(fastest, wave.angular_frequency)
-        return fastest
-
-    def motion(self, time_us: ArrayLike) -> SurfaceMotion:
-        """Return the height with its derivatives at a time in us, from one sine-cosine pair a wave."""
-        time = as_argument(time_us)
-        ramped = self.offset_nm + self.offset_rate_nm_per_us * time
-        return SurfaceMotion(ramped, self.offset_rate_nm_per_us, tuple(wave.at(time) for wave in self.tones))
-
-    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return height in nm and velocity in nm/us at a time in us."""
-        motion = self.motion(time_us)
-        return motion.position, motion.velocity
-
-    def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return the height in nm at a time in us."""
-        return self.position_and_velocity(time_us)[0]
-
-    def velocity(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return the velocity in nm/us at a time in us."""
-        return self.position_and_velocity(time_us)[1]
-
-    def acceleration(self, time_us: ArrayLike) -> Float[Array, "..."]:
-        """Return the acceleration in nm/us^2 at a time in us."""
-        return self.motion(time_us).acceleration
-
-    def _total(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
-        return sum(parts, start=jnp.zeros_like(self.offset_nm))
+    def waves(self) -> tuple[Wave, ...]:
+        """The waves."""
+        return self.tones
 
 
 def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
@@ -143,18 +66,16 @@ def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
     if scene.base is None and scene.force is None:
         return scene.platform, None
     platform, cantilever = scene.platform, scene.cantilever
+    # an acceleration in nm/us^2 for 1 nm of the base and 1 nN
+    pushes = cantilever.angular_frequency**2, 1.0 / cantilever.mass_ng
     response: list[Wave] = []
-    if scene.base is not None:
-        per_nm = cantilever.angular_frequency**2
-        response += _responses(cantilever, scene.base.tones, per_nm, "base")
-    if scene.force is not None:
-        response += _responses(cantilever, scene.force.tones, 1.0 / cantilever.mass_ng, "force")
-    motion: list[Wave] = []
-    if not _is_known_zero(platform.amplitude_nm):
-        motion.append(Wave(platform.amplitude_nm, jnp.zeros_like(platform.amplitude_nm), platform.angular_frequency))
-    if platform.second is not None and not _is_known_zero(platform.second.amplitude):
-        motion.append(_wave_of(platform.second))
-    against = [Wave(-wave.cosine, -wave.sine, wave.angular_frequency) for wave in response]
+    for name, drive, push in zip(("base", "force"), (scene.base, scene.force), pushes, strict=True):
+        if drive is not None:
+            check_steady_response(cantilever, drive.tones, name)
+            moving = (tone for tone in drive.tones if not _is_known_zero(tone.amplitude))
+            response += [_response(cantilever, tone.wave, push) for tone in moving]
+    motion = [wave for wave in platform.waves if not (_is_known_zero(wave.cosine) and _is_known_zero(wave.sine))]
+    against = [-wave for wave in response]
     surface = Surface(platform.offset_nm, platform.offset_rate_nm_per_us, _joined([*motion, *against]))
     still = jnp.zeros_like(platform.offset_nm)
     return surface, Surface(still, still, _joined(response))
@@ -203,7 +124,7 @@ def free_frame(scene: Scene) -> FreeFrame:
         frequency = jnp.where(amplitude > 0.0, own, frequency)
     periodic = jnp.ones_like(frequency, dtype=bool)
     for amplitude, own in tones:
-        periodic = periodic & ((amplitude == 0.0) | (jnp.abs(own - frequency) <= _ONE_FREQUENCY * frequency))
+        periodic = periodic & ((amplitude == 0.0) | (jnp.abs(own - frequency) <= SAME_FREQUENCY * frequency))
     omega = RAD_PER_US_PER_KHZ * frequency
     motion = _summed(surface.tones, omega)
     phase = _angle(motion.cosine, motion.sine)
@@ -212,7 +133,7 @@ def free_frame(scene: Scene) -> FreeFrame:
         platform=Platform(motion.amplitude_nm, frequency, surface.offset_nm, surface.offset_rate_nm_per_us),
         phase_rad=phase,
         response=_later(_summed(response.tones, omega), phase),
-        base=None if scene.base is None else _later(_wave_of(scene.base.tones[0]), phase),
+        base=None if scene.base is None else _later(scene.base.tones[0].wave, phase),
         drive_phase_rad=drive.tones[0].phase_rad + phase,
         periodic=periodic,
     )
@@ -220,10 +141,7 @@ def free_frame(scene: Scene) -> FreeFrame:
 
 def _summed(waves: Iterable[Wave], angular_frequency: Float[Array, "..."]) -> Wave:
     zero = jnp.zeros_like(angular_frequency)
-    cosine, sine = zero, zero
-    for wave in waves:
-        cosine, sine = cosine + wave.cosine, sine + wave.sine
-    return Wave(cosine, sine, angular_frequency)
+    return sum(waves, start=Wave(zero, zero, angular_frequency))
 
 
 def _later(wave: Wave, phase: Float[Array, "..."]) -> Wave:
@@ -372,49 +290,29 @@ def check_steady_response(cantilever: Cantilever, tones: tuple[Tone, ...], name:
             )
 
 
-def _responses(
-    cantilever: Cantilever, tones: tuple[Tone, ...], push_per_amplitude: Float[Array, "..."], name: str
-) -> list[Wave]:
-    """Return the steady responses to tones that push the tip with an acceleration, in nm/us^2 per amplitude."""
-    check_steady_response(cantilever, tones, name)
-    moving = (tone for tone in tones if not _is_known_zero(tone.amplitude))
-    return [_response(cantilever, tone, push_per_amplitude) for tone in moving]
+def _response(cantilever: Cantilever, wave: Wave, push: Float[Array, "..."]) -> Wave:
+    """Return the steady response to a wave that pushes the tip with an acceleration, in nm/us^2 per amplitude.
 
-
-def _response(cantilever: Cantilever, tone: Tone, push_per_amplitude: Float[Array, "..."]) -> Wave:
-    """Return Re(H(omega) a exp(i(omega t + phi))) = c cos(omega t) + s sin(omega t).
-
-    With H = (d - i g)/(d^2 + g^2), d = Omega^2 - omega^2 and g = omega Omega/Q: c = Re(a exp(i phi) H) and
-    s = -Im(a exp(i phi) H).
+    A wave is Re((c - i s) exp(i omega t)), and its response has the factor H = (d - i g)/(d^2 + g^2) with
+    d = Omega^2 - omega^2 and g = omega Omega/Q.
     """
-    Omega, omega = cantilever.angular_frequency, tone.angular_frequency
+    Omega, omega = cantilever.angular_frequency, wave.angular_frequency
     # as a product: a difference of squares loses digits near resonance
-    d = (Omega - omega) * (Omega + omega)
-    sine, cosine = sine_cosine(tone.phase_rad)
-    push = push_per_amplitude * tone.amplitude
-    if cantilever.quality_factor is None:
-        return Wave(push * cosine / d, -push * sine / d, omega)
-    g = 2.0 * cantilever.decay_rate * omega
+    d, g = (Omega - omega) * (Omega + omega), 2.0 * cantilever.decay_rate * omega
     size = push / (d * d + g * g)
-    return Wave(size * (d * cosine + g * sine), size * (g * cosine - d * sine), omega)
-
-
-def _wave_of(tone: Tone) -> Wave:
-    """Return a cos(omega t + phi) as a cos(phi) cos(omega t) - a sin(phi) sin(omega t)."""
-    sine, cosine = sine_cosine(tone.phase_rad)
-    return Wave(tone.amplitude * cosine, -tone.amplitude * sine, tone.angular_frequency)
+    return Wave(size * (d * wave.cosine - g * wave.sine), size * (g * wave.cosine + d * wave.sine), omega)
 
 
 def _joined(waves: list[Wave]) -> tuple[Wave, ...]:
     """Return waves with those that are known to have one frequency added up."""
     joined: list[Wave] = []
     for wave in waves:
-        for place, other in enumerate(joined):
-            if _is_known_same(wave.angular_frequency, other.angular_frequency):
-                joined[place] = Wave(other.cosine + wave.cosine, other.sine + wave.sine, other.angular_frequency)
-                break
-        else:
+        same = (k for k, other in enumerate(joined) if _is_known_same(wave.angular_frequency, other.angular_frequency))
+        place = next(same, None)
+        if place is None:
             joined.append(wave)
+        else:
+            joined[place] = joined[place] + wave
     return tuple(joined)
 
 

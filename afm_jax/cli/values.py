@@ -277,15 +277,15 @@ def _number(text: str, what: str, *, positive: bool) -> float:
 
 
 def scene_and_start(name: str, *, notes: bool = True) -> "tuple[Scene, Start | None]":
-    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.read_named_scene`.
+    """Return the scene that an argument names and its start; see `afm_jax.scenefile.scenefile.read_scene`.
 
     Args:
         name: a path, or a preset's name.
         notes: whether the result says what the file leaves to be assumed.
     """
-    from afm_jax.scenefile import presets  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import read_scene  # noqa: PLC0415
 
-    read = presets.read_named_scene(name)
+    read = read_scene(name)
     for note in read.notes if notes else ():
         add_note(note)
     return read.scene, read.start

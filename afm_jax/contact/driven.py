@@ -164,7 +164,7 @@ def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surf
             (wave.angular_frequency**2 - square) * wave.sine + friction * wave.angular_frequency * wave.cosine,
             wave.angular_frequency,
         )
-        for wave in waves_of(surface)
+        for wave in surface.waves
     )
     ramp = surface.offset_rate_nm_per_us
     mean_push = (-square * surface.offset_nm - friction * ramp, -square * ramp)
@@ -184,16 +184,3 @@ def free_tip(contact: Contact, junction: Junction, mass_ng: Float[Array, "..."])
         solid=contact.solid,
         drive=None,
     )
-
-
-def waves_of(surface: Platform | Surface) -> tuple[Wave, ...]:
-    """Return the cosines of a surface's motion."""
-    if isinstance(surface, Surface):
-        return surface.tones
-    first = Wave(surface.amplitude_nm, jnp.zeros_like(surface.amplitude_nm), surface.angular_frequency)
-    if surface.second is None:
-        return (first,)
-    # a cos(omega t + phi) = a cos(phi) cos(omega t) - a sin(phi) sin(omega t)
-    tone = surface.second
-    sine, cosine = sine_cosine(tone.phase_rad)
-    return first, Wave(tone.amplitude * cosine, -tone.amplitude * sine, tone.angular_frequency)

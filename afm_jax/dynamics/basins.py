@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.columns import rows_of
 from afm_jax.contact.contact import Contact
@@ -177,7 +177,7 @@ class Basins(ResultTuple):
 
 @checked
 def basins_of_attraction(
-    scene: SceneLike,
+    scene: Scene,
     *,
     columns: int = 300,
     rows: int = 300,
@@ -197,7 +197,6 @@ def basins_of_attraction(
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene does not repeat with one drive period, or there is no such grid.
     """
-    scene = as_scene(scene)
     seen = sample_driven(scene)
     scene, ahead = seen.scenes, float(seen.frame.phase_rad)
     if scene.platform.frequency_khz.ndim or columns < 2 or rows < 2:

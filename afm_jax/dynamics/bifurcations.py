@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import Record, Tips, follow
@@ -28,7 +28,7 @@ from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_be
 from afm_jax.motion.start import gap_of_departure, start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, ResultTuple, public_result
-from afm_jax.scenefile.parameter_paths import scene_batch
+from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
 from afm_jax.solve.lanes import LANES, Report, compiled_quickly, in_blocks
 from afm_jax.units import within_turn
 
@@ -185,9 +185,9 @@ class Ramps(NamedTuple):
 
 @checked
 def bifurcation_diagram(  # noqa: PLR0913
-    scene: SceneLike,
+    scene: Scene,
     parameter: str,
-    values: Float[np.ndarray, " values"],
+    values: Float[np.ndarray, " values"] | None = None,
     *,
     start: tuple[float, float, float] | None = None,
     upward: bool = True,
@@ -199,8 +199,8 @@ def bifurcation_diagram(  # noqa: PLR0913
 
     Args:
         scene: a scene with a law or a contact, driven with one frequency.
-        parameter: its path in the scene file.
-        values: of the parameter, ascending.
+        parameter: "platform.offset_nm=-2:2:400", its range and how many values, as in the command; or its path alone.
+        values: of a path, ascending.
         start: where the tip begins, and anew where its motion has ended: as of `start_of`; None: on the stable
             single-impact orbit of the order nearest to resonance, else leaving the platform upward.
         upward: from the lowest value to the highest, or the other way round.
@@ -212,7 +212,8 @@ def bifurcation_diagram(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene lacks the parameter or does not repeat with one drive period, or values do not rise.
     """
-    scene = as_scene(scene)
+    if values is None:
+        parameter, values = (swept := parse_range(parameter, counted=True)).path, swept.values
     ordered = np.asarray(values, float)
     if ordered.ndim != 1 or len(ordered) < 1 or np.any(np.diff(ordered) <= 0.0):
         raise ValueError("`values` must be rising numbers, one at least")

@@ -5,7 +5,7 @@ judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 a
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,7 +27,7 @@ from afm_jax.impact.closure import OrbitPlace, OrbitProblem, find_roots
 from afm_jax.impact.law import TabulatedLaw, impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
 from afm_jax.results import Result, public_result
-from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
+from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parse_range, scene_family
 from afm_jax.solve.lanes import Report, again_for, in_blocks
 
 _LANES = 1024
@@ -304,19 +304,21 @@ class StabilityChart(Result):
 
 @checked
 def stability_chart(
-    scene_of: Callable[..., Scene],
+    scene_of: Scene | Callable[..., Scene],
     *,
-    x_values: Float[np.ndarray, " columns"],
-    y_values: Float[np.ndarray, " rows"],
+    x_values: str | Float[np.ndarray, " columns"],
+    y_values: str | Float[np.ndarray, " rows"],
     last_order: int,
     report: Report | None = None,
 ) -> StabilityChart:
     """Return which single-impact orbits exist, are stable and coexist over two parameters of a scene.
 
     Args:
-        scene_of: the scene at the two parameters' values; it must allow `vmap` (`parameter_paths.scene_family`).
-        x_values: of the first parameter, ascending: the chart's columns.
-        y_values: of the second, ascending: its rows.
+        scene_of: one scene, whose parameters the values name; or the scene at two parameters' values, a function that
+            allows `vmap`.
+        x_values: of the first parameter, ascending, the chart's columns: "platform.reduced_frequency=0.4:4.4:1000" as
+            in the command, of a function the values alone.
+        y_values: of the second, likewise: its rows.
         last_order: highest order N that is looked for.
         report: told how many of how many points are done.
 
@@ -328,6 +330,12 @@ def stability_chart(
     """
     if last_order < 1:
         raise ValueError(f"`last_order` must be 1 or more, but is {last_order}")
+    if isinstance(scene_of, Scene):
+        across, up = (parse_range(str(text), counted=True) for text in (x_values, y_values))
+        check_ranges(scene_of, across, up)
+        values = {"x_values": across.values, "y_values": up.values}
+        family = scene_family(scene_of, across.path, up.path)
+        return replace(stability_chart(family, **values, last_order=last_order, report=report), x=across, y=up)
     x, y = (np.asarray(values, float) for values in (x_values, y_values))
     for name, values in (("x_values", x), ("y_values", y)):
         if values.ndim != 1 or not values.size or not np.all(np.diff(values) > 0.0):

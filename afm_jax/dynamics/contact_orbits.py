@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
 
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
+from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
@@ -67,9 +67,7 @@ _LONGEST_CONTACT = 0.5
 
 
 @checked
-def contact_orbits(
-    scene: SceneLike, order: int, impacts: int, *, accuracy: float = DEFAULT_ACCURACY
-) -> ManyImpactOrbits:
+def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = DEFAULT_ACCURACY) -> ManyImpactOrbits:
     """Return the orbits of m contacts in N drive periods of a scene with a contact.
 
     Args:
@@ -90,7 +88,6 @@ def contact_orbits(
         ValueError: if order or impacts is no positive integer, there are more impacts than 64, or the drive does not
             repeat.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     if not isinstance(scene.interaction, Contact):
         raise TypeError("`scene` must have a `Contact`; `many_impact_orbits` has the orbits of a law")

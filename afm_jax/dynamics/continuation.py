@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from rich.table import Table
 
-from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene, SceneLike, as_scene, drive_of
+from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene, drive_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.contact.contact import Contact
@@ -48,7 +48,13 @@ from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.results import columns_of as columns_of_record
-from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parameter_values, scene_family
+from afm_jax.scenefile.parameter_paths import (
+    ParameterRange,
+    check_ranges,
+    parameter_values,
+    parse_range,
+    scene_family,
+)
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import counted
 
@@ -231,7 +237,12 @@ class Continuation(ResultTuple):
 
 @checked
 def continue_orbits(
-    scene: SceneLike, order: int, given: ParameterRange, *, impacts: int = 1, second: ParameterRange | None = None
+    scene: Scene,
+    order: int,
+    given: str | ParameterRange,
+    *,
+    impacts: int = 1,
+    second: str | ParameterRange | None = None,
 ) -> Continuation:
     """Follow the (m, N) orbits of a scene through a parameter, and their special points through a second one.
 
@@ -243,7 +254,7 @@ def continue_orbits(
         scene: one scene with an `ImpactLaw` or a `Contact`, driven with one period. A contact's curves end where the
             orbit grazes and where it is captured.
         order: N, drive periods in which the orbit repeats.
-        given: the parameter and its range.
+        given: the parameter and its range, "platform.amplitude_nm=0.5:6" as in the command.
         impacts: m, impacts in them; 0: the motion of a tip that meets nothing.
         second: another parameter and its range, which holds the scene's own value; None: no curves are followed.
 
@@ -253,8 +264,9 @@ def continue_orbits(
         ValueError: if the drive does not repeat, a parameter or a range is none of the scene's, or order and impacts
             are no numbers of impacts and periods.
     """
-    scene = as_scene(scene)
     require_float64(scene)
+    given = parse_range(given, counted=False)
+    second = None if second is None else parse_range(second, counted=False)
     ranges = (given,) if second is None else (given, second)
     driven = driven_part(scene)
     _check(scene, order, impacts, ranges)

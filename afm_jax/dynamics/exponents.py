@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.many_tips import (
@@ -226,7 +226,7 @@ class _Sums(NamedTuple):
 
 @checked
 def lyapunov_spectrum(
-    scene: SceneLike,
+    scene: Scene,
     start: State | None = None,
     *,
     impacts: int = 2000,
@@ -251,7 +251,6 @@ def lyapunov_spectrum(
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene does not repeat with one drive period, or there are too few impacts to tell errors.
     """
-    scene = as_scene(scene)
     seen = sample_driven(scene)
     if impacts < _PARTS or transient < 0:
         raise ValueError(f"`impacts` must be {_PARTS} or more and `transient` not negative: {impacts} and {transient}")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
@@ -124,7 +124,7 @@ def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray,
 
 
 @checked
-def many_impact_orbits(scene: SceneLike, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
+def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
     """Return the orbits of m impacts in N drive periods that a search from many starts finds.
 
     Args:
@@ -143,7 +143,6 @@ def many_impact_orbits(scene: SceneLike, order: int, impacts: int, *, starts: in
         ValueError: if order or impacts is no positive integer, there are more impacts than 64, or the drive does not
             repeat.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     driven = driven_part(scene)

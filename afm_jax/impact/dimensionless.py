@@ -46,7 +46,7 @@ def dimensionless_scene(
     quality_factor = 0.5 / damping_ratio if damping_ratio else None
     return Scene(
         Cantilever(natural_khz, quality_factor, mass_ng=1.0),
-        Platform(0.0, omega * natural_khz, -1.0 * gap),
+        Platform(offset_nm=-1.0 * gap),
         ImpactLaw(r=r),
         force=ForceDrive(force, omega * natural_khz),
     )

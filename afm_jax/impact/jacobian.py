@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import as_argument, check_parameter, checked
 from afm_jax.impact.lasting_impact import speeds_of_impact
@@ -205,7 +205,7 @@ def contact_jacobian(
 
 
 @checked
-def map_jacobian(scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: ArrayLike) -> Float[Array, "2 2"]:
+def map_jacobian(scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike) -> Float[Array, "2 2"]:
     """Return d(time, velocity after) of the next impact over d(time, velocity after) of this one (eqs. 5 and 7).
 
     Args:
@@ -223,7 +223,6 @@ def map_jacobian(scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: Array
         ValueError: if time or velocity is an array or not finite, or an undamped cantilever is driven at its free
             frequency.
     """
-    scene = as_scene(scene)
     check_parameter("time_us", time_us, "finite")
     check_parameter("velocity_nm_per_us", velocity_nm_per_us, "finite")
     impact = next_impact(scene, time_us, velocity_nm_per_us)

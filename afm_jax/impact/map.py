@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, FirstImpact, Flight, first_impact
@@ -111,7 +111,7 @@ ThroughImpact = Callable[[FollowedTip, NextImpact], tuple[FollowedTip, Any]]
 
 @checked
 def next_impact(
-    scene: SceneLike,
+    scene: Scene,
     time_us: ArrayLike,
     velocity_nm_per_us: ArrayLike,
     *,
@@ -148,7 +148,7 @@ def next_impact(
 
 @checked
 def iterate_map(
-    scene: SceneLike,
+    scene: Scene,
     time_us: ArrayLike,
     velocity_nm_per_us: ArrayLike,
     impacts: int,
@@ -182,7 +182,7 @@ def iterate_map(
 
 
 def _free_start(
-    scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike
+    scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike
 ) -> tuple[Scene, Surface | None, Departure, Float[Array, ""]]:
     """Return scene, steady response to base and force, start without it, and tolerance in us, checked.
 
@@ -193,7 +193,6 @@ def _free_start(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if something is an array, or the search has no step or no tolerance.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     for name, value in (("time_us", time_us), ("velocity_nm_per_us", velocity_nm_per_us)):
@@ -387,7 +386,7 @@ DEFAULT_BLOCK = 1000
 
 @checked
 def iterate_batch(
-    scene: SceneLike,
+    scene: Scene,
     time_us: ArrayLike,
     velocity_nm_per_us: ArrayLike,
     impacts: int,
@@ -415,7 +414,6 @@ def iterate_batch(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if shapes do not fit together, or `impacts` or `block` is not positive.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     dtype = scene.platform.frequency_khz.dtype

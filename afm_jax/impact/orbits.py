@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame, Surface, Wave, free_frame, size_and_lag
 from afm_jax.checks import as_argument, checked, is_traced, require_float64
 from afm_jax.impact.closure import (
@@ -110,7 +110,7 @@ class SingleImpactOrbits(Result, eqx.Module):
 
 
 @checked
-def single_impact_orbits(scene: SceneLike, order: ArrayLike) -> SingleImpactOrbits:
+def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     """Return every single-impact orbit of an order (eq. 9; damped, with viscous loss and delay).
 
     Args:
@@ -129,7 +129,6 @@ def single_impact_orbits(scene: SceneLike, order: ArrayLike) -> SingleImpactOrbi
         ValueError: if the order is not a positive integer, the platform's offset ramps, the drive has several
             frequencies, or an undamped cantilever is driven at its free one.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     _check_order(order)
@@ -284,10 +283,7 @@ def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) ->
     readings_of_height = {"peak_amplitude_nm": peak, "phase_lag_deg": lag} | dict(zip(names, readings, strict=True))
     if frame.base is None:
         return readings_of_height
-    response, base = frame.response, frame.base
-    peak, *readings, lag = read(
-        Wave(response.cosine - base.cosine, response.sine - base.sine, response.angular_frequency)
-    )
+    peak, *readings, lag = read(frame.response + -frame.base)
     of_deflection = {f"deflection_{name}": value for name, value in zip(names, readings, strict=True)}
     return readings_of_height | {"peak_deflection_nm": peak, "phase_lag_deg": lag} | of_deflection
 
@@ -413,28 +409,12 @@ def is_stable(
 def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
     """Return the steady motion of the greatest approach speed, without derivatives, and whether there is one.
 
-    The roots are those of `steady_orbits`; of the stable ones flights are followed only until one is admissible.
+    The roots are those of `steady_orbits`.
     """
-    problem = lax.stop_gradient(problem)
-    roots = find_roots(problem, COARSE)
-    states = jax.vmap(orbit_state, in_axes=(0, None))(roots.place, problem)
-
-    def goes_on(search):
-        untried, _, steady = search
-        return jnp.any(untried > -jnp.inf) & ~steady
-
-    def try_fastest(search):
-        untried, _, _ = search
-        slot = jnp.argmax(untried)
-        state = jax.tree.map(lambda leaf: leaf[slot], states)
-        # of a batch, a search that has ended follows no flight
-        admissible = is_admissible(goes_on(search), state, problem)
-        return untried.at[slot].set(-jnp.inf), slot, admissible
-
-    stable = jax.vmap(is_stable, in_axes=(0, 0, 0, None))(roots.place, roots.slopes, states, problem)
-    untried = jnp.where(roots.found & stable, states.speeds.approach, -jnp.inf)
-    _, slot, steady = lax.while_loop(goes_on, try_fastest, (untried, jnp.argmax(untried), jnp.zeros((), bool)))
-    return jax.tree.map(lambda leaf: leaf[slot], states), steady
+    orbits = steady_orbits(problem)
+    states = jax.vmap(orbit_state, in_axes=(0, None))(orbits.place, lax.stop_gradient(problem))
+    fastest = jnp.argmax(jnp.where(orbits.steady, states.speeds.approach, -jnp.inf))
+    return jax.tree.map(lambda leaf: leaf[fastest], states), jnp.any(orbits.steady)
 
 
 def amplitudes(

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of, require_one_frequency
+from afm_jax.apparatus.scene import Scene, drive_of, require_one_frequency
 from afm_jax.apparatus.surface import drive_per_free_height, force_per_height, surface_of
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.contact.contact import Contact
@@ -117,7 +117,7 @@ class ApproachCurve(ResultTuple):
 
 @checked
 def approach_curve(
-    scene: SceneLike,
+    scene: Scene,
     heights_nm: Sequence[float] | Float[np.ndarray, " heights"],
     *,
     both_ways: bool = True,
@@ -143,7 +143,6 @@ def approach_curve(
         ValueError: if nothing or more than the cantilever is driven, the sample moves, or there are no heights.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     drive = _only_drive(scene)
     course = np.asarray(heights_nm, float).ravel()

@@ -11,7 +11,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, is_traced, require_float64
 from afm_jax.contact.contact import Contact
@@ -27,6 +27,7 @@ from afm_jax.motion.record import (
     State,
     to_gap,
 )
+from afm_jax.motion.start import default_start
 from afm_jax.solve.lanes import power_of_two
 
 DEFAULT_ACCURACY = 1e-9
@@ -40,9 +41,9 @@ _LEAST_ROOM = 64
 
 @checked
 def simulate(  # noqa: PLR0913
-    scene: SceneLike,
-    start: State,
-    duration_us: ArrayLike,
+    scene: Scene,
+    start: State | None = None,
+    duration_us: ArrayLike = 1000.0,
     *,
     max_contacts: int | None = None,
     accuracy: float = DEFAULT_ACCURACY,
@@ -56,7 +57,8 @@ def simulate(  # noqa: PLR0913
 
     Args:
         scene: a scene with an `ImpactLaw`, a `Contact`, or no interaction (a free cantilever).
-        start: time, height and velocity of the tip in the lab, scalars.
+        start: time, height and velocity of the tip in the lab, scalars; None: where `afm-jax simulate` starts a scene
+            without a start of its own (`default_start`), whose numbers must be known.
         duration_us: how long to follow it, in us.
         max_contacts: most contacts (impacts) there is room for, a plain integer that shapes the result; None: a power
             of two, enough for the duration, which must then be a number. A motion with more (chatter with r close to 1)
@@ -79,9 +81,9 @@ def simulate(  # noqa: PLR0913
         ValueError: if the duration is not positive, start or duration are arrays, there is room for nothing, the
             contact has no junction, the start is inside the sample, or there is no such method or accuracy.
     """
-    scene = as_scene(scene)
     require_float64(scene)
     check_parameter("duration_us", duration_us, "positive")
+    start = default_start(scene) if start is None else start
     for name, value in (("duration_us", duration_us), *zip(State._fields, start, strict=True)):
         check_scalar(name, value)
     for name, count in (("max_contacts", max_contacts), ("max_rounds", max_rounds)):

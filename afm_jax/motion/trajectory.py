@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
@@ -161,7 +161,7 @@ class DensePath(NamedTuple):
 
 
 @checked
-def trajectory(scene: SceneLike, simulation: Simulation, times_us: ArrayLike) -> Trajectory:
+def trajectory(scene: Scene, simulation: Simulation, times_us: ArrayLike) -> Trajectory:
     """Return height, velocity, gap and force of the tip at given times of a simulation.
 
     Args:
@@ -172,7 +172,6 @@ def trajectory(scene: SceneLike, simulation: Simulation, times_us: ArrayLike) ->
     Raises:
         ValueError: if a time lies outside the simulation, or the simulation is a batch.
     """
-    scene = as_scene(scene)
     wanted = np.asarray(times_us, float)
     # without times: a stretch of no length
     ends = (wanted.min(), wanted.max()) if wanted.size else (simulation.start.time_us,) * 2

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import drive_per_free_height
 from afm_jax.checks import checked, is_traced
 from afm_jax.scenefile.scenefile import scene_of_tables, scene_tables
@@ -44,19 +44,21 @@ class ParameterRange(NamedTuple):
         return f"{self.path}={self.low:g}:{self.high:g}{counted}"
 
 
-def parse_range(text: str, *, counted: bool) -> ParameterRange:
-    """Return the range that a text says.
+def parse_range(text: str | ParameterRange, *, counted: bool) -> ParameterRange:
+    """Return the range that a text says, the same for options of commands and arguments of functions.
 
     >>> parse_range("platform.offset_nm=-2:2:5", counted=True).values.tolist()
     [-2.0, -1.0, 0.0, 1.0, 2.0]
 
     Args:
-        text: `path=low:high`, with `:count` behind it if counted.
+        text: `path=low:high`, with `:count` behind it if counted; or a range already.
         counted: whether the range is that of a number of values, or everything between its ends.
 
     Raises:
         ValueError: if it says no rising range, or less than two values of one.
     """
+    if isinstance(text, ParameterRange):
+        return text
     shape = "PARAMETER=low:high:count" if counted else "PARAMETER=low:high"
     example = f"platform.reduced_frequency=0.9:1.1{':100' if counted else ''}"
     path, _, rest = text.partition("=")
@@ -147,7 +149,7 @@ def _tables_with(scene: Scene, path: str, value: float) -> dict[str, Any]:
 
 
 @checked
-def scene_family(scene: SceneLike, *paths: str) -> Callable[..., Scene]:
+def scene_family(scene: Scene, *paths: str) -> Callable[..., Scene]:
     """Return the function from values of some parameters to the scene that has them, differentiable and for `vmap`.
 
     >>> from afm_jax import Cantilever, ImpactLaw, Platform
@@ -163,7 +165,6 @@ def scene_family(scene: SceneLike, *paths: str) -> Callable[..., Scene]:
     Raises:
         ValueError: if the scene lacks one, with what it has.
     """
-    scene = as_scene(scene)
     existing = parameter_values(scene)
     for path in paths:
         if path not in existing:

@@ -47,7 +47,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
-from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -58,12 +58,13 @@ from jaxtyping import ArrayLike
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, check_mass, drive_of
+from afm_jax.apparatus.scene import Scene, check_mass, drive_of
 from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
 from afm_jax.checks import check_parameter, checked
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law, TabulatedLaw, law_of_dict
 from afm_jax.motion.record import State
 from afm_jax.scenefile.law_files import law_beside
+from afm_jax.scenefile.presets import PRESETS, STARTS
 from afm_jax.scenefile.tables import (
     INNER_TABLES,
     KEYS,
@@ -71,6 +72,7 @@ from afm_jax.scenefile.tables import (
     TABLES,
     SceneError,
     SceneTable,
+    Start,
     advise_table,
     in_words,
     printable,
@@ -89,22 +91,6 @@ MASS_ASSUMED = (
 )
 
 
-class Start(NamedTuple):
-    """Where a simulation begins: `phase_deg` of the drive, height above the platform, velocity in the lab."""
-
-    phase_deg: float
-    height_above_platform_nm: float
-    velocity_nm_per_us: float
-
-
-class SceneAsRead(NamedTuple):
-    """What a scene file holds: scene and start (None: left to the simulation), and what a reader should know of it."""
-
-    scene: Scene
-    start: Start | None
-    notes: tuple[str, ...]
-
-
 @checked
 def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Return the scene that a TOML file describes, or that a preset's name means.
@@ -116,17 +102,31 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
             junction; the message names the place and says how to mend it.
     """
-    # presets are read from files of scenes
-    return import_module("afm_jax.scenefile.presets").read_named_scene(os.fspath(path)).scene
+    return read_scene(path).scene
+
+
+class SceneAsRead(NamedTuple):
+    """What a scene file holds: scene and start (None: left to the simulation), and what a reader should know of it."""
+
+    scene: Scene
+    start: Start | None
+    notes: tuple[str, ...]
 
 
 def read_scene(path: str | os.PathLike[str]) -> SceneAsRead:
-    """Return what a scene file holds.
+    """Return what a scene file holds, or a preset is.
+
+    Args:
+        path: the file, or a name of `PRESETS` where there is no file of that name.
 
     Raises:
         SceneError: as `load_scene`.
     """
     source = os.fspath(path)
+    if not (Path(source).exists() or source.endswith(".toml") or len(Path(source).parts) > 1):
+        if source not in PRESETS:
+            raise SceneError(f"{printable(source)}: there is no such file or preset; presets are {', '.join(PRESETS)}")
+        return SceneAsRead(PRESETS[source](), STARTS.get(source), ())
     tables = _checked(read_toml(source), source)
     scene = _scene_of(tables)
     stated = {"mass_ng", "spring_constant_n_per_m"} & set(tables["cantilever"].values)
@@ -153,7 +153,7 @@ def scene_of_tables(contents: Mapping[str, Any], source: str) -> Scene:
 
 
 @checked
-def save_scene(scene: SceneLike, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
+def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
     """Write a scene, and a start if there is one, to a TOML file from which `load_scene` returns an equal scene.
 
     The file names a contact's effects in the paper's order, whatever the order of its forces.
@@ -164,7 +164,6 @@ def save_scene(scene: SceneLike, path: str | os.PathLike[str], *, start: Start |
         ValueError: if the scene is a batch of scenes, its contact or its drives are none that a file can hold, or the
             start is impossible in it.
     """
-    scene = as_scene(scene)
     tables = scene_tables(scene)
     if start is not None:
         check_start(start, scene)

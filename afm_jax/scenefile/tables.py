@@ -113,6 +113,14 @@ def _owners(key: str) -> list[str]:
 Built = TypeVar("Built")
 
 
+class Start(NamedTuple):
+    """Where a simulation begins: `phase_deg` of the drive, height above the platform, velocity in the lab."""
+
+    phase_deg: float
+    height_above_platform_nm: float
+    velocity_nm_per_us: float
+
+
 class SceneError(ValueError):
     """Raised where a scene file cannot be used; the message is one line: what, where, how to mend it."""
 

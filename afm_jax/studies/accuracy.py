@@ -34,7 +34,7 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip, waves_of
+from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip
 from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.contact.parameters import PAPER
 from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting, Setting
@@ -47,7 +47,7 @@ from afm_jax.motion.contact_motion import follow_contacts
 from afm_jax.motion.record import ContactKind, State, to_gap
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
-from afm_jax.scenefile.presets import preset, read_named_scene
+from afm_jax.scenefile.scenefile import load_scene, read_scene
 from afm_jax.studies.timing import compiled_for, progress, time_compiled
 
 Row = dict[str, Any]
@@ -375,7 +375,7 @@ def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
     cantilever, surface = motion.cantilever, motion.surface
     assert cantilever is not None  # it flies  # noqa: S101
     assert surface is not None  # noqa: S101
-    waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in waves_of(surface)])
+    waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in surface.waves])
     own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, Phase.DRY)
     return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
 
@@ -483,7 +483,7 @@ _ROOT_TOLERANCES_US = (1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-13)
 
 def impact_times(tips: int) -> AccuracyProblem:
     """Return the time of the next impact, by the time and the velocity of departures around figure 2's (1,1) orbit."""
-    scene = preset("figure2")
+    scene = load_scene("figure2")
     orbits = jax.jit(single_impact_orbits)(scene, 1)
     stable = int(np.argmax(np.asarray(orbits.exists & orbits.admissible & orbits.stable)))
     first, second = evenly_spread(tips).T - 0.5
@@ -623,7 +623,7 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     Raises:
         ValueError: if the tip is free, or has fewer contacts.
     """
-    read = read_named_scene(name)
+    read = read_scene(name)
     scene = read.scene
     if scene.interaction is None:
         raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")

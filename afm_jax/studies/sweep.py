@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
+from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import free_frame
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, open_cache, silence_xla
@@ -48,6 +48,7 @@ from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     check_ranges,
     parameter_values,
+    parse_range,
     scene_batch,
     scene_family,
 )
@@ -847,10 +848,18 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
         yield client
 
 
+def _axis_table(axis: str | Mapping[str, Any]) -> dict[str, Any]:
+    """Return an axis of a grid as its table in a sweep file."""
+    if not isinstance(axis, str):
+        return dict(axis)
+    along = parse_range(axis, counted=True)
+    return {"parameter": along.path, "linear": [along.low, along.high, along.number]}
+
+
 @checked
 def sweep(  # noqa: PLR0913
-    scene: SceneLike,
-    axes: Sequence[Mapping[str, Any]],
+    scene: Scene,
+    axes: Sequence[str | Mapping[str, Any]],
     record: str | Mapping[str, Any],
     *,
     out: str | os.PathLike[str] | None = None,
@@ -865,9 +874,9 @@ def sweep(  # noqa: PLR0913
 
     Args:
         scene: one scene.
-        axes: of the grid, tables as in a sweep file: {"parameter": "interaction.r", "linear": [0.5, 0.9, 100]}, "log"
-            likewise, "list" with values; or {"random": {"interaction.r": [0.5, 0.9]}, "count": 100, "seed": 1}.
-            Parameters are paths of the scene file.
+        axes: of the grid, "interaction.r=0.5:0.9:100" as in commands, or tables as in a sweep file: {"parameter":
+            "interaction.r", "linear": [0.5, 0.9, 100]}, "log" likewise, "list" with values; or {"random":
+            {"interaction.r": [0.5, 0.9]}, "count": 100, "seed": 1}. Parameters are paths of the scene file.
         record: "orbits", "collide", "lyapunov" or "simulation", or a table with that as `what` and settings.
         out: folder of the results: chunks that are done there are kept; None: nothing is kept on the disk. What two
             sweeps write into one folder at the same time is undefined.
@@ -891,11 +900,10 @@ def sweep(  # noqa: PLR0913
     """
     import xarray  # noqa: PLC0415 (an extra package)
 
-    scene = as_scene(scene)
     require_float64(scene)
     check_count("workers", workers)
     table = {"what": record} if isinstance(record, str) else dict(record)
-    given = {"scene": scene_tables(scene), "axes": [dict(axis) for axis in axes], "record": table}
+    given = {"scene": scene_tables(scene), "axes": list(map(_axis_table, axes)), "record": table}
     begin = None if start is None else start._asdict()
     plan = plan_of(given | {"start": begin, "accuracy": accuracy, "chunk": chunk})
     with ExitStack() as stack:
