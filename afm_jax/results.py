@@ -72,10 +72,15 @@ class Result:
         printed = getattr(self, "printed", None)
         return text_of(self) if printed is None else text_of_parts(printed())
 
-    def plot(self, path: str | Path | None = None) -> "Figure":
-        """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given."""
+    def plot(self, path: str | Path | None = None, **options: Any) -> "Figure":
+        """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given.
+
+        Args:
+            path: of the file; None: none is written.
+            options: of the picture, such as `ordinate` of a bifurcation diagram.
+        """
         module, _, name = self._picture.partition(":")
-        figure = getattr(importlib.import_module(module), name)(self)
+        figure = getattr(importlib.import_module(module), name)(self, **options)
         style = importlib.import_module("afm_jax.plots.picture_style")
         # a figure without pyplot is shown by a notebook only if it says how
         figure._repr_png_ = lambda: style.png_of(figure)

@@ -10,7 +10,7 @@ from afm_jax.dynamics.bands import verdict_probability
 from afm_jax.dynamics.bifurcations import Ramps, bifurcation_diagram
 
 
-def bifurcation(
+def bifurcation(  # noqa: PLR0913
     session: Session,
     scene: NamedScene,
     *,
@@ -18,6 +18,7 @@ def bifurcation(
     both: bool,
     down: bool,
     impacts: int,
+    ordinate: str,
     draws: int,
 ) -> Output:
     """Return what motions of a scene come to along a parameter, ramped up, down or both ways."""
@@ -39,4 +40,4 @@ def bifurcation(
     if not all(sweep.complete for sweep in sweeps):
         session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     ramps = Ramps(swept.path, sweeps, impacts)
-    return Output.of(ramps, files={"bifurcation.png": picture_of("dynamics:bifurcation_figure", ramps)})
+    return Output.of(ramps, files={"bifurcation.png": picture_of("dynamics:bifurcation_figure", ramps, ordinate)})

@@ -23,5 +23,5 @@ def chart(session: Session, scene: NamedScene, *, x: str, y: str, orders: int, d
         if scene.unknowns is not None:
             probability = stable_probability(scene.scene, result, scene.unknowns, paths, draws=draws)
             result = replace(result, probability=probability)
-    files = {"chart.png": picture_of("dynamics:chart_figure", result, *paths, result.probability)}
+    files = {"chart.png": picture_of("dynamics:chart_figure", result)}
     return Output.of(result, files=files)

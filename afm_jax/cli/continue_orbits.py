@@ -32,8 +32,7 @@ def follow(
             amplitude_errors=tuple(amplitude_errors(followed, branch, uncertain) for branch in followed.branches),
             special_errors=special_errors(followed, uncertain),
         )
-    errors = {"bands": followed.amplitude_errors, "errors": followed.special_errors}
-    files = {"branches.png": picture_of("branches:continuation_figure", followed, **errors)}
+    files = {"branches.png": picture_of("branches:continuation_figure", followed)}
     if followed.curves:
         files["curves.png"] = picture_of("branches:curves_figure", followed)
     return Output.of(followed, files=files)

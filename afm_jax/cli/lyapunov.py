@@ -31,8 +31,5 @@ def lyapunov(
             band = drawn_exponents(scene.scene, values, scene.unknowns, draws=draws, **lengths)
     if not ranges:
         return Output.of(result._replace(larger_interval95=None if band is None else band[0]))
-    (along,) = ranges
-    return Output.of(
-        result._replace(along=along, larger_interval95=band),
-        files={"lyapunov.png": picture_of("dynamics:exponents_figure", result, along.path, along.values, band)},
-    )
+    result = result._replace(along=ranges[0], larger_interval95=band)
+    return Output.of(result, files={"lyapunov.png": picture_of("dynamics:exponents_figure", result)})

@@ -6,7 +6,7 @@ from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.impact_orbits import many_impact_orbits
-from afm_jax.dynamics.orbit_tables import ManyOrbitTable, OrbitTable
+from afm_jax.dynamics.orbit_tables import OrbitTable
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
 
@@ -29,7 +29,7 @@ def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | No
         with session.working("searching for orbits (the first run compiles for some seconds)"):
             search = contact_orbits if resolved else many_impact_orbits
             of_scene = search(scene.scene, order, impacts)
-        told = ManyOrbitTable(scene.scene, order, impacts, of_scene)
+        told = OrbitTable(scene.scene, order, of_scene, impacts)
     return Output.of(told, files={"orbits.png": lambda path: save(told.plot(), path)})
 
 

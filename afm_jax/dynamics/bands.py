@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
-from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
+from afm_jax.dynamics.bifurcations import BifurcationDiagram, bifurcation_diagram
 from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.curves import BLOCK, equations_at, loop_at
 from afm_jax.dynamics.exponents import lyapunov_spectrum
@@ -168,7 +168,7 @@ def drawn_exponents(
 def verdict_probability(
     scene: Scene,
     parameter: str,
-    sweep: Sweep,
+    sweep: BifurcationDiagram,
     uncertain: UncertainParameters,
     *,
     start: tuple[float, float, float] | None = None,

@@ -1,9 +1,8 @@
 """Basins of attraction: which start ends where.
 
-A sample of starts is followed for long; what it comes to are the attractors. Around each point of each orbit the
-largest radius is sought from within which all of a ring and a disc of tips come back. Then every start is followed
-until it is within such a radius, is held, or flies away, and drops out; what is left in the end is followed on and told
-apart like the sample. Distances are in drive phase (rad) and velocity over beta omega.
+A sample of starts is followed for long; what it comes to are the attractors. Then every start is followed until it is
+at a point of an orbit, is held, or flies away, and drops out; what is left in the end is followed on and told apart
+like the sample. Distances are in drive phase (rad) and velocity over beta omega.
 """
 
 from typing import Any, NamedTuple
@@ -19,7 +18,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.columns import rows_of
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
+from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of
 from afm_jax.dynamics.many_tips import Record, Tips, advance, follow
 from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, settled_below, verdicts_of
@@ -33,17 +32,15 @@ _LONG = 1000
 """Impacts after which the motions of a sample are told apart."""
 _SAME = 1e-3
 """Distance below which points are those of one orbit."""
-_RADII = (0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.0)
-_AROUND = 24
-_BACK = 300
-"""Impacts after which a tip near an orbit must be on it."""
 _POINTS = 64
+"""Points of orbits at which starts drop out."""
 _ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
 """Impacts after each of which starts that have arrived drop out."""
 _PART = 8 * LANES
+_ACCURACY = 1e-6
+"""Of resolved contacts."""
 _LEFT = 20_000
 """Starts at most that are told apart one by one in the end."""
-
 
 _NOTHING = np.zeros(0)
 
@@ -244,17 +241,6 @@ _velocity = jax.jit(Platform.velocity)
 """Compiled: all of a formula in one program."""
 
 
-class _Targets(NamedTuple):
-    """Points of orbits, filled up to one number of them."""
-
-    points: Float[np.ndarray, "points 2"]
-    """Phase in rad, and velocity over beta omega."""
-    radius: Float[np.ndarray, " points"]
-    """From within which all tips come back; negative where there is no point."""
-    owner: Int[np.ndarray, " points"]
-    """The number of the attractor."""
-
-
 class _Finder:
     """The attractors of one scene that are known so far, and how starts are matched with them.
 
@@ -264,7 +250,6 @@ class _Finder:
     def __init__(self, scene: Scene):
         self.scene = scene
         self.attractors: list[Attractor] = []
-        self.radius: list[float] = []
         self.omega, self.top = float(scene.platform.angular_frequency), float(scene.platform.top_speed_nm_per_us)
 
     def scenes(self, count: int) -> Scene:
@@ -280,7 +265,7 @@ class _Finder:
         """Return tips some impacts later, and the record of the last ones."""
 
         def work(some: Tips) -> tuple[Tips, Record]:
-            return follow(self.scenes(len(some.time_us)), some, skip=impacts, record=RECORDED, accuracy=1e-6)
+            return follow(self.scenes(len(some.time_us)), some, skip=impacts, record=RECORDED, accuracy=_ACCURACY)
 
         return in_blocks(work, tips, report=report)
 
@@ -327,63 +312,38 @@ class _Finder:
                 return number
         name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
         self.attractors.append(Attractor(name, *kind, phase, velocity, approach))
-        self.radius.append(0.0)
         return len(self.attractors) - 1
 
     def look_around(self, high: float, low: float) -> None:
-        """Find attractors with a sample of starts, how close to an orbit a tip is its own, and what is chaotic."""
+        """Find attractors with a sample of starts, and what of them is chaotic."""
         across, up = evenly_spread(_SAMPLE).T
         tips = self.tips(2.0 * np.pi * across, low + (high - low) * up)
         label = self.told_apart(tips)
-        orbits = [number for number, attractor in enumerate(self.attractors) if attractor.impacts]
-        if orbits:
-            self._find_radii(orbits)
         for number, attractor in enumerate(self.attractors):
             if attractor.kind == MotionKind.IRREGULAR:
                 chosen = np.flatnonzero(label == number)[:16]
                 some = jax.tree.map(lambda part, chosen=chosen: part[chosen], tips)
-                exponents = exponents_of_law(self.scenes(len(chosen)), some, impacts=1000, transient=_LONG)
+                exponents = exponents_of(
+                    self.scenes(len(chosen)), some, impacts=1000, transient=_LONG, accuracy=_ACCURACY
+                )
                 larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
                 finite = np.isfinite(larger)
                 if finite.any() and np.median(larger[finite]) > CHAOTIC_ERRORS * np.median(error[finite]):
                     self.attractors[number] = attractor._replace(name="chaotic")
-
-    def _find_radii(self, numbers: list[int]) -> None:
-        """Find the largest radius around the points of each orbit from within which all tips come back to it."""
-        angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
-        ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], 1) * size for size in (1.0, 0.5)])
-        rows, owner, sizes = [], [], []
-        for number in numbers:
-            orbit = self.attractors[number]
-            for phase, velocity in zip(orbit.phase_rad, orbit.velocity_nm_per_us, strict=True):
-                for size in _RADII[:-1]:
-                    rows.append(np.stack([phase + size * ring[:, 0], velocity + size * ring[:, 1] * self.top], 1))
-                    owner += [number] * len(ring)
-                    sizes += [size] * len(ring)
-        points, owner, sizes = np.concatenate(rows), np.asarray(owner), np.asarray(sizes)
-        time = points[:, 0] % (2.0 * np.pi) / self.omega
-        tips = jax.tree.map(np.asarray, tips_at(self.scenes(len(points)), time, points[:, 1]))
-        # no start: beside the orbit of a tip that leaves with the platform's own speed
-        into = points[:, 1] <= np.asarray(_velocity(self.scene.platform, time))
-        end, record = self._later(tips, _BACK)
-        # on the orbit: the last point is one of its own
-        phase, velocity = self.omega * record.departure_us[:, -1], record.velocity_after_nm_per_us[:, -1]
-        for number in numbers:
-            around, orbit = owner == number, self.attractors[number]
-            apart = self._distance(orbit, phase[around], velocity[around])
-            size = max(1.0, np.abs(orbit.velocity_nm_per_us).max() / self.top)
-            back = ((apart < _SAME * size) & (end.outcome[around] == Outcome.IMPACT)) | into[around]
-            good = [size for size in _RADII if back[sizes[around] <= size].all()]
-            self.radius[number] = max(good, default=0.0)
 
     def arrived(self, tips: Tips, report: Report | None) -> Int[np.ndarray, " lanes"]:
         """Return the attractor of every start, as soon as it has arrived."""
         count = len(tips.time_us)
         label, remaining = np.full(count, -1), np.arange(count)
         for impacts in _ROUNDS:
-            targets = self.targets()
-            tips, nearest = self.towards(targets, tips, impacts=impacts)
-            arrival = np.where(nearest >= 0, targets.owner[np.maximum(nearest, 0)], -1)
+            points, owner = self._points()
+
+            def work(some: Tips, impacts: int = impacts, points: np.ndarray = points) -> tuple[Tips, Array]:
+                return _towards(self.scene, some, points, impacts=impacts)
+
+            program = _towards, jax.tree.structure(self.scene)
+            tips, nearest = in_blocks(work, tips, block=_PART, program=program)
+            arrival = owner[nearest]
             for outcome, kind in (
                 (Outcome.CAPTURED, MotionKind.STUCK),
                 (Outcome.NO_FURTHER_IMPACT, MotionKind.FREE),
@@ -407,25 +367,19 @@ class _Finder:
             label[remaining] = self._number_of((int(MotionKind.IRREGULAR), 0, 0))
         return label
 
-    def towards(self, targets: "_Targets", tips: Tips, *, impacts: int) -> tuple[Tips, Int[np.ndarray, " lanes"]]:
-        """Return tips some impacts later, and the number of the point that each has come close enough to; -1: none."""
+    def _points(self) -> tuple[Float[np.ndarray, "points 2"], Int[np.ndarray, " points"]]:
+        """Return points of the known orbits, phase in rad and velocity over beta omega, filled up with NaN to 64.
 
-        def work(some: Tips) -> tuple[Tips, Array]:
-            return _towards(self.scene, some, targets.points, targets.radius, impacts=impacts)
-
-        return in_blocks(work, tips, block=_PART, program=(_towards, jax.tree.structure(self.scene)))
-
-    def targets(self) -> "_Targets":
-        """Return the points of the orbits that are known."""
-        points, radius, owner = np.zeros((_POINTS, 2)), np.full(_POINTS, -1.0), np.zeros(_POINTS, int)
-        used = 0
+        And the number of the attractor that each belongs to; of the last one, which is never a point, -1.
+        """
+        points, owner, used = np.full((_POINTS + 1, 2), np.nan), np.full(_POINTS + 1, -1), 0
         for number, orbit in enumerate(self.attractors):
-            if orbit.impacts and used + orbit.impacts <= _POINTS and self.radius[number] > 0.0:
+            if orbit.impacts and used + orbit.impacts <= _POINTS:
                 some = slice(used, used + orbit.impacts)
                 points[some] = np.stack([orbit.phase_rad, orbit.velocity_nm_per_us / self.top], axis=1)
-                radius[some], owner[some] = self.radius[number], number
+                owner[some] = number
                 used += orbit.impacts
-        return _Targets(points, radius, owner)
+        return points, owner
 
 
 @jax.jit
@@ -433,20 +387,19 @@ def _towards(
     scene: Scene,
     tips: Tips,
     points: Float[np.ndarray | Array, "points 2"],
-    radius: Float[np.ndarray | Array, " points"],
     *,
     impacts: int | Int[Array, ""],
 ) -> tuple[Tips, Int[Array, " lanes"]]:
-    """Return tips some impacts later, and the number of the point that each has come close enough to; -1: none."""
+    """Return tips some impacts later, and the number of the point that each is at; -1: none."""
     omega, top = scene.platform.angular_frequency, scene.platform.top_speed_nm_per_us
 
     def piece(tips: Tips) -> tuple[Tips, Array]:
         scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tips.time_us.shape, *leaf.shape)), scene)
-        end = lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now).end, tips)
+        end = lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now)[0], tips)
         turn = omega * end.time_us[:, None] - points[:, 0]
         turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
         square = turn**2 + (end.velocity_nm_per_us[:, None] / top - points[:, 1]) ** 2
-        near = (square < radius**2) & (radius > 0.0) & (end.outcome == Outcome.IMPACT)[:, None]
+        near = (square < _SAME**2) & (end.outcome == Outcome.IMPACT)[:, None]
         return end, jnp.where(near.any(axis=1), jnp.argmax(near, axis=1), -1)
 
     lanes = tips.time_us.shape[0]

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
@@ -32,14 +31,12 @@ from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
 from afm_jax.solve.lanes import LANES, Report, compiled_quickly, in_blocks
 from afm_jax.units import within_turn
 
-_STRETCHES, _MORE_STRETCHES = 512, 1024
-"""Stretches at most that are ramped side by side: one block of tips; two where that leaves long ones."""
-_LONG_STRETCH = 8
-"""Values: the shorter stretches are, the more often they are ramped again."""
-_PASSES = 40
-"""Times at most that stretches are ramped again."""
+_STRETCHES = LANES
+"""Stretches at most that are ramped side by side: one block of tips."""
+_LONGEST_AGAIN = 320
+"""Values at most over which a stretch goes on."""
 _FEW = 16
-"""Lanes of a block of laws unless there are more than fill a whole one."""
+"""Lanes of a block of laws."""
 _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 _LISTED = 6
@@ -50,8 +47,8 @@ _NONE_WENT_ON = (
 
 
 @public_result(picture="afm_jax.plots.dynamics:bifurcation_figure")
-class Sweep(ResultTuple):
-    """A sweep of a parameter, arrays of one row a value, in the order of the values.
+class BifurcationDiagram(ResultTuple):
+    """What motions come to along a parameter that is ramped one way, arrays of one row a value, by rising value.
 
     Attributes:
         values: of the parameter, ascending.
@@ -65,7 +62,7 @@ class Sweep(ResultTuple):
         height_nm: heights of the platform when the tip arrives.
         strobe_height_nm: the tip's height whenever the drive's phase is 0 (the platform, if it moves, is highest),
             (values, drive periods), of the last ones.
-        complete: False where stretches were still being ramped again when there were enough.
+        complete: False where stretches still went on when they had been ramped over the most values.
         verdict_probability: at each value the fraction of drawn laws with this verdict; None: no laws were drawn.
     """
 
@@ -137,7 +134,7 @@ class Ramps(NamedTuple):
     """What `afm-jax bifurcation` tells: a parameter, by its path, that is ramped up, down or both ways."""
 
     parameter: str
-    sweeps: list[Sweep]
+    sweeps: list[BifurcationDiagram]
     impacts_each: int
     """Impacts at each value."""
 
@@ -194,7 +191,7 @@ def bifurcation_diagram(  # noqa: PLR0913
     impacts: int = 2000,
     accuracy: float = 1e-6,
     report: Report | None = None,
-) -> Sweep:
+) -> BifurcationDiagram:
     """Return the last impacts of the motion at each value of a parameter, which is ramped up or down.
 
     Args:
@@ -206,7 +203,7 @@ def bifurcation_diagram(  # noqa: PLR0913
         upward: from the lowest value to the highest, or the other way round.
         impacts: at each value; the last of them are recorded.
         accuracy: of resolved contacts, as for `simulate`.
-        report: told how many of how many values are done, in the first sweep of all.
+        report: told how many of how many values are done, in the first ramp.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
@@ -224,115 +221,96 @@ def bifurcation_diagram(  # noqa: PLR0913
     begin = None if start is None else seen.start(start_of(scenes, start))
     _, fresh = batch_and_tips(seen.scenes, begin)
     seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
-    swept, complete = _Sweeper(seen.scenes, fresh, impacts, accuracy).run(report)
-    restarted = np.append(False, swept.end.outcome[:-1] != Outcome.IMPACT)
+    ramped, complete = _ramped(seen.scenes, fresh, impacts, accuracy, report)
+    restarted = np.append(False, ramped.end.outcome[:-1] != Outcome.IMPACT)
     order = slice(None) if upward else slice(None, None, -1)
-    seen, platform, swept, restarted = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept, restarted))
+    seen, platform, ramped, restarted = _rows_of((seen, scenes.platform, ramped, restarted), order)
     seen, platform = jax.tree.map(jnp.asarray, (seen, platform))
-    return _sweep_of(seen, platform, swept, restarted, ordered, upward=upward, complete=complete)
+    record, verdicts = ramped.record, ramped.verdicts
+    period = np.asarray(seen.scenes.platform.period_us)
+    # of an orbit its last impacts, each point once
+    shown = (verdicts.impacts[:, None] == 0) | (np.arange(RECORDED, 0, -1) <= verdicts.impacts[:, None])
+
+    def known(part: np.ndarray) -> np.ndarray:
+        return np.where(shown, part, np.nan)
+
+    # in the lab the platform is another one than the frame's
+    amplitude, offset, ahead = (
+        np.asarray(part)[:, None] for part in (platform.amplitude_nm, platform.offset_nm, seen.frame.phase_rad)
+    )
+    omega, response = 2.0 * np.pi / period[:, None], np.asarray(seen.response(record.departure_us)[1])
+    return BifurcationDiagram(
+        values=ordered,
+        upward=upward,
+        verdicts=verdicts,
+        restarted=restarted,
+        phase_rad=known(within_turn(omega * record.departure_us + ahead, 2.0 * np.pi)),
+        approach_nm_per_us=known(record.approach_nm_per_us),
+        velocity_after_nm_per_us=known(record.velocity_after_nm_per_us + response),
+        height_nm=known(offset + amplitude * np.cos(omega * record.arrival_us + ahead)),
+        strobe_height_nm=_strobes(seen, record, shown, period),
+        complete=complete,
+    )
 
 
-class _SweptRows(NamedTuple):
-    """Of every value, arrays with a leading axis of values."""
+class _Ramped(NamedTuple):
+    """What motions come to at values in the order of the ramp, arrays with a leading axis of values."""
 
     end: Tips
     record: Record
     verdicts: Verdicts
 
 
-class _Sweeper:
-    """Sweeps of the same scenes in stretches; the scenes are in the order in which they are ramped."""
+def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: Report | None) -> tuple[_Ramped, bool]:
+    """Return what tips come to at all values, and whether no stretch was left to go on.
 
-    def __init__(self, scenes: Scene, fresh: Tips, impacts: int, accuracy: float):
-        self.scenes, self.fresh, self.impacts, self.accuracy = scenes, fresh, impacts, accuracy
-        self.count = len(scenes.platform.frequency_khz)
-        self.period_us = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
-        shortest, longest = (-(-self.count // most) for most in (_MORE_STRETCHES, _STRETCHES))
-        self.stretch = max(shortest, min(longest, _LONG_STRETCH))
-        self.lanes = -(-self.count // self.stretch)
+    Args:
+        scenes: at the values, in the order of the ramp.
+        fresh: tips that begin there.
+        impacts: at each value.
+        accuracy: of resolved contacts.
+        report: told how many of how many values are done.
+    """
+    count = len(fresh.time_us)
+    length = -(-count // _STRETCHES)
+    starts = np.arange(0, count, length)
+    rows = _motions(_rows_of(scenes, starts), _rows_of(fresh, starts), impacts, accuracy)
+    ramped = jax.tree.map(lambda part: np.empty((count, *part.shape[1:]), part.dtype), rows)
+    _write(ramped, starts, rows)
 
-    def run(self, report: Report | None) -> tuple[_SweptRows, bool]:
-        """Return the sweep of all values, and whether nothing was left to be ramped again.
+    def motions(numbers: np.ndarray) -> _Ramped:
+        before = _rows_of((scenes, ramped.end), numbers - 1)
+        at, begin = _rows_of((scenes, fresh), numbers)
+        return _motions(at, carried(before[0], at, begin, before[1]), impacts, accuracy)
 
-        Args:
-            report: told how many of how many values are done.
-        """
-        parts, changed = self._sweep(report), np.arange(self.lanes)
-        for _ in range(_PASSES):
-            changed = self._swept_again(parts, changed[changed + 1 < self.lanes] + 1)
-            if not changed.size:
-                return self._joined(parts), True
-        return self._joined(parts), False
+    for place in range(1, length):
+        if report is not None:
+            report(min(place * len(starts), count), count)
+        numbers = starts[starts + place < count] + place
+        _write(ramped, numbers, motions(numbers))
+    numbers = starts[1:]
+    for _ in range(_LONGEST_AGAIN):
+        if not numbers.size:
+            break
+        rows = motions(numbers)
+        differs = ~_same(rows, _rows_of(ramped, numbers))
+        _write(ramped, numbers[differs], _rows_of(rows, differs))
+        numbers = numbers[differs & (numbers + 1 < count)] + 1
+    return ramped, not numbers.size
 
-    def _numbers(self, lanes: np.ndarray) -> np.ndarray:
-        """Return the numbers of the values of stretches; the last stretch ends with its last value again and again."""
-        return np.minimum(lanes[:, None] * self.stretch + np.arange(self.stretch), self.count - 1)
 
-    def _joined(self, parts: list[_SweptRows]) -> _SweptRows:
-        def join(*columns: np.ndarray) -> np.ndarray:
-            return np.stack(columns, axis=1).reshape(self.lanes * self.stretch, *columns[0].shape[1:])[: self.count]
+def _motions(scenes: Scene, tips: Tips, impacts: int, accuracy: float) -> _Ramped:
+    """Return what tips come to, one at each value."""
 
-        return jax.tree.map(join, *parts)
+    def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
+        return follow(*lanes, skip=impacts - RECORDED, record=RECORDED, accuracy=accuracy)
 
-    def _at(self, numbers: np.ndarray) -> tuple[Scene, Tips]:
-        """Return the scenes of values, and the tips that begin there."""
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), (self.scenes, self.fresh))
-
-    def _sweep(self, report: Report | None) -> list[_SweptRows]:
-        """Return what comes out at the first, second, ... value of all stretches."""
-        lanes, parts = np.arange(self.lanes), []
-        tips = jax.tree.map(lambda leaf: leaf[self._numbers(lanes)[:, 0]], self.fresh)
-        for place in range(self.stretch):
-            if place:
-                tips = self._carried(parts, lanes, place)
-            parts.append(self._follow(self._numbers(lanes)[:, place], tips))
-            if report is not None:
-                report(min((place + 1) * self.lanes, self.count), self.count)
-        return parts
-
-    def _swept_again(self, parts: list[_SweptRows], lanes: np.ndarray) -> np.ndarray:
-        """Ramp stretches again from the ends of those before them, each for as long as that makes a difference.
-
-        Args:
-            parts: what came out at the first, second, ... value of all stretches; what differs is written over.
-            lanes: the stretches.
-
-        Returns:
-            The stretches whose end became another one.
-        """
-        for place in range(self.stretch):
-            if not lanes.size:
-                break
-            tips = self._carried(parts, lanes, place)
-            now, then = self._follow(self._numbers(lanes)[:, place], tips), _rows_of(parts[place], lanes)
-            differs = ~_same(now, then)
-            lanes = lanes[differs]
-            for part, rows in zip(jax.tree.leaves(parts[place]), jax.tree.leaves(now), strict=True):
-                part[lanes] = rows[differs]
-        return lanes
-
-    def _carried(self, parts: list[_SweptRows], lanes: np.ndarray, place: int) -> Tips:
-        """Return the tips of the value before at a value of stretches; before the first one ends another stretch."""
-        before, rows = (parts[place - 1], lanes) if place else (parts[-1], lanes - 1)
-        old, new = self._numbers(rows)[:, place - 1], self._numbers(lanes)[:, place]
-        tips = carried(self._at(old)[0], *self._at(new), _rows_of(before.end, rows))
-        return jax.tree.map(np.asarray, tips)
-
-    def _follow(self, numbers: np.ndarray, tips: Tips) -> _SweptRows:
-        """Return what tips come to, one at each value."""
-
-        def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
-            return follow(*lanes, skip=self.impacts - RECORDED, record=RECORDED, accuracy=self.accuracy)
-
-        scenes, _ = self._at(numbers)
-        if isinstance(scenes.interaction, Contact):
-            end, record = in_blocks(work, (scenes, tips))
-        else:
-            width = LANES if len(numbers) > LANES else _FEW
-            program = (follow, self.impacts, self.accuracy)
-            end, record = in_blocks(work, (scenes, tips), block=width, widths=(width,), program=program)
-        period = self.period_us[numbers]
-        return _SweptRows(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
+    if isinstance(scenes.interaction, Contact):
+        end, record = in_blocks(work, (scenes, tips))
+    else:
+        end, record = in_blocks(work, (scenes, tips), block=_FEW, widths=(_FEW,), program=(follow, impacts))
+    period = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
+    return _Ramped(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
 
 
 @jax.jit
@@ -361,55 +339,20 @@ def _rows_of(tree: Any, rows: Any) -> Any:
     return jax.tree.map(lambda part: part[rows], tree)
 
 
-def _same(one: _SweptRows, other: _SweptRows) -> Bool[np.ndarray, " lanes"]:
+def _write(tree: Any, rows: np.ndarray, values: Any) -> None:
+    for part, new in zip(jax.tree.leaves(tree), jax.tree.leaves(values), strict=True):
+        part[rows] = new
+
+
+def _same(one: _Ramped, other: _Ramped) -> Bool[np.ndarray, " lanes"]:
     """Say which motions are the same: of one kind, and orbits through the same points."""
     a, b = one.verdicts, other.verdicts
     same = (a.kind == b.kind) & (a.impacts == b.impacts) & (a.periods == b.periods)
     for lane in np.flatnonzero(same & (a.kind == MotionKind.ORBIT)):
         m = a.impacts[lane]
-        points = [np.sort(swept.record.approach_nm_per_us[lane, -m:]) for swept in (one, other)]
+        points = [np.sort(each.record.approach_nm_per_us[lane, -m:]) for each in (one, other)]
         same[lane] = np.max(np.abs(points[0] - points[1])) <= _SAME * max(np.max(points[1]), 1e-12)
     return same
-
-
-def _sweep_of(
-    seen: SampleDriven,
-    platform: Platform,
-    swept: _SweptRows,
-    restarted: Bool[np.ndarray, " values"],
-    values: Float[np.ndarray, " values"],
-    *,
-    upward: bool,
-    complete: bool,
-) -> Sweep:
-    """Return the rows as they are in the lab, where the platform is another one than the frame's."""
-    record, verdicts = swept.record, swept.verdicts
-    period = np.asarray(seen.scenes.platform.period_us)
-    # of an orbit its last impacts, each point once
-    number = np.arange(RECORDED, 0, -1)
-    shown = (verdicts.impacts[:, None] == 0) | (number <= verdicts.impacts[:, None])
-
-    def known(part: np.ndarray) -> np.ndarray:
-        return np.where(shown, part, np.nan)
-
-    amplitude, offset, ahead = (
-        np.asarray(part)[:, None] for part in (platform.amplitude_nm, platform.offset_nm, seen.frame.phase_rad)
-    )
-    turn = 2.0 * np.pi / period[:, None]
-    return Sweep(
-        values=values,
-        upward=upward,
-        verdicts=verdicts,
-        restarted=restarted,
-        phase_rad=known(within_turn(turn * record.departure_us + ahead, 2.0 * np.pi)),
-        approach_nm_per_us=known(record.approach_nm_per_us),
-        velocity_after_nm_per_us=known(
-            record.velocity_after_nm_per_us + np.asarray(seen.response(record.departure_us)[1])
-        ),
-        height_nm=known(offset + amplitude * np.cos(turn * record.arrival_us + ahead)),
-        strobe_height_nm=_strobes(seen, record, shown, period),
-        complete=complete,
-    )
 
 
 _STROBE_IMPACTS, _STROBES = 48, 8

@@ -6,6 +6,7 @@ judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 a
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -74,20 +75,16 @@ def orbit_verdicts(
     """
     seen = sample_driven(scenes)
     if isinstance(scenes.interaction, Contact):
-        numbers = single_contact_orbits(seen, range(first_order, last_order + 1), report=report)
-        return OrbitVerdicts(**{name: column.T for name, column in numbers.items()})
+        return OrbitVerdicts(**single_contact_orbits(seen, range(first_order, last_order + 1), report=report))
     orders = jnp.arange(first_order, last_order + 1, dtype=float)
-    table = isinstance(scenes.interaction, TabulatedLaw)
+    names = ("peak_amplitude_nm", "largest_multiplier")
+    if isinstance(scenes.interaction, TabulatedLaw):
+        names = (*names, "approach_speed_nm_per_us")
 
     def work(part: SampleDriven) -> OrbitVerdicts:
-        orbits = highest_orbits(part.scenes, part.frame, orders)
-        return OrbitVerdicts(
-            stable=orbits["stable_orbits"] > 0,
-            admissible=orbits["admissible_orbits"] > 0,
-            peak_amplitude_nm=orbits["peak_amplitude_nm"],
-            largest_multiplier=orbits["largest_multiplier"],
-            approach_speed_nm_per_us=orbits["approach_speed_nm_per_us"] if table else None,
-        )
+        orbits = highest_orbits(part.scenes, part.frame, orders, names=names)
+        numbers = {name: orbits[name] for name in names}
+        return OrbitVerdicts(orbits["stable_orbits"] > 0, orbits["admissible_orbits"] > 0, **numbers)
 
     return jax.tree.map(
         np.transpose, in_blocks(work, seen, block=_LANES, report=report, program=(orbit_verdicts, len(orders)))
@@ -110,22 +107,23 @@ _ORBITS_AT_ONCE = 2
 """Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
 
-@jax.jit
+@partial(jax.jit, static_argnames=("names",))
 def highest_orbits(
-    scenes: Scene, frame: FreeFrame, orders: Float[Array, " orders"]
+    scenes: Scene, frame: FreeFrame, orders: Float[Array, " orders"], *, names: tuple[str, ...] = ORBIT_NUMBERS
 ) -> dict[str, Shaped[Array, "lanes orders"]]:
     """Return of a block of scenes, for each order, how many orbits there are, and the highest stable one's numbers.
+
+    Only the numbers that are asked for are computed.
 
     Args:
         scenes: a batch of scenes with a law.
         frame: of each scene, a batch.
         orders: N.
+        names: some of `ORBIT_NUMBERS` and, where base or force drive, `DRIVEN_NUMBERS`.
 
     Returns:
-        ``stable_orbits``, ``admissible_orbits``, `ORBIT_NUMBERS` and, where base or force drive, `DRIVEN_NUMBERS`, NaN
-        where no orbit is stable.
+        ``stable_orbits``, ``admissible_orbits``, and the numbers by their names, NaN where no orbit is stable.
     """
-    names = ORBIT_NUMBERS[:-1] + (() if frame.response is None else DRIVEN_NUMBERS)
 
     def problem_of(scene: Scene, own_frame: FreeFrame, order: Array) -> OrbitProblem:
         return orbit_problem(scene.cantilever, own_frame.platform, impact_law_of(scene), order)
@@ -141,7 +139,8 @@ def highest_orbits(
             # a pair on a circle has the root of the determinant for its size
             pair = jnp.sqrt(jnp.abs(determinant))
             size = jnp.where(inside > 0.0, half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0)), pair)
-            numbers = jnp.stack([*(getattr(orbit, name) for name in names), size])
+            wanted = [size if name == "largest_multiplier" else getattr(orbit, name) for name in names]
+            numbers = jnp.stack([orbit.peak_amplitude_nm, *wanted])
             return orbit.admissible, orbit.admissible & orbit.stable, numbers
 
         roots = jax.vmap(lambda scene, own_frame: find_roots(problem_of(scene, own_frame, order)))(scenes, frame)
@@ -161,7 +160,7 @@ def highest_orbits(
             "stable_orbits": steady.sum(axis=1, dtype=jnp.int8),
             "admissible_orbits": admissible.sum(axis=1, dtype=jnp.int8),
         }
-        return counts | {name: chosen[:, column] for column, name in enumerate((*names, ORBIT_NUMBERS[-1]))}
+        return counts | {name: chosen[:, column] for column, name in enumerate(names, 1)}
 
     return jax.tree.map(jnp.transpose, lax.map(of_order, orders))
 
@@ -283,19 +282,15 @@ class StabilityChart(Result):
             f"several orders are stable at {100.0 * told['several_stable_share']:.4g} % of the points",
         ]
 
-    def arrays(self) -> dict[str, Shaped[np.ndarray, "orders points"]]:
-        """Return what a file holds of every order and point."""
-        names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
-        arrays = {name: getattr(self.verdicts, name) for name in names} | {"stable_probability": self.probability}
-        return {name: array for name, array in arrays.items() if array is not None}
-
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of chart.csv, a row a point."""
         x, y = ("x" if self.x is None else self.x.path, "y" if self.y is None else self.y.path)
         columns: dict[str, Any] = dict(zip((x, y), self.points(), strict=True))
         columns["lowest_stable_order"] = self.lowest_stable_order.ravel()
+        names = ("admissible", "stable", "peak_amplitude_nm", "largest_multiplier", "unresolved")
+        arrays = {name: getattr(self.verdicts, name) for name in names} | {"stable_probability": self.probability}
         for order in range(self.orders):
-            columns |= {f"{name}_{order + 1}": array[order] for name, array in self.arrays().items()}
+            columns |= {f"{name}_{order + 1}": array[order] for name, array in arrays.items() if array is not None}
         return {"chart.csv": columns}
 
     def _plane(self, rows: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.dynamics.impact_loop import FreeFlights, LoopFamily, LoopReading, driven_part, lowest_of_flights
+from afm_jax.dynamics.impact_loop import LoopFamily, LoopReading, driven_part, lowest_gap
 from afm_jax.dynamics.impact_orbits import (
     ManyImpactOrbits,
     check_loop,
@@ -30,21 +30,20 @@ from afm_jax.dynamics.impact_orbits import (
 )
 from afm_jax.dynamics.many_tips import next_contact, tips_after_contacts
 from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leaving_tips, sample_driven
+from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_flight, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import default_start, gap_of_departure
 from afm_jax.scenefile.parameter_paths import scene_family
-from afm_jax.solve.arclength import EquationsAt
+from afm_jax.solve.arclength import EquationsAt, PointInPlane
 from afm_jax.solve.lanes import Report, compiled_quickly, in_blocks
-from afm_jax.solve.newton import LinearisedRows, Newton, Roots, newton_rows, shortened
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows, shortened
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _STARTS = 8
 """Tips that are simulated for guesses, besides the one that starts where `simulate` does."""
-_GRID, _SPEEDS = (32, 24), (0.05, 20.0)
-"""Drive phases and rebound speeds that are tried for orbits of one contact; the speeds' ends, over `leaving_tips`'."""
 _SETTLING = 60
 """Contacts before their guesses."""
 _WINDOW = 0.05
@@ -128,8 +127,6 @@ def contact_loops(
     scene, order = flights.scene_at(*values), flights.order
     seen = sample_driven(scene)
     guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, seen, order, impacts, flights.accuracy)]
-    if impacts == 1:
-        guesses += [*_near_a_grid(seen, flights, values)]
     loops = _closed(np.array(guesses).reshape(-1, 2 * impacts), flights, values)
     return loops_told_apart(loops, order)
 
@@ -179,33 +176,6 @@ def _where_contact_ends(
     rise_us = (crossing[..., 0] - fraction) * after[1]
     speed = np.take_along_axis(np.asarray(velocity - surface_rate), crossing, axis=-1)[..., 0]
     return phases + omega * rise_us, speed
-
-
-def _near_a_grid(
-    seen: SampleDriven, flights: "ContactFlights", values: Float[np.ndarray, " parameters"]
-) -> Float[np.ndarray, "guesses 2"]:
-    """Return the departures of a grid of drive phases and rebound speeds that are within a cell of an orbit.
-
-    From these a step of Newton's method is not longer than the grid is wide there. The phases count from where the
-    surface that the free tip sees is highest.
-
-    Args:
-        seen: the scene.
-        flights: of the scene and its parameters.
-        values: of the parameters.
-    """
-    tip = leaving_tips(jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], seen.scenes))
-    usual = float(tip.velocity_nm_per_us[0] - seen.scenes.platform.velocity(tip.time_us)[0])
-    phase, across = np.linspace(0.0, 2.0 * np.pi, _GRID[0], endpoint=False, retstep=True)
-    speed = usual * np.geomspace(*_SPEEDS, _GRID[1])
-    grid = np.stack(np.meshgrid(phase + float(seen.frame.phase_rad), speed, indexing="ij"), axis=-1).reshape(-1, 2)
-    cell = np.stack([np.full(len(grid), across), grid[:, 1] * (speed[1] / speed[0] - 1.0)], axis=1)
-    near = []
-    for departure, width, flown in zip(grid, cell, flights.flown(grid, np.tile(values, (len(grid), 1))), strict=True):
-        if flown is not None:
-            step = np.linalg.lstsq(flown.slopes[:, :2], flown.gaps)[0]
-            near += [departure] if (np.abs(step) <= width).all() else []
-    return np.array(near).reshape(-1, 2)
 
 
 def _repetitions(scene: Scene, seen: SampleDriven, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
@@ -268,7 +238,7 @@ def _damped(loops: Float[np.ndarray, "loops n"], step: Float[np.ndarray, "loops 
 
 def single_contact_orbits(
     seen: SampleDriven, orders: Sequence[int], *, accuracy: float = CHART_ACCURACY, report: Report | None = None
-) -> dict[str, Shaped[np.ndarray, "lanes orders"]]:
+) -> dict[str, Shaped[np.ndarray, "orders lanes"]]:
     """Return which orbits of one contact there are at many scenes with a contact.
 
     Every orbit of the law with delay closest to the contact is a guess, from which Newton's method closes the simulated
@@ -278,92 +248,69 @@ def single_contact_orbits(
         seen: the scenes, a batch.
         orders: N.
         accuracy: of `simulate`.
-        report: told how many of how many orbits of the law have been followed.
+        report: told how far it is, in scenes.
 
     Returns:
         ``stable``, ``admissible`` and ``unresolved``, and of the stable orbit, the highest if there are several,
         ``peak_amplitude_nm`` and ``largest_multiplier``, NaN where there is none.
     """
-    guesses = _guesses_of_law(seen, orders)
-    count = len(guesses.lane)
-    scenes = jax.tree.map(np.asarray, seen)
+    laws = laws_of(jax.tree.map(jnp.asarray, seen.scenes))
+    of_orders, lanes = [], len(seen.scenes.platform.frequency_khz)
+    for number, order in enumerate(orders, 1):
+        of_orders.append(_of_one_order(seen, laws, order, accuracy))
+        if report is not None:
+            report(number * lanes // len(orders), lanes)
+    return {name: np.stack([columns[name] for columns in of_orders]) for name in of_orders[0]}
+
+
+def _of_one_order(
+    seen: SampleDriven, laws: tuple[Law, np.ndarray] | None, order: int, accuracy: float
+) -> dict[str, Shaped[np.ndarray, " lanes"]]:
+    """Return what `single_contact_orbits` returns, of one order; the laws closest to the contacts as of `laws_of`."""
+    scenes = jax.tree.map(jnp.asarray, seen.scenes)
+    lanes = len(scenes.platform.frequency_khz)
+    columns = {name: np.zeros(lanes, bool) for name in ("stable", "admissible", "unresolved")}
+    columns |= {name: np.full(lanes, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
+    if laws is None:
+        return columns
+    law, exists = laws
+    with_law, all_seen = np.flatnonzero(exists), jax.tree.map(np.asarray, seen)
+
+    def of_law(block: Scene) -> SingleImpactOrbits:
+        return jax.vmap(lambda scene: single_impact_orbits(scene, order))(block)
+
+    law_scenes = jax.tree.map(lambda leaf: leaf[with_law], Scene(scenes.cantilever, scenes.platform, law))
+    orbits = in_blocks(of_law, law_scenes, block=_CONTACTS_AT_ONCE)
+    row, slot = np.nonzero(orbits.exists & orbits.admissible)
+    lane, rebound = with_law[row], orbits.rebound_speed_nm_per_us[row, slot]
+    # a straight path to the gap at which contact ends
+    rise = np.asarray(scenes.platform.angular_frequency * gap_of_departure(scenes))
+    guesses = np.stack([orbits.phase_rad[row, slot] + rise[lane] / rebound, rebound], axis=1)
 
     def linearised(departures: Float[np.ndarray, "open 2"], rows: Int[np.ndarray, " open"]) -> LinearisedRows:
-        if report is not None:
-            report(count - len(rows), count)
-
         def work(block: tuple[SampleDriven, Array, Array, Array]) -> _Return:
             return _returns(*block, accuracy=accuracy)
 
-        flown = jax.tree.map(lambda leaf: leaf[guesses.lane[rows]], scenes), *departures.T, guesses.turn_rad[rows]
+        turns = np.full(len(rows), 2.0 * np.pi * order)
+        flown = jax.tree.map(lambda leaf: leaf[lane[rows]], all_seen), *departures.T, turns
         returns = in_blocks(work, flown, block=_CONTACTS_AT_ONCE)
         scale = np.stack([np.ones(len(rows)), departures[:, 1]], axis=1)
         details = np.stack([returns.trace, returns.determinant, returns.peak_amplitude_nm], axis=1)
         return LinearisedRows(returns.gaps / scale, returns.slopes / scale[:, :, None], list(details))
 
-    roots = newton_rows(linearised, np.stack([guesses.phase_rad, guesses.rebound_speed], axis=1), _CLOSING_A_CHART)
-    if report is not None and count:
-        report(count, count)
-    return _chart_columns(guesses, roots, (len(seen.scenes.platform.frequency_khz), len(orders)))
-
-
-class _Guesses(NamedTuple):
-    """Orbits of laws as guesses for orbits of contacts, one row each."""
-
-    lane: Int[np.ndarray, " guesses"]
-    """Number of the scene."""
-    column: Int[np.ndarray, " guesses"]
-    """Number of the order."""
-    phase_rad: Float[np.ndarray, " guesses"]
-    """At the departure from where contact ends."""
-    rebound_speed: Float[np.ndarray, " guesses"]
-    turn_rad: Float[np.ndarray, " guesses"]
-    """Drive phase that an orbit takes: 2 pi N."""
-
-
-def _guesses_of_law(seen: SampleDriven, orders: Sequence[int]) -> _Guesses:
-    """Return the admissible single-impact orbits of the laws closest to contacts, where these let the tip go."""
-    scenes = jax.tree.map(jnp.asarray, seen.scenes)
-    columns = [_Guesses(*[np.zeros(0, int)] * 2, *[np.zeros(0)] * 3)]
-    laws = laws_of(scenes)
-    law, exists = laws or (None, np.zeros(0, bool))
-    with_law = np.flatnonzero(exists)
-    law_scenes = jax.tree.map(lambda leaf: leaf[with_law], Scene(scenes.cantilever, scenes.platform, law))
-    rise = np.asarray(scenes.platform.angular_frequency * gap_of_departure(scenes))
-    for column, order in enumerate(orders if with_law.size else ()):
-
-        def work(block: Scene, order: int = order) -> SingleImpactOrbits:
-            return jax.vmap(lambda scene: single_impact_orbits(scene, order))(block)
-
-        orbits = in_blocks(work, law_scenes, block=_CONTACTS_AT_ONCE)
-        row, slot = np.nonzero(orbits.exists & orbits.admissible)
-        rebound, lane = orbits.rebound_speed_nm_per_us[row, slot], with_law[row]
-        # a straight path to the gap at which contact ends
-        phase = orbits.phase_rad[row, slot] + rise[lane] / rebound
-        columns.append(
-            _Guesses(lane, np.full(len(row), column), phase, rebound, np.full(len(row), 2.0 * np.pi * order))
-        )
-    return _Guesses(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
-
-
-def _chart_columns(
-    guesses: _Guesses, roots: Roots, shape: tuple[int, int]
-) -> dict[str, Shaped[np.ndarray, "lanes orders"]]:
-    """Return what `single_contact_orbits` returns, from the closed orbits of single contacts."""
+    roots = newton_rows(linearised, guesses, _CLOSING_A_CHART)
     closed = np.flatnonzero(roots.converged)
     trace, determinant, peak = np.array([roots.details[row] for row in closed]).reshape(-1, 3).T
     multipliers = np.abs(multipliers_of(trace, determinant)[:, 0])
-    columns = {name: np.zeros(shape, bool) for name in ("stable", "admissible", "unresolved")}
-    columns |= {name: np.full(shape, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
-    columns["admissible"][guesses.lane[closed], guesses.column[closed]] = True
+    columns["admissible"][lane[closed]] = True
+    columns["unresolved"][lane[~roots.converged]] = True
+    columns["unresolved"] &= ~columns["admissible"]
     stable = np.flatnonzero(multipliers < 1.0)
     # the highest last: of several values for one place the last one stays
     stable = stable[np.argsort(peak[stable], kind="stable")]
-    place = guesses.lane[closed[stable]], guesses.column[closed[stable]]
+    place = lane[closed[stable]]
     columns["stable"][place] = True
     columns["peak_amplitude_nm"][place], columns["largest_multiplier"][place] = peak[stable], multipliers[stable]
-    columns["unresolved"][guesses.lane[~roots.converged], guesses.column[~roots.converged]] = True
-    columns["unresolved"] &= ~columns["admissible"]
     return columns
 
 
@@ -544,7 +491,7 @@ class ContactFlights:
         return [None if loop is None else self._reading(loop) for loop in self.flown(loops, values)]
 
     def _reading(self, flown: FlownLoop) -> LoopReading:
-        there, time, rebound = self._departures(flown)
+        there, time, rebound = self.departures(flown)
         loop, contacts, count = flown.loop, flown.contacts, len(rebound)
         height, rate = (np.asarray(part) for part in there.platform.position_and_velocity(time))
         ends, forms = float(gap_of_departure(there)), float(there.interaction.bridge_forms_nm)
@@ -566,51 +513,63 @@ class ContactFlights:
         )
         return LoopReading(*(jnp.asarray(part) for part in facts))
 
-    def readings_of_points(self, points: Float[np.ndarray, "points n"], family: LoopFamily) -> LoopReading:
-        """Return what there is to know of the loops at points of a curve (`solve`), NumPy arrays."""
-        readings = [reading for reading in self.readings(*family.loops_and_values(points)) if reading is not None]
-        if len(readings) < len(points):
-            raise ValueError("a loop that was closed does not fly")
-        return _stacked(readings, len(readings[0].phase_rad))
-
-    def _departures(self, flown: FlownLoop) -> tuple[Scene, np.ndarray, np.ndarray]:
+    def departures(self, flown: FlownLoop) -> tuple[Scene, np.ndarray, np.ndarray]:
         """Return the scene of a loop, its departure times in us and rebound speeds in nm/us."""
         phase, rebound = np.split(flown.loop, 2)
         there = self.scene_at(*flown.values)
         return there, phase / float(RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz), rebound
 
-    def linearised(self, point: Float[np.ndarray, " n"], family: LoopFamily) -> EquationsAt | None:
-        """Return the closing conditions at a point of a curve, and the test functions there; None where none flies.
+    def lowest_gap(self, flown: FlownLoop) -> float:
+        """Return the lowest point of a loop's flights above the gap at which the bridge forms, in nm times rad/us."""
+        lowest, omega = _lowest_gap(*self.departures(flown), flown.contacts.arrival_time_us)
+        return float(lowest * omega)
 
-        Args:
-            point: m phases in rad, m rebound speeds in the unit of speeds, the parameters as fractions of their ranges.
-            family: of the curve.
-        """
+
+class ContactLoops(LoopFamily):
+    """Loops of a scene with a contact, each of whose contacts is simulated."""
+
+    flights: ContactFlights = eqx.field(static=True, kw_only=True)
+
+    def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt | None:
+        """Return the closing conditions and the wanted test function at a point of a curve; None where none flies."""
         # the test function's derivatives are differences, which only lead to its root
         size = len(point)
-        around = [np.eye(size), -np.eye(size)] if family.test is not None else []
+        around = [np.eye(size), -np.eye(size)] if self.test is not None else []
         aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
-        flown = [loop for loop in self.flown(*family.loops_and_values(point + aside)) if loop is not None]
+        flown = [loop for loop in self.flights.flown(*self.loops_and_values(point + aside)) if loop is not None]
         if len(flown) < len(aside):
             return None
         here = flown[0]
-        units = family.units(len(here.loop) // 2)
-        value, slopes = here.gaps / units, here.slopes * np.concatenate([units, family.width]) / units[:, None]
-        if family.test is not None:
-            tests = np.array([self.tests(loop, family, grazing=family.test == _GRAZING)[family.test] for loop in flown])
+        units = self.units(len(here.loop) // 2)
+        value, slopes = here.gaps / units, here.slopes * np.concatenate([units, self.width]) / units[:, None]
+        if self.test is not None:
+            tests = np.array([self._tests(loop, grazing=self.test == _GRAZING)[self.test] for loop in flown])
             value = np.append(value, tests[0])
             slopes = np.vstack([slopes, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
         return EquationsAt(value, slopes, here)
 
-    def tests(self, flown: FlownLoop, family: LoopFamily, *, grazing: bool = True) -> np.ndarray:
+    def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
+        """Return the test functions at a point of a curve; of a simulated loop no delay is too long."""
+        return self._tests(solved.details), 0.0
+
+    def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
+        """Return the readings of the orbits at points of a curve, NumPy arrays."""
+        found = self.flights.readings(*self.loops_and_values(points))
+        readings = [reading for reading in found if reading is not None]
+        if len(readings) < len(points):
+            raise ValueError("a loop that was closed does not fly")
+        return _stacked(readings, len(readings[0].phase_rad))
+
+    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:  # noqa: ARG002
+        """Say no: a contact may capture."""
+        return False
+
+    def _tests(self, flown: FlownLoop, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `curves`; that of grazing NaN where it is not asked for."""
         trace, determinant = flown.trace_and_determinant
-        slowest = np.split(flown.loop, 2)[1].min() / float(family.speed_unit)
-        near = np.nan
-        if grazing:
-            lowest, omega = _lowest_gap(*self._departures(flown), flown.contacts.arrival_time_us)
-            near = float(lowest * omega) / float(family.speed_unit)
-        return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, [near, slowest])
+        near, slowest = self.flights.lowest_gap(flown) if grazing else np.nan, np.split(flown.loop, 2)[1].min()
+        speeds = np.array([near, slowest]) / float(self.speed_unit)
+        return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, speeds)
 
 
 @compiled_quickly()
@@ -622,6 +581,6 @@ def _lowest_gap(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array
     surface, _ = surface_of(scene)
     height, rate = surface.position_and_velocity(begin_us)
     contact, still = scene.interaction, jnp.zeros_like(begin_us)
-    flights = FreeFlights(begin_us, height + gap_of_departure(scene), rate + rebound, still, arrival_us - begin_us)
-    lowest = lowest_of_flights(scene.cantilever, surface, flights, _SAMPLES).gap_nm - contact.bridge_forms_nm
-    return lowest, scene.cantilever.angular_frequency
+    flights = begin_us, height + gap_of_departure(scene), rate + rebound, still, arrival_us - begin_us
+    lowest = lowest_gap(scene.cantilever, surface, flights, _SAMPLES)
+    return lowest - contact.bridge_forms_nm, scene.cantilever.angular_frequency

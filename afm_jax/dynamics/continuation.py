@@ -6,25 +6,26 @@ are located (`special_points`), which are followed through a second parameter in
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from rich.table import Table
 
 from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene, drive_of
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.columns import Cell, columns_of, printed_table, rows_of
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
+from afm_jax.dynamics.contact_orbits import ContactFlights, ContactLoops, contact_loops
 from afm_jax.dynamics.curves import (
     CAPTURE,
     CurveLeg,
     FollowedCurve,
-    family_of,
+    LawLoops,
     followed_both_ways,
     lies_on,
-    read_points,
     root_on,
     tested_by,
 )
@@ -40,14 +41,12 @@ from afm_jax.dynamics.special_points import (
     OrbitBranch,
     SpecialCurve,
     SpecialPoint,
-    captures_nothing,
     special_curves,
     special_points_of,
 )
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.results import columns_of as columns_of_record
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     check_ranges,
@@ -107,14 +106,8 @@ class Continuation(ResultTuple):
     """Standard errors of the parameter at the special points."""
 
     def points(self) -> list[dict[str, Any]]:
-        """Return a mapping for each point of the branches: the branch, the parameter, what is read of the orbit."""
-        rows = []
-        for number, branch in enumerate(self.branches):
-            columns = {name: array for name, (array, _) in columns_of_record(branch.reading).items() if array.ndim == 1}
-            for i, value in enumerate(branch.parameter.tolist()):
-                orbit = {name: array[i].item() for name, array in columns.items()}
-                rows.append({"branch": number, "parameter": value, **orbit})
-        return rows
+        """Return the rows of branches.csv, one a point."""
+        return rows_of(self.tables()["branches.csv"])
 
     @property
     def reason(self) -> str | None:
@@ -268,17 +261,16 @@ def continue_orbits(
     given = parse_range(given, counted=False)
     second = None if second is None else parse_range(second, counted=False)
     ranges = (given,) if second is None else (given, second)
-    driven = driven_part(scene)
+    driven_part(scene)
     _check(scene, order, impacts, ranges)
     if second is not None:
         value = parameter_values(scene)[second.path]
         if not second.low <= value <= second.high:
             raise ValueError(f"{second}: the range must hold the scene's own value, {value:g}, where the curves begin")
-    flights = ContactFlights(scene, order, (given.path,)) if isinstance(scene.interaction, Contact) else None
-    starts, rejected = _orbits_in_range(scene, order, impacts, given, flights)
+    family = _family(scene, order, ranges[:1])
+    starts, rejected = _orbits_in_range(scene, family, impacts, given)
     speed_unit = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
-    static = {"speed_unit": speed_unit, "samples": samples_for(scene, order, driven), "flights": flights}
-    family = family_of(scene, order, (given,), driven, **static)
+    family = replace(family, speed_unit=jnp.asarray(speed_unit))
     followed: list[FollowedCurve] = []
     for fraction, loop in starts:
         start = np.concatenate([loop[:impacts], loop[impacts:] / speed_unit, [fraction]])
@@ -292,7 +284,7 @@ def continue_orbits(
     )
     curves = ()
     if second is not None:
-        both = family_of(scene, order, ranges, driven, **static)
+        both = replace(_family(scene, order, ranges), speed_unit=family.speed_unit)
         curves = special_curves(special, both, second, parameter_values(scene)[second.path])
     return Continuation(order, impacts, given, second, branches, special, curves, rejected, family)
 
@@ -320,8 +312,18 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
                 raise ValueError(f"{given}: {problem}{hint}") from None
 
 
+def _family(scene: Scene, order: int, ranges: Sequence[ParameterRange]) -> LoopFamily:
+    """Return the loops of a scene over the ranges of some parameters; the unit of speeds is 1 nm/us."""
+    low, high = (jnp.asarray([getattr(given, end) for given in ranges]) for end in ("low", "high"))
+    paths, driven = tuple(given.path for given in ranges), driven_part(scene)
+    numbers = scene, jnp.asarray(float(order)), jnp.ones(()), low, high - low, paths, driven
+    if isinstance(scene.interaction, Contact):
+        return ContactLoops(*numbers, flights=ContactFlights(scene, order, paths))
+    return LawLoops(*numbers, samples_for(scene, order, driven))
+
+
 def _orbits_in_range(
-    scene: Scene, order: int, impacts: int, given: ParameterRange, flights: ContactFlights | None
+    scene: Scene, family: LoopFamily, impacts: int, given: ParameterRange
 ) -> tuple[list[tuple[float, np.ndarray]], int]:
     """Return orbits at some values in the range, and how many were left out as not admissible.
 
@@ -329,24 +331,25 @@ def _orbits_in_range(
     rebound speeds).
     """
     value = parameter_values(scene)[given.path]
-    tried = np.linspace(0.0, 1.0, (_VALUES_TRIED if impacts == 1 and flights is None else _FEWER_TRIED) + 2)[1:-1]
+    order, contact = int(family.order), isinstance(family, ContactLoops)
+    tried = np.linspace(0.0, 1.0, (_VALUES_TRIED if impacts == 1 and not contact else _FEWER_TRIED) + 2)[1:-1]
     # the middle first
     fractions = list(tried[np.argsort(np.abs(tried - 0.5), kind="stable")])
     if given.low <= value <= given.high:
         fractions = [(value - given.low) / (given.high - given.low), *fractions]
     if impacts == 0:
         return [(float(fractions[0]), np.zeros(0))], 0
-    family, orbits, rejected = scene_family(scene, given.path), [], 0
+    scene_at, orbits, rejected = scene_family(scene, given.path), [], 0
     one_cosine = all(part is None or part.second is None for part in (scene.platform, scene.base, scene.force))
     for fraction in fractions:
         value = given.low + (given.high - given.low) * fraction
-        if flights is not None:
-            loops = contact_loops(flights, np.array([value]), impacts)
+        if isinstance(family, ContactLoops):
+            loops = contact_loops(family.flights, np.array([value]), impacts)
         elif impacts == 1 and one_cosine:
-            loops, passing = _single_impact_loops(family(value), order)
+            loops, passing = _single_impact_loops(scene_at(value), order)
             rejected += passing
         else:
-            loops = many_impact_orbits(family(value), order, impacts).loops
+            loops = many_impact_orbits(scene_at(value), order, impacts).loops
         orbits += [(float(fraction), loop) for loop in loops]
     return orbits, rejected
 
@@ -368,10 +371,10 @@ def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:
     for place, legs in ((0, curve.behind), (-1, curve.ahead)):
         if ends[place] == "capture":
             points[place] = _before_capture(legs[-1], family)
-            if captures_nothing(points[place], family):
+            if family.captures_nothing(points[place]):
                 ends[place] = "no_speed"
     value = float(family.low[0]) + float(family.width[0]) * points[:, -1]
-    return OrbitBranch(value, points[:, :-1], read_points(points, family), (ends[0], ends[1]))
+    return OrbitBranch(value, points[:, :-1], family.readings(points), (ends[0], ends[1]))
 
 
 def _before_capture(leg: CurveLeg, family: LoopFamily) -> Float[np.ndarray, " n"]:

@@ -14,7 +14,7 @@ On curves in two parameters the test function is solved for together with the cl
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
     LoopFamily,
@@ -34,8 +33,8 @@ from afm_jax.dynamics.impact_loop import (
     reading_of,
     trace_and_determinant_of,
 )
-from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
-from afm_jax.solve.arclength import EquationsAt, point_in_plane
+from afm_jax.scenefile.parameter_paths import with_numbers
+from afm_jax.solve.arclength import EquationsAt, PointInPlane, point_in_plane
 from afm_jax.solve.derivatives import bracketed_root, largest
 from afm_jax.solve.lanes import compiled_quickly, in_blocks
 from afm_jax.solve.newton import Newton
@@ -68,24 +67,6 @@ _UNLIKE = 1e-3
 _SAME = 1e-5
 
 
-def family_of(
-    scene: Scene, order: int, ranges: Sequence[ParameterRange], driven: str, *, speed_unit: float = 1.0, **static: Any
-) -> LoopFamily:
-    """Return the loops of a scene over the ranges of some parameters.
-
-    Args:
-        scene: one scene.
-        order: N.
-        ranges: of the parameters.
-        driven: the part that sets the period.
-        speed_unit: unit of speeds in nm/us.
-        static: samples, test and flights of the family.
-    """
-    low, high = (jnp.asarray([getattr(given, end) for given in ranges]) for end in ("low", "high"))
-    paths, number = tuple(given.path for given in ranges), jnp.asarray(float(order))
-    return LoopFamily(scene, number, jnp.asarray(speed_unit), low, high - low, paths, driven, **static)
-
-
 def loop_at(fractions: Float[Array, " parameters"], family: LoopFamily) -> ImpactLoop:
     """Return the loop of a law scene where the parameters are at fractions of their ranges."""
     values = dict(zip(family.paths, family.low + family.width * fractions, strict=True))
@@ -101,7 +82,7 @@ def split_point(point: Array, family: LoopFamily) -> tuple[Array, Array]:
 def _tests(unknowns: Array, loop: ImpactLoop, family: LoopFamily) -> list[Array]:
     """Return the test functions in the order of `KINDS`, without dimension."""
     trace, determinant = trace_and_determinant_of(unknowns, loop)
-    near = nearest_approach(unknowns, loop, family.samples).gap_nm
+    near = nearest_approach(unknowns, loop, family.samples)
     if family.test == CAPTURE:
         near = jnp.minimum(near, _rise_when_captured(unknowns, loop))
     speeds = unknowns[unknowns.shape[0] // 2 :]
@@ -173,21 +154,8 @@ def _tests_and_delay(family: LoopFamily, point: Array) -> tuple[Array, Array]:
 
 def solved_point(guess: np.ndarray, normal: np.ndarray, family: LoopFamily) -> CurvePoint | None:
     """Return the point of a curve in the plane through a guess across a normal; None where no loop closes there."""
-    flights = family.flights
-
-    def linearised(point: np.ndarray) -> EquationsAt | None:
-        if flights is not None:
-            return flights.linearised(point, family)
-        return EquationsAt(*(np.asarray(part) for part in _linearised(family, jnp.asarray(point))))
-
-    point = point_in_plane(linearised, guess, normal, _CLOSING)
-    if point is None:
-        return None
-    if flights is None:
-        tests, delay = (np.asarray(part) for part in _tests_and_delay(family, jnp.asarray(point.x)))
-    else:
-        tests, delay = flights.tests(point.details, family), 0.0
-    return CurvePoint(point.x, point.tangent, tests, delay)
+    point = point_in_plane(family.linearised, guess, normal, _CLOSING)
+    return None if point is None else CurvePoint(point.x, point.tangent, *family.tests(point))
 
 
 @compiled_quickly()
@@ -199,11 +167,25 @@ def _read(family: LoopFamily, points: Array) -> LoopReading:
     return jax.vmap(reading_at)(points)
 
 
-def read_points(points: Float[np.ndarray, "points n"], family: LoopFamily) -> LoopReading:
-    """Return the readings of the orbits at points of a curve, NumPy arrays."""
-    if family.flights is not None:
-        return family.flights.readings_of_points(points, family)
-    return in_blocks(lambda block: _read(family, block), points, block=BLOCK, widths=())
+class LawLoops(LoopFamily):
+    """Loops of a scene with a law, all of whose flights are closed forms."""
+
+    def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt:
+        """Return the closing conditions and the wanted test function at a point of a curve."""
+        return EquationsAt(*(np.asarray(part) for part in _linearised(self, jnp.asarray(point))))
+
+    def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
+        """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods."""
+        tests, delay = _tests_and_delay(self, jnp.asarray(solved.x))
+        return np.asarray(tests), float(delay)
+
+    def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
+        """Return the readings of the orbits at points of a curve, NumPy arrays."""
+        return in_blocks(lambda block: _read(self, block), points, block=BLOCK, widths=())
+
+    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:
+        """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
+        return float(loop_at(split_point(jnp.asarray(point), self)[1], self).impact.lowest) == 0.0
 
 
 class CurveLeg(NamedTuple):

@@ -7,43 +7,34 @@ forgets its start: the map has rank one at the capture and rank zero after the r
 infinity. Near grazing the Jacobian grows without bound; such impacts are counted.
 """
 
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import (
-    MapStep,
-    Record,
-    Tips,
-    advance,
-    departure_jacobians,
-    record_of,
-    skipped,
-    tips_after_contacts,
-)
+from afm_jax.dynamics.impact_orbits import multipliers_of
+from afm_jax.dynamics.many_tips import Record, Tips, departure_jacobians, follow
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
-from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import ParameterRange
-from afm_jax.solve.lanes import Report, in_blocks
+from afm_jax.solve.lanes import LANES, WIDTHS, Report, in_blocks
 from afm_jax.words import counted, with_error
 
 _PARTS = 20
 """Parts of a motion whose means tell the errors."""
+_MOST_IMPACTS = 1_200_000
+"""Impacts recorded together: of long motions a block holds fewer."""
 _CONTACTS_AT_ONCE = 256
 """Contacts whose Jacobians are computed together."""
 _PUSH = 1e-3
@@ -211,19 +202,6 @@ def on_unstable_orbit(exponents: Lyapunov) -> Bool[np.ndarray, " lanes"]:
     return (exponents.verdicts.kind == MotionKind.ORBIT) & (larger > np.maximum(_GROWS, error))
 
 
-class _Sums(NamedTuple):
-    """Of a part of a motion, arrays of one lane a motion."""
-
-    growth: Float[Any, " lanes"]
-    """Sum of ln |J q|."""
-    determinant: Float[Any, " lanes"]
-    """Sum of ln |det J|."""
-    impacts: Float[Any, " lanes"]
-    time_us: Float[Any, " lanes"]
-    near_grazing: Float[Any, " lanes"]
-    rested: Float[Any, " lanes"]
-
-
 @checked
 def lyapunov_spectrum(
     scene: Scene,
@@ -257,183 +235,58 @@ def lyapunov_spectrum(
     single = scene.platform.frequency_khz.ndim == 0
     scenes, tips = batch_and_tips(seen.scenes, None if start is None else seen.start(start))
 
-    def spectrum_from(tips: Tips) -> Lyapunov:
-        if isinstance(scene.interaction, Contact):
-            return _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
-        return exponents_of_law(scenes, tips, impacts=impacts, transient=transient, report=report)
-
-    exponents = spectrum_from(tips)
+    lengths = {"impacts": impacts, "transient": transient, "accuracy": accuracy}
+    exponents = exponents_of(scenes, tips, **lengths, report=report)
     unstable = on_unstable_orbit(exponents)
     if unstable.any():
         # rounding may hold a tip on such an orbit for ever: no neighbour comes to it
         velocity = np.asarray(tips.velocity_nm_per_us)
         speed = velocity - np.asarray(jax.vmap(Platform.velocity)(scenes.platform, jnp.asarray(tips.time_us)))
-        exponents = spectrum_from(
-            tips._replace(velocity_nm_per_us=velocity + np.where(unstable, _PUSH * np.abs(speed), 0.0))
-        )
+        pushed = tips._replace(velocity_nm_per_us=velocity + np.where(unstable, _PUSH * np.abs(speed), 0.0))
+        exponents = exponents_of(scenes, pushed, **lengths)
     return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 
-def exponents_of_law(
-    scenes: Scene, tips: Tips, *, impacts: int, transient: int, report: Report | None = None
+def exponents_of(
+    scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float, report: Report | None = None
 ) -> Lyapunov:
-    """Return the exponents of motions in a batch of law scenes; arguments as for `lyapunov_spectrum`."""
+    """Return the exponents of motions in a batch of scenes; arguments as for `lyapunov_spectrum`."""
 
     def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
-        return _exponents_of_block(*lanes, impacts=impacts, transient=transient)
+        return _exponents_of_block(*lanes, impacts=impacts, transient=transient, accuracy=accuracy)
 
-    program = (_exponents_of_block, impacts, transient)
-    return in_blocks(work, (scenes, tips), report=report, program=program)
-
-
-def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:
-    """Return the exponents of contact scenes: the motion first, then the Jacobians of all its contacts at once."""
-    each = -(-impacts // _PARTS)
-    count = (_PARTS + 1) * each + 1
-    tips, record = tips_after_contacts(scenes, tips, skip=transient, record=max(count, RECORDED + 1), accuracy=accuracy)
-    period, lanes = np.asarray(scenes.platform.period_us), len(tips.time_us)
-    verdicts = verdicts_of(record, tips.outcome, period, tolerance=_ARRIVED)
-    departure, velocity = record.departure_us, record.velocity_after_nm_per_us
-    turns = record.departure_periods * period[:, None] + departure
-    passed = np.diff(turns, axis=1)
-    exists = np.isfinite(passed)
-    steps = passed.shape[1]
-    pairs = [np.where(exists, part, 0.0).ravel() for part in (departure[:, :-1], velocity[:, :-1], passed)]
-    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps, axis=0), scenes)
-
-    def work(rows: tuple[Scene, Array, Array, Array]) -> Array:
-        each_scene, time, speed, duration = rows
-        return departure_jacobians(each_scene, time, speed, time + duration, accuracy=accuracy)
-
-    slopes = in_blocks(work, (of_all, *pairs), block=_CONTACTS_AT_ONCE).reshape(lanes, steps, 2, 2)
-    unit = np.asarray(scenes.platform.angular_frequency * scenes.platform.top_speed_nm_per_us)
-    scale = np.stack([np.ones_like(unit), unit, 1.0 / unit, np.ones_like(unit)], axis=1).reshape(lanes, 1, 2, 2)
-    jacobians = np.moveaxis(np.where(exists[..., None, None], slopes * scale, np.eye(2)), 1, 0)
-    determinants = np.linalg.det(jacobians)
-    last = steps - (_PARTS + 1) * each
-    sums = _sums_of(
-        jacobians[last:], determinants[last:], exists.T[last:], np.where(exists, passed, 0.0).T[last:], each
-    )
-    flat = np.moveaxis(jacobians.reshape(steps, lanes, 4), 1, 2)
-    return _of_orbits(_of_sums(sums, verdicts, record.approach_nm_per_us[:, -RECORDED:]), flat, determinants, period)
+    if isinstance(scenes.interaction, Contact):
+        return work((scenes, tips))
+    block = max(1, min(LANES, _MOST_IMPACTS // impacts))
+    widths, program = [width for width in WIDTHS if width <= block], (work.__qualname__, impacts, transient)
+    return in_blocks(work, (scenes, tips), block=block, widths=widths, report=report, program=program)
 
 
-def _sums_of(
-    jacobians: np.ndarray, determinants: np.ndarray, exists: np.ndarray, passed: np.ndarray, each: int
-) -> _Sums:
-    """Return the sums of `_measured` from Jacobians that are known, the axis of impacts first."""
-    vector = np.broadcast_to([0.8, 0.6], (jacobians.shape[1], 2))
-    growth = np.zeros(exists.shape)
-    for number, matrix in enumerate(jacobians):
-        image = np.einsum("lij,lj->li", matrix, vector)
-        length = np.linalg.norm(image, axis=1)
-        length = np.where(length > 0.0, length, 1.0)
-        vector, growth[number] = image / length[:, None], np.log(length)
-    logs = np.log(np.where(exists & (determinants != 0.0), np.abs(determinants), 1.0))
-    parts = [growth, logs, exists.astype(float), passed, np.zeros(exists.shape), np.zeros(exists.shape)]
-    return _Sums(*(part.reshape(_PARTS + 1, each, -1).sum(axis=1)[1:] for part in parts))
+def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:
+    """Return the exponents of a block of motions: the motion first, then the Jacobians of all its impacts at once.
 
-
-def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int) -> Lyapunov:
-    """Return the exponents of a block of motions in law scenes: means over all impacts, of orbits the multipliers."""
-    each = -(-impacts // _PARTS)
-    tips = skipped(scenes, tips, impacts=transient)
-    tips, sums = _measured(scenes, tips, each=each)
-    tips, (record, jacobians, determinants) = _recorded(scenes, tips)
-    record = Record(*(np.asarray(part).T for part in record))
-    period = np.asarray(scenes.platform.period_us)
-    outcome = np.asarray(tips.outcome)
-    verdicts = verdicts_of(record, outcome, period, tolerance=_ARRIVED)
-    means = _of_sums(_Sums(*(np.asarray(part) for part in sums)), verdicts, record.approach_nm_per_us)
-    return _of_orbits(means, np.asarray(jacobians), np.asarray(determinants), period)
-
-
-@partial(jax.jit, static_argnames=("each",))
-def _measured(scenes: Scene, tips: Tips, *, each: int) -> tuple[Tips, _Sums]:
-    """Return tips later, and the sums of parts of `each` impacts; before them a part turns the tangent vectors."""
-    none = jnp.zeros_like(tips.time_us)
-    begin = _Sums(none, none, none, none, none, none)
-
-    def impact(_, state):
-        tips, vector, sums = state
-        step = advance(scenes, tips)
-        jacobian, determinant, landed = _jacobian(scenes, step)
-        a, b = vector
-        image = jacobian[0] * a + jacobian[1] * b, jacobian[2] * a + jacobian[3] * b
-        square = image[0] ** 2 + image[1] ** 2
-        counts = landed & ~step.rested & (square > 0.0)
-        growth = 0.5 * jnp.log(jnp.where(counts, square, 1.0))
-        length = jnp.sqrt(jnp.where(counts, square, 1.0))
-        vector = tuple(jnp.where(counts, new / length, old) for new, old in zip(image, vector, strict=True))
-        end = step.end
-        passed = (end.periods - tips.periods) * scenes.platform.period_us + end.time_us - tips.time_us
-        more = _Sums(
-            growth,
-            jnp.log(jnp.where(counts, jnp.abs(determinant), 1.0)),
-            landed.astype(none.dtype),
-            jnp.where(landed, passed, 0.0),
-            (landed & step.impact.near_grazing).astype(none.dtype),
-            (landed & step.rested).astype(none.dtype),
-        )
-        return end, vector, jax.tree.map(jnp.add, sums, more)
-
-    def part_of_run(state, _):
-        tips, vector, sums = lax.fori_loop(0, each, impact, (*state, begin))
-        return (tips, vector), sums
-
-    one = jnp.ones_like(none)
-    (tips, _), sums = lax.scan(part_of_run, (tips, (0.8 * one, 0.6 * one)), length=_PARTS + 1)
-    return tips, jax.tree.map(lambda rows: rows[1:], sums)
-
-
-@jax.jit
-def _recorded(scenes: Scene, tips: Tips) -> tuple[Tips, tuple[Record, Array, Array]]:
-    """Return tips later, their impacts, Jacobians and determinants, with the axis of impacts first."""
-
-    def next_impacts(now: Tips, _: Any):
-        step = advance(scenes, now)
-        jacobian, determinant, _ = _jacobian(scenes, step)
-        return step.end, (record_of(scenes, step), jnp.stack(jacobian), determinant)
-
-    return lax.scan(next_impacts, tips, length=RECORDED)
-
-
-def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
-    """Return the map's Jacobian in drive phase and velocity over beta omega, its determinant, and whether it has one.
-
-    The determinant of a flight is known: -exp(-Omega T/Q) u_out/u_in, with the speeds at its start and end.
+    They are means over all impacts, of orbits the logarithms of the multipliers. A part of the motion before those that
+    count turns the tangent vectors.
     """
-    impact, start = step.impact, step.start
-    landed = (start.outcome == Outcome.IMPACT) & (step.end.outcome == Outcome.IMPACT)
-    arrival = jnp.where(landed, impact.arrival_time_us, start.time_us + scenes.platform.period_us)
-    before = jnp.where(landed, impact.velocity_before_nm_per_us, scenes.platform.velocity(arrival) - 1.0)
+    each = -(-impacts // _PARTS)
+    steps = (_PARTS + 1) * each
+    recorded = max(steps, RECORDED) + 1
+    tips, record = follow(scenes, tips, skip=max(transient - 1, 0), record=recorded, accuracy=accuracy)
+    period = np.asarray(scenes.platform.period_us)
+    last = Record(*(part[:, -RECORDED:] for part in record))
+    verdicts = verdicts_of(last, np.asarray(tips.outcome), period, tolerance=_ARRIVED)
+    jacobians, determinants, passed = _linearised(scenes, record, period, accuracy)
 
-    def jacobian_of(scene: Scene, time: Array, velocity: Array, arrival: Array, before: Array):
-        cantilever, platform = scene.cantilever, scene.platform
-        law = impact_law_of(scene)
-        flight = flight_jacobian(cantilever, platform, time, velocity, arrival)
-        contact = contact_jacobian(law, cantilever, platform, arrival, before)
-        damped = jnp.exp(-2.0 * cantilever.decay_rate * (arrival - time))
-        ratio = (velocity - platform.velocity(time)) / (before - platform.velocity(arrival))
-        determinant = damped * ratio * (contact[0, 0] * contact[1, 1] - contact[0, 1] * contact[1, 0])
-        (a, b), (c, d) = contact
-        (e, f), (g, h) = flight
-        unit = platform.angular_frequency * platform.top_speed_nm_per_us
-        return (a * e + b * g, (a * f + b * h) * unit, (c * e + d * g) / unit, c * f + d * h), determinant
+    def parts(of_impacts: np.ndarray) -> Shaped[np.ndarray, "parts lanes"]:
+        return of_impacts[:, -steps:].reshape(len(period), _PARTS + 1, each).sum(axis=2).T[1:]
 
-    jacobian, determinant = jax.vmap(jacobian_of)(scenes, start.time_us, start.velocity_nm_per_us, arrival, before)
-    return jacobian, determinant, landed
-
-
-def _of_sums(sums: _Sums, verdicts: Verdicts, approach: Float[np.ndarray, "lanes last"]) -> Lyapunov:
-    """Return the exponents as means over all impacts."""
-    impacts = sums.impacts.sum(axis=0)
-    enough = (sums.impacts > 0).all(axis=0)
-    kind = verdicts.kind
-    rested = sums.rested.sum(axis=0)
-    forgotten = (kind == MotionKind.STUCK) | (rested > 0)
-    measured = enough & ~forgotten & np.isin(kind, (MotionKind.ORBIT, MotionKind.IRREGULAR))
-    logs = np.stack([sums.growth, sums.determinant - sums.growth], axis=-1)
+    growth = parts(_growth_of(jacobians[:, -steps:]))
+    determinant = parts(np.log(np.abs(determinants)))
+    made, time_us = parts(np.isfinite(passed)), parts(np.nan_to_num(passed))
+    rested = parts(record.rested[:, 1:]).sum(axis=0)
+    forgotten = (verdicts.kind == MotionKind.STUCK) | (rested > 0)
+    measured = (made > 0).all(axis=0) & ~forgotten & np.isin(verdicts.kind, (MotionKind.ORBIT, MotionKind.IRREGULAR))
+    logs = np.stack([growth, determinant - growth], axis=-1)
 
     def mean_and_error(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         total = np.where(measured, weight.sum(axis=0), 1.0)[:, None]
@@ -445,51 +298,131 @@ def _of_sums(sums: _Sums, verdicts: Verdicts, approach: Float[np.ndarray, "lanes
         mean = np.where(measured[:, None], mean, np.where(forgotten[:, None], -np.inf, np.nan))
         return mean, np.where(measured[:, None], error, np.where(forgotten[:, None], 0.0, np.nan))
 
-    per_impact, per_us = mean_and_error(sums.impacts), mean_and_error(sums.time_us)
-    determinant = sums.determinant.sum(axis=0) / np.where(measured, impacts, 1.0)
-    return Lyapunov(
+    per_impact, per_us = mean_and_error(made), mean_and_error(time_us)
+    mean_determinant = determinant.sum(axis=0) / np.where(measured, made.sum(axis=0), 1.0)
+    means = Lyapunov(
         exponents_per_impact=per_impact[0],
         exponents_per_us=per_us[0],
         exponents_per_impact_error=per_impact[1],
         exponents_per_us_error=per_us[1],
-        mean_log_determinant=np.where(measured, determinant, np.where(forgotten, -np.inf, np.nan)),
-        impacts=impacts.astype(int),
-        near_grazing=sums.near_grazing.sum(axis=0).astype(int),
-        rested=rested.astype(int),
+        mean_log_determinant=np.where(measured, mean_determinant, np.where(forgotten, -np.inf, np.nan)),
+        impacts=made.sum(axis=0),
+        near_grazing=parts(record.near_grazing[:, 1:]).sum(axis=0),
+        rested=rested,
         verdicts=verdicts,
-        approach_speed_nm_per_us=approach,
+        approach_speed_nm_per_us=last.approach_nm_per_us,
     )
+    return _of_orbits(means, jacobians, determinants, period)
 
 
-def _of_orbits(means: Lyapunov, jacobians: np.ndarray, determinants: np.ndarray, period: np.ndarray) -> Lyapunov:
+def _linearised(
+    scenes: Scene, record: Record, period_us: Float[np.ndarray, " lanes"], accuracy: float
+) -> tuple[Float[np.ndarray, "lanes steps 2 2"], Float[np.ndarray, "lanes steps"], Float[np.ndarray, "lanes steps"]]:
+    """Return the map's Jacobians between recorded impacts, their determinants, and the times in us in between.
+
+    The coordinates are drive phase and velocity over beta omega. Where there is no impact, or the tip rested before its
+    departure, the Jacobian is 1.
+    """
+    departure, velocity = record.departure_us[:, :-1], record.velocity_after_nm_per_us[:, :-1]
+    before = record.departure_periods[:, :-1]
+    passed, flown = (
+        (periods[:, 1:] - before) * period_us[:, None] + time[:, 1:]
+        for periods, time in (
+            (record.departure_periods, record.departure_us),
+            (record.arrival_periods, record.arrival_us),
+        )
+    )
+    there = np.isfinite(passed)
+    # both count from the beginning of the period of the departure
+    rows = [
+        np.where(there, part, 0.0) for part in (departure, velocity, passed, flown, record.approach_nm_per_us[:, 1:])
+    ]
+    if isinstance(scenes.interaction, Contact):
+        steps = there.shape[1]
+        of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps, axis=0), scenes)
+
+        def work(lanes: tuple[Scene, Array, Array, Array]) -> Array:
+            return departure_jacobians(*lanes, accuracy=accuracy)
+
+        flat = (of_all, *(part.ravel() for part in rows[:3]))
+        jacobians = in_blocks(work, flat, block=_CONTACTS_AT_ONCE).reshape(*there.shape, 2, 2)
+        determinants = np.linalg.det(jacobians)
+    else:
+        jacobians, determinants = map(np.asarray, _impact_jacobians(scenes, *rows[:2], *rows[3:]))
+    unit = np.asarray(scenes.platform.angular_frequency * scenes.platform.top_speed_nm_per_us)
+    scale = np.stack([np.ones_like(unit), unit, 1.0 / unit, np.ones_like(unit)], axis=1).reshape(-1, 1, 2, 2)
+    counts = there & ~record.rested[:, 1:]
+    jacobians = np.where(counts[..., None, None], jacobians * scale, np.eye(2))
+    return jacobians, np.where(counts & (determinants != 0.0), determinants, 1.0), passed - departure
+
+
+@jax.jit
+def _impact_jacobians(
+    scenes: Scene,
+    departure_us: Float[Array, "lanes steps"],
+    velocity_nm_per_us: Float[Array, "lanes steps"],
+    arrival_us: Float[Array, "lanes steps"],
+    approach_nm_per_us: Float[Array, "lanes steps"],
+) -> tuple[Float[Array, "lanes steps 2 2"], Float[Array, "lanes steps"]]:
+    """Return the Jacobians of the impact map in time and velocity, and their determinants.
+
+    The determinant of a flight is known: -exp(-Omega T/Q) u_out/u_in, with the speeds at its start and end.
+    """
+
+    def jacobian_of(scene: Scene, time: Array, velocity: Array, arrival: Array, approach: Array) -> tuple[Array, Array]:
+        cantilever, platform = scene.cantilever, scene.platform
+        flight = flight_jacobian(cantilever, platform, time, velocity, arrival)
+        before = platform.velocity(arrival) - approach
+        contact = contact_jacobian(impact_law_of(scene), cantilever, platform, arrival, before)
+        damped = jnp.exp(-2.0 * cantilever.decay_rate * (arrival - time))
+        ratio = (platform.velocity(time) - velocity) / approach
+        determinant = damped * ratio * (contact[0, 0] * contact[1, 1] - contact[0, 1] * contact[1, 0])
+        # products and a sum: under `vmap` a matrix product of this size costs ten times as much
+        return jnp.sum(contact[:, :, None] * flight, axis=1), determinant
+
+    over_impacts = jax.vmap(jacobian_of, in_axes=(None, 0, 0, 0, 0))
+    return jax.vmap(over_impacts)(scenes, departure_us, velocity_nm_per_us, arrival_us, approach_nm_per_us)
+
+
+def _growth_of(jacobians: Float[np.ndarray, "lanes steps 2 2"]) -> Float[np.ndarray, "lanes steps"]:
+    """Return ln |J q| of every step, q the unit tangent vector that the steps before have turned."""
+    vector, growth = np.broadcast_to([0.8, 0.6], (len(jacobians), 2)), np.zeros(jacobians.shape[:2])
+    for number in range(jacobians.shape[1]):
+        image = np.einsum("lij,lj->li", jacobians[:, number], vector)
+        length = np.linalg.norm(image, axis=1)
+        length = np.where(length > 0.0, length, 1.0)
+        vector, growth[:, number] = image / length[:, None], np.log(length)
+    return growth
+
+
+def _of_orbits(
+    means: Lyapunov,
+    jacobians: Float[np.ndarray, "lanes steps 2 2"],
+    determinants: Float[np.ndarray, "lanes steps"],
+    period_us: Float[np.ndarray, " lanes"],
+) -> Lyapunov:
     """Return exponents with the multipliers' logarithms in place of means where the motion has come to an orbit.
 
     Args:
         means: exponents as means over all impacts.
-        jacobians: of the last impacts, (impacts, 4, lanes).
-        determinants: of these Jacobians, (impacts, lanes).
-        period: of the drive in us.
+        jacobians: of the last impacts.
+        determinants: of these Jacobians.
+        period_us: of the drive.
     """
     verdicts = means.verdicts
-    count = verdicts.impacts
-    lanes = np.flatnonzero((count > 0) & np.isfinite(means.exponents_per_impact[:, 0]))
+    lanes = np.flatnonzero((verdicts.impacts > 0) & np.isfinite(means.exponents_per_impact[:, 0]))
     if not lanes.size:
         return means
-    m = count[lanes]
-    product = np.broadcast_to(np.eye(2), (lanes.size, 2, 2))
-    logarithm = np.zeros(lanes.size)
+    m = verdicts.impacts[lanes]
+    product, determinant = np.broadcast_to(np.eye(2), (lanes.size, 2, 2)), np.ones(lanes.size)
     for back in range(int(m.max()), 0, -1):
-        here = m >= back
-        matrix = np.moveaxis(jacobians[-back][:, lanes].reshape(2, 2, -1), -1, 0)
-        product = np.where(here[:, None, None], matrix @ product, product)
-        logarithm += np.where(here, np.log(np.abs(np.where(here, determinants[-back, lanes], 1.0))), 0.0)
-    half, sign = 0.5 * (product[:, 0, 0] + product[:, 1, 1]), np.sign(np.linalg.det(product))
-    inside = half**2 - sign * np.exp(logarithm)
-    # a pair on a circle has the root of the determinant for its size
-    real = inside > 0.0
-    larger = np.where(real, np.log(np.abs(half) + np.sqrt(np.where(real, inside, 0.0)) + 1e-300), 0.5 * logarithm)
+        counts = m >= back
+        product = np.where(counts[:, None, None], jacobians[lanes, -back] @ product, product)
+        determinant = determinant * np.where(counts, determinants[lanes, -back], 1.0)
+    trace, logarithm = np.trace(product, axis1=1, axis2=2), np.log(np.abs(determinant))
+    larger = np.log(np.abs(multipliers_of(trace, determinant)[:, 0]))
     logs = np.stack([larger, logarithm - larger], axis=1) / m[:, None]
-    per_us = m / (verdicts.periods[lanes] * period[lanes])
+    per_us = m / (verdicts.periods[lanes] * period_us[lanes])
     error = np.repeat(verdicts.remaining[lanes][:, None], 2, axis=1)
 
     def replaced(old: np.ndarray, new: np.ndarray) -> np.ndarray:

@@ -8,8 +8,10 @@ Whether the tip really makes those flights is another question, and that of the 
 The linearised map of the whole loop is the product of its flights' and impacts' Jacobians.
 """
 
+import abc
+import math
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,7 +29,9 @@ from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import speeds_of_lasting_impact
 from afm_jax.impact.law import Law, Speeds, impact_law_of
 from afm_jax.impact.orbits import FlightEnds, ends_at_its_own_impact, highest_of_flight
+from afm_jax.solve.arclength import EquationsAt, PointInPlane
 from afm_jax.solve.derivatives import largest
+from afm_jax.solve.lanes import power_of_two
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 SAMPLES_PER_TURN = 32
@@ -103,10 +107,7 @@ def loop_of(scene: Scene, order: Float[Array, ""], driven: str, speed_unit: Arra
 def samples_for(scene: Scene, order: int, driven: str) -> int:
     """Return how many heights are computed of every flight of an orbit of an order: a power of 2."""
     ratio = float(scene.cantilever.frequency_khz) / float(getattr(scene, driven).frequency_khz)
-    wanted, samples = SAMPLES_PER_TURN * order * max(1.0, ratio), 64
-    while samples < wanted and samples < _MOST_SAMPLES:
-        samples *= 2
-    return samples
+    return min(_MOST_SAMPLES, power_of_two(math.ceil(SAMPLES_PER_TURN * order * max(1.0, ratio)), 64))
 
 
 def impacts_at(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Impacts:
@@ -160,53 +161,40 @@ def trace_and_determinant_of(
     return whole[0, 0] + whole[1, 1], jnp.prod(each)
 
 
-class NearestApproach(NamedTuple):
-    """Where a loop's flights come closest to the surface between impacts."""
-
-    gap_nm: Float[Array, ""]
-    """Negative where a flight would pass through it; infinite where no flight has a lowest point."""
-    flight: Float[Array, ""]
-    """Number of the flight, a whole number."""
-
-
-def nearest_approach(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> NearestApproach:
-    """Return the lowest point of a closed loop's flights above the surface, differentiable.
+def nearest_approach(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> Float[Array, ""]:
+    """Return the lowest point of a closed loop's flights above the surface in nm, differentiable; see `lowest_gap`.
 
     Args:
         unknowns: of the loop.
         loop: what it closes.
-        samples: heights computed in every flight; the lowest of them is improved by Newton's method.
+        samples: heights computed in every flight.
     """
     if unknowns.shape[0] == 0:
         zero = jnp.zeros((1,))
-        begin, first = zero, zero
-        height, velocity, lasts = zero, zero, _RESTING_PERIODS * loop.period_us[None]
+        flights = zero, zero, zero, zero, _RESTING_PERIODS * loop.period_us[None]
     else:
         impacts = impacts_at(unknowns, loop)
-        begin, height, velocity, lasts = impacts.leaving_us, impacts.height, impacts.velocity, impacts.duration_us
         # a flight counts from max(t_in, t_out) on
         first = jnp.maximum(-impacts.speeds.delay, 0.0)
-
-    flights = FreeFlights(begin, height, velocity, first, lasts)
-    return lowest_of_flights(loop.cantilever, loop.surface, flights, samples)
-
-
-class FreeFlights(NamedTuple):
-    """Flights of a loop, arrays of one number each: us, nm and nm/us against the resting tip."""
-
-    begin_us: Float[Array, " m"]
-    height: Float[Array, " m"]
-    velocity: Float[Array, " m"]
-    first_us: Float[Array, " m"]
-    """Time after the beginning from which on a flight counts."""
-    lasts_us: Float[Array, " m"]
+        flights = impacts.leaving_us, impacts.height, impacts.velocity, first, impacts.duration_us
+    return lowest_gap(loop.cantilever, loop.surface, flights, samples)
 
 
-def lowest_of_flights(
-    cantilever: Cantilever, surface: Platform | Surface, flights: FreeFlights, samples: int
-) -> NearestApproach:
-    """Return the lowest point of flights above the surface, differentiable; arguments as for `nearest_approach`."""
-    begin, height, velocity, first, lasts = flights
+def lowest_gap(
+    cantilever: Cantilever, surface: Platform | Surface, flights: tuple[Float[Array, " m"], ...], samples: int
+) -> Float[Array, ""]:
+    """Return the lowest point of flights above the surface in nm, differentiable.
+
+    It is negative where a flight would pass through the surface, and infinite where no flight has a lowest point.
+
+    Args:
+        cantilever: of the flights.
+        surface: below them.
+        flights: when each begins in us, height in nm and velocity in nm/us there, the time after the beginning from
+            which on it counts, and its duration.
+        samples: heights computed in every flight; the lowest of them is improved by Newton's method.
+    """
+    begin_us, height, velocity, first_us, lasts_us = flights
 
     def motion(start, height, velocity, after):
         position, speed = cantilever.propagator(after)(height, velocity)
@@ -214,16 +202,16 @@ def lowest_of_flights(
         bend = cantilever.acceleration(position, speed) - surface.acceleration(start + after)
         return position - level, speed - rate, bend
 
-    step = (lasts - first) / samples
-    after = first[:, None] + step[:, None] * jnp.arange(samples + 1.0)
-    gap, _, _ = motion(begin[:, None], height[:, None], velocity[:, None], after)
+    step = (lasts_us - first_us) / samples
+    after = first_us[:, None] + step[:, None] * jnp.arange(samples + 1.0)
+    gap, _, _ = motion(begin_us[:, None], height[:, None], velocity[:, None], after)
     left, middle, right = gap[:, :-2], gap[:, 1:-1], gap[:, 2:]
     lowest = (middle <= left) & (middle <= right)
     bend = right - 2.0 * middle + left
     vertex = middle - (right - left) ** 2 / (8.0 * jnp.where(bend > 0.0, bend, 1.0))
     place = jnp.argmin(jnp.where(lowest, vertex, jnp.inf))
     flight, sample = place // (samples - 1), place % (samples - 1) + 1
-    start = begin[flight], height[flight], velocity[flight]
+    start = begin_us[flight], height[flight], velocity[flight]
     guess, width = lax.stop_gradient((after[flight, sample], step[flight]))
 
     def improve(_, time):
@@ -233,7 +221,7 @@ def lowest_of_flights(
 
     # its own change counts nothing, because the gap is lowest there
     gap, _, _ = motion(*start, lax.stop_gradient(lax.fori_loop(0, 6, improve, guess)))
-    return NearestApproach(jnp.where(lowest.any(), gap, jnp.inf), flight.astype(gap.dtype))
+    return jnp.where(lowest.any(), gap, jnp.inf)
 
 
 def flies(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Bool[Array, ""]:
@@ -330,7 +318,7 @@ def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> 
 class LoopFamily(eqx.Module):
     """Closed loops of a scene of which parameters move: what is solved along a curve of them, and in which units.
 
-    What is static makes a program of its own.
+    Loops of laws and of simulated contacts differ in its four methods. What is static makes a program of its own.
     """
 
     scene: Scene
@@ -350,8 +338,26 @@ class LoopFamily(eqx.Module):
     """Heights at which every flight is evaluated for its lowest point."""
     test: int | None = eqx.field(static=True, default=None)
     """Number of the test function that is 0 besides; None: none is."""
-    flights: Any = eqx.field(static=True, default=None)
-    """`ContactFlights` that simulate the loops of a scene with a contact; None: the scene has a law."""
+
+    @abc.abstractmethod
+    def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt | None:
+        """Return the closing conditions and the wanted test function at a point of a curve; None: it has no value.
+
+        Args:
+            point: m phases in rad, m speeds in the unit of speeds, the parameters as fractions of their ranges.
+        """
+
+    @abc.abstractmethod
+    def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
+        """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods."""
+
+    @abc.abstractmethod
+    def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
+        """Return the readings of the orbits at points of a curve, NumPy arrays."""
+
+    @abc.abstractmethod
+    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:
+        """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
 
     def units(self, impacts: int) -> Float[np.ndarray, " n"]:
         """Return the units of a loop's unknowns: m phases in rad, m speeds or coordinates in nm/us."""

@@ -244,8 +244,7 @@ def _closed_loop(guess: Float[Array, " n"], loop: ImpactLoop) -> Float[Array, " 
 def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
     """Return each loop once, its hardest impact first; without those that repeat a shorter one."""
     count = loops.shape[1] // 2
-    seen: dict[tuple[int, ...], list[np.ndarray]] = {}
-    result = []
+    distinct, result = np.zeros((0, 3, count)), []
     for unknowns in loops:
         phases, sizes = unknowns[:count], unknowns[count:]
         if np.any(np.diff(phases) <= 0.0) or phases[-1] - phases[0] >= 2.0 * np.pi * order:
@@ -254,27 +253,10 @@ def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[n
         turned = np.concatenate([phases[first:], phases[:first] + 2.0 * np.pi * order])
         turned -= 2.0 * np.pi * np.floor(turned[0] / (2.0 * np.pi))
         states = np.stack([np.cos(turned), np.sin(turned), np.roll(sizes, -first) / sizes.max()])
-        if _repeats(states):
+        rolled = [np.roll(states, -shift, axis=1) for shift in range(count)]
+        repeats = any(np.abs(states - rolled[shift]).max() < _SAME for shift in range(1, count) if count % shift == 0)
+        if repeats or any((np.abs(distinct - each).max(axis=(1, 2)) < _SAME).any() for each in rolled):
             continue
-        # neighbours of a rounded number may be rounded apart: both are looked up
-        invariant = np.array([states.sum(), sizes.sum() / sizes.max()])
-        keys = {tuple(int(part) for part in np.floor(invariant * 1e4 + shift)) for shift in (0.0, 0.5)}
-        others = [other for key in keys for other in seen.get(key, [])]
-        if any(_is_a_turn_of(states, other) for other in others):
-            continue
-        for key in keys:
-            seen.setdefault(key, []).append(states)
+        distinct = np.concatenate([distinct, states[None]])
         result.append(np.concatenate([turned, np.roll(sizes, -first)]))
     return np.array(result).reshape(-1, 2 * count)
-
-
-def _repeats(states: np.ndarray) -> bool:
-    """Say whether a loop comes back to its state after fewer impacts than it has."""
-    count = states.shape[1]
-    return any(
-        count % part == 0 and np.abs(states - np.roll(states, part, axis=1)).max() < _SAME for part in range(1, count)
-    )
-
-
-def _is_a_turn_of(states: np.ndarray, other: np.ndarray) -> bool:
-    return any(np.abs(np.roll(states, turn, axis=1) - other).max() < _SAME for turn in range(states.shape[1]))

@@ -110,19 +110,8 @@ def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float
     return tips, Record(*(np.asarray(column).T for column in rows))
 
 
-class MapStep(NamedTuple):
-    """One step of the map, arrays of one lane a tip; numbers without meaning where a tip had ended before."""
-
-    start: Tips
-    impact: NextImpact
-    """Times count from the same period as the start's."""
-    rested: Bool[Array, " lanes"]
-    """The tip came to rest on the platform, by a capture or by chatter."""
-    end: Tips
-
-
-def advance(scenes: Scene, tips: Tips) -> MapStep:
-    """Return one step of the impact map for a block of tips: the next impacts, and where the flights after them begin.
+def advance(scenes: Scene, tips: Tips) -> tuple[Tips, Record]:
+    """Return one step of the impact map for a block of tips: where the flights after the next impacts begin, and these.
 
     Args:
         scenes: a batch of scenes with a law, every number of one lane a tip.
@@ -142,8 +131,8 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
     return after_impacts(scenes, tips, jax.vmap(impact_at_end)(scenes, flights, ends_of_flights))
 
 
-def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
-    """Return the step of the map for impacts that are known: what follows each, a flight, a rest or the end."""
+def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> tuple[Tips, Record]:
+    """Return what follows impacts that are known, a flight, a rest or the end, and their record, one lane a tip."""
     going = tips.outcome == Outcome.IMPACT
     captured = going & (impact.outcome == Outcome.CAPTURED)
     landed = captured | (going & (impact.outcome == Outcome.IMPACT))
@@ -169,7 +158,23 @@ def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
         velocity_nm_per_us=jnp.where(goes_on, velocity, tips.velocity_nm_per_us),
         outcome=jnp.where(going, outcome, tips.outcome).astype(tips.outcome.dtype),
     )
-    return MapStep(tips, impact, rested, end)
+    arrival = jnp.where(goes_on, impact.arrival_time_us, 0.0)
+    passed = jnp.floor(arrival / surface.period_us)
+
+    def if_it_goes_on(value: Array) -> Array:
+        return jnp.where(goes_on, value, jnp.nan)
+
+    record = Record(
+        arrival_us=if_it_goes_on(arrival - passed * surface.period_us),
+        approach_nm_per_us=if_it_goes_on(surface.velocity(arrival) - impact.velocity_before_nm_per_us),
+        departure_us=if_it_goes_on(end.time_us),
+        velocity_after_nm_per_us=if_it_goes_on(end.velocity_nm_per_us),
+        arrival_periods=if_it_goes_on(tips.periods + passed),
+        departure_periods=if_it_goes_on(end.periods),
+        near_grazing=goes_on & impact.near_grazing,
+        rested=goes_on & rested,
+    )
+    return end, record
 
 
 def _flight_of(scene: Scene, tip: Tips) -> Flight:
@@ -200,12 +205,6 @@ def _rest(scene: Scene, impact: NextImpact) -> tuple[Departure, Bool[Array, ""],
     return departure, rested & ~held, held
 
 
-@jax.jit
-def skipped(scenes: Scene, tips: Tips, *, impacts: int | Int[Array, ""]) -> Tips:
-    """Return a block of tips some impacts later."""
-    return lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now).end, tips)
-
-
 @partial(jax.jit, static_argnames=("impacts",))
 def recorded(scenes: Scene, tips: Tips, skip: int | Int[Array, ""] = 0, *, impacts: int) -> tuple[Tips, Record]:
     """Return a block of tips `skip` and then so many more impacts later, and these, with axes (impacts, lanes).
@@ -213,44 +212,14 @@ def recorded(scenes: Scene, tips: Tips, skip: int | Int[Array, ""] = 0, *, impac
     The map stands in the program once: compiling it takes longer than most runs of it.
     """
 
-    def next_row(step: MapStep, count: Array) -> tuple[MapStep, Record]:
-        step = lax.fori_loop(0, count, lambda _, before: advance(scenes, before.end), step)
-        return step, record_of(scenes, step)
+    def next_row(state: tuple[Tips, Record], count: Array) -> tuple[tuple[Tips, Record], Record]:
+        state = lax.fori_loop(0, count, lambda _, before: advance(scenes, before[0]), state)
+        return state, state[1]
 
     counts = jnp.ones(impacts, int).at[0].add(skip)
-    step, rows = lax.scan(next_row, _before_any(tips), counts)
-    return step.end, rows
-
-
-def _before_any(tips: Tips) -> MapStep:
-    """Return a step that ends where tips are, for a loop to begin with."""
-    no_number, no = jnp.zeros_like(tips.time_us), jnp.zeros_like(tips.time_us, bool)
-    impact = NextImpact(no_number, no_number, no_number, no_number, tips.outcome, no)
-    return MapStep(tips, impact, no, tips)
-
-
-def record_of(scenes: Scene, step: MapStep) -> Record:
-    """Return the record of the impacts of a step, arrays of one lane a tip."""
-    impact, end = step.impact, step.end
-    landed = (step.start.outcome == Outcome.IMPACT) & (end.outcome == Outcome.IMPACT)
-    platform = scenes.platform
-    arrival = jnp.where(landed, impact.arrival_time_us, 0.0)
-    passed = jnp.floor(arrival / platform.period_us)
-    approach = platform.velocity(arrival) - impact.velocity_before_nm_per_us
-
-    def if_landed(value: Array) -> Array:
-        return jnp.where(landed, value, jnp.nan)
-
-    return Record(
-        arrival_us=if_landed(arrival - passed * platform.period_us),
-        approach_nm_per_us=if_landed(approach),
-        departure_us=if_landed(end.time_us),
-        velocity_after_nm_per_us=if_landed(end.velocity_nm_per_us),
-        arrival_periods=if_landed(step.start.periods + passed),
-        departure_periods=if_landed(end.periods),
-        near_grazing=landed & impact.near_grazing,
-        rested=landed & step.rested,
-    )
+    no_number, no = jnp.full(tips.time_us.shape, jnp.nan), jnp.zeros(tips.time_us.shape, bool)
+    (tips, _), rows = lax.scan(next_row, (tips, Record(*[no_number] * 6, *[no] * 2)), counts)
+    return tips, rows
 
 
 def tips_after_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float) -> tuple[Tips, Record]:
@@ -264,23 +233,15 @@ def tips_after_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, ac
         record: contacts that are recorded.
         accuracy: of `simulate`.
     """
-    stretches = []
-    needed = -(-record // _ROWS)
     tips = jax.tree.map(np.asarray, tips)
-    for _ in range(-(-skip // _ROWS) + needed):
+    no_number = np.full((len(tips.time_us), record), np.nan)
+    kept = Record(*[no_number] * 6, *[np.zeros_like(no_number, bool)] * 2)
+    for _ in range(-(-skip // _ROWS) + -(-record // _ROWS)):
         tips, rows = _stretch(scenes, tips, accuracy)
-        stretches = [*stretches, rows][-needed:] if needed else []
+        kept = Record(*(np.concatenate(both, axis=1)[:, _ROWS:] for both in zip(kept, rows, strict=True)))
         if np.all(tips.outcome != Outcome.IMPACT):
             break
-    if not stretches:
-        empty = np.full((len(tips.time_us), record), np.nan)
-        return tips, Record(*[empty] * 6, *[np.zeros_like(empty, bool)] * 2)
-    columns = [np.concatenate(parts, axis=1)[:, -record:] for parts in zip(*stretches, strict=True)]
-    # where all tips end early there are fewer than asked for
-    missing = ((0, 0), (record - columns[0].shape[1], 0))
-    return tips, Record(
-        *(np.pad(rows, missing, constant_values=False if rows.dtype == bool else np.nan) for rows in columns)
-    )
+    return tips, kept
 
 
 def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
@@ -291,11 +252,10 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     going = tips.outcome == Outcome.IMPACT
     leaves = (contacts.kind == ContactKind.IMPACT) & going[:, None]
     count = leaves.sum(axis=1)
-    last = np.maximum(count - 1, 0)[:, None]
     departure = np.where(leaves, contacts.departure_time_us, np.nan)
     arrival = np.where(leaves, contacts.arrival_time_us, np.nan)
     full = count == _ROWS
-    since = motion.final.time_us - np.where(count > 0, np.take_along_axis(departure, last, axis=1)[:, 0], tips.time_us)
+    since = motion.final.time_us - np.nanmax(np.column_stack([tips.time_us, departure]), axis=1)
     held = (motion.phase != Phase.DRY) & (since > HELD_PERIODS * slower)
     outcome = np.select(
         [full, held, since > _AWAY * slower],
@@ -306,15 +266,12 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     passed, passed_at_arrival = np.floor(departure / period[:, None]), np.floor(arrival / period[:, None])
     velocity = np.where(leaves, contacts.departure_velocity_nm_per_us, np.nan)
 
-    def of_last(rows: np.ndarray, old: np.ndarray) -> np.ndarray:
-        return np.where(goes_on, np.take_along_axis(rows, last, axis=1)[:, 0], old)
-
     time_in_period = departure - passed * period[:, None]
     end = Tips(
-        time_us=of_last(time_in_period, tips.time_us),
-        periods=tips.periods + of_last(passed, np.zeros_like(tips.periods)),
+        time_us=np.where(goes_on, time_in_period[:, -1], tips.time_us),
+        periods=tips.periods + np.where(goes_on, passed[:, -1], 0.0),
         gap_nm=np.where(goes_on, np.asarray(gap_of_departure(scenes)), tips.gap_nm),
-        velocity_nm_per_us=of_last(velocity, tips.velocity_nm_per_us),
+        velocity_nm_per_us=np.where(goes_on, velocity[:, -1], tips.velocity_nm_per_us),
         outcome=np.where(going, outcome, tips.outcome).astype(np.int32),
     )
     rows = Record(

@@ -31,8 +31,6 @@ _OF_A_DRIVEN_TIP = (
     *("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg"),
 )
 """What is told besides of a tip that base or force drives; the deflection's over a moving base only."""
-_MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
-"""What is told in a row of an orbit of several impacts, of its impacts the first."""
 _IMPACT_CELLS: dict[str, Cell] = {
     "phase\nrad": "phase_rad",
     "velocity after\nnm/us": "velocity_after_nm_per_us",
@@ -42,32 +40,36 @@ _IMPACT_CELLS: dict[str, Cell] = {
 }
 
 
-def _picture_of_orbits(self: "OrbitTable | ManyOrbitTable", path: str | Path | None = None) -> "Figure":
-    """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
-    return self.orbits.plot(path)
-
-
 class OrbitTable(NamedTuple):
-    """The single-impact orbits of one scene, of order N."""
+    """The orbits of one scene of order N: of a law's those of one impact, or with `impacts` those of several."""
 
     scene: Scene
     order: int
-    orbits: SingleImpactOrbits
+    orbits: SingleImpactOrbits | ManyImpactOrbits
+    impacts: int | None = None
 
-    text, plot = Result.text, _picture_of_orbits
+    text = Result.text
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """What is told of an orbit: attributes that orbits of such a scene have."""
-        there = (name for name in (*_OF_A_DRIVEN_TIP, "extrapolated") if getattr(self.orbits, name) is not None)
-        return (*IMPACT_COLUMNS, *_OF_AN_ORBIT, *there)
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """Return the picture of the orbits, a matplotlib figure; write it if a path is given."""
+        return self.orbits.plot(path)
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """The orbits that exist as plain numbers, by rising approach speed."""
-        columns = {name: getattr(self.orbits, name).tolist() for name in self.columns}
+        """The orbits that exist as plain numbers: by rising approach speed, or each with all its impacts."""
+        if isinstance(self.orbits, ManyImpactOrbits):
+            return [orbit_facts(self.orbits.reading, index) for index in range(len(self.orbits.stable))]
+        columns = {name: getattr(self.orbits, name).tolist() for name in self._columns}
         slots = [slot for slot, exists in enumerate(self.orbits.exists.tolist()) if exists]
         return [{name: values[slot] for name, values in columns.items()} for slot in slots]
+
+    @property
+    def _columns(self) -> tuple[str, ...]:
+        """What is told in a row of an orbit: attributes of orbits of such a scene; of several impacts the first's."""
+        if self.impacts is not None:
+            return (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
+        there = (name for name in (*_OF_A_DRIVEN_TIP, "extrapolated") if getattr(self.orbits, name) is not None)
+        return (*IMPACT_COLUMNS, *_OF_AN_ORBIT, *there)
 
     @property
     def reason(self) -> str | None:
@@ -75,20 +77,25 @@ class OrbitTable(NamedTuple):
         rows = self.rows
         if any(orbit["admissible"] for orbit in rows):
             return None
-        return why_none(self.scene, self.order, rejected=len(rows))
+        return why_none(self.scene, self.order, rejected=len(rows), impacts=self.impacts or 1)
 
     @property
     def impact_speeds_nm_per_us(self) -> list[float]:
-        """Approach speed of each orbit."""
-        return [orbit["approach_speed_nm_per_us"] for orbit in self.rows]
+        """Approach speed of each impact of each orbit."""
+        return [impact["approach_speed_nm_per_us"] for orbit in self.rows for impact in orbit.get("impacts", [orbit])]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
-        return {"order": self.order, "orbits": self.rows, "complete": self.orbits.complete}
+        orbits = self.orbits
+        several = isinstance(orbits, ManyImpactOrbits)
+        more = {"impacts": self.impacts} if several else {"complete": orbits.complete}
+        return {"order": self.order, "orbits": self.rows} | more
 
     def printed(self) -> list[str | Table]:
         """Return the orbits as a table; where base or force drive with what is read at the drive's frequency."""
         rows = self.rows
+        if self.impacts is not None:
+            return [self._printed_impacts(rows, self.impacts)]
         cells: dict[str, Cell] = {**_IMPACT_CELLS, "peak\nnm": "peak_amplitude_nm"}
         if rows and "drive_lockin_amplitude_nm" in rows[0]:
             cells |= {"at drive\nnm": "drive_lockin_amplitude_nm", "at drive\ndeg": "drive_lockin_phase_deg"}
@@ -104,43 +111,7 @@ class OrbitTable(NamedTuple):
             parts.append("Two of them nearly coincide (a fold): derivatives there have no meaning.")
         return parts
 
-    def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of orbits.csv, a row an orbit."""
-        return {"orbits.csv": columns_of(self.rows, self.columns)}
-
-
-class ManyOrbitTable(NamedTuple):
-    """The orbits of one scene with several impacts, or of its contact."""
-
-    scene: Scene
-    order: int
-    impacts: int
-    orbits: ManyImpactOrbits
-
-    text, plot = Result.text, _picture_of_orbits
-
-    @property
-    def rows(self) -> list[dict[str, Any]]:
-        """The orbits as plain numbers, each with all its impacts."""
-        return [orbit_facts(self.orbits.reading, index) for index in range(len(self.orbits.stable))]
-
-    @property
-    def reason(self) -> str | None:
-        """Why there is no orbit of this order; None where there is one."""
-        if len(self.orbits.stable):
-            return None
-        return why_none(self.scene, self.order, rejected=0, impacts=self.impacts)
-
-    @property
-    def impact_speeds_nm_per_us(self) -> list[float]:
-        """Approach speed of each impact of each orbit."""
-        return [impact["approach_speed_nm_per_us"] for orbit in self.rows for impact in orbit["impacts"]]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        return {"order": self.order, "impacts": self.impacts, "orbits": self.rows}
-
-    def printed(self) -> list[str | Table]:
+    def _printed_impacts(self, orbits: list[dict[str, Any]], impacts: int) -> Table:
         """Return the orbits as a table, a line an impact, an orbit's numbers in its first."""
 
         def of_orbit(cell: Callable[[dict[str, Any]], str]) -> Cell:
@@ -148,7 +119,7 @@ class ManyOrbitTable(NamedTuple):
 
         rows = [
             {**impact, "orbit": orbit | {"number": number}, "first": place == 0}
-            for number, orbit in enumerate(self.rows)
+            for number, orbit in enumerate(orbits)
             for place, impact in enumerate(orbit["impacts"])
         ]
         cells: dict[str, Cell] = {
@@ -158,15 +129,17 @@ class ManyOrbitTable(NamedTuple):
             "multipliers": of_orbit(lambda orbit: ", ".join(map(_multiplier, orbit["multipliers"]))),
             "stable": of_orbit(lambda orbit: "yes" if orbit["stable"] else "no"),
         }
-        title = f"Orbits with {counted(self.impacts, 'impact')} in {counted(self.order, 'drive period')}"
-        return [printed_table(title, cells, rows)]
+        title = f"Orbits with {counted(impacts, 'impact')} in {counted(self.order, 'drive period')}"
+        return printed_table(title, cells, rows)
 
     def tables(self) -> dict[str, dict[str, Any]]:
-        """Return the columns of orbits.csv, a row an orbit, and of impacts.csv, a row an impact."""
+        """Return the columns of orbits.csv, a row an orbit, and of several impacts of impacts.csv, a row an impact."""
         orbits = self.rows
+        if self.impacts is None:
+            return {"orbits.csv": columns_of(orbits, self._columns)}
         impacts = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
         return {
-            "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], _MANY_COLUMNS),
+            "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], self._columns),
             "impacts.csv": columns_of(impacts, ("orbit", *IMPACT_COLUMNS)),
         }
 

@@ -9,11 +9,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.dynamics.contact_orbits import ContactFlights
 from afm_jax.dynamics.curves import (
     AT_A_ROOT,
     CAPTURE,
@@ -27,10 +25,7 @@ from afm_jax.dynamics.curves import (
     FollowedCurve,
     followed_both_ways,
     lies_on,
-    loop_at,
-    read_points,
     root_on,
-    split_point,
     tested_by,
 )
 from afm_jax.dynamics.impact_loop import LoopFamily, LoopReading
@@ -116,7 +111,7 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
     if not roots:
         return []
     roots.sort(key=lambda root: root.position)
-    readings = read_points(np.stack([point for root in roots for point in root.seen]), family)
+    readings = family.readings(np.stack([point for root in roots for point in root.seen]))
     low, width = float(family.low[0]), float(family.width[0])
     special, first = [], 0
     for root in roots:
@@ -190,15 +185,7 @@ def at_lost_ends(curve: FollowedCurve) -> list[_Root]:
 
 def _kind_of(test: int, point: CurvePoint, family: LoopFamily) -> str:
     """Return what a root of a test function is: where the law captures nothing, an impact that vanishes is a graze."""
-    return KINDS[GRAZING] if test == CAPTURE and captures_nothing(point.point, family) else KINDS[test]
-
-
-def captures_nothing(point: Float[np.ndarray, " n"], family: LoopFamily) -> bool:
-    """Say whether the impacts of a point of a curve are of a law without adhesion, which any speed leaves."""
-    if family.flights is not None:
-        return False
-    _, fractions = split_point(jnp.asarray(point), family)
-    return float(loop_at(fractions, family).impact.lowest) == 0.0
+    return KINDS[GRAZING] if test == CAPTURE and family.captures_nothing(point.point) else KINDS[test]
 
 
 def special_curves(
@@ -213,16 +200,13 @@ def special_curves(
         value: of the second parameter at the special points.
     """
     followed: list[tuple[int, FollowedCurve]] = []
-    curves, flights = [], None
+    curves = []
     for point in special:
         if not point.admissible:
             continue
         fraction = (point.parameter - float(family.low[0])) / float(family.width[0])
         start = np.concatenate([point.unknowns, [fraction, (value - second.low) / (second.high - second.low)]])
         with_test = replace(family, test=point.test)
-        if family.flights is not None:
-            flights = flights or ContactFlights(family.scene, int(family.order), family.paths)
-            with_test = replace(with_test, flights=flights)
         if any(lies_on(start, curve, with_test) for test, curve in followed if test == point.test):
             continue
         curve = followed_both_ways(start, with_test)
@@ -255,7 +239,7 @@ def _special_curve(kind: str, curve: FollowedCurve, family: LoopFamily) -> Speci
         other = np.array([point.tests[GRAZING + CAPTURE - family.test] for point in curve.steps])
         admissible = ~(other < -AT_A_ROOT)
     else:
-        admissible = np.asarray(read_points(curve.points, family).admissible)
+        admissible = np.asarray(family.readings(curve.points).admissible)
     return SpecialCurve(kind, values[:, 0], values[:, 1], admissible, tuple(meetings), curve.ends)
 
 

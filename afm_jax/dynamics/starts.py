@@ -133,7 +133,7 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
 
     starts = State(*(jnp.broadcast_to(part, scenes.platform.frequency_khz.shape) for part in start))
     tips = tips_at(scenes, starts.time_us, starts.velocity_nm_per_us)
-    return after_impacts(scenes, tips, jax.vmap(first_impact_of)(scenes, starts)).end
+    return after_impacts(scenes, tips, jax.vmap(first_impact_of)(scenes, starts))[0]
 
 
 @compiled_quickly()

@@ -20,37 +20,26 @@ _MARKS = {
     "torus": ("D", "#CC79A7"),
     "grazing": ("^", "#56B4E9"),
     "capture": ("v", DARK),
-    "rest_lost": ("P", "#D55E00"),
-    "held": ("H", "#0072B2"),
 }
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
 
 
-def continuation_figure(
-    found: Continuation,
-    *,
-    bands: Sequence[Float[np.ndarray, " points"]] | None = None,
-    errors: Float[np.ndarray, " special"] | None = None,
-) -> Figure:
+def continuation_figure(found: Continuation) -> Figure:
     """Return peak amplitude against the parameter: stable solid, unstable dashed, not admissible dotted and light.
 
-    Marks of special points are hollow: the branch goes on through them.
-
-    Args:
-        found: what is shown.
-        bands: standard errors of the amplitude, an array a branch: shaded to 95 %.
-        errors: standard errors of the special points: bars to 95 %.
+    Marks of special points are hollow: the branch goes on through them. Where the law has errors, 95 % of the
+    amplitudes are within the ground that is coloured, and of the special points within the bars.
     """
     figure = new_figure(7.0, 4.6)
     axes = figure.subplots()
     for number, branch in enumerate(found.branches):
         _draw_branch(axes, branch, [one for one in found.special if one.branch == number])
-        if bands is not None:
-            _draw_band(axes, branch, bands[number])
+        if found.amplitude_errors is not None:
+            _draw_band(axes, branch, found.amplitude_errors[number])
     for index, point in enumerate(found.special):
         if not point.admissible:
             continue
-        half = None if errors is None else TWO_SIDED_95 * float(errors[index])
+        half = None if found.special_errors is None else TWO_SIDED_95 * float(found.special_errors[index])
         marker, colour = _MARKS[point.kind]
         height = float(point.reading.peak_amplitude_nm)
         axes.errorbar(

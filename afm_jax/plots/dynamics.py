@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.dynamics.basins import Attractor, Basins
-from afm_jax.dynamics.bifurcations import Ramps, Sweep
+from afm_jax.dynamics.bifurcations import BifurcationDiagram, Ramps
 from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.dynamics.exponents import Lyapunov
 from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
@@ -130,29 +130,19 @@ _FEW = 100
 """Orbits up to which marks are large."""
 
 
-def exponents_figure(
-    found: Lyapunov,
-    path: str = "",
-    values: Float[np.ndarray, " values"] | None = None,
-    band: Float[np.ndarray, "values 2"] | None = None,
-) -> Figure:
+def exponents_figure(found: Lyapunov) -> Figure:
     """Return both Lyapunov exponents per impact, of one motion or of many: chaos is what lies above the line at 0.
 
-    Where the tip rests they are minus infinity: such motions have a tick on the lower edge.
-
-    Args:
-        found: the exponents.
-        path: of the parameter along which the motions are; empty: they are numbered.
-        values: of that parameter.
-        band: within which 95 % of the larger one's draws lie.
+    Where the tip rests they are minus infinity: such motions have a tick on the lower edge. The ground is coloured
+    where 95 % of the larger exponents of drawn laws lie.
     """
     exponents = np.asarray(found.exponents_per_impact, float).reshape(-1, 2)
-    values = np.arange(1.0, len(exponents) + 1.0) if values is None else values
+    values = np.arange(1.0, len(exponents) + 1.0) if found.along is None else found.along.values
     figure = new_figure(9.0, 4.8)
     axes: Axes = figure.subplots()
     size = 8.0 if len(values) < 10 else max(0.8, min(3.0, 3000.0 / len(values)))
-    if band is not None:
-        finite = np.where(np.isfinite(band), band, np.nan)
+    if found.larger_interval95 is not None:
+        finite = np.where(np.isfinite(found.larger_interval95), found.larger_interval95, np.nan).reshape(-1, 2)
         axes.fill_between(values, finite[:, 0], finite[:, 1], color=ACCENT, alpha=0.25, linewidth=0.0)
     # of many motions both are equal: the smaller one shows around the larger one
     axes.plot(
@@ -170,28 +160,36 @@ def exponents_figure(
     axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.3, high + 0.2))
     axes.grid(color=GRID, alpha=0.25)
     axes.axhline(0.0, color="black", linewidth=1.0)
-    label_axes(axes, x=label_of(path) if path else "number of the motion", y="Lyapunov exponent per impact")
+    x = "number of the motion" if found.along is None else label_of(found.along.path)
+    label_axes(axes, x=x, y="Lyapunov exponent per impact")
     legend = figure.legend(loc="outside upper center", ncols=3, fontsize=11, frameon=False)
     for handle in legend.get_lines():
         handle.set_markersize(10.0)
     return figure
 
 
-def bifurcation_figure(ramped: Sweep | Ramps) -> Figure:
-    """Return a bifurcation diagram: height at impact, and the tip's height whenever the drive's phase is 0.
+def bifurcation_figure(ramped: BifurcationDiagram | Ramps, ordinate: str = "height") -> Figure:
+    """Return a bifurcation diagram: what its impacts are like, and the tip's height whenever the drive's phase is 0.
 
     Where the motion ended the ground has the ramp's colour; where a verdict's probability is below 95 % it is grey.
 
     Args:
         ramped: one ramp of a parameter, or up and down; where both are, the one down lies over the one up.
+        ordinate: of the impacts: "height" of the platform, drive "phase" or "impact_speed" relative to the platform.
+
+    Raises:
+        ValueError: if there is no such ordinate.
     """
-    sweeps, path = ([ramped], "") if isinstance(ramped, Sweep) else (ramped.sweeps, ramped.parameter)
+    if ordinate not in _ORDINATES:
+        raise ValueError(f"`ordinate` must be one of {', '.join(_ORDINATES)}, but is {ordinate!r}")
+    attribute, label = _ORDINATES[ordinate]
+    sweeps, path = ([ramped], "") if isinstance(ramped, BifurcationDiagram) else (ramped.sweeps, ramped.parameter)
     figure = new_figure(9.0, 8.0)
     panels = figure.subplots(2, 1, sharex=True)
     for sweep in sweeps:
         colour, word = (BLUE, "ramped up") if sweep.upward else (ACCENT, "ramped down")
         size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [8.0, 5.0, 4.0, 1.0]))
-        for axes, part in zip(panels, (sweep.height_nm, sweep.strobe_height_nm), strict=True):
+        for axes, part in zip(panels, (getattr(sweep, attribute), sweep.strobe_height_nm), strict=True):
             there = np.isfinite(part)
             at = np.repeat(sweep.values, there.sum(axis=1))
             axes.plot(at, part[there], ".", color=colour, mew=0.0, ms=size, alpha=0.5, label=word, rasterized=True)
@@ -200,7 +198,7 @@ def bifurcation_figure(ramped: Sweep | Ramps) -> Figure:
         if sweep.verdict_probability is not None:
             for axes in panels:
                 _shade(axes, sweep, sweep.verdict_probability < _SURE, color=GRID, label="verdict uncertain")
-    label_axes(panels[0], x="", y="height at impact (nm)")
+    label_axes(panels[0], x="", y=label)
     label_axes(panels[1], x=label_of(path) if path else "parameter", y="height at drive phase 0 (nm)")
     # also where the tip is stuck and there is nothing to draw
     ends = [end for sweep in sweeps for end in (sweep.values.min(), sweep.values.max())]
@@ -217,6 +215,12 @@ def bifurcation_figure(ramped: Sweep | Ramps) -> Figure:
     return figure
 
 
+_ORDINATES = {
+    "height": ("height_nm", "height at impact (nm)"),
+    "phase": ("phase_rad", "drive phase just after the impact (rad)"),
+    "impact_speed": ("approach_nm_per_us", r"impact speed (nm/$\mu$s)"),
+}
+"""Attributes of a diagram that may be drawn against the parameter, and what the axis says."""
 _SURE = 0.95
 """Share of drawn laws with a verdict from which on it counts as sure."""
 _ENDED = {
@@ -227,7 +231,7 @@ _ENDED = {
 """What is said of motions without impacts to draw, and their ground."""
 
 
-def _shade(axes: Axes, sweep: Sweep, where: Bool[np.ndarray, " values"], **style: Any) -> None:
+def _shade(axes: Axes, sweep: BifurcationDiagram, where: Bool[np.ndarray, " values"], **style: Any) -> None:
     """Give the ground of a panel a colour at some of a ramp's values."""
     edges = cell_edges(sweep.values)
     changes = np.flatnonzero(np.diff(np.concatenate([[0], where.astype(int), [0]])))
@@ -235,19 +239,10 @@ def _shade(axes: Axes, sweep: Sweep, where: Bool[np.ndarray, " values"], **style
         axes.axvspan(float(edges[begin]), float(edges[end]), alpha=0.15, lw=0.0, **style)
 
 
-def chart_figure(
-    chart: StabilityChart,
-    x: str = "first parameter",
-    y: str = "second parameter",
-    probability: Float[np.ndarray, "orders points"] | None = None,
-) -> Figure:
+def chart_figure(chart: StabilityChart) -> Figure:
     """Return the picture of a chart: the lowest stable order, and how fast its orbit attracts; white: none is stable.
 
-    Args:
-        chart: the chart.
-        x: path of the parameter of its columns.
-        y: path of that of its rows.
-        probability: that an orbit of each order is stable; dashed where that of one is 2.5 or 97.5 %.
+    Dashed: where the probability that an orbit of an order is stable is 2.5 or 97.5 %.
     """
     figure = new_figure(12.0, 5.2)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -268,7 +263,7 @@ def chart_figure(
         known.append(Line2D([], [], color="black", linewidth=1.0, label="within: several orders are stable"))
         left.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)
     left.set_title("lowest stable order N", fontsize=12)
-    for row in () if probability is None else probability.reshape(stable.shape):
+    for row in () if chart.probability is None else chart.probability.reshape(stable.shape):
         if row.min() < row.max():
             style = {"colors": DARK, "linewidths": 0.8, "linestyles": "dashed"}
             left.contour(chart.x_values, chart.y_values, row, levels=[0.025, 0.975], **style)
@@ -279,8 +274,9 @@ def chart_figure(
     mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=min(least, 0.99), vmax=1.0, rasterized=True)
     figure.colorbar(mesh, ax=right, label="modulus of its larger multiplier; 1: stability is lost")
     right.set_title("how fast its orbit attracts", fontsize=12)
-    label_axes(left, x=label_of(x), y=label_of(y))
-    label_axes(right, x=label_of(x), y="")
+    x = "first parameter" if chart.x is None else label_of(chart.x.path)
+    label_axes(left, x=x, y="second parameter" if chart.y is None else label_of(chart.y.path))
+    label_axes(right, x=x, y="")
     figure.legend(handles=known, loc="outside lower center", ncols=2, fontsize=11, frameon=False)
     return figure
 

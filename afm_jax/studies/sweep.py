@@ -31,7 +31,7 @@ from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, open_cache, silence_xla
 from afm_jax.contact.collide import ONLY_FREE, collide
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.charts import highest_orbits
+from afm_jax.dynamics.charts import DRIVEN_NUMBERS, ORBIT_NUMBERS, highest_orbits
 from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.starts import sample_driven
@@ -401,11 +401,12 @@ def _orbits(
 
     def record_batch(columns: Columns) -> Columns:
         scenes = made(columns)
-        found = highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
+        found = highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float), names=names)
         outside = jax.vmap(lambda law, speed: law.extrapolated(speed)) if beyond else None
         return found | ({} if outside is None else {EXTRAPOLATED: outside(scenes.interaction, found[APPROACH_SPEED])})
 
     driven = () if scene.base is None and scene.force is None else _DRIVEN_ORBIT_VARIABLES
+    names = ORBIT_NUMBERS + (DRIVEN_NUMBERS if driven else ())
     points = 4096 if law.delay else 1 << 18
     return Recorder((*_ORBIT_VARIABLES, *driven, *beyond), _in_batches(record_batch), points, extra)
 
@@ -419,7 +420,7 @@ def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row:
         blank = {"float64": math.nan, "bool": False}
         nothing = {each.name: np.full(len(orders), blank[each.dtype]) for each in _CONTACT_ORBIT_VARIABLES}
         return nothing | {MESSAGE.name: str(error)}
-    return {each.name: found[each.name][0] for each in _CONTACT_ORBIT_VARIABLES} | {MESSAGE.name: ""}
+    return {each.name: found[each.name][:, 0] for each in _CONTACT_ORBIT_VARIABLES} | {MESSAGE.name: ""}
 
 
 def _codes(kinds: Any) -> dict[int, str]:

@@ -51,6 +51,12 @@ BIFURCATION = Command(
         flag("--both", "Ramp up and then down, so that hysteresis shows."),
         flag("--down", "Ramp down instead of up."),
         valued("--impacts", click.IntRange(200), "At every value.", default=2000),
+        valued(
+            "--ordinate",
+            click.Choice(("height", "phase", "impact_speed")),
+            "What the picture draws of an impact.",
+            default="height",
+        ),
         LAW,
         DRAWS,
     ),
