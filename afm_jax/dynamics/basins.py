@@ -414,7 +414,7 @@ class _Finder:
         def work(some: Tips) -> tuple[Tips, Array]:
             return _towards(self.scene, some, targets.points, targets.radius, impacts=impacts)
 
-        return in_blocks(work, tips, block=_PART, program=(_towards, jax.tree.structure(self.scene)))
+        return in_blocks(work, tips, block=_PART)
 
     def targets(self) -> "_Targets":
         """Return the points of the orbits that are known."""

@@ -328,8 +328,7 @@ class _Sweeper:
             end, record = in_blocks(work, (scenes, tips))
         else:
             width = LANES if len(numbers) > LANES else _FEW
-            program = (follow, self.impacts, self.accuracy)
-            end, record = in_blocks(work, (scenes, tips), block=width, widths=(width,), program=program)
+            end, record = in_blocks(work, (scenes, tips), block=width, widths=(width,))
         period = self.period_us[numbers]
         return _SweptRows(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
 

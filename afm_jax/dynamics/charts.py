@@ -89,9 +89,7 @@ def orbit_verdicts(
             approach_speed_nm_per_us=orbits["approach_speed_nm_per_us"] if table else None,
         )
 
-    return jax.tree.map(
-        np.transpose, in_blocks(work, seen, block=_LANES, report=report, program=(orbit_verdicts, len(orders)))
-    )
+    return jax.tree.map(np.transpose, in_blocks(work, seen, block=_LANES, report=report))
 
 
 ORBIT_NUMBERS = (

@@ -283,8 +283,7 @@ def exponents_of_law(
     def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
         return _exponents_of_block(*lanes, impacts=impacts, transient=transient)
 
-    program = (_exponents_of_block, impacts, transient)
-    return in_blocks(work, (scenes, tips), report=report, program=program)
+    return in_blocks(work, (scenes, tips), report=report)
 
 
 def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:
