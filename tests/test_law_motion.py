@@ -6,7 +6,6 @@ import pytest
 from scipy.integrate import quad
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.junction import Phase
@@ -150,17 +149,6 @@ def test_an_end_within_the_collision_delay_is_on_the_platform():
     assert int(cut.contacts.kind[row]) == ContactKind.HELD
     assert int(cut.outcome) == MotionOutcome.HELD
     assert float(cut.final.position_nm) == pytest.approx(float(scene.platform.position(cut.final.time_us)), abs=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("within", [lambda end: jax.jit(jax.grad(end)), jax.hessian])
-def test_reverse_that_was_not_asked_for_is_one_clear_error(within):
-    def end(offset):
-        scene = Scene(Cantilever(90.0, 40.0), Platform(3.0, 170.0, offset), ImpactLaw(0.9, 40.0), BaseDrive(1.5, 88.0))
-        return simulated(scene, (0.4, 18.0, 3.0), 30.0).final.position_nm
-
-    with pytest.raises(ValueError, match=r"`simulate` is differentiable in reverse mode .* with `reverse=True` only"):
-        within(end)(-1.0)
 
 
 def test_a_batch_is_its_members():

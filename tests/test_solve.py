@@ -1,8 +1,5 @@
 """Numerics without physics: lanes in blocks and again, roots, points of curves, quadrature, derivatives by rules."""
 
-import threading
-import time
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,41 +32,6 @@ def test_many_lanes_are_worked_on_in_blocks_of_one_size(count: int, sizes: set[i
     assert set(seen) == sizes
     assert told == ([(23, 23)] if count == 23 else [])
     assert power_of_two(count) == {1: 1, 5: 8, 16: 16, 23: 32}[count]
-
-
-def test_blocks_of_a_program_that_has_run_begin_side_by_side(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("afm_jax.solve.lanes.available_cores", lambda: 2)
-    two, values = threading.Barrier(2, timeout=20.0), VALUES[:8]
-
-    def at_once(some):
-        two.wait()  # until another block has begun
-        return some
-
-    in_blocks(lambda some: some, values, block=4, widths=(), program="two blocks")
-    np.testing.assert_array_equal(in_blocks(at_once, values, block=4, widths=(), program="two blocks"), values)
-    two.abort()
-    with pytest.raises(threading.BrokenBarrierError):
-        in_blocks(at_once, values, block=4, widths=())
-
-
-def test_a_program_whose_first_block_has_failed_has_not_run(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("afm_jax.solve.lanes.available_cores", lambda: 2)
-    running, most = [], []
-
-    def fails(_):
-        raise MemoryError
-
-    def counted(some):
-        running.append(some)
-        time.sleep(0.05)
-        most.append(len(running))
-        running.pop()
-        return some
-
-    with pytest.raises(MemoryError):
-        in_blocks(fails, VALUES[:8], block=4, widths=(), program="a first block")
-    in_blocks(counted, VALUES[:8], block=4, widths=(), program="a first block")
-    assert most == [1, 1]
 
 
 @pytest.mark.parametrize("recompute", [False, True])

@@ -45,6 +45,8 @@ _WRITTEN_OUT = 3
 """Iterations up to which they are written out in the program; more are a loop."""
 _REMEMBERED = 20
 """Steps up to which reverse mode keeps what it needs of each; of more it computes them again."""
+_TRIAL_MARGIN = 1e-3
+"""Margin of a first pass of the retraction, which tells how fast the tip is at its end."""
 _TURN_NODES, _TURN_ITERATIONS = 48, 12
 _TURN_ROUNDS = 2
 _SCAN = 256
@@ -60,7 +62,7 @@ class Exit(NamedTuple):
     scale_nm: Float[Array, "..."]
     start_y: Float[Array, "..."]
     length: Float[Array, "..."]
-    sense: float | Float[Array, ""]
+    sense: float
 
     def at(self, fraction: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the gap in nm, and the path |dD| per fraction of the way."""
@@ -109,7 +111,7 @@ class Way(NamedTuple):
     """A way through the bridge; made by `way_through`."""
 
     tip: Driven
-    sense: float | Float[Array, ""]
+    sense: float
     """+1 on the way in, -1 on the way out."""
     begin_us: Float[Array, "..."]
     total_aj: Float[Array, "..."]
@@ -120,7 +122,7 @@ class Way(NamedTuple):
     """Floor of the kinetic energy, which keeps the integrand finite; None: a tip stops where it has none."""
 
     @property
-    def inward(self) -> bool | Bool[Array, ""]:
+    def inward(self) -> bool:
         """Whether the tip approaches."""
         return self.sense > 0.0
 
@@ -179,7 +181,7 @@ def way_through(
     start_energy_aj: Float[Array, "..."],
     margin: Float[Array, "..."],
     *,
-    inward: bool | Bool[Array, ""],
+    inward: bool,
     begin_us: Float[Array, "..."] | float = 0.0,
 ) -> Way:
     """Return a way through the bridge.
@@ -193,20 +195,13 @@ def way_through(
         begin_us: time at the start.
     """
     potentials = tuple(tip.potential(gap) for gap in gaps_nm)
-    start, end = _either(potentials, potentials[::-1], inward=inward)
+    start, end = potentials if inward else potentials[::-1]
     total = start_energy_aj + start
     outer, inner = gaps_nm
     at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
-    start_y, sense = _either(at_outer, at_inner, inward=inward), _either(1.0, -1.0, inward=inward)
-    course = Exit(outer * jnp.exp(margin), start_y, at_inner - at_outer, sense)
+    sense = 1.0 if inward else -1.0
+    course = Exit(outer * jnp.exp(margin), at_outer if inward else at_inner, at_inner - at_outer, sense)
     return Way(tip, sense, jnp.asarray(begin_us, total.dtype), total, end, course)
-
-
-def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
-    """Return the one for a tip that goes in, the other for one that goes out; a loop's program knows it at run time."""
-    if not isinstance(inward, jax.Array):
-        return one if inward else other
-    return jax.tree.map(lambda a, b: jnp.where(inward, a, b), one, other)
 
 
 def margin_of(energy: Float[Array, "..."], pull: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -309,7 +304,7 @@ def pass_by_collocation(way: Way, nodes: int, iterations: int) -> Passage:
 
 
 def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
-    """Return the passage after a fixed number of Diffrax's Runge-Kutta steps; differentiable forward and reverse.
+    """Return the passage of a free tip after a fixed number of Diffrax's steps; differentiable forward and reverse.
 
     Args:
         way: the way.
@@ -320,7 +315,13 @@ def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
 
     # the kind of scan that can be differentiated both ways
     chosen = getattr(diffrax, solver)(scan_kind="bounded")
-    term = diffrax.ODETerm(lambda fraction, state, _: way_rates(way, fraction, state))
+
+    def rates(fraction: Any, spent_and_time: tuple[Array, Array], _: Any) -> tuple[Array, Array]:
+        at = way.along(fraction)
+        speed, time_slope = way.speed_and_time_slope(at.path_nm, at.available_aj - spent_and_time[0])
+        return at.drag * speed, time_slope
+
+    term = diffrax.ODETerm(rates)
 
     # The fraction of the way is the time of the solver, one for all tips: a batch is an axis of the state, which costs
     # less than a batch of solvers.
@@ -329,9 +330,10 @@ def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
         after, _, _, memory, _ = chosen.step(term, ends[0], ends[1], state, None, memory, made_jump=False)
         return (after, memory), None
 
-    even = np.linspace(0.0, 1.0, steps + 1)
-    fractions = _either(1.0 - (1.0 - even) ** GRADING, even, inward=way.inward)
-    begin = nothing_spent(way)
+    fractions = np.linspace(0.0, 1.0, steps + 1)
+    if way.inward:
+        fractions = 1.0 - (1.0 - fractions) ** GRADING
+    begin = (jnp.zeros_like(way.total_aj),) * 2
     ends = jnp.stack([fractions[:-1], fractions[1:]], axis=1).astype(begin[0].dtype)
     memory = chosen.init(term, ends[0, 0], ends[0, 1], begin, None)
     # in reverse mode many steps are computed again one by one, few are remembered
@@ -339,25 +341,37 @@ def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
     return way.end(*state)
 
 
-def nothing_spent(way: Way) -> tuple[Float[Array, "..."], ...]:
-    """Return the state of `way_rates` at the start of a way."""
-    return (jnp.zeros_like(way.total_aj),) * (2 if way.tip.drive is None else 3)
+def approach_through_bridge(tip: Driven, energy_aj: Float[Array, "..."], setting: Setting) -> Passage:
+    """Return the way of a free tip from where the bridge forms to where the junction does, from a kinetic energy."""
+    margin = margin_of(energy_aj, pull_at(tip, tip.forms_nm))
+    gaps = tip.forms_nm, tip.junction.forms_gap_nm
+    return _pass_bridge(way_through(tip, gaps, energy_aj, margin, inward=True), setting)
 
 
-def way_rates(way: Way, fraction: Any, state: tuple[Float[Array, "..."], ...]) -> tuple[Float[Array, "..."], ...]:
-    """Return the rates per fraction of the state: energy spent, time, and for a driven tip energy dissipated."""
-    at = way.along(fraction)
-    speed, time_slope = way.speed_and_time_slope(at.path_nm, at.available_aj - state[0])
-    spending = way.spending(at, speed, state[1])
-    return (spending, time_slope) if way.tip.drive is None else (spending, time_slope, at.drag * speed)
+def retract_through_bridge(tip: Driven, energy_aj: Float[Array, "..."], setting: Setting) -> Passage:
+    """Return the way of a free tip from where the junction breaks to where contact ends, from a kinetic energy."""
+    gaps = tip.ends_nm, tip.junction.breaks_gap_nm
+
+    def out(margin: Float[Array, "..."]) -> Way:
+        return way_through(tip, gaps, energy_aj, margin, inward=False)
+
+    # twice: roughly, for the energy at its end and so for its margin, then as the setting says
+    trial = out(jnp.full_like(energy_aj, _TRIAL_MARGIN))
+    end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
+    return _pass_bridge(out(margin_of(end, pull_at(tip, tip.ends_nm))), setting)
 
 
-def pass_bridge(way: Way, setting: Setting) -> Passage:
+def pull_at(tip: Driven, gap_nm: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return -F(D) D in aJ: beside it a small kinetic energy counts as slow (`margin_of`)."""
+    return -tip.bridge.force(gap_nm) * gap_nm
+
+
+def _pass_bridge(way: Way, setting: Setting) -> Passage:
     """Return the passage by the integrator of a setting; of no length where the solids meet where contact begins."""
     if not way.tip.bridge.spans:
         nothing = jnp.zeros_like(way.total_aj)
         return way.end(nothing, nothing)
-    size = setting.inward if setting.careful or way.inward else setting.outward
+    size = setting.inward if way.inward else setting.outward
     if way.quiet:
         return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
     if setting.rule == "collocation":
@@ -457,29 +471,28 @@ def turn_in_bridge(
     tip = free_tip(contact, junction, mass)
     total = 0.5 * mass * approach_speed**2 + tip.potential(tip.forms_nm)
 
-    def leg(before, goes_in):
-        # in as often as the gap needs to settle, then out from the last one: in a loop, for copies take long to compile
-        gap, _, inward, _ = before
-        next_gap, turns = _turning_gap(tip, total - inward.dissipated_aj)
-        gap = jnp.where(goes_in, next_gap, gap)
-        ends = jnp.where(goes_in, tip.forms_nm, gap), jnp.where(goes_in, gap, tip.breaks_nm)
-        level = jnp.where(goes_in, total, tip.potential(gap))
-        way = Way(tip, 1.0, jnp.zeros_like(level), level, tip.potential(ends[1]), Turning(*ends))
-        half = collocate(way, _TURN_NODES, _TURN_ITERATIONS)
-        settles = half.end_change_aj <= 1e-9 * (jnp.abs(level) + jnp.abs(half.passage.dissipated_aj)) + 1e-12
-        return (gap, jnp.where(goes_in, turns, before[1]), half.passage, inward), settles
+    def half(start: Array, end: Array, level: Array) -> tuple[Passage, Array]:
+        way = Way(tip, 1.0, jnp.zeros_like(level), level, tip.potential(end), Turning(start, end))
+        found = collocate(way, _TURN_NODES, _TURN_ITERATIONS)
+        scale = jnp.abs(level) + jnp.abs(found.passage.dissipated_aj)
+        return found.passage, found.end_change_aj <= 1e-9 * scale + 1e-12
+
+    def inwards(_, before):
+        # as often as the gap needs to settle
+        gap, turns = _turning_gap(tip, total - before[2].dissipated_aj)
+        return gap, turns, *half(tip.forms_nm, gap, total)
 
     nothing = jnp.zeros_like(total)
-    begin = Passage(nothing, nothing, spent + nothing)
-    first = (nothing + tip.forms_nm, nothing > 0.0, begin, begin)
-    (gap, turns, outward, inward), settles = lax.scan(leg, first, jnp.arange(_TURN_ROUNDS + 2) <= _TURN_ROUNDS)
+    guess = nothing, nothing > 0.0, Passage(nothing, nothing, spent + nothing), nothing > 0.0
+    gap, turns, inward, settles_in = lax.fori_loop(0, _TURN_ROUNDS + 1, inwards, guess)
+    outward, settles_out = half(gap, tip.breaks_nm, tip.potential(gap))
     return Turn(
         turns=turns,
         gap_nm=gap,
         energy_aj=outward.energy_aj,
         dissipated_aj=inward.dissipated_aj + outward.dissipated_aj,
         time_us=inward.time_us + outward.time_us,
-        settled=settles[-2] & settles[-1],
+        settled=settles_in & settles_out,
     )
 
 

@@ -7,7 +7,7 @@ steps and again in many for the few tips that need it; `capture_speed` is the ro
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -31,12 +31,10 @@ from afm_jax.columns import Cell, columns_of, printed_table
 from afm_jax.contact.bridge_leg import (
     Passage,
     Turn,
-    Way,
-    margin_of,
-    pass_bridge,
-    pass_by_collocation,
+    approach_through_bridge,
+    pull_at,
+    retract_through_bridge,
     turn_in_bridge,
-    way_through,
 )
 from afm_jax.contact.contact import Contact, bridge_of
 from afm_jax.contact.driven import Driven, free_tip
@@ -46,7 +44,7 @@ from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.derivatives import by_tangents, implicit_root
-from afm_jax.solve.lanes import LANES, again_for_the_open, compiled_quickly, filled, for_each_lane, rows_in_blocks
+from afm_jax.solve.lanes import LANES, compiled_quickly, filled, for_each_lane, rows_in_blocks
 
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
@@ -57,8 +55,6 @@ _NEAR_CAPTURE = (-0.02, 0.2)
 
 The upper bound is reached at about 1.1 times the capture speed.
 """
-_TRIAL_MARGIN = 1e-3
-"""Margin of a first pass of the retraction, which tells how fast the tip is at its end."""
 
 ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
 # a captured tip stops before it has lost all of that
@@ -148,9 +144,8 @@ def collide(
             )
     # one axis of tips inside, the speeds' own shape outside
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
-    small = speeds.size <= LANES
-    stages = (_in_few_steps, _in_many_steps)
-    result = by_tangents(_tips, contact, mass, speeds.ravel(), small=small, stages=stages, setting=setting)
+    tips = contact, mass, speeds.ravel()
+    result = by_tangents(_quick, *tips, small=speeds.size <= LANES, many_steps=_careful, setting=setting)
     if not any(leaf.ndim for leaf in jax.tree.leaves(contact)):
         require_junction(contact, result.outcome != CollisionOutcome.NO_JUNCTION)
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
@@ -178,7 +173,7 @@ def collision(
     valid = (approach_speed > 0.0) & jnp.isfinite(approach_speed)
     speed = jnp.where(valid, approach_speed, 1.0)
     parts = three_parts(contact, junction, speed, mass, setting)
-    result = collision_of(contact, junction, speed, mass, parts)
+    result = _collision_of_parts(contact, junction, speed, mass, parts)
     finite = jnp.ones_like(valid)
     if setting.careful and contact.spans:
         turn = for_each_lane(turn_in_bridge, contact, junction, speed, mass, parts.approach.dissipated_aj)
@@ -198,18 +193,12 @@ def collision(
     return result._replace(approach_speed_nm_per_us=approach_speed, outcome=outcome), resolved
 
 
-_Pair = tuple[Float[Array, "..."], Float[Array, "..."]]
-"""Of approach and retraction, or of the outer and the inner end of one."""
-
-
 class ThreeParts(NamedTuple):
     """The three parts of a collision that forms the junction."""
 
     approach: Passage
     junction: JunctionWay
     retract: Passage
-    outer_gap_nm: Float[Array, "..."]
-    """Gap at which contact ends: where the bridge breaks, or the junction if that lasts longer."""
     resolved: Bool[Array, "..."]
     """Whether the setting's few steps are enough."""
 
@@ -220,7 +209,6 @@ def three_parts(
     approach_speed: Float[Array, "..."],
     mass: Float[Array, "..."],
     setting: Setting,
-    crossing: Callable[[Way], Passage] | None = None,
 ) -> ThreeParts:
     """Return approach, junction and retraction of one tip, each from the kinetic energy that the one before leaves.
 
@@ -230,86 +218,38 @@ def three_parts(
         approach_speed: in nm/us, positive.
         mass: in ng.
         setting: how finely.
-        crossing: integrates a way through the bridge in place of the setting's integrator; None: the setting's.
     """
     tip = free_tip(contact, junction, mass)
-    gaps_in, gaps_out = (tip.forms_nm, junction.forms_gap_nm), (tip.ends_nm, junction.breaks_gap_nm)
-    # -F(D) D in aJ at either outer gap: beside it a small kinetic energy counts as slow (`margin_of`)
-    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap, _ in (gaps_in, gaps_out))
     start = 0.5 * mass * approach_speed * approach_speed
+    approach = approach_through_bridge(tip, start, setting)
+    solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
+    retract = retract_through_bridge(tip, solid.energy_aj, setting)
 
-    if setting.careful and crossing is None and not tip.bridge.conserves:
-        approach, solid, retract = _parts_in_a_loop(tip, start, (gaps_in, gaps_out), (pull_in, pull_out), setting)
-    else:
-        cross = crossing or partial(pass_bridge, setting=setting)
-        approach = cross(way_through(tip, gaps_in, start, margin_of(start, pull_in), inward=True))
-        solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
-        # the way out twice: roughly, for the energy at its end and so for its margin, then as the setting says
-        trial = way_through(tip, gaps_out, solid.energy_aj, jnp.full_like(start, _TRIAL_MARGIN), inward=False)
-        end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
-        retract = cross(way_through(tip, gaps_out, solid.energy_aj, margin_of(end, pull_out), inward=False))
-
-    resolved = _few_steps_suffice(tip, (approach, solid, retract), start, (pull_in, pull_out), setting)
-    return ThreeParts(approach, solid, retract, tip.ends_nm, resolved)
-
-
-def _few_steps_suffice(
-    tip: Driven,
-    parts: tuple[Passage, JunctionWay, Passage],
-    start: Float[Array, "..."],
-    pulls_aj: _Pair,
-    setting: Setting,
-) -> Bool[Array, "..."]:
-    """Say whether a setting's few steps resolve a collision of a free tip.
-
-    They do where dissipation is small against the energies along the way, no repulsion almost stops the tip inside the
-    bridge, and it is not close to capture.
-    """
-    approach, solid, retract = parts
-    # at an end that pulls, a slow tip's drag must be small against the pull for the substitution of the gap to hold
-    calm_in, calm_out = (
-        (pull <= 0.0)
-        | (tip.bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / tip.mass_ng) <= 0.1 * pull)
-        for gap, pull in zip((tip.forms_nm, tip.ends_nm), pulls_aj, strict=True)
-    )
-    least = jnp.minimum(start + jnp.maximum(pulls_aj[0], 0.0), approach.energy_aj)
+    # Few steps resolve a collision where dissipation is small against the energies along the way, no repulsion almost
+    # stops the tip inside the bridge, and it is not close to capture.
+    pull_in, calm_in = _pull_and_calm(tip, tip.forms_nm)
+    _, calm_out = _pull_and_calm(tip, tip.ends_nm)
+    least = jnp.minimum(start + jnp.maximum(pull_in, 0.0), approach.energy_aj)
     spent = _MOST_SPENT[setting.rule]
     easy_in = (approach.dissipated_aj < spent * least) & (approach.energy_aj > 0.1 * start) & calm_in
     easy_out = (retract.dissipated_aj < spent * solid.energy_aj) & calm_out
     # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
     energy_left = jnp.where(solid.energy_aj > 0.0, retract.energy_aj, solid.energy_aj)
     clear = (energy_left > _NEAR_CAPTURE[1] * start) | (energy_left < _NEAR_CAPTURE[0] * start)
-    return easy_in & clear & (easy_out | (solid.energy_aj <= 0.0))
+    return ThreeParts(approach, solid, retract, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
 
 
-def _parts_in_a_loop(
-    tip: Driven, start: Float[Array, "..."], gaps_nm: tuple[_Pair, _Pair], pulls_aj: _Pair, setting: Setting
-) -> tuple[Passage, JunctionWay, Passage]:
-    """Return approach, junction and retraction by one program in a loop, since three copies of it compile for long.
+def _pull_and_calm(tip: Driven, outer_nm: Float[Array, "..."]) -> tuple[Float[Array, "..."], Bool[Array, "..."]]:
+    """Return the pull at an outer gap in aJ, and whether a slow tip's drag is small against it.
 
-    The three rounds are: the approach; the retraction for its energy at the end; the retraction. Every round computes
-    the junction, too; before the approach is known (round 0) its result is not used.
+    Else the substitution of the gap does not hold.
     """
-
-    def leg(before, number):
-        formed_aj, end_aj = before
-        goes_in, first_out = number == 0, number == 1
-        solid = pass_through_junction(tip, formed_aj, setting.junction_nodes)
-        # of the way in or of the way out
-        gaps, pull = jax.tree.map(lambda a, b: jnp.where(goes_in, a, b), *zip(gaps_nm, pulls_aj, strict=True))
-        margin = jnp.where(first_out, _TRIAL_MARGIN, margin_of(end_aj, pull))
-        energy = jnp.where(goes_in, start, solid.energy_aj)
-        passage = pass_bridge(way_through(tip, gaps, energy, margin, inward=goes_in), setting)
-        return (jnp.where(goes_in, passage.energy_aj, formed_aj), passage.energy_aj), (passage, solid)
-
-    _, (passages, solids) = lax.scan(leg, (start, start), jnp.arange(3))
-    approach, solid, retract = (
-        jax.tree.map(lambda part, k=k: part[k], parts) for parts, k in ((passages, 0), (solids, 2), (passages, 2))
-    )
-    return approach, solid, retract
+    pull = pull_at(tip, outer_nm)
+    drag = tip.bridge.damping(outer_nm) * outer_nm * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / tip.mass_ng)
+    return pull, (pull <= 0.0) | (drag <= 0.1 * pull)
 
 
-def collision_of(
+def _collision_of_parts(
     contact: Contact,
     junction: Junction,
     approach_speed: Float[Array, "..."],
@@ -317,7 +257,7 @@ def collision_of(
     parts: ThreeParts,
 ) -> Collision:
     """Return the collision that three parts make, for a tip that forms the junction."""
-    approach, solid, retract = parts[:3]
+    approach, solid, retract, _ = parts
     reached, broke = approach.energy_aj > 0.0, solid.energy_aj > 0.0
     leaves = reached & broke & (retract.energy_aj > 0.0)
     lacking = jnp.minimum(retract.energy_aj, jnp.minimum(solid.energy_aj, approach.energy_aj))
@@ -328,7 +268,7 @@ def collision_of(
         leaves,
         energy_aj=jnp.where(leaves, retract.energy_aj, lacking),
         time_us=approach.time_us + solid.time_us + retract.time_us,
-        gaps_nm=(contact.bridge_forms_nm, parts.outer_gap_nm),
+        gaps_nm=(contact.bridge_forms_nm, jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)),
         outcome=jnp.where(leaves, CollisionOutcome.REBOUND, captured),
         time_in_junction_us=jnp.where(leaves, solid.time_us, 0.0),
         deepest_gap_nm=solid.deepest_gap_nm,
@@ -366,7 +306,7 @@ def _collision(
     *,
     energy_aj: Array,
     time_us: Array,
-    gaps_nm: _Pair,
+    gaps_nm: tuple[Array, Array],
     **others: Any,
 ) -> Collision:
     """Return a collision with rebound speed and delay, from its energy at the end and its duration.
@@ -482,55 +422,34 @@ def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"]
     return _quick(contact, jnp.asarray(mass_ng, speeds.dtype), speeds, setting)[0]
 
 
-def _tips(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting) -> Collision:
-    """Return the collisions of a batch: in few steps, and those that these do not resolve again in many."""
-    quick, resolved, junction = _quick(contact, mass, speeds, setting)
-    return again_for_the_open(_careful, resolved, ((contact, junction), mass, speeds), quick)
-
-
 @partial(jax.jit, static_argnames="setting")
 def _quick(
-    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
-) -> tuple[Collision, Bool[Array, "..."], Junction]:
-    """Return the collisions of a batch in few steps, which of them these resolve, and the junction or junctions."""
-    junction = _junctions(contact, speeds)
-    return *_in_blocks((contact, junction), mass, speeds, setting), junction
+    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting
+) -> tuple[Collision, Bool[Array, " tips"]]:
+    """Return the collisions of a batch in few steps, and which of them these resolve."""
+    return _in_blocks(contact, mass, speeds, setting)
 
 
-def _junctions(contact: Contact, speeds: Float[Array, "..."]) -> Junction:
-    """Return the junction of a contact, or of each tip its own."""
-    if any(leaf.ndim for leaf in jax.tree.leaves(contact)):
-        return rows_in_blocks(lambda some, _: for_each_lane(find_junction, some), contact, speeds)
-    return find_junction(contact)
-
-
-def _in_few_steps(
-    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
-) -> tuple[Collision, Bool[Array, "..."]]:
-    return _quick(contact, mass, speeds, setting)[:2]
-
-
-def _in_many_steps(
-    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
-) -> Collision:
+@compiled_quickly(static_argnames="setting")
+def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting) -> Collision:
+    """Return the collisions of a batch in many steps, whatever the setting, turning points in the bridge included."""
     del setting
-    return _careful((contact, _junctions(contact, speeds)), mass, speeds)
-
-
-@compiled_quickly()
-def _careful(contact: tuple[Contact, Junction], mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
-    """Return the collisions of a batch in many steps, turning points in the bridge included."""
     return _in_blocks(contact, mass, speeds, CAREFUL)[0]
 
 
 def _in_blocks(
-    contact: tuple[Contact, Junction], mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
-) -> tuple[Collision, Bool[Array, "..."]]:
+    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting
+) -> tuple[Collision, Bool[Array, " tips"]]:
+    if any(leaf.ndim for leaf in jax.tree.leaves(contact)):
+        junction = rows_in_blocks(lambda some, _: for_each_lane(find_junction, some), contact, speeds)
+    else:
+        junction = find_junction(contact)
+
     def block(parameters, speed):
         (contact, junction), mass = parameters
         return collision(contact, junction, speed, mass, setting)
 
-    return rows_in_blocks(block, (contact, mass), speeds)
+    return rows_in_blocks(block, ((contact, junction), mass), speeds)
 
 
 _POINTS = 20

@@ -177,32 +177,16 @@ def _scan(model: Tangent, low: Float[Array, ""], high: Float[Array, ""]) -> tupl
     Without one, the interval around the least excess of stiffness is returned: a narrow crossing may hide there.
     """
     bridge, load_scale, depth_scale = model
-    step = (high - low) / (_POINTS - 1)
-
-    def inward(carry, count):
-        softer_before, found, left, least, place = carry
-        point = high - step * count
-        gap = jnp.exp(point)
-        load = bridge.force(gap) / load_scale
-        stiffness = bridge.stiffness(gap) * depth_scale / load_scale
-        borne = load > -1.5
-        excess = stiffness * stiffness * stiffness - _elastic_cube(load)
-        stiffer = borne & (excess > 0.0)
-        crossing = stiffer & softer_before & ~found
-        close = borne & (stiffness > 0.0) & (excess < least)
-        carry = (
-            borne & ~stiffer,
-            found | crossing,
-            jnp.where(crossing, point, left),
-            jnp.where(close, excess, least),
-            jnp.where(close, point, place),
-        )
-        return carry, None
-
-    never = jnp.zeros_like(low, bool)
-    start = (never, never, low, jnp.full_like(low, jnp.inf), low)
-    # a loop rather than an array of points: what depends on the parameters alone is then computed once
-    (_, found, left, _, place), _ = lax.scan(inward, start, jnp.arange(_POINTS, dtype=low.dtype))
+    points = jnp.linspace(high, low, _POINTS)
+    step, gaps = (high - low) / (_POINTS - 1), jnp.exp(points)
+    load = bridge.force(gaps) / load_scale
+    stiffness = bridge.stiffness(gaps) * depth_scale / load_scale
+    borne = load > -1.5
+    excess = stiffness * stiffness * stiffness - _elastic_cube(load)
+    crossing = (borne & (excess > 0.0))[1:] & (borne & ~(excess > 0.0))[:-1]
+    close = jnp.where(borne & (stiffness > 0.0), excess, jnp.inf)
+    found, left = crossing.any(), points[1 + jnp.argmax(crossing)]
+    place = jnp.where(jnp.isfinite(close.min()), points[jnp.argmin(close)], low)
     return (jnp.where(found, left, place - step), jnp.where(found, left + step, place + step)), found
 
 

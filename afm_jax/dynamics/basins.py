@@ -341,8 +341,7 @@ class _Finder:
             def work(some: Tips, impacts: int = impacts, points: np.ndarray = points) -> tuple[Tips, Array]:
                 return _towards(self.scene, some, points, impacts=impacts)
 
-            program = _towards, jax.tree.structure(self.scene)
-            tips, nearest = in_blocks(work, tips, block=_PART, program=program)
+            tips, nearest = in_blocks(work, tips, block=_PART)
             arrival = owner[nearest]
             for outcome, kind in (
                 (Outcome.CAPTURED, MotionKind.STUCK),

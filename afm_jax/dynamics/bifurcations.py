@@ -308,7 +308,7 @@ def _motions(scenes: Scene, tips: Tips, impacts: int, accuracy: float) -> _Rampe
     if isinstance(scenes.interaction, Contact):
         end, record = in_blocks(work, (scenes, tips))
     else:
-        end, record = in_blocks(work, (scenes, tips), block=_FEW, widths=(_FEW,), program=(follow, impacts))
+        end, record = in_blocks(work, (scenes, tips), block=_FEW, widths=(_FEW,))
     period = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
     return _Ramped(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
 

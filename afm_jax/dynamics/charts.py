@@ -86,9 +86,7 @@ def orbit_verdicts(
         numbers = {name: orbits[name] for name in names}
         return OrbitVerdicts(orbits["stable_orbits"] > 0, orbits["admissible_orbits"] > 0, **numbers)
 
-    return jax.tree.map(
-        np.transpose, in_blocks(work, seen, block=_LANES, report=report, program=(orbit_verdicts, len(orders)))
-    )
+    return jax.tree.map(np.transpose, in_blocks(work, seen, block=_LANES, report=report))
 
 
 ORBIT_NUMBERS = (

@@ -258,8 +258,8 @@ def exponents_of(
     if isinstance(scenes.interaction, Contact):
         return work((scenes, tips))
     block = max(1, min(LANES, _MOST_IMPACTS // impacts))
-    widths, program = [width for width in WIDTHS if width <= block], (work.__qualname__, impacts, transient)
-    return in_blocks(work, (scenes, tips), block=block, widths=widths, report=report, program=program)
+    widths = [width for width in WIDTHS if width <= block]
+    return in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
 
 
 def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:

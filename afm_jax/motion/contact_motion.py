@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
@@ -70,21 +71,12 @@ _LESS = 4.0
 
 
 class ContactRow(NamedTuple):
-    """One contact as numbers in one vector: gaps in nm over the surface, their rates in nm/us, times in us."""
+    """One contact, kept as numbers in one vector: gaps in nm over the surface, their rates in nm/us, times in us."""
 
-    kind: Float[Array, "..."]
-    arrival_us: Float[Array, "..."]
-    arrival_gap_nm: Float[Array, "..."]
-    arrival_rate: Float[Array, "..."]
-    departure_us: Float[Array, "..."]
-    departure_gap_nm: Float[Array, "..."]
-    departure_rate: Float[Array, "..."]
-    junctions: Float[Array, "..."]
-    junction_forms_us: Float[Array, "..."]
-    junction_breaks_us: Float[Array, "..."]
-    time_in_junction_us: Float[Array, "..."]
-    deepest_gap_nm: Float[Array, "..."]
-    viscous_loss_aj: Float[Array, "..."]
+    kind: Int[Array, "..."]
+    arrival: ContactState
+    tip: TipInContact
+    """Where it ended, with a record of the contact."""
 
 
 class Repeats(NamedTuple):
@@ -147,7 +139,7 @@ def follow_contacts(  # noqa: PLR0913
     begun = _at_start(driven, start.time_us, *to_gap(surface, response, start), rows=max_contacts)
     end = _at_end(driven, begun, until, setting, rounds=max_rounds, reverse=reverse)
     state, phase = end.tip.state, end.tip.phase
-    row = ContactRow(*jnp.moveaxis(end.rows, -1, 0))
+    row = jax.vmap(ravel_pytree(ContactRow(end.contacts, end.arrival, end.tip))[1])(end.rows)
     return Simulation(
         start=start,
         contacts=_contacts(row, scene, surface, response, driven),
@@ -209,12 +201,14 @@ def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, row
     phase = jnp.where(leaves | (gap_nm > driven.forms_nm), Phase.DRY, Phase.BRIDGE)
     none, zero = jnp.zeros_like(phase), jnp.zeros_like(time_us)
     start = ContactState(gap_nm, rate, time_us, zero)
+    tip = TipInContact.at_start(start, phase)
+    columns = ravel_pytree(ContactRow(none, start, tip))[0].size
     return ContactTip(
-        tip=TipInContact.at_start(start, phase),
+        tip=tip,
         arrival=start,
         repeats=Repeats(none.astype(jnp.int32), zero, zero),
         contacts=none,
-        rows=jnp.zeros((rows, len(ContactRow._fields)), time_us.dtype),
+        rows=jnp.zeros((rows, columns), time_us.dtype),
         outcome=outcome.astype(jnp.int32),
         done=outcome != MotionOutcome.FINISHED,
         rounds=none,
@@ -263,12 +257,14 @@ def _round(driven: Driven, course: ContactTip, *, until_us: Array, setting: Driv
     if setting.agreement is not None:
         tip = _where(again, TipInContact.arriving(driven, arrival, jnp.ones_like(again)), tip)
     place = jnp.where(ends & ~full, course.contacts, room)
+    kind = jnp.where(leaves, ContactKind.IMPACT, ContactKind.HELD).astype(course.contacts.dtype)
+    row, _ = ravel_pytree(ContactRow(kind, arrival, tip))
     return ContactTip(
         tip=tip,
         arrival=arrival,
         repeats=repeats,
         contacts=course.contacts + ends.astype(course.contacts.dtype),
-        rows=course.rows.at[place].set(_row(tip, arrival, held=~leaves), mode="drop"),
+        rows=course.rows.at[place].set(row, mode="drop"),
         outcome=jnp.where(course.done, course.outcome, outcome).astype(jnp.int32),
         done=course.done | (free & ~arrives) | (in_contact & over) | full | lost | ~finite,
         rounds=course.rounds + 1,
@@ -478,27 +474,6 @@ def _repetition(
     return again, _where(again, Repeats(repeats.times + 1, departed.time_us, departed.gap_rate), over)
 
 
-def _row(tip: TipInContact, arrival: ContactState, *, held: Array) -> Float[Array, " columns"]:
-    """Return a contact as a row; without departure where the tip is held."""
-    state = tip.state
-    row = ContactRow(
-        kind=jnp.where(held, float(ContactKind.HELD), float(ContactKind.IMPACT)),
-        arrival_us=arrival.time_us,
-        arrival_gap_nm=arrival.x,
-        arrival_rate=arrival.gap_rate,
-        departure_us=jnp.where(held, jnp.inf, state.time_us),
-        departure_gap_nm=jnp.where(held, 0.0, state.x),
-        departure_rate=jnp.where(held, 0.0, state.gap_rate),
-        junctions=tip.junctions.astype(state.x.dtype),
-        junction_forms_us=tip.junction_forms_us,
-        junction_breaks_us=tip.junction_breaks_us,
-        time_in_junction_us=tip.time_in_junction_us,
-        deepest_gap_nm=tip.deepest_gap_nm,
-        viscous_loss_aj=state.viscous_loss_aj,
-    )
-    return jnp.stack(row)
-
-
 def _contacts(
     row: ContactRow, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
 ) -> Contacts:
@@ -506,24 +481,26 @@ def _contacts(
 
     Loss = hysteresis of the bridge (of a tip that left) + junctions times their hysteresis + viscous loss.
     """
-    junction = driven.junction
-    has_left, touched = row.kind == ContactKind.IMPACT, row.junctions > 0.0
+    junction, tip = driven.junction, row.tip
+    has_left, touched = row.kind == ContactKind.IMPACT, tip.junctions > 0
     bridge = jnp.where(has_left, junction.bridge_hysteresis_aj, 0.0)
-    solid = row.junctions * junction.junction_hysteresis_aj
-    depth = junction.shift_nm - jnp.where(touched, row.deepest_gap_nm, 0.0)
+    solid = tip.junctions * junction.junction_hysteresis_aj
+    depth = junction.shift_nm - jnp.where(touched, tip.deepest_gap_nm, 0.0)
     force = jnp.where(touched, scene.interaction.solid.force(depth), 0.0)
     detail = ContactDetail(
-        junctions=row.junctions.astype(jnp.int32),
-        junction_forms_us=row.junction_forms_us,
-        junction_breaks_us=row.junction_breaks_us,
-        time_in_junction_us=row.time_in_junction_us,
-        deepest_gap_nm=row.deepest_gap_nm,
+        junctions=tip.junctions,
+        junction_forms_us=tip.junction_forms_us,
+        junction_breaks_us=tip.junction_breaks_us,
+        time_in_junction_us=tip.time_in_junction_us,
+        deepest_gap_nm=tip.deepest_gap_nm,
         peak_force_nn=jnp.maximum(force, 0.0),
         bridge_hysteresis_aj=bridge,
         junction_hysteresis_aj=solid,
-        viscous_loss_aj=row.viscous_loss_aj,
+        viscous_loss_aj=tip.state.viscous_loss_aj,
     )
-    arrival = State(row.arrival_us, row.arrival_gap_nm, row.arrival_rate)
-    departure = State(row.departure_us, row.departure_gap_nm, row.departure_rate)
-    lost = bridge + solid + row.viscous_loss_aj
+    arrival = State(row.arrival.time_us, row.arrival.x, row.arrival.gap_rate)
+    departure = State(tip.state.time_us, tip.state.x, tip.state.gap_rate)
+    held = row.kind == ContactKind.HELD
+    departure = State(*(jnp.where(held, none, part) for part, none in zip(departure, (jnp.inf, 0.0, 0.0), strict=True)))
+    lost = bridge + solid + tip.state.viscous_loss_aj
     return contacts_in_lab(surface, response, row.kind, arrival, departure, lost, detail)

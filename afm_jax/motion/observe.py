@@ -34,7 +34,6 @@ from afm_jax.impact.orbits import FlightEnds, highest_of_flight
 from afm_jax.motion.record import ContactKind, Contacts, Simulation, State, contacts_left, to_gap
 from afm_jax.motion.settle import Settled, Window, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
-from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -621,12 +620,12 @@ def peaks_of_flights(
     return np.asarray(_peaks(scene.cantilever, response, *columns))
 
 
-@compiled_quickly()
+@jax.jit
 def _least_force(solid: ElasticCurve, depths_nm: Float[np.ndarray | Array, " loads"]) -> Float[Array, ""]:
     return jnp.min(solid.force(depths_nm))
 
 
-@compiled_quickly()
+@jax.jit
 def _peaks(
     cantilever: Cantilever,
     response: Surface | None,

@@ -8,6 +8,7 @@ import enum
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -16,7 +17,6 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
 from afm_jax.outcomes import OutcomeInWords
 from afm_jax.results import Result, ResultTuple, public_result
-from afm_jax.solve.lanes import compiled_quickly
 
 
 class MotionOutcome(OutcomeInWords):
@@ -152,7 +152,7 @@ def contacts_left(simulation: Simulation) -> Bool[np.ndarray, " rows"]:
     return np.isin(np.asarray(simulation.contacts.kind), (ContactKind.IMPACT, ContactKind.CHATTER))
 
 
-@compiled_quickly()
+@jax.jit
 def to_gap(
     surface: Platform | Surface, response: Surface | None, state: State
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -165,7 +165,7 @@ def to_gap(
     return position - height, velocity - speed
 
 
-@compiled_quickly()
+@jax.jit
 def to_lab(
     surface: Platform | Surface, response: Surface | None, time_us: ArrayLike, gap_nm: ArrayLike, gap_rate: ArrayLike
 ) -> State:

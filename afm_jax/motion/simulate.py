@@ -6,8 +6,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.platform import Platform
@@ -104,19 +102,11 @@ def simulate(  # noqa: PLR0913
     else:
         kind = type(scene.interaction).__name__
         raise TypeError(f"the interaction must be an ImpactLaw, a Contact or None, not {kind}")
-    try:
-        if max_contacts is not None:
-            simulation = follow(max_contacts=max_contacts)
-        else:
-            room = _room(scene, surface, duration_us)
-            # in reverse mode every round is run, needed or not
-            simulation = _with_room(follow, room if reverse else max(_LEAST_ROOM, power_of_two(room)))
-    except TypeError as error:
-        # JAX's own, where reverse derivatives through its loop are differentiated once more
-        if reverse or "NoneType" not in str(error):
-            raise
-        raise ValueError(_NOT_BACKWARDS) from error
-    return simulation if reverse else jax.tree.map(_only_forwards, simulation)
+    if max_contacts is not None:
+        return follow(max_contacts=max_contacts)
+    room = _room(scene, surface, duration_us)
+    # in reverse mode every round is run, needed or not
+    return _with_room(follow, room if reverse else max(_LEAST_ROOM, power_of_two(room)))
 
 
 @jax.jit
@@ -154,32 +144,6 @@ def _follow_free(
         held=jnp.zeros((), bool),
         outcome=outcome,
     )
-
-
-_forwards = Primitive("forwards")
-"""A number itself, which says in reverse mode what that needs, before JAX says that a loop has none."""
-_forwards.def_impl(lambda number: number)
-_forwards.def_abstract_eval(lambda number: number)
-mlir.register_lowering(_forwards, lambda _, number: [number])
-batching.primitive_batchers[_forwards] = lambda numbers, axes: (_forwards.bind(*numbers), axes[0])
-
-
-_NOT_BACKWARDS = (
-    "`simulate` is differentiable in reverse mode (`grad`, `vjp`, `jacrev`, `hessian`) with `reverse=True` only: add "
-    "it, or take `jvp` or `jacfwd`"
-)
-
-
-def _refuse(*_):
-    raise ValueError(_NOT_BACKWARDS)
-
-
-ad.deflinear2(_forwards, _refuse)
-
-
-def _only_forwards(part: Array) -> Array:
-    """Return a part of a result that is traced so that it refuses reverse mode."""
-    return _forwards.bind(part) if is_traced(part) and jnp.issubdtype(part.dtype, jnp.floating) else part
 
 
 def _with_room(follow: Callable[..., Simulation], room: int) -> Simulation:

@@ -2,9 +2,7 @@
 
 A simulation keeps its contacts alone. `dense_path` makes pieces of it in the order of time, each with a state from
 which the tip is followed: flights, in closed form; steps of contacts, which are integrated once more, a place inside a
-step being one step of order 8 from its beginning; rests on the surface of a law. Where contacts need not be known so
-well they are straight lines between the points that a simulation keeps of them (bridge formed, junction formed,
-deepest, junction broken, bridge broken), without a second integration.
+step being one step of order 8 from its beginning; rests on the surface of a law.
 """
 
 import math
@@ -23,7 +21,7 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, driven_by
-from afm_jax.contact.junction import Phase, find_junction, force_in_phase
+from afm_jax.contact.junction import Phase, force_in_phase
 from afm_jax.contact.step import TipInContact, advance, eighth_order_step
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
 from afm_jax.results import ResultTuple, public_result
@@ -38,8 +36,8 @@ _NODES_PER_STEP = 8
 _NODES_PER_PANEL = 16
 _PANEL_RAD = 1.5
 """Phase of the fastest motion that one panel of a flight spans."""
-FLIGHT, REST, STRAIGHT = -1, -2, -3
-_PHASES = {FLIGHT: int(Phase.DRY), REST: int(Phase.JUNCTION), STRAIGHT: int(Phase.BRIDGE)}
+FLIGHT, REST = -1, -2
+_PHASES = {FLIGHT: int(Phase.DRY), REST: int(Phase.JUNCTION)}
 
 
 @public_result(phase=Phase)
@@ -68,9 +66,7 @@ class PreparedScene(NamedTuple):
     surface: Platform | Surface
     response: Surface | None
     driven: Driven | None = None
-    """None for a law, without an interaction, and where contacts are not integrated once more."""
-    kept_gaps: tuple[float, ...] | None = None
-    """Where they are not: gaps in nm at which the bridge forms, the junction forms and breaks, the bridge breaks."""
+    """None for a law, and without an interaction."""
 
 
 class Pieces(NamedTuple):
@@ -79,7 +75,7 @@ class Pieces(NamedTuple):
     begin_us: np.ndarray
     end_us: np.ndarray
     kind: np.ndarray
-    """`FLIGHT`, `REST`, `STRAIGHT`, or the phase of a step of a contact."""
+    """`FLIGHT`, `REST`, or the phase of a step of a contact."""
     origin_us: np.ndarray
     """Time at which the tip has the state that follows: of a flight the departure, or the start."""
     x: np.ndarray
@@ -123,9 +119,7 @@ class DensePath(NamedTuple):
         piece = self.pieces.where(np.clip(np.searchsorted(self.pieces.begin_us, times, side="right") - 1, 0, None))
         flown = _flight(self.scene.cantilever, prepared.surface, piece.x, piece.rate, piece.origin_us, times)
         gap, rate = (np.where(piece.kind == FLIGHT, np.asarray(part), 0.0) for part in flown)
-        straight, touching = piece.kind == STRAIGHT, piece.kind >= 0
-        gap = np.where(straight, piece.x + piece.rate * (times - piece.origin_us), gap)
-        rate = np.where(straight, piece.rate, rate)
+        touching = piece.kind >= 0
         if touching.any():
             inside = Pieces(*(_filled_up(column[touching]) for column in piece))
             in_contact = _in_contact(prepared, inside, _filled_up(times[touching]))
@@ -178,9 +172,7 @@ def trajectory(scene: Scene, simulation: Simulation, times_us: ArrayLike) -> Tra
     return dense_path(scene, simulation, *(float(end) for end in ends)).at(wanted)
 
 
-def dense_path(
-    scene: Scene, simulation: Simulation, from_us: float, to_us: float, *, integrated: bool = True
-) -> DensePath:
+def dense_path(scene: Scene, simulation: Simulation, from_us: float, to_us: float) -> DensePath:
     """Return the tip over a stretch of time, to be asked for times and nodes as often as wanted.
 
     A tip that is held is integrated from the beginning of its contact: a second time would cost as much again.
@@ -190,27 +182,15 @@ def dense_path(
         simulation: of one scene, not of a batch.
         from_us: beginning of the stretch.
         to_us: its end.
-        integrated: integrate contacts once more; else they are straight between the points that the simulation keeps
-            of them, and have no force.
 
     Raises:
         ValueError: if a time lies outside the simulation, or the simulation is a batch.
     """
     _check(simulation, np.array([from_us, to_us]))
-    prepared = _prepared(scene, integrated=integrated)
-    return DensePath(simulation, prepared, pieces_between(prepared, simulation, from_us, to_us))
-
-
-def _prepared(scene: Scene, *, integrated: bool) -> PreparedScene:
-    """Return a scene prepared, its contacts to be integrated once more or straight."""
     contact, prepared = scene.interaction, PreparedScene(scene, *surface_of(scene))
-    if not isinstance(contact, Contact):
-        return prepared
-    if integrated:
-        return prepared._replace(driven=driven_by(contact, scene.cantilever, prepared.surface))
-    junction = find_junction(contact)
-    gaps = (contact.bridge_forms_nm, junction.forms_gap_nm, junction.breaks_gap_nm, contact.bridge_breaks_nm)
-    return prepared._replace(kept_gaps=tuple(float(gap) for gap in gaps))
+    if isinstance(contact, Contact):
+        prepared = prepared._replace(driven=driven_by(contact, scene.cantilever, prepared.surface))
+    return DensePath(simulation, prepared, pieces_between(prepared, simulation, from_us, to_us))
 
 
 def flights_of(scene: Scene, simulation: Simulation) -> Pieces:
@@ -252,7 +232,7 @@ def state_at(scene: Scene, simulation: Simulation, time_us: float) -> State | No
     return State(*(jnp.asarray(part) for part in (time_us, position[0, 0], velocity[0, 0])))
 
 
-@compiled_quickly()
+@jax.jit
 def _flight(
     cantilever: Cantilever,
     surface: Platform | Surface,
@@ -280,9 +260,7 @@ def pieces_between(prepared: PreparedScene, simulation: Simulation, low: float, 
     stops = np.minimum(np.asarray(rows.departure_time_us), last)
     touched = (np.asarray(rows.kind) != ContactKind.NONE) & (stops >= low) & (arrival <= high) & (stops > arrival)
     touched = np.flatnonzero(touched)
-    if prepared.kept_gaps is not None:
-        contacts = _straight_contacts(simulation, touched, stops[touched], prepared.kept_gaps)
-    elif prepared.driven is not None and touched.size:
+    if prepared.driven is not None and touched.size:
         # to the end of the last step that a wanted time may lie in
         contacts = _integrated_contacts(prepared, simulation, touched, min(high, last))
     else:
@@ -290,28 +268,6 @@ def pieces_between(prepared: PreparedScene, simulation: Simulation, low: float, 
         contacts = Pieces(begin, stops[touched], np.full(begin.shape, REST), begin, still, still)
     both = Pieces(*(np.concatenate(columns) for columns in zip(flights, contacts, strict=True)))
     return both.where(np.argsort(both.begin_us, kind="stable"))
-
-
-def _straight_contacts(
-    simulation: Simulation, rows: np.ndarray, stops_us: np.ndarray, gaps: tuple[float, ...]
-) -> Pieces:
-    """Return contacts as straight lines between the times and gaps that a simulation keeps of them."""
-    contacts, detail = simulation.contacts, simulation.contacts.detail
-    assert detail is not None  # contacts that are resolved have details  # noqa: S101
-    columns = (contacts.arrival_time_us, detail.junction_forms_us, detail.junction_breaks_us, detail.deepest_gap_nm)
-    arrival, forms, breaks, deepest = (np.asarray(column)[rows] for column in columns)
-    whole = (np.asarray(detail.junctions)[rows] > 0) & (arrival < forms) & (forms < breaks) & (breaks < stops_us)
-    middle = np.where(whole, 0.5 * (forms + breaks), 0.5 * (arrival + stops_us))
-    forms, breaks = np.where(whole, forms, middle), np.where(whole, breaks, middle)
-    bridge_forms, junction_forms, junction_breaks, bridge_breaks = gaps
-    junction_gaps = [np.where(whole, gap, deepest) for gap in (junction_forms, junction_breaks)]
-    bridge_gaps = [np.full(deepest.shape, gap) for gap in (bridge_forms, bridge_breaks)]
-    times = np.stack([arrival, forms, middle, breaks, stops_us], axis=1)
-    corners = np.stack([bridge_gaps[0], junction_gaps[0], deepest, junction_gaps[1], bridge_gaps[1]], axis=1)
-    lasts = np.diff(times) > 0.0
-    begin, length, rise = times[:, :-1][lasts], np.diff(times)[lasts], np.diff(corners)[lasts]
-    kind = np.full(begin.shape, STRAIGHT)
-    return Pieces(begin, times[:, 1:][lasts], kind, begin, corners[:, :-1][lasts], rise / length)
 
 
 def _integrated_contacts(prepared: PreparedScene, simulation: Simulation, rows: np.ndarray, until_us: float) -> Pieces:
@@ -362,7 +318,7 @@ def _in_contact(prepared: PreparedScene, piece: Pieces, times: np.ndarray) -> tu
     return np.asarray(gap), np.asarray(rate)
 
 
-@compiled_quickly()
+@jax.jit
 def _states_at(
     driven: Driven, start: ContactState, phase: Int[Array, " times"], time_us: Float[Array, " times"]
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:

@@ -258,12 +258,12 @@ _FORWARD_BY = 4
 """Numbers of a tip up to which passes forward take less time than one in reverse mode, whatever the batch."""
 
 
-Stages = tuple[Callable[..., tuple[Any, Array]], Callable[..., Any]]
-"""A function in two stages: results in few steps and where these are enough, and results in many steps."""
-
-
 def by_tangents(
-    function: Callable[..., Any], *arguments: Any, small: bool, stages: Stages | None = None, **settings: Hashable
+    function: Callable[..., Any],
+    *arguments: Any,
+    small: bool,
+    many_steps: Callable[..., Any] | None = None,
+    **settings: Hashable,
 ) -> Any:
     """Return `function(*arguments, **settings)`, with derivatives that are computed forward.
 
@@ -274,24 +274,32 @@ def by_tangents(
             At least one has an axis of tips.
         small: whether the batch is so small that forward passes along all numbers are quick; else reverse mode goes
             back through the function itself where more than a few numbers move.
-        stages: the function in two stages of the same arguments: derivatives outside of compiled programs compile the
-            second one only where a tip needs it.
+        many_steps: the function for hard tips; `function` then returns with its results for which tips they hold, and
+            the others are computed again.
         settings: what is no array.
     """
     leaves, structure = jax.tree.flatten(arguments)
-    return _differentiable(_Work(function, structure, tuple(settings.items()), stages), leaves, small=small)
+    return _differentiable(_Work(function, many_steps, structure, tuple(settings.items())), leaves, small=small)
 
 
 class _Work(NamedTuple):
     """A function of flat arguments, which can be compared: equal work shares compiled programs."""
 
     function: Callable[..., Any]
+    many_steps: Callable[..., Any] | None
     structure: Any
     settings: tuple[tuple[str, Hashable], ...]
-    stages: Stages | None
 
     def of(self, *leaves: Array) -> Any:
-        return self.function(*jax.tree.unflatten(self.structure, leaves), **dict(self.settings))
+        found = self.function(*jax.tree.unflatten(self.structure, leaves), **dict(self.settings))
+        if self.many_steps is None:
+            return found
+        return again_for_the_open(self.hard.of, found[1], leaves, found[0])
+
+    @property
+    def hard(self) -> "_Work":
+        """The work for hard tips."""
+        return self._replace(function=self.many_steps, many_steps=None)
 
 
 class _Slopes(NamedTuple):
@@ -302,11 +310,12 @@ class _Slopes(NamedTuple):
 
     def of(self, *leaves: Array) -> Any:
         work = self.work
-        if isinstance(work, _Slopes) or work.stages is None or any(map(is_traced, leaves)):
+        if isinstance(work, _Slopes) or work.many_steps is None or any(map(is_traced, leaves)):
             return _with_slopes(leaves, self)
-        few, many = (_Slopes(work._replace(function=stage), self.moving) for stage in work.stages)
-        (results, enough), (slopes, _) = _with_slopes(leaves, few)
-        return again_for_the_open(lambda *some: _with_slopes(some, many), enough, tuple(leaves), (results, slopes))
+        # by themselves: the second program is made only where a tip needs it
+        (results, enough), (slopes, _) = _with_slopes(leaves, self._replace(work=work._replace(many_steps=None)))
+        hard = self._replace(work=work.hard)
+        return again_for_the_open(lambda *some: _with_slopes(some, hard), enough, leaves, (results, slopes))
 
 
 def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bool) -> Any:
@@ -326,17 +335,13 @@ def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bo
 
 
 def _along(result: Array, slopes: Array, tangents: Sequence[Array]) -> Any:
-    """Return the tangent of a result; numbers for all tips are one product, so that its transpose is a single sum."""
+    """Return the tangent of a result, from the slopes by each number and the numbers' tangents."""
     if not _is_real(result):
         return np.zeros(result.shape, jax.dtypes.float0)
-    shared = [place for place, tangent in enumerate(tangents) if not tangent.ndim]
     total = jnp.zeros_like(result)
     for place, tangent in enumerate(tangents):
-        if tangent.ndim:
-            total = total + slopes[:, place] * tangent.reshape(-1, *(1,) * (result.ndim - 1))
-    if shared:
-        along = jnp.stack([tangents[place] for place in shared])
-        total = total + jnp.tensordot(along, slopes[:, np.array(shared)], axes=(0, 1))
+        along = tangent.reshape(-1, *(1,) * (result.ndim - 1)) if tangent.ndim else tangent
+        total = total + slopes[:, place] * along
     return total
 
 
@@ -352,12 +357,7 @@ def _with_slopes(leaves: tuple[Array, ...], asked: _Slopes) -> tuple[Any, Any]:
         return jax.tree.map(lambda part: part if _is_real(part) else jnp.zeros(part.shape), results), results
 
     at = jnp.zeros(len(asked.moving), jnp.result_type(*leaves))
-    if len(asked.moving) > 1:
-        slopes, results = jax.jacfwd(shifted, has_aux=True)(at)
-    else:
-        # one number needs no axis of directions
-        _, slopes, results = jax.jvp(shifted, (at,), (jnp.ones_like(at),), has_aux=True)
-        slopes = jax.tree.map(lambda part: part[..., None], slopes)
+    slopes, results = jax.jacfwd(shifted, has_aux=True)(at)
     return results, jax.tree.map(lambda part: jnp.moveaxis(part, -1, 1), slopes)
 
 

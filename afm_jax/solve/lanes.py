@@ -7,10 +7,9 @@ A batch costs what its hardest lane costs where all lanes take the same steps. S
 need more are gathered into small blocks of their own, where no others wait for them.
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property, update_wrapper
+from functools import cached_property, partial, update_wrapper
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -29,8 +28,6 @@ LANES = 512
 """Lanes of a block that stay in the processor's cache; from 300 to 1000 differ little."""
 WIDTHS = (1, 16, 128, LANES)
 """Sizes of blocks: few, so that few programs are compiled."""
-_COMPILED: set[Hashable] = set()
-"""Programs of `in_blocks` that have run, with the shapes of their lanes."""
 Report = Callable[[int, int], object]
 """Told how many of how many lanes are done."""
 
@@ -55,11 +52,10 @@ def in_blocks(
     block: int = LANES,
     widths: Sequence[int] = WIDTHS,
     report: Report | None = None,
-    program: Hashable = None,
 ) -> Any:
     """Return the results of work on lanes as NumPy arrays, done block by block on all cores.
 
-    The first block is done alone, so that programs are compiled once, unless that is known to have happened before.
+    The first block is done alone, so that programs are compiled once.
 
     Args:
         work: takes a tree of JAX arrays with a leading axis of lanes, gives one of arrays with the same axis.
@@ -67,7 +63,6 @@ def in_blocks(
         block: lanes of a block; of fewer lanes there is one smaller block.
         widths: sizes that a smaller block may have, in ascending order.
         report: told how far it is, from the second block on.
-        program: names the work with all that shapes its programs but the lanes; None: it may be new every time.
     """
     count = len(jax.tree.leaves(lanes)[0])
     width = next((width for width in widths if width >= min(count, block)), block)
@@ -83,54 +78,38 @@ def in_blocks(
             return jax.tree.map(np.asarray, work(jax.device_put(jax.tree.map(cut, whole))))
 
     firsts = range(0, count, width)
-    leaves, structure = jax.tree.flatten(whole)
-    compiled = (program, width, structure, *((leaf.dtype, leaf.shape[1:]) for leaf in leaves))
-    alone = 0 if compiled in _COMPILED and len(firsts) > 1 else 1
-    done = [part(first) for first in firsts[:alone]]
-    if program is not None:
-        # only now: a block that fails compiles nothing, and others that run meanwhile must not count on it
-        _COMPILED.add(compiled)
-    if len(firsts) > alone:
+    done = [part(0)]
+    if len(firsts) > 1:
         with ThreadPoolExecutor(available_cores()) as pool:
-            for result in pool.map(part, firsts[alone:]):
+            for result in pool.map(part, firsts[1:]):
                 done.append(result)
-                if report is not None and len(done) > 1:
+                if report is not None:
                     report(min(len(done) * width, count), count)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
 
 
-@dataclass(eq=False)
 class QuicklyCompiled:
-    """A function that is compiled with `quick_options`; inside of another program it is compiled as that one is.
+    """A function that is compiled with `quick_options`: for programs that take longer to compile than to run.
 
-    Attributes:
-        function: of trees of arrays.
-        static_argnames: as of `jax.jit`.
-        level: of `quick_options`.
+    Inside of another program it is compiled as that one is.
     """
 
-    function: Callable[..., Any]
-    static_argnames: str | Sequence[str]
-    level: int
-
-    def __post_init__(self) -> None:
+    def __init__(self, function: Callable[..., Any], static_argnames: str | Sequence[str], level: int):
         """Take the function's name and docstring."""
-        update_wrapper(self, self.function)
-
-    @cached_property
-    def inside(self) -> Callable[..., Any]:
-        """The function as a part of other programs."""
-        return jax.jit(self.function, static_argnames=self.static_argnames)
-
-    @cached_property
-    def outside(self) -> Any:
-        """The function by itself; the options are known once JAX has started."""
-        return jax.jit(self.function, static_argnames=self.static_argnames, compiler_options=self.options)
+        update_wrapper(self, function)
+        self.level = level
+        self.jitted = partial(jax.jit, function, static_argnames=static_argnames)
+        self.inside = self.jitted()
 
     @property
     def options(self) -> dict[str, Any] | None:
-        """The compiler's options."""
+        """The compiler's options, known once JAX has started."""
         return quick_options(self.level)
+
+    @cached_property
+    def outside(self) -> Any:
+        """The function by itself."""
+        return self.jitted(compiler_options=self.options)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Return the function's result."""
@@ -142,7 +121,7 @@ class QuicklyCompiled:
 def compiled_quickly(
     *, static_argnames: str | Sequence[str] = (), level: int = 1
 ) -> Callable[[Callable[..., Any]], QuicklyCompiled]:
-    """Return a decorator like `jax.jit` for what takes longer to compile than to run: see `QuicklyCompiled`.
+    """Return a decorator like `jax.jit` for the beginning of a program that is not run for long.
 
     Args:
         static_argnames: as of `jax.jit`.

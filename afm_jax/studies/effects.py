@@ -451,8 +451,8 @@ def _periods_read(observed: Observed) -> int:
 
 
 def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
-    """Return a reading, a smooth function of a simulation's numbers: contacts, short, are not integrated once more."""
-    motion = MotionWindow(dense_path(scene, simulation, *window, integrated=False), *window)
+    """Return a reading of a simulation over a window."""
+    motion = MotionWindow(dense_path(scene, simulation, *window), *window)
     value = motion.height.lockin(angular_frequency)
     lost = motion.rows.energy_lost_aj[motion.begun]
     return Reading(
