@@ -15,7 +15,6 @@ from click.testing import CliRunner
 import fitting
 from afm_jax.cli import main
 from afm_jax.cli.command import in_options
-from afm_jax.cli.commands.measure import FIT, READ
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import in_callers_words
 from fitting.instruments.curve import table_text
@@ -178,7 +177,7 @@ def test_text_json_and_files_of_a_command_name_its_options(tmp_path: Path, monke
 def test_what_becomes_of_an_argument():
     options = {
         str(each.name): each
-        for row in (READ, FIT)
+        for row in (main.COMMANDS["read"], main.COMMANDS["fit"])
         for each in row.click_command().params
         if isinstance(each, click.Option)
     }

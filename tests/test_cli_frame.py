@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import click
@@ -23,12 +22,12 @@ import fitting
 from afm_jax import strict_json
 from afm_jax.cli import main, session
 from afm_jax.cli.command import Command, Output
-from afm_jax.cli.main import NotValid
-from afm_jax.cli.options import SCENE
+from afm_jax.cli.ending import NotValid
 from afm_jax.cli.session import Session
 from afm_jax.columns import printed_table
 from afm_jax.results import text_of_parts
 from afm_jax.words import text_table
+from tests import trial_commands
 from tests.fresh_python import outputs, python
 
 HEAVY = "{'jax', 'numpy', 'matplotlib', 'equinox', 'rich'}"
@@ -38,12 +37,9 @@ HEAVY = "{'jax', 'numpy', 'matplotlib', 'equinox', 'rich'}"
 def trial(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
     """Run a function as the command `trial` of afm-jax."""
 
-    def run(body: Callable[..., Output | None], *arguments: str, options: tuple[Any, ...] = ()) -> Result:
-        module = ModuleType("trial_command")
-        module.__dict__["body"] = body
-        monkeypatch.setitem(sys.modules, "trial_command", module)
-        told = {"name": "trial", "help": "Try.", "options": options}
-        row = Command(**told, runs="trial_command:body", computes=False)
+    def run(body: Callable[..., Output | None], *arguments: str, function: str = "trial") -> Result:
+        monkeypatch.setattr(trial_commands, "body", body)
+        row = Command("trial", "Check", f"tests.trial_commands:{function}", computes=False)
         monkeypatch.setitem(main.COMMANDS, "trial", row)
         return CliRunner().invoke(main.main, ["trial", *arguments])
 
@@ -188,7 +184,7 @@ def test_text_fits_the_terminal_and_numbers_stay_whole(
 
 def test_a_result_with_impacts_says_whether_its_law_is_extrapolated(trial: Callable[..., Result]):
     # a formula is known at all speeds, a result may be without impacts: it is said all the same
-    result = trial(lambda *_, **__: Output(payload={}, impact_speeds=()), "figure2", "--json", options=(SCENE,))
+    result = trial(lambda *_: Output(payload={}, impact_speeds=()), "figure2", "--json", function="trial_of_a_scene")
     told = json.loads(result.stdout)
     assert (result.exit_code, told.pop("scene")["platform"]["amplitude_nm"]) == (0, 2.0)
     assert told == LABEL | {"extrapolated": None}

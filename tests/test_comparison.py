@@ -65,7 +65,7 @@ def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pyt
         raise OverflowError("math range error")
 
     # the command has imported the function by its name
-    monkeypatch.setattr("afm_jax.cli.fit.compare", fail)
+    monkeypatch.setattr("afm_jax.cli.fit.compared_models", fail)
     done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare", "--json", "--out", str(tmp_path)])
     assert done.exit_code == 1
     assert strictly(done.stdout)["valid"] is True

@@ -213,7 +213,7 @@ jax.config.update("jax_enable_x64", True)
 from afm_jax.cli.main import COMMANDS
 for row in COMMANDS.values():
     try:
-        importlib.import_module(row.runs.partition(":")[0])
+        importlib.import_module(row.runs.partition(":")[0], "afm_jax.cli")
     except ModuleNotFoundError as error:
         print(row.name, error.name)
 """

@@ -9,7 +9,7 @@ import pytest
 
 import afm_jax as afm
 from afm_jax import CollisionDelay, ImpactLaw, TabulatedLaw
-from afm_jax.cli.fitted_law import as_drawn, with_fitted_law
+from afm_jax.cli.scenes import as_drawn, with_fitted_law
 from afm_jax.dynamics.charts import batch_of_scenes
 from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family

@@ -182,13 +182,15 @@ def test_no_message_quotes_a_name_of_any_length_or_what_commands_the_terminal(tm
 
 
 COMMAND = """
-import atexit, os, signal, sys, time, types
-from afm_jax.cli.main import COMMANDS, Command, main
+import atexit, os, signal, sys, time
+from afm_jax.cli.command import Command
+from afm_jax.cli.main import COMMANDS, main
 # a job in the background of a shell is born deaf
 signal.signal(signal.SIGINT, signal.default_int_handler)
 {}
-sys.modules["rough"] = types.SimpleNamespace(command=command)
-COMMANDS["rough"] = Command(name="rough", help="", runs="rough:command", computes=False)
+import tests.trial_commands
+tests.trial_commands.body = command
+COMMANDS["rough"] = Command("rough", "Check", "tests.trial_commands:trial", computes=False)
 sys.argv[1:] = ["rough"]
 main()
 """

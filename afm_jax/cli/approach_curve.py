@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.cli.command import NamedScene, Output, picture_of
+from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.columns import Cell, printed_table
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome, approach_curve

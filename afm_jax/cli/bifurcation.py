@@ -1,11 +1,12 @@
 """`afm-jax bifurcation SCENE.toml --parameter P=a:b:n`: what motions come to along a parameter, ramped up and down."""
 
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from afm_jax.cli.command import NamedScene, Output, picture_of
-from afm_jax.cli.fitted_law import as_drawn
+from click import IntRange
+
+from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.scenes import NamedScene, as_drawn, ranges_of
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.bands import verdict_probability
 from afm_jax.dynamics.bifurcations import Ramps, bifurcation_diagram
 
@@ -14,15 +15,34 @@ def bifurcation(  # noqa: PLR0913
     session: Session,
     scene: NamedScene,
     *,
-    parameter: str,
-    both: bool,
-    down: bool,
-    impacts: int,
-    ordinate: str,
-    draws: int,
+    parameter: Annotated[str, "P=a:b:n"],
+    both: bool = False,
+    down: bool = False,
+    impacts: Annotated[int, IntRange(200)] = 2000,
+    ordinate: Literal["height", "phase", "impact_speed"] = "height",
+    draws: Annotated[int, IntRange(2)] = 20,
 ) -> Output:
-    """Return what motions of a scene come to along a parameter, ramped up, down or both ways."""
-    (swept,) = ranges_of(scene.name, scene.scene, [parameter], counted=True)
+    """Ramp a parameter and record on which motion the tip settles at each of its values.
+
+    The tip is carried from value to value with its drive phase and rebound speed. It starts, and starts again where the
+    sample held it or it flew away, at the file's [start]; without one on a stable single-impact orbit of the order
+    nearest to resonance (of a contact: of the law closest to it), else leaving the sample upward. The output gives the
+    motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last impacts. With
+    --out bifurcation.csv (a row a value), impacts.csv (a row an impact; of an orbit each once), strobe.csv (heights
+    whenever the platform is highest) and a picture. With --law it also gives the fraction of the fit's draws with the
+    same motion. Exit code 3 if no motion went on anywhere.
+
+    Args:
+        session: for progress and messages.
+        scene: the scene.
+        parameter: a parameter of the scene file and its values.
+        both: ramp up and then down, so that hysteresis shows.
+        down: ramp down instead of up.
+        impacts: at every value.
+        ordinate: what the picture draws of an impact.
+        draws: laws drawn from the fit for the bands.
+    """
+    (swept,) = ranges_of(scene, [parameter], counted=True)
     how: dict[str, Any] = {"start": scene.start, "impacts": impacts}
     sweeps = []
     for upward in [True, False] if both else [not down]:
@@ -32,11 +52,14 @@ def bifurcation(  # noqa: PLR0913
             sweeps.append(bifurcation_diagram(drawn, swept.path, swept.values, upward=upward, report=report, **how))
     if scene.unknowns is not None:
         with session.working("sweeping with drawn laws"):
-            given = {**how, "draws": draws}
-            probabilities = [
-                verdict_probability(scene.scene, swept.path, sweep, scene.unknowns, **given) for sweep in sweeps
+            sweeps = [
+                sweep._replace(
+                    verdict_probability=verdict_probability(
+                        scene.scene, swept.path, sweep, scene.unknowns, draws=draws, **how
+                    )
+                )
+                for sweep in sweeps
             ]
-        sweeps = [sweep._replace(verdict_probability=each) for sweep, each in zip(sweeps, probabilities, strict=True)]
     if not all(sweep.complete for sweep in sweeps):
         session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     ramps = Ramps(swept.path, sweeps, impacts)

@@ -1,19 +1,45 @@
 """`afm-jax chart SCENE.toml --x P=a:b:n --y P=a:b:n --orders 8`: which single-impact orbits there are, over a plane."""
 
 from dataclasses import replace
+from typing import Annotated
 
-from afm_jax.cli.command import NamedScene, Output, picture_of
+from click import IntRange
+
+from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.scenes import NamedScene, ranges_of
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.charts import stability_chart, stable_probability
 from afm_jax.scenefile.parameter_paths import scene_family
 
 _MOST_POINTS = 4_000_000
 
 
-def chart(session: Session, scene: NamedScene, *, x: str, y: str, orders: int, draws: int) -> Output:
-    """Return which single-impact orbits are stable over a plane of two parameters of a scene."""
-    across, up = ranges_of(scene.name, scene.scene, [x, y], counted=True)
+def chart(
+    session: Session,
+    scene: NamedScene,
+    *,
+    x: Annotated[str, "P=a:b:n"],
+    y: Annotated[str, "P=a:b:n"],
+    orders: Annotated[int, IntRange(1, 100)] = 8,
+    draws: Annotated[int, IntRange(2)] = 20,
+) -> Output:
+    """Chart over two parameters of a scene which single-impact orbits exist, are stable and coexist.
+
+    Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
+    if there are several) the peak amplitude and the size of the larger multiplier. A contact's orbits are closed by
+    simulation from those of the law closest to it: chart a thousand points, not a million; where none closes the point
+    is unresolved. With --law the fraction of the fit's draws in which an orbit is stable is given, too. With --out
+    chart.csv and a picture. Exit code 3 if there is no admissible orbit at all.
+
+    Args:
+        session: for progress.
+        scene: the scene.
+        x: a parameter of the scene file: the chart's columns.
+        y: another one: its rows.
+        orders: highest order N.
+        draws: laws drawn from the fit for the bands.
+    """
+    across, up = ranges_of(scene, [x, y], counted=True)
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")
     paths, values = (across.path, up.path), {"x_values": across.values, "y_values": up.values}

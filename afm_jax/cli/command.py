@@ -1,13 +1,14 @@
-"""A command is a row: name, the function that it calls, its options and its help. The runner is here, too.
+"""A command is a row: name, group, the function that it calls, and options besides those of the function.
 
-The rows stand in `measure.py`, `simulate.py`, `contact.py` and `check.py` of `afm_jax/cli/commands`, without JAX, so
-that help needs none. The function that a row names stands in a module that imports all that it needs at its top: the
-runner starts JAX before it imports the module. The function gets the session (for progress and messages) and the
-options by their names, and returns an `Output`, which the runner writes (None: the function has written all itself):
+The rows stand in `afm_jax/cli/commands.py`. Help and options come from the function's docstring and signature
+(`options.py`), without JAX, so that help needs none. The function stands in a module that imports all that it needs at
+its top: the runner starts JAX before it imports the module. The function gets the session (for progress and messages)
+and the options by their names, and returns an `Output`, which the runner writes (None: the function has written all
+itself):
 
-    def basins(session: Session, scene: NamedScene, *, grid, speeds, draws) -> Output:
+    def basins(session: Session, scene: NamedScene, *, draws: Annotated[int, IntRange(2)] = 20) -> Output:
         with session.working("following starts", "starts") as report:
-            result = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
+            result = basins_of_attraction(scene.scene, report=report)
         return Output.of(result, files={"basins.png": picture_of("dynamics:basins_figure", result)})
 
 A result says itself: `to_dict()` is the JSON object, `printed()` what is written in the terminal, `tables()` are the
@@ -21,39 +22,16 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
 import click
 
 from afm_jax.cli.ending import NotValid, is_inner
-from afm_jax.cli.options import SCENE
+from afm_jax.cli.options import SCENE, described
 from afm_jax.cli.session import Session, session_options, write_json
-from afm_jax.cli.values import Share, scene_and_start
+from afm_jax.cli.values import Share
 from afm_jax.compilation_cache import silence_xla
 from afm_jax.whole_files import arguments_named, in_callers_words
-
-if TYPE_CHECKING:
-    from afm_jax.apparatus.scene import Scene
-    from afm_jax.dynamics.bands import UncertainParameters
-    from afm_jax.scenefile.scenefile import Start
-
-Options = dict[str, Any]
-
-
-class NamedScene(NamedTuple):
-    """The scene of a call: what the argument SCENE named, with the law of --law in place of its own.
-
-    Attributes:
-        name: as it was given, for messages.
-        scene: the scene.
-        start: the start that its file states, if it does.
-        unknowns: what is uncertain of the law of --law, if its file tells errors.
-    """
-
-    name: str
-    scene: "Scene"
-    start: "Start | None"
-    unknowns: "UncertainParameters | None"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +48,6 @@ class Output:
         json_file: name of the file of the --out folder that holds the JSON object; empty: none does.
         report: writes a report into a folder and returns the paths; it gets the folder and `Session.write_table`.
         not_valid: why the result is not valid, which makes the exit code 3; None: it is valid.
-        failure: what ended the command after this much of its result.
     """
 
     payload: Mapping[str, Any]
@@ -81,7 +58,6 @@ class Output:
     json_file: str = ""
     report: Callable[..., Sequence[Path]] | None = None
     not_valid: str | None = None
-    failure: Exception | None = None
 
     @classmethod
     def of(cls, result: Any, stem: str = "", **more: Any) -> "Output":
@@ -131,42 +107,39 @@ def picture_of(figure: str, *arguments: Any, **options: Any) -> Callable[[Path],
     return draw
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Command:
     """A command of `afm-jax`.
 
     Attributes:
         name: what is typed.
-        runs: the function that is called, "module:function".
-        help: what `afm-jax NAME --help` says above the options; its first sentence, a paragraph, lists it.
-        options: arguments and options, decorators of click; `SCENE` is loaded, with the law of `LAW` if that is there.
-        check: what is refused before JAX starts (it raises `click.UsageError`); it may change the options.
+        group: the heading under which it is listed.
+        runs: the function that is called, "module:function"; a module that begins with a point is of this folder.
+        more: options besides those of the function: some, or a class that has them, named likewise (`described`).
         computes: whether JAX is started, before the function's module is imported.
-        programs: from the options the jitted functions whose traces are kept (see `Session.start_computing`).
         out_file: what the file is called that --out names, for a command that writes a single one; empty: a folder.
     """
 
     name: str
+    group: str
     runs: str
-    help: str
-    options: tuple[Callable[..., Any], ...] = ()
-    check: Callable[[Session, Options], None] | None = None
+    more: Sequence[click.Option | str] = ()
     computes: bool = True
-    programs: Callable[[Options], Sequence[str]] = lambda _: ()
     out_file: str = ""
 
     @property
     def summary(self) -> str:
         """The line of `afm-jax --help`."""
-        return " ".join(self.help.partition("\n\n")[0].split())
+        return described(self.runs)[0].partition("\n\n")[0]
 
     def click_command(self) -> click.Command:
         """Return the command for click."""
-        function = partial(run_in_options, self)
-        # click lists options in the order of decorators, of which the last is applied first
-        for option in reversed((*self.options, *session_options(self.out_file))):
-            function = option(function)
-        return click.command(self.name, help=self.help)(function)
+        text, parameters = described(self.runs)
+        more = [described(each)[1] if isinstance(each, str) else (each,) for each in self.more]
+        parameters = [*parameters, *(option for options in more for option in options)]
+        parameters += session_options(self.out_file)
+        run = partial(run_in_options, self)
+        return click.Command(self.name, callback=run, params=parameters, help=text.replace("\\b\n", "\b\n"))
 
 
 _ARGUMENT = re.compile(r"`(\w+)=([^`]*?)(?:, \1_error=([^`]*))?`")
@@ -216,7 +189,7 @@ def run_in_options(row: Command, **options: Any) -> None:
 
 
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
-    """Run a command: check the call, start JAX, load the scene, call the function, hand out the result.
+    """Run a command: start JAX, load the scene, call the function, hand out the result.
 
     Args:
         row: the command.
@@ -229,17 +202,15 @@ def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **
         NotValid: if the result is not valid; it has been handed out then.
     """
     session = Session(json, out, verbose)
-    # before anything loads JAX: checks of options may
     silence_xla()
-    if row.check is not None:
-        row.check(session, options)
     if row.computes:
-        session.start_computing(*row.programs(options))
-    scene = None
-    if SCENE in row.options:
-        scene = options["scene"] = _loaded(options)
+        session.start_computing()
+    scene: Any = None
+    if SCENE in described(row.runs)[1]:
+        load_named = import_module("afm_jax.cli.scenes").load_named
+        scene = options["scene"] = load_named(options["scene"], options.pop("law", None))
     module, _, name = row.runs.partition(":")
-    function = getattr(import_module(module), name)
+    function = getattr(import_module(module, __package__), name)
     with _naming(scene):
         output = function(session, **options)
     if output is None:
@@ -267,13 +238,11 @@ def hand_out(session: Session, output: Output) -> None:
         for path in () if output.report is None else output.report(session.out, session.write_table):
             session.note(f"wrote {path}")
     session.emit(output.payload, *output.text)
-    if output.failure is not None:
-        raise output.failure
     if output.not_valid is not None:
         raise NotValid(in_callers_words(output.not_valid))
 
 
-def _with_scene(output: Output, scene: NamedScene, options: Options) -> Output:
+def _with_scene(output: Output, scene: Any, options: Mapping[str, Any]) -> Output:
     """Return a result that says of which scene it is, and where its law is extrapolated."""
     scene_tables = import_module("afm_jax.scenefile.scenefile").scene_tables
     payload, text = {**output.payload, "scene": scene_tables(scene.scene)}, list(output.text)
@@ -286,18 +255,8 @@ def _with_scene(output: Output, scene: NamedScene, options: Options) -> Output:
     return replace(output, payload=payload, text=text)
 
 
-def _loaded(options: Options) -> NamedScene:
-    """Return the scene of a call, and take the option --law out of the options."""
-    name, law = options["scene"], options.pop("law", None)
-    scene, start = scene_and_start(name)
-    if law is None:
-        return NamedScene(name, scene, start, None)
-    scene, unknowns = import_module("afm_jax.cli.fitted_law").with_fitted_law(scene, law)
-    return NamedScene(name, scene, start, unknowns)
-
-
 @contextmanager
-def _naming(scene: NamedScene | None) -> Iterator[None]:
+def _naming(scene: Any) -> Iterator[None]:
     """Let messages about wrong values speak in the caller's words, and begin with the scene's name if there is one."""
     try:
         yield

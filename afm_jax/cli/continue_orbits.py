@@ -1,9 +1,12 @@
 """`afm-jax continue SCENE.toml --order N --parameter P=a:b`: orbits followed through one parameter, or two."""
 
-from afm_jax.cli.command import NamedScene, Output, picture_of
-from afm_jax.cli.orbits import refuse_other_than_law
+from typing import Annotated
+
+from click import IntRange
+
+from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.scenes import NamedScene, ranges_of, refuse_other_than_law
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import ranges_of
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import amplitude_errors, special_errors
 from afm_jax.dynamics.continuation import continue_orbits
@@ -13,16 +16,29 @@ def follow(
     session: Session,
     scene: NamedScene,
     *,
-    order: int,
-    impacts: int,
-    parameter: str,
-    second: str | None,
+    order: Annotated[int, IntRange(1, 1_000_000)],
+    impacts: Annotated[int, IntRange(0, 64)] = 1,
+    parameter: Annotated[str, "P=A:B"],
+    second: Annotated[str | None, "P=A:B"] = None,
 ) -> Output:
-    """Return the branches of orbits through a parameter, their special points, and these as curves in two."""
+    """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
+
+    Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
+    followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
+    instead of the map, and curves end where the orbit grazes or is captured. With --law every special point has a 95 %
+    interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
+
+    Args:
+        session: for progress.
+        scene: the scene.
+        order: drive periods of the orbit.
+        impacts: impacts in them; 0: the tip meets nothing.
+        parameter: a parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.
+        second: another one: the special points are followed as curves in both.
+    """
     if not isinstance(scene.scene.interaction, Contact):
-        refuse_other_than_law(scene.scene, scene.name)
-    given = [parameter, *([] if second is None else [second])]
-    first, *others = ranges_of(scene.name, scene.scene, given, counted=False)
+        refuse_other_than_law(scene)
+    first, *others = ranges_of(scene, [parameter, *([second] if second else [])], counted=False)
     with session.working("following orbits (the first run compiles for some seconds)"):
         followed = continue_orbits(scene.scene, order, first, impacts=impacts, second=others[0] if others else None)
     uncertain = scene.unknowns

@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import click
 import numpy as np
+from click import IntRange
 
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import option_of
+from afm_jax.cli.values import ModelName, Names, Numbers, Orders, Share, option_of
 from afm_jax.whole_files import in_callers_words
 from fitting.experiments.candidates import drive_grid
 from fitting.experiments.design import design
@@ -19,36 +21,93 @@ from fitting.parameters import LAW_NAMES, PRIOR_NUISANCES
 _TIP = {"orders": (1,), "detunings": (1.02, 1.04, 1.06, 1.08, 1.1), "amplitudes_nm": (40.0, 80.0)}
 _SAMPLE = {"orders": (1, 2, 3, 4), "detunings": np.arange(97, 106) / 100, "amplitudes_nm": (2.0, 4.0, 7.0, 10.0)}
 """What is looked at if a call does not say, where the tip or the sample is driven."""
-_OF_DESIGN = ("points", "noise", "interest", "amplitudes", "largest_nm", "phase_noise_deg")
 
 
-def planned(session: Session, **options: Any) -> Output:
-    """Return the drives to measure next, of all combinations of the lists, and what they will determine."""
-    prior, places = prior_of_options(options), {"offsets_nm": options["offsets_nm"], "heights": options["heights"]}
-    tapping = prior.problem.tapping
-    if places == {"offsets_nm": None, "heights": None}:
+def planned(  # noqa: PLR0913
+    session: Session,
+    *,
+    orders: Annotated[tuple[int, ...] | None, Orders()] = None,
+    detunings: Annotated[tuple[float, ...] | None, Numbers(), "--detuning"] = None,
+    amplitudes_nm: Annotated[tuple[float, ...] | None, Numbers(), "--drive-nm"] = None,
+    offsets_nm: Annotated[tuple[float, ...] | None, Numbers(positive=False)] = None,
+    heights: Annotated[tuple[float, ...] | None, Numbers(positive=False)] = None,
+    largest_nm: float | None = None,
+    points: Annotated[int, IntRange(1, 200)] = 8,
+    interest: Annotated[tuple[str, ...] | None, Names(), "--for"] = None,
+    noise: Annotated[float, Share("a relative error")] = 0.01,
+    phase_noise_deg: float = 0.2,
+    amplitudes: Literal["both", "peak", "lockin"] = "both",
+    uncertainty: Annotated[float, Share("a relative error")] = 0.1,
+    fit: Annotated[Path | None, "JSON"] = None,
+    model: ModelName | None = None,
+    mass_ng: float | None = None,
+    drive: Literal["sample", "force", "base"] | None = None,
+    **law_and_instrument: Any,
+) -> Output:
+    """Choose the drives to measure next, and forecast how well the law will then be known.
+
+    Say what is known: the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r,
+    --epsilon, ...), or a fit of what was measured so far (--fit); and what can be driven: every combination of
+    orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
+    itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
+    or 170:190:1. With --out design.csv, .json and .png. Exit code 3 if no drive can be planned with, or the points do
+    not determine the law.
+
+    Args:
+        session: for progress.
+        orders: drive periods an impact; else 1-4, or 1 where the tip is driven.
+        detunings: drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 where
+            the tip is driven, else 1.02:1.1:0.02.
+        amplitudes_nm: drive amplitudes, else 2,4,7,10; or free ones, else 40,80.
+        offsets_nm: offsets; else -1,0,1.
+        heights: where the tip is driven, in place of offsets: distances of the sample as shares of each free amplitude;
+            else 0.1:0.9:0.1.
+        largest_nm: peak amplitude that the instrument takes.
+        points: how many to choose.
+        interest: parameters to be known well, as r,epsilon; else the law's.
+        noise: relative error of an amplitude.
+        phase_noise_deg: error of a lag, tip driven.
+        amplitudes: what is read of a point.
+        uncertainty: how far the law may be off where no fit says.
+        fit: a fit to add to, as `afm-jax fit --json` writes it, or its folder.
+        model: what will be fitted; else law+delay, or the fit's.
+        mass_ng: effective mass of the tip.
+        drive: what is driven; else the sample.
+        **law_and_instrument: numbers of the law, and of the instrument with their errors.
+    """
+    stated = {"mass_ng": mass_ng, "drive": drive} | law_and_instrument
+    prior = prior_of(fit, model, uncertainty, {name: value for name, value in stated.items() if value is not None})
+    places, tapping = {"offsets_nm": offsets_nm, "heights": heights}, prior.problem.tapping
+    if offsets_nm is None and heights is None:
         places = {"heights": np.arange(1, 10) / 10} if tapping else {"offsets_nm": (-1.0, 0.0, 1.0)}
-    lists = {name: options[name] or usual for name, usual in (_TIP if tapping else _SAMPLE).items()}
+    asked = {"orders": orders, "detunings": detunings, "amplitudes_nm": amplitudes_nm}
+    lists = {name: asked[name] or usual for name, usual in (_TIP if tapping else _SAMPLE).items()}
     with session.working("forecasting (the first run compiles for some seconds)"):
         known = {"free_frequency_khz": prior.free_frequency_khz, "drive": prior.problem.drive}
-        result = design(prior, drive_grid(**lists, **places, **known), **{name: options[name] for name in _OF_DESIGN})
+        result = design(
+            prior,
+            drive_grid(**lists, **places, **known),
+            points=points,
+            noise=noise,
+            interest=interest,
+            amplitudes=amplitudes,
+            largest_nm=largest_nm,
+            phase_noise_deg=phase_noise_deg,
+        )
     return Output.of(result, "design")
 
 
-def prior_of_options(options: Mapping[str, Any]) -> Prior:
+def prior_of(path: Path | None, model: str | None, uncertainty: float, given: Mapping[str, Any]) -> Prior:
     """Return what is known before: what a fit left, or the values of a call.
 
     Raises:
         click.UsageError: if the options contradict each other, or say nothing of the cantilever.
         ValueError: if a value is impossible, or the file cannot be read.
     """
-    known = ("mass_ng", "drive", *LAW_NAMES, *(nuisance.name for nuisance in PRIOR_NUISANCES))
-    given = {name: options[name] for name in known if options.get(name) is not None}
-    path, model = options.get("fit"), options.get("model")
     if path is not None:
         for name in given:
             raise click.UsageError(in_callers_words(f"`{name}` is what `fit=...` says already; leave one of them out"))
-        prior = read_prior(path / "fit.json" if path.is_dir() else path, options["uncertainty"])
+        prior = read_prior(path / "fit.json" if path.is_dir() else path, uncertainty)
         if model not in (None, prior.problem.model):
             raise click.UsageError(f"{path} is a fit of the model {prior.problem.model}, not {model}")
         return prior
@@ -66,6 +125,6 @@ def prior_of_options(options: Mapping[str, Any]) -> Prior:
         mass_ng=given.get("mass_ng"),
         values={name: given[name] for name in LAW_NAMES if name in given},
         constraints={name: both for name, both in instrument.items() if both[1] is not None},
-        uncertainty=options["uncertainty"],
+        uncertainty=uncertainty,
         drive=given.get("drive", "sample"),
     )

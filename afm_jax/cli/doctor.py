@@ -20,7 +20,12 @@ _PROBE = "small_program_of_the_doctor"
 
 
 def doctor(session: Session) -> Output:
-    """Return what is installed, how JAX computes, and whether its compilation cache works."""
+    """Say what is installed, how JAX computes, and whether its compilation cache works.
+
+    A small program is compiled by two fresh processes: the second should find it in the cache. Exit code 3 if it does
+    not, or if the cache's folder cannot be used; every command then compiles anew, which takes up to a minute. Exit
+    code 3, too, where a version of JAX is installed that computes wrongly or very slowly.
+    """
     cache = session.start_computing()
     import jax  # noqa: PLC0415
 

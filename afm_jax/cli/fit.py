@@ -1,64 +1,151 @@
 """`afm-jax fit TABLE.csv`: the impact law from measured vibration amplitudes."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from afm_jax.cli.command import Output
+import click
+from click import IntRange
+
+from afm_jax.cli.command import Output, hand_out
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import example_path, tables_with
-from fitting.infer.comparison import compare, rivals
+from afm_jax.cli.tables import example_path, tables_with
+from afm_jax.cli.values import Constraint, Fixed, ModelName, Names, QualityFactor, Share
+from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
+from afm_jax.whole_files import in_callers_words
+from fitting.infer.comparison import compare as compared_models
+from fitting.infer.comparison import rivals
 from fitting.infer.fit import fit as fit_tables
-from fitting.infer.result import FitResult
+from fitting.parameters import CONTACT_DEFAULT, model_parameters
 from fitting.report.report import summary, write_report
-from fitting.sampling.posterior import posterior, require_blackjax, sampled_by_gaussian
+from fitting.sampling.posterior import posterior as sampled_posterior
+from fitting.sampling.posterior import require_blackjax, sampled_by_gaussian
 from fitting.tables.several import SeveralTables
 
 
-def fit(
+def fit(  # noqa: PLR0913
     session: Session,
+    tables: Annotated[Sequence[Path], "[TABLE.csv]..."],
     *,
-    tables: tuple[Path, ...],
-    model: str,
-    noise: float | None,
-    settings: dict[str, Any],
-    **options: Any,
-) -> Output:
-    """Return the fit of one law to tables, with what was asked for besides."""
-    if options["posterior"] and not sampled_by_gaussian(model):
+    model: ModelName = "law",
+    noise: Annotated[float | None, Share("a relative error")] = None,
+    quality_factor: QualityFactor | None = None,
+    scale_errors: bool = False,
+    robust: bool = False,
+    free: Annotated[tuple[str, ...] | None, Names()] = None,
+    fixed: Annotated[Sequence[tuple[str, float]], Fixed(), "--fix", "NAME=VALUE"] = (),
+    constraints: Annotated[
+        Sequence[tuple[str, tuple[float, float]]], Constraint(), "--constrain", "NAME=VALUE+-ERROR"
+    ] = (),
+    no: Annotated[tuple[str, ...] | None, Names()] = None,
+    compare: bool = False,
+    posterior: bool = False,
+    seed: Annotated[int, IntRange(0)] = 0,
+    share: Annotated[tuple[str, ...] | None, Names()] = None,
+    example: bool = False,
+) -> Output | None:
+    """Fit the impact law to a table of vibration amplitudes, or one law to several tables.
+
+    The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
+    order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
+    with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
+    counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
+    offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
+    ones, and the report says how far each is from the others (its deviation). With --out the report: fit.html, fit.txt,
+    fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not converged, not explained by
+    the model, or a parameter not identified.
+
+    Args:
+        session: for progress and messages.
+        tables: files.
+        model: restitution: a restitution without adhesion (r); law: a restitution with adhesion (r, epsilon); viscous:
+            a loss linear in speed with adhesion (epsilon, viscous_loss); full: a restitution, a loss linear in speed
+            and adhesion (r, epsilon, viscous_loss); each with the collision delay, which amplitudes near resonance need
+            (+delay); contact: physical parameters through the resolved contact, of tapping curves on resonance too.
+        noise: relative error of amplitudes without one, such as 1%.
+        quality_factor: instead of the table's; '40 +- 2', or none: no air damping.
+        scale_errors: take the errors as relative: scale them, by 3 at most, until chi2/dof is 1.
+        robust: leave outliers out, one row in ten at most.
+        free: the parameters that are fitted, if not all that are not fixed; of a contact, if left out,
+            relative_humidity,adhesion_energy_j_per_m2,viscosity_pa_s,modulus_gpa.
+        fixed: hold a parameter at a value.
+        constraints: what is known beforehand: quality_factor, offset_origin_nm, tip_calibration, drive_calibration,
+            free_frequency_khz, phase_zero_deg, phase_drift_deg, free_amplitude_drift, or a parameter of the model; of a
+            contact also one that is held, at the value then.
+        no: contact: effects that it does not have.
+        compare: fit the rival models too and say what the table can tell.
+        posterior: credible intervals, too, by the no-U-turn sampler (extra `nuts`); where impacts last, of a Gaussian
+            around the fit.
+        seed: seed of the random numbers.
+        share: of several tables: nuisances (of --constrain) that all have in common, or all; else each has its own.
+        example: fit the bundled table instead of a file.
+    """
+    if example == bool(tables):
+        both = "not both: " if example else ""
+        raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
+    if posterior and len(tables) > 1:
+        raise click.UsageError("--posterior is about one table: give one, or leave it out")
+    settings: dict[str, Any] = {"scale_errors": scale_errors, "robust": robust, "constraints": dict(constraints)}
+    settings |= parameters_of(model, free, dict(fixed), no) | ({"share": share} if share else {})
+    if posterior and not sampled_by_gaussian(model):
         require_blackjax()
-    read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
+    read = tables_with(tables or (example_path(),), noise, quality_factor)
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
     first = "the first run compiles for ten seconds" if "delay" in model or model == "contact" else "some seconds"
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
     with session.working(f"fitting {rows}, model {model} ({first})"):
         result = fit_tables(measured, model, **settings)
-    extras, failure = _extras(session, result, settings, options)
-    return Output(
-        payload=result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()},
-        text=[partial(summary, result, **extras)],
-        report=partial(write_report, result, **extras),
-        not_valid=None if result.valid else result.reasons[0],
-        failure=failure,
-    )
-
-
-def _extras(
-    session: Session, result: FitResult, settings: dict[str, Any], options: dict[str, Any]
-) -> tuple[dict[str, Any], Exception | None]:
-    """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
-    if options["posterior"] and not result.valid:
+    failure = None
+    if posterior and not result.valid:
         session.note("no posterior: the fit is not valid")
     try:
-        if options["comparing"]:
+        if compare:
             models = rivals(result.model, settings["fixed"])
             with session.working(f"comparing {', '.join(models)}"):
                 known = {result.model: result}
-                extras["comparison"] = compare(result.table, models, known=known, **settings)
-        if options["posterior"] and result.valid:
+                extras["comparison"] = compared_models(result.table, models, known=known, **settings)
+        if posterior and result.valid:
             with session.working("sampling the posterior"):
-                extras["posterior"] = posterior(result, seed=options["seed"])
+                extras["posterior"] = sampled_posterior(result, seed=seed)
     except Exception as error:  # noqa: BLE001
-        return extras, error
-    return extras, None
+        failure = error
+    output = Output.of_report(result, partial(summary, result, **extras), partial(write_report, result, **extras))
+    output = replace(output, payload={**output.payload, **{name: extra.to_dict() for name, extra in extras.items()}})
+    if failure is None:
+        return output
+    # the fit itself stands
+    hand_out(session, output)
+    raise failure
+
+
+def parameters_of(
+    model: str, free: tuple[str, ...] | None, fixed: dict[str, float], no: tuple[str, ...] | None
+) -> dict[str, Any]:
+    """Return which parameters `fitting.fit` fits and fixes, and the effects of a contact.
+
+    Raises:
+        click.UsageError: if options contradict each other or the model.
+    """
+    settings: dict[str, Any] = {"free": free, "fixed": fixed}
+    if model == "contact":
+        for name in no or ():
+            if name not in REMOVABLE_EFFECTS:
+                raise click.UsageError(f"--no takes {', '.join(REMOVABLE_EFFECTS)}, but one is {name!r}")
+        effects = tuple(name for name in EFFECTS if name not in (no or ()))
+        for option, names in (("--free", free or ()), ("--fix", fixed)):
+            for name in names:
+                missing = idle_without(name, effects)
+                if missing:
+                    raise click.UsageError(f"{option} {name} changes nothing without the effect {' or '.join(missing)}")
+        usual = tuple(name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects))
+        settings |= {"effects": effects, "free": free or usual}
+    elif no:
+        raise click.UsageError("--no is about the contact's effects; add --model contact")
+    try:
+        model_parameters(model, settings["free"], fixed)
+    except ValueError as error:
+        raise click.UsageError(in_callers_words(str(error))) from error
+    return settings

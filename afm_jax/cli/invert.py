@@ -1,23 +1,42 @@
 """`afm-jax invert TABLE.csv`: speeds and delay of every impact from amplitude and phase, without any law."""
 
 from pathlib import Path
+from typing import Annotated
+
+import click
 
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import example_path, tables_with
+from afm_jax.cli.tables import example_path, tables_with
+from afm_jax.cli.values import QualityFactor, Share
 from fitting.inversion.invert import invert
 
 
 def inversion(
     session: Session,
+    table: Annotated[Path | None, "[TABLE.csv]"] = None,
     *,
-    table: Path | None,
-    noise: float | None,
-    quality_factor: tuple[float, float | None] | None,
-    example: bool,
+    noise: Annotated[float | None, Share("a relative error")] = None,
+    quality_factor: QualityFactor | None = None,
+    example: bool = False,
 ) -> Output:
-    """Return the inversion of a table, or of the bundled one."""
-    (measured,) = tables_with([example_path() if example or table is None else table], noise, quality_factor)
+    """Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
+
+    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses u_in^2 - u_out^2 are then set on
+    straight lines over (1, u_in), a viscous loss, and (1, u_in^2), a restitution. Rows that give nothing are named,
+    with the reason. With --out invert.csv, .json and .png. Exit code 3 if the rows determine no line, or none
+    explains them.
+
+    Args:
+        session: for progress.
+        table: the file.
+        noise: relative error of amplitudes without one, such as 1%.
+        quality_factor: instead of the table's; '40 +- 2', or none: no air damping.
+        example: invert the bundled table instead of a file.
+    """
+    if example == (table is not None):
+        raise click.UsageError("give a table to invert, `afm-jax invert TABLE.csv`, or --example for the bundled one")
+    (measured,) = tables_with([table or example_path()], noise, quality_factor)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured)
     return Output.of(result, "invert")

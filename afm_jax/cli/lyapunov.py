@@ -1,8 +1,12 @@
 """`afm-jax lyapunov SCENE.toml`: the Lyapunov exponents of a motion, or of one for each value of a parameter."""
 
-from afm_jax.cli.command import NamedScene, Output, picture_of
+from typing import Annotated
+
+from click import IntRange
+
+from afm_jax.cli.command import Output, picture_of
+from afm_jax.cli.scenes import NamedScene, ranges_of
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.bands import drawn_exponents
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.motion.start import start_of
@@ -13,13 +17,30 @@ def lyapunov(
     session: Session,
     scene: NamedScene,
     *,
-    impacts: int,
-    transient: int,
-    parameter: str | None,
-    draws: int,
+    impacts: Annotated[int, IntRange(20)] = 2000,
+    transient: Annotated[int, IntRange(0)] = 500,
+    parameter: Annotated[str | None, "P=a:b:n"] = None,
+    draws: Annotated[int, IntRange(2)] = 20,
 ) -> Output:
-    """Return the Lyapunov exponents of a scene's motion, or of those along a parameter."""
-    ranges = ranges_of(scene.name, scene.scene, [parameter] if parameter else [], counted=True)
+    """Compute Lyapunov exponents by QR of the impact map's exact Jacobians; a contact's come from its simulation.
+
+    Of a motion that has come to an orbit they are the logarithms of its multipliers. A tip that rests on the platform
+    forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start]; without
+    one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it if it is
+    unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves the sample
+    upward. An orbit is reported only if it is stable. With --law there is a band for the larger exponent, begun without
+    [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 where every motion ends before enough
+    impacts.
+
+    Args:
+        session: for progress.
+        scene: the scene.
+        impacts: impacts to average over.
+        transient: impacts before.
+        parameter: a parameter of the scene file and its values, one motion each.
+        draws: laws drawn from the fit for the bands.
+    """
+    ranges = ranges_of(scene, [parameter] if parameter else [], counted=True)
     values = {swept.path: swept.values for swept in ranges}
     motions = scene_batch(scene.scene, values) if values else scene.scene
     start = None if scene.start is None else start_of(motions, scene.start)

@@ -14,11 +14,8 @@ from typing import Any
 
 import click
 
-from afm_jax.cli.command import Command
-from afm_jax.cli.commands import check, contact, measure, simulate
-from afm_jax.cli.ending import INTERRUPTED, NotValid, exit_code_of
-
-__all__ = ["COMMANDS", "NotValid", "main"]
+from afm_jax.cli.commands import COMMANDS
+from afm_jax.cli.ending import INTERRUPTED, exit_code_of
 
 
 def _check_streams() -> None:
@@ -88,16 +85,6 @@ def _interrupt(number: int, frame: types.FrameType | None) -> None:
     signal.default_int_handler(number, frame)
 
 
-_GROUPS = {
-    "Measure: read data, fit and plan": measure,
-    "Simulate: motions, orbits, basins of a scene": simulate,
-    "Contact: forces between tip and sample": contact,
-    "Check: equations, accuracy, speed, installation": check,
-}
-"""The commands by the headings of their list."""
-COMMANDS: dict[str, Command] = {row.name: row for group in _GROUPS.values() for row in group.COMMANDS}
-
-
 class LazyGroup(click.Group):
     """A group that lists its commands from a table, and ends every failure with one line and an exit code."""
 
@@ -109,12 +96,14 @@ class LazyGroup(click.Group):
         """Return a command; None if there is none of this name."""
         return COMMANDS[cmd_name].click_command() if cmd_name in COMMANDS else None
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         """Write the list of commands, a section a group."""
-        rows = [COMMANDS[name] for name in self.list_commands(ctx)]
-        for heading, group in _GROUPS.items():
+        groups = {row.group: [] for row in COMMANDS.values()}
+        for _, row in sorted(COMMANDS.items()):
+            groups[row.group].append((row.name, row.summary))
+        for heading, rows in groups.items():
             with formatter.section(heading):
-                formatter.write_dl([(row.name, row.summary) for row in rows if row in group.COMMANDS])
+                formatter.write_dl(rows)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

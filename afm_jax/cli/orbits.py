@@ -1,23 +1,46 @@
 """`afm-jax orbits SCENE.toml|PRESET --order N [--impacts m]`: the orbits of a scene."""
 
-from afm_jax.apparatus.scene import Scene
-from afm_jax.cli.command import NamedScene, Output, later
+from typing import Annotated
+
+from click import IntRange
+
+from afm_jax.cli.command import Output, later
+from afm_jax.cli.scenes import NamedScene, refuse_other_than_law
 from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.impact_orbits import many_impact_orbits
 from afm_jax.dynamics.orbit_tables import OrbitTable
-from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
 
 save = later("afm_jax.plots.picture_style:save")
 
 
-def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | None) -> Output:
-    """Return the single-impact orbits of a scene; of a contact, or with ``impacts``, those of several impacts."""
+def orbits(
+    session: Session,
+    scene: NamedScene,
+    *,
+    order: Annotated[int, IntRange(1, 1_000_000)],
+    impacts: Annotated[int | None, IntRange(1, 1_000_000)] = None,
+) -> Output:
+    """Find all single-impact orbits of a scene with a law, or with --impacts orbits of several impacts.
+
+    Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
+    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase and lag
+    at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and orbits.png. Exit
+    code 3 if none is admissible. With --impacts every impact is listed, the hardest first. A contact's orbits are
+    listed like this, too: an impact lasts from the formation of the bridge to its rupture (of a dry contact: while its
+    forces act); phase and velocity are those at rupture. The search may miss orbits of a contact, never of a law.
+
+    Args:
+        session: for progress and messages.
+        scene: the scene.
+        order: drive periods between two impacts, a positive integer.
+        impacts: impacts in these periods, found by a search from many starts; without it, all single-impact orbits.
+    """
     resolved = isinstance(scene.scene.interaction, Contact)
     if not resolved:
-        refuse_other_than_law(scene.scene, scene.name)
+        refuse_other_than_law(scene)
     if impacts is None and not resolved:
         with session.working("searching for orbits"):
             of_scene = single_impact_orbits(scene.scene, order)
@@ -31,22 +54,3 @@ def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | No
             of_scene = search(scene.scene, order, impacts)
         told = OrbitTable(scene.scene, order, of_scene, impacts)
     return Output.of(told, files={"orbits.png": lambda path: save(told.plot(), path)})
-
-
-def refuse_other_than_law(scene: Scene, path: str) -> None:
-    """Check that a scene's interaction is a law.
-
-    Raises:
-        ValueError: if not; says what gives one.
-    """
-    if isinstance(scene.interaction, Law):
-        return
-    absent = scene.interaction is None
-    advice = (
-        "a tip that meets nothing has none"
-        if absent
-        else f"`afm-jax collide {path} --make-law --out DIR` gives a contact's law"
-    )
-    raise ValueError(
-        f'{path}: [interaction] model: must be "law" here, but is "{"none" if absent else "contact"}"; {advice}'
-    )

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.columns import columns_of, csv_cells
-from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import in_callers_words, write_whole
 from afm_jax.words import broken, lines_at_most, shown, text_table
@@ -52,11 +51,12 @@ def labelled(payload: Mapping[str, Any]) -> dict[str, Any]:
 _NOTES = "afm_jax.notes"
 
 
-def add_note(note: str) -> None:
-    """Let the result of this call say a sentence: in its JSON under `notes`, in its text at the end."""
+def add_note(*notes: str) -> None:
+    """Let the result of this call say sentences: in its JSON under `notes`, in its text at the end."""
     context = click.get_current_context(silent=True)
-    if context is not None and note not in context.meta.setdefault(_NOTES, []):
-        context.meta[_NOTES].append(note)
+    if context is not None:
+        said = context.meta.setdefault(_NOTES, [])
+        said += [note for note in notes if note not in said]
 
 
 def _notes() -> list[str]:
@@ -88,26 +88,14 @@ class Session:
     out: Path | None
     verbose: bool = False
 
-    def start_computing(self, *programs: str) -> "Cache":
-        """Start JAX with 64-bit floats and its compilation cache; call it before importing the physics.
-
-        Args:
-            programs: jitted functions whose traces are kept as well, "module:function" (see `keep_programs`).
-        """
+    def start_computing(self) -> "Cache":
+        """Start JAX with 64-bit floats and its compilation cache; call it before importing the physics."""
         from afm_jax.cli.compilation import count_programs, start_jax  # noqa: PLC0415
 
         cache = start_jax(self.tell)
         if self.verbose:
             counts = count_programs()
             click.get_current_context().call_on_close(lambda: self.tell(_counted(**counts)))
-        if programs and cache.folder is not None and cache.folder == cache_folder():
-            from afm_jax.cli.programs import keep_programs  # noqa: PLC0415
-
-            try:
-                make_private(cache.folder / "traced")
-                keep_programs(programs, cache.folder / "traced", self.tell)
-            except OSError as error:
-                self.tell(f"traced programs are not kept: {error.filename}: {error.strerror}")
         return cache
 
     def tell(self, message: str) -> None:
@@ -217,25 +205,25 @@ class Session:
         self.note(f"wrote {self.out / name}")
 
 
-def session_options(out_file: str) -> tuple[Callable[..., Any], ...]:
+def session_options(out_file: str) -> list[click.Option]:
     """Return the options of every command, which are the attributes of its session.
 
     Args:
         out_file: what the file is called that `--out` names, for a command that writes a single one; empty: a folder.
     """
-    return (
-        click.option("--json", is_flag=True, help="Write one JSON object to standard output, nothing else."),
-        click.option(
-            "--out",
+    return [
+        click.Option(["--json"], is_flag=True, help="Write one JSON object to standard output, nothing else."),
+        click.Option(
+            ["--out"],
             metavar=out_file or "DIR",
             type=click.Path(path_type=Path),
             callback=functools.partial(_prepared, is_file=bool(out_file)),
             help="Write this table." if out_file else "Write tables (CSV) and pictures (PNG) into this folder.",
         ),
-        click.option(
-            "--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where."
+        click.Option(
+            ["--verbose"], is_flag=True, help="Say on standard error what is kept, read and compiled, and where."
         ),
-    )
+    ]
 
 
 def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None, *, is_file: bool) -> Path | None:

@@ -2,15 +2,17 @@
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import click
 import numpy as np
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.cli.approach_curve import NOISE, PHASE_NOISE_DEG, approach
-from afm_jax.cli.command import NamedScene, Output, later
-from afm_jax.cli.commands.simulate import DEFAULT_PERIODS
+from afm_jax.cli.command import Output, later
+from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
+from afm_jax.cli.values import Course, Orders, Positive, Share
 from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.motion_table import MotionTable, stretch_written
 from afm_jax.motion.observe import observe
@@ -23,6 +25,8 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 draw_motion = later("afm_jax.plots.motion:draw_motion")
 stretch_drawn = later("afm_jax.plots.motion:stretch_drawn")
 
+_MOST_PERIODS = 2000
+"""Drive periods followed at most where no duration is given."""
 MOST_OSCILLATIONS = 1e7
 """Oscillations of the free tip or the drive that are followed at most: some minutes of computing."""
 _TRACE_RESPONSES = 24
@@ -35,23 +39,60 @@ def simulation(  # noqa: PLR0913
     session: Session,
     scene: NamedScene,
     *,
-    duration_us: float | None,
-    periods: float | None,
-    harmonics: tuple[int, ...],
-    accuracy: float,
-    samples: str | None,
-    heights: tuple[float, ...] | None,
-    noise: float | None,
-    phase_noise_deg: float | None,
+    heights: Annotated[tuple[float, ...] | None, Course(), "FROM:TO:COUNT"] = None,
+    duration_us: Positive | None = None,
+    periods: Positive | None = None,
+    harmonics: Annotated[tuple[int, ...], Orders("multiple")] = (1,),
+    accuracy: Positive = 1e-9,
+    samples: Literal["uniform"] | None = None,
+    noise: Annotated[float | None, Share("a relative error")] = None,
+    phase_noise_deg: Positive | None = None,
 ) -> Output:
-    """Return a scene followed in time, and what an instrument reads of it; with heights an approach curve."""
+    """Follow a scene in time: contacts, amplitudes, phases, forces, energies.
+
+    SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The start is the
+    file's [start]; without one the tip starts on the single-impact orbit that the law with delay predicts, if there is
+    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth, at the
+    drive's frequency and at the response's, which is 1/N of it where the motion repeats after N drive periods. With
+    --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
+    exit code 3 if the simulation broke off.
+
+    With --heights the sample goes through heights over the rest position of a cantilever driven by [force] or [base],
+    and back: amplitude and lag against height, each followed from the motion before until it settles (--periods at
+    most). With --out curve.csv, with noise as `afm-jax tapping` reads it, curve_points.csv without, curve.json and
+    curve.png; exit code 3 if the tip settles at no height.
+
+    Args:
+        session: for progress and files.
+        scene: the scene.
+        heights: record an approach curve, both ways: heights of the sample in nm, negative below the rest position.
+        duration_us: how long to follow the scene, in us.
+        periods: how long, in periods of the drive. Without a duration the end is where the motion has settled, after
+            2000 of them at most.
+        harmonics: multiples of the response frequency omega/N at which amplitude and phase are read, besides the
+            drive's (N times it), which always is.
+        accuracy: of every resolved contact: relative of the rebound speed.
+        samples: write trace.csv into --out, too: the deflection over the last response periods at equal steps of time,
+            as `afm-jax lockin` reads it.
+        noise: with --heights: of the amplitudes in curve.csv; else 0.3%.
+        phase_noise_deg: with --heights: of the lags in curve.csv; else 0.2.
+    """
+    if duration_us is not None and periods is not None:
+        raise click.UsageError("--duration-us and --periods say the same: give one of them")
+    if samples and session.out is None:
+        raise click.UsageError("--samples writes a trace: say into which folder by --out DIR")
+    if heights is not None and (duration_us is not None or samples):
+        raise click.UsageError("--heights follows every height until it settles: leave out --duration-us, --samples")
+    for option, value in (("--noise", noise), ("--phase-noise-deg", phase_noise_deg)):
+        if value is not None and heights is None:
+            raise click.UsageError(f"{option} is that of an approach curve: give --heights, too")
     if heights is not None:
         settings = {"longest_periods": periods and math.ceil(periods), "accuracy": accuracy}
         errors = {"noise": noise or NOISE, "phase_noise_deg": phase_noise_deg or PHASE_NOISE_DEG}
         return approach(session, scene, heights, settings, errors)
     until_settled = duration_us is None and periods is None
     period_us = drive_of(scene.scene).period_us
-    longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period_us
+    longest = duration_us if duration_us is not None else (periods or _MOST_PERIODS) * period_us
     _check_duration(scene.scene, longest)
     settings = {"accuracy": accuracy, "until_settled": until_settled}
     run = _follow(session, scene, longest, settings)

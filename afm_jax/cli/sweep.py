@@ -5,15 +5,15 @@ from collections import Counter
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 import xarray
+from click import IntRange
 
 from afm_jax.cli.command import Output, picture_of
-from afm_jax.cli.fitted_law import with_fitted_law
+from afm_jax.cli.scenes import load_named
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import scene_and_start
 from afm_jax.compilation_cache import available_cores
 from afm_jax.scenefile.scenefile import read_toml, scene_tables
 from afm_jax.studies.sweep import EXTRAPOLATED, MESSAGE, STORE, SweepPlan, plan_of, run_plan
@@ -26,10 +26,45 @@ _MOST_MESSAGES = 3
 
 
 def sweep(
-    session: Session, *, sweep: Path, workers: int | None, scheduler: str | None, plot: bool, law: Path | None
+    session: Session,
+    sweep: Annotated[Path, "SWEEP.toml"],
+    *,
+    workers: Annotated[int | None, IntRange(1, 1024)] = None,
+    scheduler: Annotated[str | None, "tcp://..."] = None,
+    plot: bool = False,
+    law: Path | None = None,
 ) -> Output:
-    """Run a sweep."""
-    assert session.out is not None  # asked before  # noqa: S101
+    r"""Compute many scenes over the grid of SWEEP.toml, into DIR/sweep.zarr; call it again to go on after a fault.
+
+    \b
+    scene = "scene.toml"                  # or a preset
+    accuracy = 1e-6                       # of resolved contacts; may be left out
+    [record]
+    what = "orbits"                       # simulation, collide, lyapunov
+    orders = [1, 2]
+    [[axes]]
+    parameter = "platform.reduced_frequency"
+    linear = [0.9, 1.1, 1000]             # or log = [low, high, count], or list = [...]
+    [[axes]]
+    random = { "interaction.r" = [0.9, 0.99], "interaction.epsilon" = { log = [1, 100] } }
+    count = 500
+    seed = 1
+
+    The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
+    are kept, whatever happens. One sweep at a time: what two write into one folder is undefined.
+
+    Args:
+        session: for progress; its folder holds the results.
+        sweep: the file.
+        workers: processes of this machine that share its cores, by Dask; 1: this one alone.
+        scheduler: a Dask scheduler whose workers do the work.
+        plot: draw a sweep of one or two axes, sweep.png.
+        law: as of other commands.
+    """
+    if workers is not None and scheduler is not None:
+        raise click.UsageError("--scheduler has workers of its own: leave --workers out")
+    if session.out is None:
+        raise click.UsageError("--out is missing: name a folder for the results")
     try:
         plan = _plan(read_toml(str(sweep)), sweep.parent, law)
     except (ValueError, TypeError) as error:
@@ -98,8 +133,7 @@ def _plan(given: dict[str, Any], folder: Path, law: Path | None) -> SweepPlan:
         missing = 'scene = "scene.toml"' if "scene" not in given else '[record] with what = "orbits"'
         raise ValueError(f"add {missing} (afm-jax sweep --help shows a whole file)")
     beside = folder / given["scene"]
-    scene, start = scene_and_start(str(beside) if beside.exists() else given["scene"])
-    scene, _ = with_fitted_law(scene, law)
+    named = load_named(str(beside) if beside.exists() else given["scene"], law)
     # a start is of use for simulations alone
-    begin = start._asdict() if start is not None and given["record"].get("what") == "simulation" else None
-    return plan_of(given | {"scene": scene_tables(scene), "start": begin})
+    begin = named.start._asdict() if named.start and given["record"].get("what") == "simulation" else None
+    return plan_of(given | {"scene": scene_tables(named.scene), "start": begin})

@@ -1,16 +1,16 @@
 """`afm-jax tapping CURVE`: the energy of a tap, thresholds and hysteresis, and where the drive allows it the law."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import click
 
 from afm_jax.cli.command import Output
-from afm_jax.cli.commands.measure import READING_OPTIONS
 from afm_jax.cli.session import Session, add_note, prepare_folder
-from afm_jax.cli.values import option_of
+from afm_jax.cli.values import CurveNumber, Share, option_of
 from afm_jax.whole_files import check_plain
 from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS
 from fitting.tables.table import AmplitudeTable, read_table
@@ -18,59 +18,94 @@ from fitting.tapping_curves.measured import MeasuredFile, is_table, read_measure
 from fitting.tapping_curves.report import tapping_summary, together_summary, write_tapping, write_together
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping, with_law
-from fitting.tapping_curves.together import TappingTogether, together
+from fitting.tapping_curves.together import together
 
 
-def energy_of_taps(
+def energy_of_taps(  # noqa: PLR0913
     session: Session,
+    curve_files: Annotated[Sequence[Path], "[CURVE]..."],
     *,
-    curve_files: tuple[Path, ...],
-    no_law: bool,
-    model: str,
-    scale_errors: bool,
-    example: bool,
-    **options: Any,
+    noise: Annotated[float | None, Share("a relative error")] = None,
+    curve: CurveNumber | None = None,
+    model: str = "viscous+delay",
+    example: bool = False,
+    no_law: bool = False,
+    scale_errors: bool = False,
+    **reading: Any,
 ) -> Output:
-    """Return the energy of a tap along tapping curves, and the impact law where the drive allows it."""
-    how = {"no_law": no_law, "scale_errors": scale_errors}
+    """Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
+
+    CURVE is a table of amplitude and phase against height (`# drive = force` or base, columns drive_frequency_khz,
+    free_amplitude_nm, offset_nm, lockin_amplitude_nm, phase_lag_deg with their errors, retract), or an instrument's
+    file, as for `afm-jax read`. Energy, thresholds and hysteresis, attractive or repulsive branch, impact speeds where
+    they can be known; then the law from the rows with fast impacts, or why not and what to record instead. With --out
+    the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law. Several files, or a file of
+    several curves, are taken as of one lever: frequency and Q are fitted to all, the scatter from curve to curve stands
+    beside the errors, with --out in together.html, .txt, .json, .png; each curve has a folder of its own.
+    Exit code 3 if the energy of a tap is not determined.
+
+    Args:
+        session: for progress and files.
+        curve_files: files.
+        noise: relative error of amplitudes without one, such as 1%.
+        curve: only this curve of an instrument's file.
+        model: of the law, as for `afm-jax fit`.
+        example: analyse the bundled raw file, simulated with the defects of real ones.
+        no_law: leave the impact law out: energy, thresholds and speeds only, at once.
+        scale_errors: multiply the rows' errors where they scatter more (up to three times), instead of refusing their
+            energy.
+        **reading: as `ReadingOptions`.
+    """
+    if example == bool(curve_files):
+        raise click.UsageError("give a curve, `afm-jax tapping CURVE`, or --example for a simulated raw file")
     if example:
-        curve_file, options = _example(options)
-        curve_files = (curve_file,)
-    files = [_read(path, options) for path in curve_files]
+        path, reading = _example(reading)
+        curve_files = (path,)
+
+    def analysed(table: AmplitudeTable) -> Tapping:
+        result = tapping(table, law=False, scale_errors=scale_errors)
+        if no_law or not result.law_allowed:
+            return result
+        session.start_computing()
+        with session.working("fitting the impact law (the first run compiles for half a minute)"):
+            return with_law(result, model)
+
+    files = [_read(path, noise, curve, reading) for path in curve_files]
     if len(files) > 1 or len(files[0].tables) != 1 or files[0].refused:
-        return _together(session, curve_files, files, model, how)
+        return _together(session, curve_files, files, analysed)
     (table,) = files[0].tables.values()
-    result = _analysed(session, table, model, **how)
+    result = analysed(table)
     output = Output.of_report(result, partial(tapping_summary, result), partial(write_tapping, result))
     return output if result.valid else replace(output, not_valid=result.in_unit(result.reasons[0]))
 
 
-def _read(path: Path, options: dict[str, Any]) -> MeasuredFile:
-    """Return the curves of a file, a table or an instrument's, with what the call says of the instrument."""
+def _read(path: Path, noise: float | None, curve: int | None, reading: dict[str, Any]) -> MeasuredFile:
+    """Return the curves of a file, a table or an instrument's, with what the call says of the instrument.
+
+    Raises:
+        click.UsageError: if an option says how to read an instrument's file where a table says it all.
+    """
     if is_table(path):
-        _refuse_reading(path, options)
-        return MeasuredFile({1: _given(read_table(path, noise=options["noise"]), options)}, {})
-    file = read_measured(path, curve=options["curve"], **{name: options[name] for name in READING_OPTIONS})
-    for note in file.notes:
-        add_note(note)
+        for name, value in {"curve": curve, **reading}.items():
+            if name not in {*_OF_TABLES, "phase_sense"} and value not in {None, ""}:
+                raise click.UsageError(
+                    f"{option_of(name)} is for an instrument's file; {path} is a table, which says that itself"
+                )
+        return MeasuredFile({1: _given(read_table(path, noise=noise), reading)}, {})
+    file = read_measured(path, curve=curve, **reading)
+    add_note(*file.notes)
     return file
 
 
-def _analysed(session: Session, table: AmplitudeTable, model: str, *, no_law: bool, scale_errors: bool) -> Tapping:
-    result = tapping(table, law=False, scale_errors=scale_errors)
-    if no_law or not result.law_allowed:
-        return result
-    session.start_computing()
-    with session.working("fitting the impact law (the first run compiles for half a minute)"):
-        return with_law(result, model)
-
-
 def _together(
-    session: Session, paths: tuple[Path, ...], files: list[MeasuredFile], model: str, how: dict[str, bool]
+    session: Session,
+    paths: Sequence[Path],
+    files: list[MeasuredFile],
+    analysed: Callable[[AmplitudeTable], Tapping],
 ) -> Output:
     """Return what is known of several curves of one lever, together and one by one."""
     tables = [(number, table) for file in files for number, table in file.tables.items()]
-    whole = together([_analysed(session, table, model, **how) for _, table in tables]) if tables else None
+    whole = together([analysed(table) for _, table in tables]) if tables else None
     numbers = [number for number, _ in tables] if len(files) == 1 else range(1, len(tables) + 1)
     curves = {} if whole is None else dict(zip(numbers, whole.curves, strict=True))
     refused = [
@@ -83,77 +118,54 @@ def _together(
     if whole is not None and len(curves) > 1:
         text.append(together_summary(whole))
     valid = whole is not None and whole.valid and not refused
-    payload = {
-        "valid": valid,
-        "curves": [{"curve": number, **result.to_dict()} for number, result in curves.items()],
-        "together": None if whole is None else whole.to_dict(),
-        "refused": refused,
-    }
-    return Output(
-        payload=payload,
-        text=text,
-        report=partial(_write_curves, session, curves, whole),
-        not_valid=None if valid else _why_not(paths, refused, curves, whole),
-    )
-
-
-def _write_curves(
-    session: Session, curves: dict[int, Tapping], whole: TappingTogether | None, folder: Path, _: Any
-) -> list[Path]:
-    """Write a report of each curve into a folder of its own, and of all together if they scatter; return the paths."""
-    written: list[Path] = []
-    for number, result in curves.items():
-        below = folder / f"curve_{number}"
-        check_plain(below)
-        prepare_folder(below)
-        written += write_tapping(result, below, replace(session, out=below).write_table)
-    if whole is not None and whole.scatter:
-        written += write_together(whole, folder)
-    return written
-
-
-def _why_not(
-    paths: tuple[Path, ...], refused: list[dict[str, Any]], curves: dict[int, Tapping], whole: TappingTogether | None
-) -> str:
     why = [f"curve {each['curve']} refused" for each in refused]
     why += [f"curve {number}: {result.reasons[0]}" for number, result in curves.items() if not result.valid]
     why += [] if whole is None else [reason for reason in whole.reasons if "disagree" in reason]
-    return f"{paths[0] if len(paths) == 1 else f'{len(paths)} files'}: {'; '.join(why)}"
+    named = f"{paths[0] if len(paths) == 1 else f'{len(paths)} files'}"
+
+    def write(folder: Path, _: Any) -> list[Path]:
+        """Write a report of each curve into a folder of its own, and of all together if they scatter."""
+        written: list[Path] = []
+        for number, result in curves.items():
+            below = folder / f"curve_{number}"
+            check_plain(below)
+            prepare_folder(below)
+            written += write_tapping(result, below, replace(session, out=below).write_table)
+        return written + (write_together(whole, folder) if whole is not None and whole.scatter else [])
+
+    return Output(
+        payload={
+            "valid": valid,
+            "curves": [{"curve": number, **result.to_dict()} for number, result in curves.items()],
+            "together": None if whole is None else whole.to_dict(),
+            "refused": refused,
+        },
+        text=text,
+        report=write,
+        not_valid=None if valid else f"{named}: {'; '.join(why)}",
+    )
 
 
-def _example(options: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+def _example(reading: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
     """Return the bundled raw file, and the options with what is known of its instrument where they say nothing."""
-    stated = {name: value for name, value in OPTIONS.items() if options[name] in {None, ""}}
+    stated = {name: value for name, value in OPTIONS.items() if reading[name] in {None, ""}}
     path = EXAMPLE.relative_to(Path.cwd()) if EXAMPLE.is_relative_to(Path.cwd()) else EXAMPLE
     # --spring-constant stands for --spring-constant-n-per-m
-    words = " ".join(f"{option_of(name.removesuffix('_n_per_m'))} {_shown(value)}" for name, value in stated.items())
-    add_note(f"The example is simulated; as if it were measured: afm-jax tapping {path} {words}")
-    return path, options | stated
+    words = [
+        f"{option_of(name.removesuffix('_n_per_m'))} {value if isinstance(value, str) else _PAIR.format(*value)}"
+        for name, value in stated.items()
+    ]
+    add_note(f"The example is simulated; as if it were measured: afm-jax tapping {path} {' '.join(words)}")
+    return path, reading | stated
 
 
-def _shown(value: Any) -> str:
-    return value if isinstance(value, str) else f"'{value[0]:g} +- {value[1]:g}'"
-
-
+_PAIR = "'{:g} +- {:g}'"
 _OF_TABLES = {
     "free_frequency_khz": ("free_frequency_khz", "free_frequency_error_khz"),
     "quality_factor": ("quality_factor", "quality_factor_error"),
     "spring_constant_n_per_m": ("spring_constant_n_per_m", "spring_constant_error_n_per_m"),
 }
 """What the command line may say in place of a table, and what a table calls value and error."""
-
-
-def _refuse_reading(path: Path, options: dict[str, Any]) -> None:
-    """Refuse options that say how to read an instrument's file where a table says it all.
-
-    Raises:
-        click.UsageError: naming the first of them.
-    """
-    for name in ("curve", *READING_OPTIONS):
-        if name not in {*_OF_TABLES, "phase_sense"} and options[name] not in {None, ""}:
-            raise click.UsageError(
-                f"{option_of(name)} is for an instrument's file; {path} is a table, which says that itself"
-            )
 
 
 def _given(table: AmplitudeTable, options: dict[str, Any]) -> AmplitudeTable:

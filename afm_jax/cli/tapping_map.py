@@ -1,27 +1,81 @@
 """`afm-jax tapping-map IMAGE`: energy of a tap and virial in every pixel."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
+from afm_jax.cli.values import Positive, Quantity
 from fitting.instruments.images import read_images
 from fitting.report.sections import text_of
 from fitting.tapping_curves.map_report import map_report, write_map
 from fitting.tapping_curves.maps import tapping_map
 
 
+class ImagingOptions:
+    """What is said of the instrument, as `fitting.tapping_map` takes it.
+
+    Attributes:
+        drive: what is driven.
+        phase_sense: whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the
+            readings decide where they can.
+        drive_frequency_khz: frequency of the drive; where nothing says it, the free frequency.
+        free_frequency_khz: natural frequency of the free cantilever, '90 +- 0.01' with its error.
+        quality_factor: its quality factor, '200 +- 5' with its error.
+        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are
+            over it, in nm^2.
+        free_amplitude_nm: amplitude of the free tip, as the instrument reads it, '13.4 +- 0.1'.
+        free_phase_deg: phase of the free tip, as the instrument reads it, '90 +- 0.05' [its error: 0.2].
+        nm_per_volt: sensitivity of an amplitude in volts.
+        tip_calibration: true over stated amplitude; '1 +- 0.02'.
+        amplitude_error_nm: standard error of a pixel's.
+        phase_error_deg: standard error of a pixel's.
+    """
+
+    drive: Literal["base", "force"] = "base"
+    phase_sense: Literal["lag", "lead"] | None = None
+    drive_frequency_khz: Quantity | None = None
+    free_frequency_khz: Quantity | None = None
+    quality_factor: Quantity | None = None
+    spring_constant_n_per_m: Annotated[Quantity | None, "--spring-constant"] = None
+    free_amplitude_nm: Quantity | None = None
+    free_phase_deg: Quantity | None = None
+    nm_per_volt: Quantity | None = None
+    tip_calibration: Quantity | None = None
+    amplitude_error_nm: Positive | None = None
+    phase_error_deg: Positive | None = None
+
+
 def map_of_an_image(
     session: Session,  # noqa: ARG001
+    image: Annotated[Path, "IMAGE"],
+    phase_image: Annotated[Path | None, "[PHASE_IMAGE]"] = None,
     *,
-    image: Path,
-    phase_image: Path | None,
-    formats: tuple[str, ...],
-    columns: str,
-    **options: Any,
+    columns: Annotated[str, "COLUMN=CHANNEL[:UNIT][:FACTOR],..."] = "",
+    formats: Annotated[Sequence[Literal["npz", "gsf", "zarr"]], "--format"] = ("npz",),
+    **imaging: Any,
 ) -> Output:
-    """Return energy and virial of every pixel of an image."""
-    result = tapping_map(read_images(image, phase_image, columns=columns), **options)
+    """Read the energy of a tap and the virial off every pixel of an image of amplitude and phase.
+
+    IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), text of numbers with
+    amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw
+    (`pip install 'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs
+    its program on the file). Needed are amplitude and phase of the free tip, at the same drive. Each pixel has its own
+    error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said once.
+    Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
+    With --out map.png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
+    median energy is below zero or only bracketed, or the sense of the phase decides and is not known.
+
+    Args:
+        session: of the call.
+        image: the file.
+        phase_image: the phase, if in a file of its own.
+        columns: which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.
+        formats: of the arrays written into --out (gsf: for Gwyddion); may be given several times.
+        **imaging: as `ImagingOptions`.
+    """
+    result = tapping_map(read_images(image, phase_image, columns=columns), **imaging)
     return Output.of_report(
         result, lambda: text_of(map_report(result)), lambda folder, _: write_map(result, folder, formats)
     )

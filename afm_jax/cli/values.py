@@ -5,21 +5,12 @@ A kind makes a value of a text, and says in a sentence what is wrong with the te
 
 import math
 import re
-from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, Literal
 
 import click
 
-from afm_jax.cli.session import add_note
-from afm_jax.scenefile.tables import cut_short
-
-if TYPE_CHECKING:
-    from afm_jax.apparatus.scene import Scene
-    from afm_jax.scenefile.parameter_paths import ParameterRange
-    from afm_jax.scenefile.scenefile import Start
-    from fitting.tables.table import AmplitudeTable
-
+from afm_jax.words import cut_short
+from fitting.parameters import MODELS
 
 _MOST_NUMBERS = 1_000_000
 _MOST_STARTS = 16_000_000
@@ -196,14 +187,14 @@ class ValueAndError(ValueKind):
 
     name = "value"
 
-    def __init__(self, *, none: bool = False):
-        """Say whether it may be the word "none", which stands for an infinite value."""
-        self.none = none
+    def __init__(self, **words: Any):
+        """Say which words may stand in its place, and for what."""
+        self.words = words
 
-    def read(self, text: str) -> tuple[float, float | None]:
-        """Return the value and its error, None if exact."""
-        if self.none and text == "none":
-            return math.inf, None
+    def read(self, text: str) -> Any:
+        """Return the value and its error, None if exact; or what a word stands for."""
+        if text in self.words:
+            return self.words[text]
         try:
             value, *error = parse_around_plus_minus(text)
         except ValueError as fault:
@@ -242,6 +233,55 @@ class Course(ValueKind):
         return tuple(first + (last - first) * index / (count - 1) for index in range(count))
 
 
+class Fixed(ValueKind):
+    """A parameter held at a value: NAME=VALUE."""
+
+    name = "value"
+
+    def read(self, text: str) -> tuple[str, float]:
+        """Return name and value."""
+        try:
+            name, (value,) = _assigned(text)
+        except ValueError as error:
+            raise ValueError(f"must be NAME=VALUE such as modulus_gpa=80, but is {text}") from error
+        return name, value
+
+
+class Constraint(ValueKind):
+    """What is known of a parameter: NAME=VALUE+-ERROR."""
+
+    name = "constraint"
+
+    def read(self, text: str) -> tuple[str, tuple[float, float]]:
+        """Return name, value and standard error."""
+        try:
+            name, (value, error) = _assigned(text)
+        except ValueError as fault:
+            raise ValueError(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {text}") from fault
+        return name, (value, error)
+
+
+def _assigned(text: str) -> tuple[str, list[float]]:
+    """Return the name before an equals sign and the numbers after it."""
+    name, _, numbers = text.partition("=")
+    if not name.strip():
+        raise ValueError("names no parameter")
+    return name.strip().replace("-", "_"), parse_around_plus_minus(numbers)
+
+
+class Names(ValueKind):
+    """Names in a comma list."""
+
+    name = "names"
+
+    def read(self, text: str) -> tuple[str, ...]:
+        """Return the names that a text lists, separated by commas."""
+        names = tuple(part.strip() for part in text.split(","))
+        if not all(names):
+            raise ValueError(f"must be names separated by commas, but is {text}")
+        return names
+
+
 def option_of(parameter: str) -> str:
     """Return the option of a parameter: of tip_radius_nm, --tip-radius-nm."""
     return f"--{parameter.replace('_', '-')}"
@@ -276,66 +316,9 @@ def _number(text: str, what: str, *, positive: bool) -> float:
     return number
 
 
-def scene_and_start(name: str, *, notes: bool = True) -> "tuple[Scene, Start | None]":
-    """Return the scene that an argument names and its start; see `afm_jax.scenefile.scenefile.read_scene`.
-
-    Args:
-        name: a path, or a preset's name.
-        notes: whether the result says what the file leaves to be assumed.
-    """
-    from afm_jax.scenefile.scenefile import read_scene  # noqa: PLC0415
-
-    read = read_scene(name)
-    for note in read.notes if notes else ():
-        add_note(note)
-    return read.scene, read.start
-
-
-def ranges_of(name: str, scene: "Scene", texts: Sequence[str], *, counted: bool) -> "list[ParameterRange]":
-    """Return the ranges of a scene's parameters that options give.
-
-    Args:
-        name: of the scene, for messages.
-        scene: the scene.
-        texts: PARAMETER=low:high:count, or without count.
-        counted: whether with count.
-
-    Raises:
-        ValueError: if one is no range, or the scene lacks a parameter or cannot be at an end.
-    """
-    from afm_jax.scenefile.parameter_paths import check_ranges, parse_range  # noqa: PLC0415
-
-    ranges = [parse_range(text, counted=counted) for text in texts]
-    try:
-        check_ranges(scene, *ranges)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
-    return ranges
-
-
-def example_path() -> Path:
-    """Return where the bundled table of `--example` lies, the short way if that is below the working folder."""
-    import fitting.examples  # noqa: PLC0415
-
-    path = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def tables_with(
-    paths: Sequence[Path], noise: float | None, quality_factor: tuple[float, float | None] | None
-) -> "list[AmplitudeTable]":
-    """Return amplitude tables from their files, with the quality factor of the call, if it gives one.
-
-    Raises:
-        TableError: if one cannot be read, or the quality factor is impossible.
-    """
-    from dataclasses import replace  # noqa: PLC0415
-
-    from fitting.tables.table import read_table  # noqa: PLC0415
-
-    read = [read_table(path, noise=noise) for path in paths]
-    if quality_factor is None:
-        return read
-    value, error = quality_factor
-    quality = None if math.isinf(value) else value
-    return [replace(table, quality_factor=quality, quality_factor_error=error) for table in read]
+Positive = Annotated[float, Finite(positive=True)]
+CurveNumber = Annotated[int, click.IntRange(1)]
+ModelName = Annotated[str, click.Choice(MODELS)]
+Quantity = Annotated[tuple[float, float | None], ValueAndError()]
+QualityFactor = Annotated[tuple[float, float | None], ValueAndError(none=(math.inf, None))]
+Sensitivity = Annotated[tuple[float, float | None] | Literal["slope"], ValueAndError(slope="slope"), "NM|slope"]

@@ -1,1 +1,0 @@
-"""The rows of all commands, a file for each group."""
