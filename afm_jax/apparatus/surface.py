@@ -60,7 +60,7 @@ class Wave(eqx.Module):
 
 
 class Surface(eqx.Module):
-    """A surface at offset + rate t + a sum of waves; what is asked of a `Platform` can be asked of it.
+    """A surface at offset + rate t + a sum of waves, with the methods of a `Platform`.
 
     Args:
         offset_nm: mean height at time 0.

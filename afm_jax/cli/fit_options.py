@@ -116,7 +116,7 @@ def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tupl
 
 
 def _check_of_use(free: tuple[str, ...], fixed: dict[str, float], effects: tuple[str, ...]) -> None:
-    """Check that each parameter of a contact is of use.
+    """Check that some effect uses each parameter of a contact.
 
     Raises:
         click.UsageError: if one is not.

@@ -30,7 +30,7 @@ from afm_jax.units import within_turn
 
 _SAMPLE = 2048
 _LONG = 1000
-"""Impacts after which the motions of a sample are told apart."""
+"""Impacts after which the motions of a sample are distinguished."""
 _SAME = 1e-3
 """Distance below which points are those of one orbit."""
 _RADII = (0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.0)
@@ -39,10 +39,10 @@ _BACK = 300
 """Impacts after which a tip near an orbit must be on it."""
 _POINTS = 64
 _ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
-"""Impacts after each of which starts that have arrived drop out."""
+"""Numbers of impacts after which starts that have arrived drop out."""
 _PART = 8 * LANES
 _LEFT = 20_000
-"""Starts at most that are told apart one by one in the end."""
+"""Largest number of starts that are distinguished one by one in the end."""
 
 
 _NOTHING = np.zeros(0)
@@ -456,7 +456,7 @@ def _towards(
 
 
 def _with_names(attractors: list[Attractor]) -> list[Attractor]:
-    """Return attractors whose names tell them apart: "(1,5) a" and "(1,5) b"."""
+    """Return attractors with distinct names: "(1,5) a" and "(1,5) b"."""
     names = [attractor.name for attractor in attractors]
     letters = {name: iter("abcdefghijklmnopqrstuvwxyz") for name in names if names.count(name) > 1}
     told_apart = [f"{name} {next(letters[name], '+')}" if name in letters else name for name in names]

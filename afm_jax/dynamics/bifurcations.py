@@ -87,7 +87,7 @@ class Sweep(ResultTuple):
         return "up" if self.upward else "down"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `afm-jax bifurcation --json` tells of one direction."""
+        """Return one direction of the ramp as `afm-jax bifurcation --json` prints it."""
         told = {
             "direction": self.direction,
             "complete": self.complete,

@@ -1,4 +1,4 @@
-"""Which of many scenes have a stable single-impact orbit of which order, and its peak amplitude.
+"""Stable single-impact orbits of many scenes: their orders and peak amplitudes.
 
 For every scene and every order N the roots of the closing condition are found; where there is one the orbit is read and
 judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 and 3: drive frequency and amplitude).
@@ -103,9 +103,9 @@ ORBIT_NUMBERS = (
     "velocity_after_nm_per_us",
     "largest_multiplier",
 )
-"""What is told of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
+"""Columns of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
 DRIVEN_NUMBERS = ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg")
-"""What is told besides of one that base or force drives."""
+"""Further columns of a scene that base or force drives."""
 _ORBITS_AT_ONCE = 2
 """Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 

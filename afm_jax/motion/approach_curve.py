@@ -179,7 +179,7 @@ def approach_curve(
 
 
 def _only_drive(scene: Scene) -> BaseDrive | ForceDrive:
-    """Return what drives the cantilever of a scene, of which there must be one thing with one frequency.
+    """Return the drive of a scene's cantilever; there must be exactly one, with one frequency.
 
     Raises:
         ValueError: if not; says how to mend it.

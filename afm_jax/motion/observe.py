@@ -215,7 +215,7 @@ OBSERVABLES: tuple[Observable, ...] = tuple(
     for row in get_args(hint)
     if isinstance(row, Observable)
 )
-"""The rows of the table, in the order in which they are told."""
+"""The rows of the table, in the order of the output."""
 
 
 def observe(

@@ -206,7 +206,7 @@ def halved(
 
 
 def bracketed_root(function: Callable[[float], float], low: float, high: float, *, tolerance: float) -> float:
-    """Return where a continuous function is 0 between two numbers, either of which may be the larger.
+    """Return where a continuous function is 0 between two numbers, in either order.
 
     Args:
         function: from a number to a number.

@@ -191,7 +191,7 @@ def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[s
 
     Args:
         problem: "map", "collide", or a scene's file or preset.
-        contacts: of a scene: the arrival of which contact is compared.
+        contacts: of a scene: number of the contact whose arrival is compared.
         quick: few settings, each measured once: to see that it works.
 
     Returns:

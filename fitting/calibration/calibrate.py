@@ -160,7 +160,7 @@ def calibrate(
         temperature_k: of lever and air, a number or a pair with its error; None: the file's, else 296 +- 3.
         length_um: of a rectangular lever, likewise; with the width it gives k by Sader's method.
         width_um: of a rectangular lever, likewise.
-        scale_error: relative error of the deflection's scale, of which k by equipartition has twice as much; force
+        scale_error: relative error of the deflection's scale; that of k by equipartition is twice as large; force
             curves repeat a scale to some per cent.
         static: the deflection was calibrated by the slope of a force curve (static InvOLS), not by the mode itself.
 

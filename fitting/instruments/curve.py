@@ -156,8 +156,8 @@ def read_curves(
         columns: which channel becomes which column, as `parse_columns` takes it, where names and units do not tell;
             `offset_nm=1/2` where approach and retract are two channels.
         drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: taken as "base", and said.
-        phase_sense: "lag" of a phase that grows as the tip lags more, "lead" of its opposite; None: told by the curve
-            where it can. A factor of the phase in `columns` says that it is a lag then.
+        phase_sense: "lag" of a phase that grows as the tip lags more, "lead" of its opposite; None: determined from the
+            curve if possible. A factor of the phase in `columns` says that it is a lag then.
         bin_nm: width of the bins of height in the table of a curve, 0 to merge equal heights only; None: rows as they
             are, or where heights repeat or are not in order bins of five rows or a 200th of a branch.
         numbers: what the file does not say, or says wrongly: the keys of `OPTIONS`, each a number or a pair with its
@@ -227,7 +227,7 @@ def _refuse_modes(recording: Recording) -> None:
     if channel is not None:
         raise TableError(
             f"{recording.source}: holds a channel {channel!r}, which is none of amplitude modulation (tapping) of one "
-            "mode; its amplitude and phase tell no energy of a tap"
+            "mode; its amplitude and phase do not give the energy of a tap"
         )
 
 
@@ -503,7 +503,7 @@ def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
 
 
 def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
-    """Return the height of the tip's rest position, as far as that can be told, else 0; add it to what is known."""
+    """Return the height of the tip's rest position if it can be determined, else 0; add it to what is known."""
     given, level = curve.known.get("offset_origin_nm"), curve.number("free_amplitude_nm")
     onsets = [look.onset_nm for branch, look in sorted(looks.items()) if look.onset_nm is not None]
     if given is not None:
@@ -518,7 +518,7 @@ def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
 _ASSUMED_ORIGIN_NM = 1.0
 """Error of an origin read off the curve: attraction moves the contact by about so much."""
 _RADIANS_DEG = 30.0
-"""How near to the free tip's lag its phase, taken for radians, must be to be told as such."""
+"""How near to the free tip's lag its phase, read as radians, must be to be recognized as such."""
 
 
 def _add_phase(

@@ -103,7 +103,7 @@ class PhaseReadings(NamedTuple):
 
     @property
     def known_zero(self) -> bool:
-        """Whether the free tip, or a statement, tells the zero of the phase."""
+        """Whether the free tip, or a statement, determines the zero of the phase."""
         return bool(self.seen_free.any()) or self.zero is not None
 
     def zero_deg(self, sign: float) -> Rows:
@@ -172,7 +172,7 @@ class PhaseReadings(NamedTuple):
             return int(np.sum((start < -_SURE * error) & (self.ratio > LEAST_RATIO)))
 
     def sign_by_energy(self) -> float | None:
-        """Return the sign with which taps take energy where they would give it away with the other.
+        """Return the sign with which taps lose energy where they would gain it with the other.
 
         0: with both signs many would; None: the energies do not tell.
         """
@@ -287,7 +287,7 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
         )
     elif origin == "unknown":
         reason = (
-            "off resonance energies depend on the sign of the phase, and the curve does not tell whether it lags or "
+            "off resonance energies depend on the sign of the phase, and the curve does not show whether it lags or "
             f"leads: say {SENSE_OPTION}"
         )
     return PhaseSense(sign, zero, origin, _notes(readings, sign, origin, zero), reason)

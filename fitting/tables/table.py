@@ -160,7 +160,7 @@ def columns_of(table: "AmplitudeTable") -> dict[str, Any]:
 
 
 def required(columns: Collection[str]) -> tuple[Column, ...]:
-    """Return the columns of which every row needs a number, of those that a table has."""
+    """Return the columns of a table in which every row needs a number."""
     return tuple(column for column in _COLUMNS if column.required and column.name in columns)
 
 

@@ -38,10 +38,10 @@ ACCURACY = Command(
         valued(
             "--contacts",
             click.IntRange(1, 10_000),
-            "For a scene: the arrival of which contact is compared.",
+            "For a scene: number of the contact whose arrival is compared.",
             default=10,
         ),
-        flag("--quick", "Few and small measurements: to see that it works."),
+        flag("--quick", "Few and small measurements, to check that it works."),
     ),
 )
 

@@ -26,10 +26,10 @@ COLLIDE = Command(
     runs="afm_jax.cli.collide:collide",
     help="""Let free tips collide with a sample at rest, through liquid bridge and solid junction.
 
-    The contact is the paper's, or that of SCENE.toml, changed by the options. Of every speed: rebound speed, collision
-    delay, whether the tip is captured, times, deepest gap, and where the energy went; and the capture speed. With
-    --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are; exit code 3 if the
-    integration does not resolve one. With --make-law the law that the contact amounts to.
+    The contact is the paper's, or that of SCENE.toml, changed by the options. The output gives the capture speed, and
+    for every speed the rebound speed, the collision delay, whether the tip is captured, times, deepest gap, and where
+    the energy went. With --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are;
+    exit code 3 if the integration does not resolve a collision. --make-law computes the impact law of the contact.
     """,
     options=(
         *CONTACT_OPTIONS,
@@ -43,8 +43,8 @@ COLLIDE = Command(
         valued("--accuracy", Finite(positive=True), "Wanted relative accuracy of the rebound speed.", default=1e-9),
         flag(
             "--make-law",
-            "Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
-            "law.json and law.csv, which scene files and --law take, and the formulas closest to it.",
+            "Compute the impact law of the contact instead of a table of collisions: with --out law.json and law.csv, "
+            "which scene files and --law read, and the formulas closest to it.",
         ),
         valued(
             "--speed-range",
@@ -55,7 +55,7 @@ COLLIDE = Command(
         valued(
             "--points",
             click.IntRange(min=10, max=100_000),
-            "With --make-law: number of speeds that formulas are fitted to; 512 without.",
+            "With --make-law: number of speeds that formulas are fitted to; else 512.",
         ),
     ),
     check=_check_law,

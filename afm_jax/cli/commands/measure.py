@@ -62,7 +62,7 @@ CALIBRATE = Command(
         valued(
             "--scale-error",
             Share("a relative error"),
-            "Relative error of the deflection's scale (its sensitivity), of which k has twice as much.",
+            "Relative error of the deflection's scale (its sensitivity); that of k is twice as large.",
             default="5%",
         ),
     ),
@@ -75,15 +75,14 @@ DESIGN = Command(
     runs="afm_jax.cli.design:planned",
     help="""Choose the drives to measure next, and forecast how well the law will then be known.
 
-    Say what is known: the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r,
-    --epsilon, ...), or a fit of what was measured so far (--fit); and what can be driven: every combination of
-    orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
-    itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
-    or 170:190:1. With --out design.csv, .json and .png. Exit code 3 if no drive can be planned with, or the points do
-    not determine the law.
+    Give the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r, --epsilon, ...), or a fit
+    of what was measured so far (--fit). Candidates are all combinations of orders, frequencies, amplitudes and offsets;
+    with --drive force or base (the cantilever is driven, amplitude and lag are read) all combinations of frequencies,
+    free amplitudes and heights. LISTs are numbers and ranges, 1,2,5 or 170:190:1. With --out design.csv, .json and
+    .png. Exit code 3 if no candidate can be used, or the points do not determine the law.
     """,
     options=(
-        valued("--orders", Orders(), "Drive periods an impact; else 1-4, or 1 where the tip is driven."),
+        valued("--orders", Orders(), "Drive periods from impact to impact; else 1-4, or 1 where the tip is driven."),
         valued(
             "--detuning",
             Numbers(),
@@ -104,16 +103,16 @@ DESIGN = Command(
             "Where the tip is driven, in place of offsets: distances of the sample as shares of each free amplitude; "
             "else 0.1:0.9:0.1.",
         ),
-        valued("--largest-nm", Finite(), "Peak amplitude that the instrument takes."),
+        valued("--largest-nm", Finite(), "Largest peak amplitude that the instrument can measure."),
         valued("--points", click.IntRange(1, 200), "How many to choose.", default=8),
-        valued("--for", Names(), "Parameters to be known well, as r,epsilon; else the law's.", into="interest"),
+        valued("--for", Names(), "Parameters to determine, as r,epsilon; else the law's.", into="interest"),
         valued("--noise", Share("a relative error"), "Relative error of an amplitude.", default="1%"),
-        valued("--phase-noise-deg", Finite(), "Error of a lag, tip driven.", default=0.2),
-        valued("--amplitudes", click.Choice(("both", "peak", "lockin")), "What is read of a point.", default="both"),
+        valued("--phase-noise-deg", Finite(), "Error of a lag where the tip is driven.", default=0.2),
+        valued("--amplitudes", click.Choice(("both", "peak", "lockin")), "The readings of a point.", default="both"),
         valued(
             "--uncertainty",
             Share("a relative error"),
-            "How far the law may be off where no fit says.",
+            "Error of the law that is assumed where no fit gives one.",
             default="10%",
         ),
         valued(
@@ -152,10 +151,11 @@ FIT = Command(
 
     The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
     order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
-    with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
-    counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
-    offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
-    ones, and the report says how far each is from the others (its deviation). With --out the report: fit.html, fit.txt,
+    with its ..._error_nm; a column no_orbit marks by 1 drives at which the tip did not settle; phase_deg
+    is used if present. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz,
+    free_amplitude_nm, offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law; their nuisances
+    are separate or shared (--share), and the report gives each table's pull: the distance between its law and that
+    of the others, in standard deviations. With --out the report: fit.html, fit.txt,
     fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not converged, not explained by
     the model, or a parameter not identified.
     """,
@@ -166,41 +166,41 @@ FIT = Command(
             click.Choice(MODELS),
             "; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
             + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
-            "of tapping curves on resonance too.",
+            "of tapping curves 3 to 10 % above resonance.",
             default="law",
         ),
         NOISE,
         QUALITY_FACTOR,
-        flag("--scale-errors", "Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1."),
-        flag("--robust", "Leave outliers out, one row in ten at most."),
+        flag("--scale-errors", "Treat the errors as relative: scale them, by 3 at most, until chi2/dof is 1."),
+        flag("--robust", "Leave out outliers, at most one row in ten."),
         valued(
             "--free",
             Names(),
-            "The parameters that are fitted, if not all that are not fixed; of a contact, if left out, "
-            f"{','.join(CONTACT_DEFAULT)}.",
+            f"The parameters to fit; else all that are not fixed, and of a contact {','.join(CONTACT_DEFAULT)}.",
         ),
         valued("--fix", Fixed(), "Hold a parameter at a value.", into="fixed", multiple=True, metavar="NAME=VALUE"),
         valued(
             "--constrain",
             Constraint(),
-            f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model; of a contact also "
-            "one that is held, at the value then.",
+            f"A value known beforehand, with its error: of {', '.join(NUISANCE_NAMES)}, or of a parameter of the "
+            "model; of a contact also of a parameter that is held at that value.",
             into="constraints",
             multiple=True,
             metavar="NAME=VALUE+-ERROR",
         ),
-        valued("--no", Names(), "contact: effects that it does not have.", into="left_out"),
-        flag("--compare", "Fit the rival models too and say what the table can tell.", into="comparing"),
+        valued("--no", Names(), "Of a contact: effects to leave out.", into="left_out"),
+        flag("--compare", "Fit the rival models too and say which of them the table distinguishes.", into="comparing"),
         flag(
             "--posterior",
-            "Credible intervals, too, by the no-U-turn sampler (extra `nuts`); where impacts last, of a Gaussian "
-            "around the fit.",
+            "Also give credible intervals, by the no-U-turn sampler (extra `nuts`); where impacts last, from a "
+            "Gaussian around the fit.",
         ),
         valued("--seed", click.IntRange(min=0), "Seed of the random numbers.", default=0),
         valued(
             "--share",
             Names(),
-            "Of several tables: nuisances (of --constrain) that all have in common, or all; else each has its own.",
+            "Of several tables: the nuisances (see --constrain) that they have in common, or all; else each table has "
+            "its own.",
         ),
         flag("--example", "Fit the bundled table instead of a file."),
     ),
@@ -219,10 +219,10 @@ INVERT = Command(
     runs="afm_jax.cli.invert:inversion",
     help="""Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
 
-    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses u_in^2 - u_out^2 are then set on
-    straight lines over (1, u_in), a viscous loss, and (1, u_in^2), a restitution. Rows that give nothing are named,
-    with the reason. With --out invert.csv, .json and .png. Exit code 3 if the rows determine no line, or none
-    explains them.
+    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. Straight lines are then fitted to the losses
+    u_in^2 - u_out^2, over (1, u_in) for a viscous loss and over (1, u_in^2) for a restitution. Rows without a result
+    are listed with the reason. With --out invert.csv, .json and .png. Exit code 3 if the rows determine no line, or
+    no line explains them.
     """,
     options=(
         click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path)),
@@ -236,10 +236,10 @@ INVERT = Command(
 LOCKIN = Command(
     name="lockin",
     runs="afm_jax.cli.lockin:lockin_of_trace",
-    help="""Read amplitude and phase of a deflection in time at the drive's frequency over N, and over 1 to 8 besides.
+    help="""Read amplitude and phase of a deflection in time at the drive's frequency over N, and over 1 to 8.
 
     TRACE is text with the columns time_us (or time_ms, time_s) and deflection_nm (the tip's height), separated by
-    commas, tabs, semicolons or spaces. The phase takes time 0 as when the platform is highest.
+    commas, tabs, semicolons or spaces. The phase assumes that the platform is highest at time 0.
     Amplitudes are integrals over whole periods, errors the scatter of up to twelve parts of the trace. Exit code 3 if
     the trace is not periodic at order N: the scatter, or the amplitude at another order, is above 2 % of that at N.
     With --out lockin.csv, .json and .png.
@@ -253,11 +253,11 @@ LOCKIN = Command(
 )
 
 _LEVER = {
-    "drive_frequency_khz": "Frequency of the drive; where nothing says it, the free frequency.",
+    "drive_frequency_khz": "Frequency of the drive; else that of the file, or the free frequency.",
     "free_frequency_khz": "Natural frequency of the free cantilever, '90 +- 0.01' with its error.",
     "quality_factor": "Its quality factor, '200 +- 5' with its error.",
-    "spring_constant_n_per_m": "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are "
-    "over it, in nm^2.",
+    "spring_constant_n_per_m": "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; if unknown, "
+    "energies are divided by it, in nm^2.",
 }
 _READING_NUMBERS = _LEVER | {
     "free_amplitude_nm": "Amplitude of the free tip; else the median of the rows far from the sample.",
@@ -278,8 +278,8 @@ class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
 _PHASE_SENSE = valued(
     "--phase-sense",
     click.Choice(["lag", "lead"]),
-    "Whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the readings decide "
-    "where they can.",
+    "Whether the phase grows (lag) or falls (lead) as the tip lags further behind its drive; else the readings decide "
+    "if they can.",
 )
 
 
@@ -290,9 +290,9 @@ def _columns(text: str) -> Callable[..., Any]:
 
 READING = (
     _columns(
-        "Which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
-        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and retract "
-        "in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8."
+        "The channel of each column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
+        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V. Files without a head have numbered channels; approach and retract "
+        "in two channels are APPROACH/RETRACT: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8."
     ),
     valued(
         "--drive",
@@ -324,11 +324,11 @@ READ = Command(
     help="""Read amplitude and phase against height out of an instrument's file.
 
     FILE is neaSNOM text, WSxM curves, an Asylum .ibw ramp, a NanoSurf .nid or Nanonis .dat file, or text separated by
-    tabs, semicolons, commas or blanks, with a head or without (--columns). Says what was found, where each number
-    comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
-    fit`; of a file of several curves one table each, TABLE_1.csv and so on. Repeated and unordered heights become bins.
-    Curves that must not be used (a free amplitude that jumps) are refused by name, and the exit code is 3. Package
-    extra for .ibw: `pip install 'afm-jax[instruments]'`.
+    tabs, semicolons, commas or blanks, with a head or without (--columns). The output says where each number comes
+    from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax fit`; a file of
+    several curves gives a table for each, TABLE_1.csv and so on. Repeated and unordered heights become bins. Curves
+    that must not be used (a free amplitude that jumps) are refused by name, with exit code 3. Extra for .ibw:
+    `pip install 'afm-jax[instruments]'`.
     """,
     options=(
         click.argument("file", metavar="FILE", type=click.Path(path_type=Path)),
@@ -349,28 +349,28 @@ def _check_curves(_: Session, options: Options) -> None:
 TAPPING = Command(
     name="tapping",
     runs="afm_jax.cli.tapping:energy_of_taps",
-    help="""Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
+    help="""Determine the energy of a tap from a tapping curve, and above resonance the impact law.
 
     CURVE is a table of amplitude and phase against height (`# drive = force` or base, columns drive_frequency_khz,
     free_amplitude_nm, offset_nm, lockin_amplitude_nm, phase_lag_deg with their errors, retract), or an instrument's
-    file, as for `afm-jax read`. Energy, thresholds and hysteresis, attractive or repulsive branch, impact speeds where
-    they can be known; then the law from the rows with fast impacts, or why not and what to record instead. With --out
-    the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law. Several files, or a file of
-    several curves, are taken as of one lever: frequency and Q are fitted to all, the scatter from curve to curve stands
-    beside the errors, with --out in together.html, .txt, .json, .png; each curve has a folder of its own.
-    Exit code 3 if the energy of a tap is not determined.
+    file, as for `afm-jax read`. The output gives the energy along the attractive and the repulsive branch, thresholds,
+    hysteresis, and impact speeds if they can be determined; then the law from the rows with fast impacts, or why there
+    is none and what to record instead. With --out the report: tapping.html, .txt, .json, .png and tapping_rows.csv,
+    and that of the law. Several files, or several curves of a file, are assumed to be of one lever: frequency and Q
+    are fitted to all of them, and the scatter from curve to curve stands beside the errors (with --out together.html,
+    .txt, .json, .png, and a folder for each curve). Exit code 3 if the energy of a tap is not determined.
     """,
     options=(
         click.argument("curve_files", metavar="[CURVE]...", nargs=-1, type=click.Path(path_type=Path)),
         NOISE,
         *READING,
         valued("--curve", click.IntRange(1), "Only this curve of an instrument's file."),
-        valued("--model", str, "Of the law, as for `afm-jax fit`.", default="viscous+delay"),
+        valued("--model", str, "Model of the law, as for `afm-jax fit`.", default="viscous+delay"),
         flag("--example", "Analyse the bundled raw file, simulated with the defects of real ones."),
-        flag("--no-law", "Leave the impact law out: energy, thresholds and speeds only, at once."),
+        flag("--no-law", "Do not fit the impact law: energy, thresholds and speeds only."),
         flag(
             "--scale-errors",
-            "Multiply the rows' errors where they scatter more (up to three times), instead of refusing their energy.",
+            "Multiply the rows' errors (by 3 at most) where rows scatter more, instead of refusing their energy.",
         ),
     ),
     check=_check_curves,
@@ -389,26 +389,26 @@ _IMAGE_NUMBERS = _LEVER | {
 TAPPING_MAP = Command(
     name="tapping-map",
     runs="afm_jax.cli.tapping_map:map_of_an_image",
-    help="""Read the energy of a tap and the virial off every pixel of an image of amplitude and phase.
+    help="""Determine the energy of a tap and the virial at every pixel of an image of amplitude and phase.
 
     IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), text of numbers with
     amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw
     (`pip install 'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs
-    its program on the file). Needed are amplitude and phase of the free tip, at the same drive. Each pixel has its own
-    error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said once.
+    its program on the file). Amplitude and phase of the free tip at the same drive are required. Each pixel has its own
+    error; the common error (spring constant, frequency, Q, calibration, free amplitude and phase) is given once.
     Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
     With --out map.png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
-    median energy is below zero or only bracketed, or the sense of the phase decides and is not known.
+    median energy is below zero or only bracketed, or the unknown sense of the phase decides.
     """,
     options=(
         click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path)),
         click.argument("phase_image", metavar="[PHASE_IMAGE]", required=False, type=click.Path(path_type=Path)),
-        _columns("Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase."),
+        _columns("The image of each quantity, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase."),
         valued("--drive", click.Choice(["base", "force"]), "What is driven.", default="base"),
         _PHASE_SENSE,
         *_numbers(_IMAGE_NUMBERS),
-        valued("--amplitude-error-nm", Finite(positive=True), "Standard error of a pixel's."),
-        valued("--phase-error-deg", Finite(positive=True), "Standard error of a pixel's."),
+        valued("--amplitude-error-nm", Finite(positive=True), "Standard error of a pixel's amplitude."),
+        valued("--phase-error-deg", Finite(positive=True), "Standard error of a pixel's phase."),
         valued(
             "--format",
             click.Choice(["npz", "gsf", "zarr"]),

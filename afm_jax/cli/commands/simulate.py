@@ -13,7 +13,7 @@ from afm_jax.cli.values import Course, Ends, Finite, Grid, Orders, Share
 BASINS = Command(
     name="basins",
     runs="afm_jax.cli.basins:basins",
-    help="""Find on which motion each start of a scene ends.
+    help="""Find the motion on which each start of a scene ends.
 
     A start is a drive phase and a speed at which the tip leaves the platform, at most four times the platform's top
     speed unless --speeds says otherwise. Attractors are named (m,N), m impacts in N drive periods, chaotic (the larger
@@ -35,22 +35,22 @@ BASINS = Command(
 BIFURCATION = Command(
     name="bifurcation",
     runs="afm_jax.cli.bifurcation:bifurcation",
-    help="""Ramp a parameter and record on which motion the tip settles at each of its values.
+    help="""Ramp a parameter and record the motion on which the tip settles at each of its values.
 
-    The tip is carried from value to value with its drive phase and rebound speed. It starts, and starts again where the
-    sample held it or it flew away, at the file's [start]; without one on a stable single-impact orbit of the order
-    nearest to resonance (of a contact: of the law closest to it), else leaving the sample upward. The output gives the
-    motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last impacts. With
-    --out bifurcation.csv (a row a value), impacts.csv (a row an impact; of an orbit each once), strobe.csv (heights
-    whenever the platform is highest) and a picture. With --law it also gives the fraction of the fit's draws with the
-    same motion. Exit code 3 if no motion went on anywhere.
+    The tip is carried from value to value with its drive phase and rebound speed. It starts at the file's [start];
+    without one on a stable single-impact orbit of the order nearest to resonance (of a contact: of the law closest to
+    it), else leaving the sample upward. Where the sample held it or it flew away it starts again in the same way. The
+    output gives the motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last
+    impacts. With --out bifurcation.csv (one row per value), impacts.csv (one row per impact; each impact of an orbit
+    once), strobe.csv (heights whenever the platform is highest) and a picture. With --law also the fraction of the
+    fit's draws with the same motion. Exit code 3 if no motion went on anywhere.
     """,
     options=(
         SCENE,
         valued("--parameter", str, "A parameter of the scene file and its values.", metavar="P=a:b:n", required=True),
         flag("--both", "Ramp up and then down, so that hysteresis shows."),
         flag("--down", "Ramp down instead of up."),
-        valued("--impacts", click.IntRange(200), "At every value.", default=2000),
+        valued("--impacts", click.IntRange(200), "Impacts at every value.", default=2000),
         LAW,
         DRAWS,
     ),
@@ -60,18 +60,18 @@ BIFURCATION = Command(
 CHART = Command(
     name="chart",
     runs="afm_jax.cli.chart:chart",
-    help="""Chart over two parameters of a scene which single-impact orbits exist, are stable and coexist.
+    help="""Chart the single-impact orbits that exist, are stable and coexist, over two parameters of a scene.
 
-    Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
-    if there are several) the peak amplitude and the size of the larger multiplier. A contact's orbits are closed by
-    simulation from those of the law closest to it: chart a thousand points, not a million; where none closes the point
-    is unresolved. With --law the fraction of the fit's draws in which an orbit is stable is given, too. With --out
-    chart.csv and a picture. Exit code 3 if there is no admissible orbit at all.
+    The output says for every point and order whether an orbit is admissible and whether one is stable. For the stable
+    one (the highest, if there are several) it gives the peak amplitude and the size of the larger multiplier. Orbits of
+    a contact are closed by simulation, from those of the law closest to it: chart a thousand points, not a million. A
+    point is unresolved where none closes. With --law also the fraction of the fit's draws in which an orbit is stable.
+    With --out chart.csv and a picture. Exit code 3 if there is no admissible orbit at all.
     """,
     options=(
         SCENE,
         valued("--x", str, "A parameter of the scene file: the chart's columns.", metavar="P=a:b:n", required=True),
-        valued("--y", str, "Another one: its rows.", metavar="P=a:b:n", required=True),
+        valued("--y", str, "A second one: the chart's rows.", metavar="P=a:b:n", required=True),
         valued("--orders", click.IntRange(1, 100), "Highest order N.", default=8),
         LAW,
         DRAWS,
@@ -81,20 +81,20 @@ CHART = Command(
 LYAPUNOV = Command(
     name="lyapunov",
     runs="afm_jax.cli.lyapunov:lyapunov",
-    help="""Compute Lyapunov exponents by QR of the impact map's exact Jacobians; a contact's come from its simulation.
+    help="""Compute Lyapunov exponents by QR of the impact map's exact Jacobians; for contacts, of the simulation's.
 
-    Of a motion that has come to an orbit they are the logarithms of its multipliers. A tip that rests on the platform
-    forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start]; without
-    one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it if it is
-    unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves the sample
-    upward. An orbit is reported only if it is stable. With --law there is a band for the larger exponent, begun without
-    [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 where every motion ends before enough
-    impacts.
+    Exponents of a motion that has reached an orbit are the logarithms of its multipliers. A tip that rests on the
+    platform forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start];
+    without one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it
+    if it is unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves
+    the sample upward. An orbit is reported only if it is stable. With --law the larger exponent has a band, whose
+    motions do not use [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 if every motion
+    ends before enough impacts.
     """,
     options=(
         SCENE,
         valued("--impacts", click.IntRange(20), "Impacts to average over.", default=2000),
-        valued("--transient", click.IntRange(0), "Impacts before.", default=500),
+        valued("--transient", click.IntRange(0), "Impacts before these.", default=500),
         valued("--parameter", str, "A parameter of the scene file and its values, one motion each.", metavar="P=a:b:n"),
         LAW,
         DRAWS,
@@ -115,7 +115,7 @@ CONTINUE = Command(
     options=(
         SCENE,
         valued("--order", click.IntRange(1, 1_000_000), "Drive periods of the orbit.", required=True),
-        valued("--impacts", click.IntRange(0, 64), "Impacts in them; 0: the tip meets nothing.", default=1),
+        valued("--impacts", click.IntRange(0, 64), "Impacts in these periods; 0: the free motion.", default=1),
         valued(
             "--parameter",
             str,
@@ -123,7 +123,7 @@ CONTINUE = Command(
             metavar="P=A:B",
             required=True,
         ),
-        valued("--second", str, "Another one: the special points are followed as curves in both.", metavar="P=A:B"),
+        valued("--second", str, "A second parameter: special points are followed as curves in both.", metavar="P=A:B"),
         LAW,
     ),
 )
@@ -134,22 +134,22 @@ EFFECTS = Command(
     runs="afm_jax.cli.effects:effects",
     help="""Say what each effect of a scene changes and costs.
 
-    Each effect is left out, absent from the program, and the steady motion compared with that of the full scene: peak
-    and lock-in amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the
-    scene's default one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared.
-    Costs are times to compute a drive period, the median of several runs. With --out effects.csv, effects.json,
-    effects.png and reduced.toml, the scene without what the accuracy does not need, and its start.
+    Each effect is left out in turn, and the steady motion is compared with that of the full scene: peak and lock-in
+    amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the scene's default
+    one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared. Costs are times
+    to compute a drive period, the median of several runs. With --out effects.csv, effects.json, effects.png and
+    reduced.toml: the scene, and its start, without the effects that the accuracy does not need.
     """,
     options=(
         SCENE,
         valued(
             "--accuracy",
             Share(),
-            "Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
+            "Wanted accuracy of the amplitudes, 1% or 0.01; the output names the effects that it does not need.",
             default="1%",
         ),
-        valued("--duration-us", Finite(positive=True), "How long to follow each scene at most, in us."),
-        valued("--only", str, "The effects to look at; all if left out.", metavar="NAME,..."),
+        valued("--duration-us", Finite(positive=True), "Longest time to follow each scene, in us."),
+        valued("--only", str, "The effects to study; else all.", metavar="NAME,..."),
     ),
 )
 
@@ -159,12 +159,13 @@ ORBITS = Command(
     runs="afm_jax.cli.orbits:orbits",
     help="""Find all single-impact orbits of a scene with a law, or with --impacts orbits of several impacts.
 
-    Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
-    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase and lag
-    at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and orbits.png. Exit
-    code 3 if none is admissible. With --impacts every impact is listed, the hardest first. A contact's orbits are
-    listed like this, too: an impact lasts from the formation of the bridge to its rupture (of a dry contact: while its
-    forces act); phase and velocity are those at rupture. The search may miss orbits of a contact, never of a law.
+    The output gives for every orbit impact phase and velocities, peak and lock-in amplitude of the height, whether it
+    is stable, and whether it is admissible (its flight stays above the platform). If base or force drive, it also gives
+    amplitude, phase and lag at the drive's frequency, and the deflection against a moving base. With --impacts it lists
+    every impact, the hardest first. Orbits of a contact are listed in the same way: an impact lasts from the formation
+    of the bridge to its rupture (of a dry contact: while its forces act); phase and velocity are those at rupture. The
+    search may miss orbits of a contact, of a law with delay, and of several impacts. With --out orbits.csv and
+    orbits.png. Exit code 3 if none is admissible.
     """,
     options=(
         SCENE,
@@ -210,17 +211,17 @@ SIMULATE = Command(
     runs="afm_jax.cli.simulate:simulation",
     help="""Follow a scene in time: contacts, amplitudes, phases, forces, energies.
 
-    SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The start is the
-    file's [start]; without one the tip starts on the single-impact orbit that the law with delay predicts, if there is
-    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth, at the
-    drive's frequency and at the response's, which is 1/N of it where the motion repeats after N drive periods. With
-    --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
-    exit code 3 if the simulation broke off.
+    SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The tip starts at
+    the file's [start]; without one on the single-impact orbit that the law with delay predicts, if there is one.
+    Amplitudes are read over the last response period if the motion has settled, else over the last fifth of the time:
+    at the drive's frequency, and at the response's, which is 1/N of it if the motion repeats after N drive periods.
+    With --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a
+    result; exit code 3 if the simulation broke off.
 
-    With --heights the sample goes through heights over the rest position of a cantilever driven by [force] or [base],
-    and back: amplitude and lag against height, each followed from the motion before until it settles (--periods at
-    most). With --out curve.csv, with noise as `afm-jax tapping` reads it, curve_points.csv without, curve.json and
-    curve.png; exit code 3 if the tip settles at no height.
+    With --heights the cantilever is driven by [force] or [base], and the sample moves through heights over its rest
+    position and back. The output is amplitude and lag against height; at each height the motion is followed from the
+    one before until it settles (--periods at most). With --out curve.csv, with noise, as `afm-jax tapping` reads it;
+    curve_points.csv, without noise; curve.json and curve.png. Exit code 3 if the tip settles at no height.
     """,
     options=(
         SCENE,
@@ -230,24 +231,24 @@ SIMULATE = Command(
             "Record an approach curve, both ways: heights of the sample in nm, negative below the rest position.",
             metavar="FROM:TO:COUNT",
         ),
-        valued("--duration-us", Finite(positive=True), "How long to follow the scene, in us."),
+        valued("--duration-us", Finite(positive=True), "Time to follow the scene, in us."),
         valued(
             "--periods",
             Finite(positive=True),
-            "How long, in periods of the drive. Without a duration the end is where the motion has settled, after "
-            f"{DEFAULT_PERIODS} of them at most.",
+            "The same in periods of the drive. Without either the simulation ends when the motion has settled, or "
+            f"after {DEFAULT_PERIODS} periods.",
         ),
         valued(
             "--harmonics",
             Orders("multiple"),
-            "Multiples of the response frequency omega/N at which amplitude and phase are read, besides the "
-            "drive's (N times it), which always is.",
+            "Multiples of the response frequency omega/N at which amplitude and phase are read; they are always read "
+            "at the drive's.",
             default="1",
         ),
         valued(
             "--accuracy",
             Finite(positive=True),
-            "Of every resolved contact: relative of the rebound speed.",
+            "Relative accuracy of the rebound speed of every resolved contact.",
             default=1e-9,
         ),
         valued(
@@ -256,8 +257,10 @@ SIMULATE = Command(
             "Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
             "time, as `afm-jax lockin` reads it.",
         ),
-        valued("--noise", Share("a relative error"), "With --heights: of the amplitudes in curve.csv; else 0.3%."),
-        valued("--phase-noise-deg", Finite(positive=True), "With --heights: of the lags in curve.csv; else 0.2."),
+        valued(
+            "--noise", Share("a relative error"), "With --heights: noise of the amplitudes in curve.csv; else 0.3%."
+        ),
+        valued("--phase-noise-deg", Finite(positive=True), "With --heights: noise of the lags in curve.csv; else 0.2."),
         LAW,
     ),
     check=_check_simulation,
@@ -277,7 +280,7 @@ def _check_sweep(session: Session, options: Options) -> None:
 SWEEP = Command(
     name="sweep",
     runs="afm_jax.cli.sweep:sweep",
-    help="""Compute many scenes over the grid of SWEEP.toml, into DIR/sweep.zarr; call it again to go on after a fault.
+    help="""Compute many scenes over the grid of SWEEP.toml into DIR/sweep.zarr; after a fault, the same call continues.
 
     \b
     scene = "scene.toml"                  # or a preset
@@ -293,15 +296,15 @@ SWEEP = Command(
     count = 500
     seed = 1
 
-    The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
-    are kept, whatever happens. One sweep at a time: what two write into one folder is undefined.
+    `xarray.open_zarr` opens the results. Other workers give the same numbers except for last digits. Finished chunks
+    are kept, whatever happens. Only one sweep at a time may write into a folder.
     """,
     options=(
         click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path)),
         valued(
             "--workers",
             click.IntRange(1, 1024),
-            "Processes of this machine that share its cores, by Dask; 1: this one alone.",
+            "Number of processes that share this machine's cores, by Dask; 1: this process alone.",
         ),
         valued("--scheduler", str, "A Dask scheduler whose workers do the work.", metavar="tcp://..."),
         flag("--plot", "Draw a sweep of one or two axes, sweep.png."),
