@@ -26,8 +26,8 @@ _KEPT_ELSEWHERE = {
     "contributing.md": "CONTRIBUTING.md",
     "security.md": "SECURITY.md",
 }
-_GALLERY = """Eight notebooks show whole studies. Each is shown as it ran, ends with assertions on its claims, and is run by the tests.
-They are in the repository's folder `notebooks/`."""
+_GALLERY = """Eight notebooks show whole studies. Each is shown as it ran, ends with assertions on its claims, and is run by
+the tests. They are in the repository's folder `notebooks/`."""
 _CODE_IN_CELLS = re.compile(r"(?<=<code>)[^<]*(?=</code>(?:(?!<t[dh]|</table>).)*</t[dh]>)", re.DOTALL)
 _JOINT = re.compile(r"(?<=[a-z]_)(?=[a-z0-9])|(?<=[(=/,])(?=[\w&])|(?<=[a-z]\.)(?=[a-z])")
 _WHOLE = re.compile(r"(?<![\w-])(--[a-z][\w-]*|afm-jax)")

@@ -16,9 +16,9 @@ from afm_jax.scenefile.parameter_paths import UNKNOWN
 def with_fitted_law(scene: Scene, path: Path | None) -> tuple[Scene, UncertainParameters | None]:
     """Return a scene with the law of a file in place of its own, and the unknowns of its errors.
 
-    Without a file it is the scene itself, of which nothing is uncertain; so it is of a law whose file tells no errors.
-    The quality factor is that of the fit where it was fitted along. What the fit found of its instrument (calibrations,
-    origin of offsets) belongs to the table, not to the scene; its uncertainty is in the law's.
+    Without a file the scene is returned as it is, without unknowns; a law whose file has no errors adds none either.
+    The quality factor is that of the fit if it was fitted along. The fitted instrument (calibrations, origin of
+    offsets) belongs to the table, not to the scene; its uncertainty is part of the law's.
 
     Args:
         scene: whose cantilever and drives are kept.

@@ -1,9 +1,9 @@
-"""Basins of attraction: which start ends where.
+"""Basins of attraction: the motion on which each start ends.
 
-A sample of starts is followed for long; what it comes to are the attractors. Around each point of each orbit the
-largest radius is sought from within which all of a ring and a disc of tips come back. Then every start is followed
-until it is within such a radius, is held, or flies away, and drops out; what is left in the end is followed on and told
-apart like the sample. Distances are in drive phase (rad) and velocity over beta omega.
+A sample of starts is followed for long; the motions that it reaches are the attractors. Around each point of each orbit
+the largest radius is sought from within which all of a ring and a disc of tips come back. Then every start is followed
+until it is within such a radius, is held, or flies away, and drops out; the rest is followed further and sorted like
+the sample. Distances are in drive phase (rad) and velocity over beta omega.
 """
 
 from typing import Any, NamedTuple
@@ -191,7 +191,7 @@ def basins_of_attraction(
         columns: phases, over the whole drive period.
         rows: rebound speeds.
         speeds_nm_per_us: their range; None: from 0 to four times the platform's top speed, or the capture speed.
-        report: told how many of how many starts have arrived.
+        report: called with how many of how many starts have arrived.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.

@@ -67,7 +67,7 @@ def orbit_verdicts(
         scenes: a batch of scenes with a law or a contact: every parameter has shape (scenes,).
         first_order: lowest order N.
         last_order: highest order N.
-        report: told how many of how many scenes are done.
+        report: called with how many of how many scenes are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
@@ -243,7 +243,7 @@ class StabilityChart(Result):
 
     @property
     def impact_speeds_nm_per_us(self) -> Any:
-        """Approach speeds of the orbits that are told; none of a contact's."""
+        """Approach speeds of the orbits in the output; none of a contact's."""
         speeds = self.verdicts.approach_speed_nm_per_us
         return () if speeds is None else speeds
 
@@ -318,7 +318,7 @@ def stability_chart(
         x_values: of the first parameter, ascending: the chart's columns.
         y_values: of the second, ascending: its rows.
         last_order: highest order N that is looked for.
-        report: told how many of how many points are done.
+        report: called with how many of how many points are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.

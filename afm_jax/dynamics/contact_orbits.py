@@ -281,7 +281,7 @@ def single_contact_orbits(
         seen: the scenes, a batch.
         orders: N.
         accuracy: of `simulate`.
-        report: told how many of how many orbits of the law have been followed.
+        report: called with how many of how many orbits of the law have been followed.
 
     Returns:
         ``stable``, ``admissible`` and ``unresolved``, and of the stable orbit, the highest if there are several,

@@ -58,7 +58,7 @@ class OrbitTable(NamedTuple):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """What is told of an orbit: attributes that orbits of such a scene have."""
+        """Columns of an orbit: attributes that orbits of such a scene have."""
         there = (name for name in (*_OF_A_DRIVEN_TIP, "extrapolated") if getattr(self.orbits, name) is not None)
         return (*IMPACT_COLUMNS, *_OF_AN_ORBIT, *there)
 

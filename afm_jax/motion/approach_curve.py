@@ -137,7 +137,7 @@ def approach_curve(
         longest_periods: drive periods after which a motion counts as not settling; None: 2000, and at least 20 Q.
         accuracy: of each contact, as for `simulate`.
         method: as for `simulate`.
-        report: told after each height how many of how many are done.
+        report: called after each height with how many of how many are done.
 
     Raises:
         ValueError: if nothing or more than the cantilever is driven, the sample moves, or there are no heights.

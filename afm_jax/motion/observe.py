@@ -500,7 +500,7 @@ def _energy_balance(motion: MotionWindow) -> EnergyBalance:
 
     m z'' + (m Omega/Q) z' + k z = F + f + k z_b, with the contact force F, the drive force f and the base z_b. The gap
     D and the platform z_p split the contact's power, F z' = F D' + F z_p'. Drives give F z_p' + f z' + k z_b z', air
-    dissipates (m Omega/Q) z'^2, and the contact takes -F D', of which conservative forces give their part back.
+    dissipates (m Omega/Q) z'^2, and the contact receives -F D', and returns the part of conservative forces.
     """
     scene, path = motion.scene, motion.path
     cantilever = scene.cantilever

@@ -1,8 +1,8 @@
 """Files that hold an impact law: a fit's, a contact's, or a table of speeds that somebody measured.
 
-Three kinds, told apart by what is in them: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
+Three kinds, recognized by their content: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
 with a column of approach speeds, one of rebound speeds, and maybe one of delays, their units in their names. A tip that
-is captured leaves at 0, or nothing is said of how, where a column `captured` says true (as of `collide --out`):
+is captured leaves at 0, or has a blank cell where a column `captured` says true (as of `collide --out`):
 
     # mass_ng = 1.2
     # origin = laser and lamp, March

@@ -32,7 +32,7 @@ WIDTHS = (1, 16, 128, LANES)
 _COMPILED: set[Hashable] = set()
 """Programs of `in_blocks` that have run, with the shapes of their lanes."""
 Report = Callable[[int, int], object]
-"""Told how many of how many lanes are done."""
+"""Called with how many of how many lanes are done."""
 
 
 def filled(values: Any, size: int) -> Any:
@@ -66,7 +66,7 @@ def in_blocks(
         lanes: the tree of all lanes, at least one.
         block: lanes of a block; of fewer lanes there is one smaller block.
         widths: sizes that a smaller block may have, in ascending order.
-        report: told how far it is, from the second block on.
+        report: called with how far it is, from the second block on.
         program: names the work with all that shapes its programs but the lanes; None: it may be new every time.
     """
     count = len(jax.tree.leaves(lanes)[0])

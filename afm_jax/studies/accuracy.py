@@ -145,7 +145,7 @@ class EquationOfMotion(eqx.Module):
 
 
 class AccuracyProblem(NamedTuple):
-    """A value of some tips as a function of parameters; errors are told of value and gradient.
+    """A value of some tips as a function of parameters; the study gives errors of value and gradient.
 
     Attributes:
         what: the value in words, with its unit.

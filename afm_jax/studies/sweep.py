@@ -741,7 +741,7 @@ class SweepRun(NamedTuple):
 
 
 Progress = Callable[[int, int], object]
-"""Told how many of how many points are done."""
+"""Called with how many of how many points are done."""
 
 
 def run_plan(
@@ -877,7 +877,7 @@ def sweep(  # noqa: PLR0913
         workers: processes; above 1 a local Dask cluster is started, which needs the extra `sweep`, and a script that
             calls this below `if __name__ == "__main__":`.
         scheduler: address of a Dask scheduler whose workers do the work, "tcp://...".
-        report: told how many of how many points are done.
+        report: called with how many of how many points are done.
 
     Returns:
         The results with a coordinate for every parameter, units, and the whole input as attributes; from a folder they

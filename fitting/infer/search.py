@@ -158,7 +158,7 @@ class Followed:
     def _steepness(
         self, place: Float[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows k"]]:
-        """Return d w^2/d u^2 at every row's approach speed, of which the determinant grows, and its derivatives."""
+        """Return d w^2/d u^2 at every row's approach speed, with which the determinant grows, and its derivatives."""
         law, theta, (slow, fast) = (
             self.model.law,
             self.model.of_law(place),

@@ -2,8 +2,8 @@
 
 What a file calls its channels, which way its heights run, in which units and with which zero of the phase differs from
 instrument to instrument. Here it becomes `offset_nm` (height of the sample over the cantilever's rest position, growing
-towards the tip), `lockin_amplitude_nm`, `phase_lag_deg` (behind the drive) and a branch; what was assumed on the way is
-said, what is missing is asked for by the option that gives it.
+towards the tip), `lockin_amplitude_nm`, `phase_lag_deg` (behind the drive) and a branch; remarks state the
+assumptions, and a message about a missing quantity names the option that gives it.
 """
 
 import re

@@ -142,7 +142,7 @@ class PhaseReadings(NamedTuple):
 
     @property
     def detuning(self) -> float:
-        """The largest factor of a sin Delta in the energy, all that hangs on the sign: 1 - s^2 under a force."""
+        """The largest factor of a sin Delta in the energy, all that depends on the sign: 1 - s^2 under a force."""
         gamma = self._gamma
         factor = np.real(gamma)
         if self.drive == "base":

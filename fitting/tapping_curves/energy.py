@@ -989,7 +989,7 @@ def one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve,
     def jacobian(x: np.ndarray) -> np.ndarray:
         """Return the changes at the likeliest readings with the groups' energies.
 
-        At others slopes hang on how the energies scatter, and pull Q and f0 to where all of them are smaller.
+        At others slopes depend on the scatter of the energies, and pull Q and f0 to where all of them are smaller.
         """
         noise, there = off(x)[1], energies(smooth, lever.instrument(0, x))
         missing = (x[count:][group] - there.energy_aj[rows]) / (noise / scale) ** 2

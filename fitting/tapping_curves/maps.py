@@ -1,7 +1,7 @@
 """Maps: energy of a tap and virial in every pixel of an image of amplitude and phase, with their errors.
 
-Pixels are rows of `energies`. The free tip must be recorded with the image: nothing else tells the zero of the phase,
-on which every energy hangs.
+Pixels are rows of `energies`. The free tip must be recorded with the image: every energy depends on the zero of
+the phase, which nothing else determines.
 """
 
 import enum
