@@ -26,8 +26,8 @@ _KEPT_ELSEWHERE = {
     "contributing.md": "CONTRIBUTING.md",
     "security.md": "SECURITY.md",
 }
-_GALLERY = """Eight notebooks show whole studies. Each is shown as it ran, ends with assertions on its claims, and is run by
-the tests. They are in the repository's folder `notebooks/`."""
+_GALLERY = """Eight notebooks show whole studies. Each is shown as it ran, ends with assertions on its claims, and is
+run by the tests. They are in the repository's folder `notebooks/`."""
 _CODE_IN_CELLS = re.compile(r"(?<=<code>)[^<]*(?=</code>(?:(?!<t[dh]|</table>).)*</t[dh]>)", re.DOTALL)
 _JOINT = re.compile(r"(?<=[a-z]_)(?=[a-z0-9])|(?<=[(=/,])(?=[\w&])|(?<=[a-z]\.)(?=[a-z])")
 _WHOLE = re.compile(r"(?<![\w-])(--[a-z][\w-]*|afm-jax)")
@@ -116,7 +116,7 @@ def commands() -> str:
         command = main.get_command(top, name)
         assert command is not None
         context = click.Context(command, info_name=name, parent=top, max_content_width=78, terminal_width=78)
-        parts.append(f"## {name}\n\n```text\n{command.get_help(context)}\n```")
+        parts.append(f'## {name}\n\n<div class="help" markdown>\n\n```text\n{command.get_help(context)}\n```\n\n</div>')
     return "\n\n".join(parts)
 
 

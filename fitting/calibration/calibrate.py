@@ -380,7 +380,7 @@ def _judged(e: Calibration) -> Calibration:
         reasons.append(f"The spring constant is not calibrated: {doubt}; {how}.")
     notes = {
         f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural.value > 2e4,
-        "The phase rises through the resonance: it was taken with the opposite sign.": e.phase_reversed,
+        "The phase rises through the resonance: its sign was reversed.": e.phase_reversed,
         f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": e.model == "power" and coarse,
         f"The spring constants contradict each other: {doubt}.": doubt is not None,
     }

@@ -437,7 +437,7 @@ WARNINGS: Rules[Evidence] = (
     ),
     Rule(
         lambda e: _lines(e, e.rows.orbits > 1),
-        "Several stable orbits coexist for {case}: the one closest to the measurement was taken.",
+        "Several stable orbits coexist for {case}: the one closest to the measurement was used.",
     ),
     Rule(lambda e: _lines(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
     Rule(
@@ -456,4 +456,4 @@ WARNINGS: Rules[Evidence] = (
         "stand as they were measured, say `# rows = in order of time`: drifts are then fitted along.",
     ),
 )
-"""What a reader should know besides."""
+"""What a reader should also know."""

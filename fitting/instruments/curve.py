@@ -155,7 +155,7 @@ def read_curves(
         path: the file; its format is recognised by its content.
         columns: which channel becomes which column, as `parse_columns` takes it, where names and units do not tell;
             `offset_nm=1/2` where approach and retract are two channels.
-        drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: taken as "base", and said.
+        drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: "base" is assumed, with a note.
         phase_sense: "lag" of a phase that grows as the tip lags more, "lead" of its opposite; None: determined from the
             curve if possible. A factor of the phase in `columns` says that it is a lag then.
         bin_nm: width of the bins of height in the table of a curve, 0 to merge equal heights only; None: rows as they
@@ -287,11 +287,11 @@ def _joined(recording: Recording, segments: list[Segment], wanted: Mapping[str, 
 
 
 _NO_PHASE = "There is no phase, so that the energy of a tap has an upper bound only"
-_INVERTED = "Sign: the amplitude is negative (an inverted channel) and was taken with the opposite sign."
+_INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
 _FEWEST, _JUMPS = 20, 0.05
 """Rows, and median step of the heights, of their range, from which they are no ramp."""
 _MIXED = (
-    "Direction: heights jump to and fro, so that approach and retract cannot be told apart: all rows are taken as one "
+    "Direction: heights jump to and fro, so that approach and retract cannot be distinguished: all rows are one "
     "branch; else give a column branch."
 )
 
@@ -319,7 +319,7 @@ def _source(
             notes.append(f"Sign: {suited[0]} grows away from the sample in this format; the offset is its negative.")
     unit, usual = source.unit or recording.units.get(source.channel, ""), "deg" if role == "phase_lag_deg" else "nm"
     if not unit:
-        notes.append(f'Unit: {source.channel} has none and is taken in {usual}; else `columns="{role}=NAME:UNIT"`.')
+        notes.append(f'Unit: {source.channel} has none; {usual} is assumed; else `columns="{role}=NAME:UNIT"`.')
     return replace(source, unit=checked_unit(unit or usual, role, source.channel, recording.source))
 
 
@@ -451,7 +451,7 @@ def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Map
         for branch, look in looks.items()
         if look.slope is not None
     ]
-    how = f"slope of the steepest settled part ({' and '.join(parts)}), taken as 1 nm per nm (a hard sample)"
+    how = f"slope of the steepest settled part ({' and '.join(parts)}), assumed to be 1 nm per nm (a hard sample)"
     return Known(scale, f"nm/{unit}", f"measured: {how}; unit {unit}", scale * slope[1] / abs(slope[0]))
 
 
@@ -467,7 +467,8 @@ def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]
     if np.ptp(list(levels.values())) > JUMP * max(levels.values()):
         jumps.append("is " + " and ".join(f"{level:.4g} {unit} in the {branch}" for branch, level in levels.items()))
     reasons = [
-        f"The free amplitude {jump}: the drive or the demodulation changed while the curve was taken." for jump in jumps
+        f"The free amplitude {jump}: the drive or the demodulation changed while the curve was recorded."
+        for jump in jumps
     ]
     if away is not None:
         far, near = (f"{amplitude:.4g} {unit}" for amplitude in away)
@@ -537,8 +538,8 @@ def _add_phase(
         known["phase_sense"] = Known("lag", "", f"option: the file's phase is a {stated}")
     if not {"drive_frequency_khz", "free_frequency_khz", "quality_factor"} <= set(known):
         if not stated:
-            notes.append(f"Sign: a larger phase is taken as a larger lag; {SENSE_OPTION} says which it is.")
-        notes.append("Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it.")
+            notes.append(f"Sign: a larger phase is assumed to be a larger lag; {SENSE_OPTION} states the sign.")
+        notes.append("Zero: the phase has the instrument's own zero; free frequency and Q would determine it.")
         return SENSES.get(stated, 1.0) * phase
     readings = _phase_readings(curve, looks)
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]

@@ -77,7 +77,7 @@ class TappingMap(JudgedResult):
         common: parts of `energy_common_error` by what they come from, with their signs.
         reasons: why the energies must not be used; empty if they may.
         size_m: height and width of the image in m, or None.
-        known: what was taken for the instrument, with where it comes from.
+        known: the assumed numbers of the instrument, with their origins.
         notes: what was assumed.
     """
 

@@ -177,7 +177,7 @@ class Tapping(JudgedResult):
 
     @property
     def warnings(self) -> list[str]:
-        """What a reader should know besides."""
+        """What a reader should also know."""
         return judge(WARNINGS, self)
 
     @property

@@ -168,7 +168,7 @@ def _same_lever(curves: Sequence[Tapping]) -> None:
             if first != other:
                 said = f"states the {ORIGINS.get(name, name)} as {other}, {curves[0].table.source} as {first}"
                 raise TableError(
-                    f"{one.table.source}: {said}; several curves are taken as of one lever: state the same in all, or "
+                    f"{one.table.source}: {said}; several curves must be of one lever: state the same in all, or "
                     "analyse them one by one"
                 )
 

@@ -1,4 +1,4 @@
-"""What makes the energy of a tap no measurement, what a reader should know besides, and what is taken for granted.
+"""What makes the energy of a tap no measurement, what a reader should also know, and what is assumed.
 
 The rules look at a `Tapping`. Its energy is given in two ways, as one number for each branch and as a function along
 it; `NO_CONSTANT` and `NO_FUNCTIONS` say why one of them is not given, `REASONS` why neither is.
@@ -223,7 +223,7 @@ WARNINGS: Rules[Any] = [
         "{case} of {e.curve.rows} rows are excluded; the column `note` of the table of rows says why",
     ),
 ]
-"""What a reader should know besides."""
+"""What a reader should also know."""
 
 
 def _spring_constant(e: Any) -> list[str]:
