@@ -334,7 +334,7 @@ def require_float64(*models: Any) -> None:
         models: trees of arrays; traced ones too.
 
     Raises:
-        RuntimeError: if JAX does not, or an array was made before it was told to; results in 32 bits are not
+        RuntimeError: if JAX does not, or an array was made before it was set to; results in 32 bits are not
             trustworthy by default.
     """
     import jax  # noqa: PLC0415
@@ -370,7 +370,7 @@ def refuse_float32(*models: Any) -> None:
     """Check that models hold 64-bit floats, where JAX computes in them.
 
     Raises:
-        RuntimeError: if one was made before JAX was told to, or of narrower numbers.
+        RuntimeError: if one was made before JAX was set to 64 bits, or of narrower numbers.
     """
     import jax  # noqa: PLC0415
 

@@ -51,7 +51,8 @@ def silence_xla() -> None:
     """Keep XLA's messages off standard error, in programs started from here too, unless the user asked for them.
 
     Its errors about "prefer-no-gather" (openxla/xla issue 44565) take tuning for a feature of the processor, on the
-    very machine that compiled a program. XLA looks at the variable when jaxlib is loaded; later jaxlib itself is told.
+    very machine that compiled a program. XLA reads the variable when jaxlib is loaded; later the
+    setting goes to jaxlib itself.
     """
     # JAX itself sets 1, and so do sessions that have imported it for the programs they start
     if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") != "1":

@@ -1,8 +1,8 @@
-"""What every result can do: say itself in a few lines, be drawn, become a table, be saved.
+"""Methods of every result: print itself in a few lines, be drawn, become a table, be saved.
 
 The decorator `public_result` gives it to named tuples, dataclasses and modules of equinox alike, from their fields
 alone: units are the ends of the fields' names, dimensions those of the annotations. Batches, traced values and shapes
-can be told too.
+can be printed, too.
 """
 
 import enum

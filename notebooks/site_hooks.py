@@ -20,14 +20,14 @@ from afm_jax.compilation_cache import available_cores
 from notebooks.run_notebooks import NOTEBOOKS, ROOT, kept
 
 _KEPT_ELSEWHERE = {
-    "glossary.md": "notebooks/design_notes.md",
+    "design_notes.md": "notebooks/design_notes.md",
     "adding_a_force.md": "notebooks/adding_a_force.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
     "security.md": "SECURITY.md",
 }
-_GALLERY = """Each notebook is shown as it ran, ends with assertions on what it claims, and is run by the tests.
-They are in the repository's folder `notebooks/`."""
+_GALLERY = """Eight notebooks show whole studies. Each is shown as it ran, ends with assertions on its claims, and is
+run by the tests. They are in the repository's folder `notebooks/`."""
 _CODE_IN_CELLS = re.compile(r"(?<=<code>)[^<]*(?=</code>(?:(?!<t[dh]|</table>).)*</t[dh]>)", re.DOTALL)
 _JOINT = re.compile(r"(?<=[a-z]_)(?=[a-z0-9])|(?<=[(=/,])(?=[\w&])|(?<=[a-z]\.)(?=[a-z])")
 _WHOLE = re.compile(r"(?<![\w-])(--[a-z][\w-]*|afm-jax)")
@@ -110,13 +110,13 @@ def gallery(pictured: dict[str, bool]) -> str:
 
 def commands() -> str:
     """Return the page of all commands, each with what `--help` prints."""
-    top = click.Context(main, info_name="afm-jax", max_content_width=100, terminal_width=100, **main.context_settings)
+    top = click.Context(main, info_name="afm-jax", max_content_width=78, terminal_width=78, **main.context_settings)
     parts = ["# Commands", "What `afm-jax COMMAND --help` prints, command by command."]
     for name in main.list_commands(top):
         command = main.get_command(top, name)
         assert command is not None
-        context = click.Context(command, info_name=name, parent=top, max_content_width=100, terminal_width=100)
-        parts.append(f"## {name}\n\n```text\n{command.get_help(context)}\n```")
+        context = click.Context(command, info_name=name, parent=top, max_content_width=78, terminal_width=78)
+        parts.append(f'## {name}\n\n<div class="help" markdown>\n\n```text\n{command.get_help(context)}\n```\n\n</div>')
     return "\n\n".join(parts)
 
 

@@ -159,7 +159,7 @@ def test_order_of_the_points_and_sign_and_turns_of_the_phase_do_not_matter(rever
     columns = result.tables()["calibration_points.csv"]
     assert np.abs(columns["fitted_phase_deg"] - phase).max() < 10.0
     for found, reversed_phase in ((result, reverse < 0.0), (plain, False)):
-        assert any("opposite sign" in warning for warning in found.warnings) == reversed_phase
+        assert any("sign was reversed" in warning for warning in found.warnings) == reversed_phase
 
 
 @pytest.mark.parametrize(

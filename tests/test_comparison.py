@@ -33,7 +33,7 @@ def test_models_are_compared_by_their_information(compared):
     assert [row["aic"] for row in compared.rows] == sorted(row["aic"] for row in compared.rows)
     # the table is made of the law r = 0.95, epsilon = 200
     assert compared.rows[0]["model"] == "law"
-    assert "tells plainly: law: a restitution with adhesion" in compared.verdict
+    assert "decides for law: a restitution with adhesion" in compared.verdict
 
 
 def test_fits_that_are_known_are_not_made_again_and_a_constraint_goes_to_the_models_that_have_it(table, monkeypatch):

@@ -51,7 +51,7 @@ RUN = "residuals run together over the approach speed (5.0"
     [
         ("law+delay", {"untabulated": (0, 2)}, "impacts misses its accuracy for lines 1, 3:", "reasons"),
         ("law", {"convergence": ADRIFT}, "Not converged: chi2 lies an estimated 0.3 above", "reasons"),
-        ("law", {"table": {"quality_factor_error": None}}, "is taken as exact", "warnings"),
+        ("law", {"table": {"quality_factor_error": None}}, "is assumed to be exact", "warnings"),
         # a bound is only worth a word where the model explains the data
         ("viscous", {"p_value": 0.5}, "at its bound", "warnings"),
         ("viscous", {"p_value": 1e-9}, "at its bound", "nowhere"),

@@ -178,7 +178,7 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
     curve = read_curve(saved(tmp_path, asylum_ramp()), drive="force")
     for key, value, unit, origin in (
         ("free_frequency_khz", 90.0, "kHz", "note: ThermalFrequency"),
-        ("free_amplitude_nm", 39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
+        ("free_amplitude_nm", 39.9996, "nm", "note: FreeAirAmplitude, assumed in V, times AmpInvOLS"),
     ):
         known = curve.known[key]
         assert (known.value, known.unit, known.origin) == (pytest.approx(value, rel=1e-12), unit, origin)
@@ -308,7 +308,7 @@ def test_approach_and_retract_that_are_mixed_are_named(curve_of):
     for rows, mixed in ((shuffled, True), (np.arange(400), False)):
         curve = curve_of(height[rows], amplitude[rows], 90.0 + 0.0 * height)
         assert set(curve.branch) == {"approach"}
-        assert any("approach and retract cannot be told apart" in note for note in curve.notes) == mixed
+        assert any("approach and retract cannot be distinguished" in note for note in curve.notes) == mixed
 
 
 EIGHT = "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"

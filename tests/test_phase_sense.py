@@ -165,7 +165,7 @@ def test_a_sign_that_the_curve_contradicts_is_refused():
     tip, truth = curve_of_force("repulsive", 150.0, 1.03, "force")
     result = tapping(replace(measured(tip, truth), phase_sense="lead"), law=False)
     assert not result.valid
-    assert "was said to lead, but" in result.reasons[0]
+    assert "was stated to lead, but" in result.reasons[0]
     # a lever whose frequency is another one: neither sign will do
     wrong = replace(measured(tip, truth), free_frequency_khz=300.0 * 1.029, mass_ng=None)
     assert not tapping(wrong, law=False).valid

@@ -183,7 +183,7 @@ def test_a_table_of_another_law_is_named():
     ]
     alike = fit(tables)
     assert not alike.valid
-    assert "part2.csv is off the others" in " ".join(alike.reasons)
+    assert "part2.csv differs from the others" in " ".join(alike.reasons)
     pulls = [table.pull for table in alike.tables]
     assert min(pulls[2:]) > 4.0 > max(pulls[:2])
 

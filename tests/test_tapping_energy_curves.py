@@ -56,7 +56,7 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function():
     answer = result.to_dict()
     assert answer["valid"]
     assert answer["energy_per_tap_aj"] is None
-    assert "one energy a branch does not describe the rows" in answer["energy_per_tap_reason"]
+    assert "one energy for each branch does not describe the rows" in answer["energy_per_tap_reason"]
     # the instrument is that of statements and free rows, not the one that a constant would need
     assert answer["nuisances_of_one_energy"] == {}
     assert [(one["repulsive"], one["constant"]) for one in answer["branches"]] == [(False, False), (True, False)]
@@ -227,11 +227,11 @@ def test_a_search_that_does_not_settle_is_said():
     lever.minimum = _minimum(lambda x: x * np.nan, lambda x: np.full((len(x), len(x)), np.nan), lever.minimum.at)
     assert not lever.minimum.settled
     lost = replace(result, functions=replace(result.functions, lever=lever, branches=()))
-    assert lost.reasons == ["the least squares of the instrument, from what is stated and free rows, does not settle"]
+    assert lost.reasons == ["the fit of the instrument to statements and free rows does not converge"]
     assert lost.fit is not None
     unfitted = replace(result, fit=replace(lost.fit, minimum=lost.fit.minimum._replace(settled=False)))
     assert (unfitted.energy["value"], unfitted.valid) == (None, True)
-    assert unfitted.energy["reason"] == "the search for one energy a branch does not settle"
+    assert unfitted.energy["reason"] == "the fit of one energy for each branch does not converge"
 
 
 def test_two_long_curves_of_one_file_share_an_instrument(tmp_path: Path):

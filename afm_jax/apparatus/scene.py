@@ -90,7 +90,7 @@ def check_mass(interaction: Any, cantilever: Cantilever) -> None:
     if np.any(np.abs(ratio - 1.0) > _SAME_MASS):
         raise ValueError(
             f"the law is that of a tip of {np.asarray(of_law).flat[0]:.6g} ng, but the cantilever's `mass_ng` is "
-            f"{np.asarray(mass).flat[0]:.6g}: what an impact takes changes with the mass; give the law's"
+            f"{np.asarray(mass).flat[0]:.6g}: the energy lost in an impact depends on the mass; give the law's"
         )
 
 

@@ -41,8 +41,8 @@ class Output:
     Attributes:
         payload: the JSON object.
         text: what is printed without --json, as `Session.emit` takes it.
-        impact_speeds: approach speeds of its impacts: whether the scene's law is known at them is told in the text's
-            last line and under `extrapolated`; None: that is not told.
+        impact_speeds: approach speeds of its impacts: the text's last line and `extrapolated` say whether the
+            scene's law is known at them; None: they do not.
         tables: columns by their names for each CSV file of the --out folder, by its name.
         files: functions that write a file of the --out folder at a path each, by its name.
         json_file: name of the file of the --out folder that holds the JSON object; empty: none does.
@@ -243,7 +243,7 @@ def hand_out(session: Session, output: Output) -> None:
 
 
 def _with_scene(output: Output, scene: Any, options: Mapping[str, Any]) -> Output:
-    """Return a result that says of which scene it is, and where its law is extrapolated."""
+    """Return a result that names its scene, and where its law is extrapolated."""
     scene_tables = import_module("afm_jax.scenefile.scenefile").scene_tables
     payload, text = {**output.payload, "scene": scene_tables(scene.scene)}, list(output.text)
     if scene.unknowns is not None and "draws" in options:

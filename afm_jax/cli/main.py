@@ -35,11 +35,11 @@ _GRACE_S = 1.0
 
 
 def _end_when_interrupted() -> threading.Event:
-    """Make sure that an interrupt ends the program; return what tells that it ends by itself.
+    """Make sure that an interrupt ends the program; return the event to set when it ends by itself.
 
     Python raises an interrupt in the main thread, where native code can hold it for a long compilation, and callbacks
-    of JAX's garbage collection can lose it. A thread is told of the signal at once, whatever the main thread does. What
-    is written is written whole, so that nothing is left half done.
+    of JAX's garbage collection can lose it. A thread receives the signal at once, whatever the main thread does. Files
+    are written whole, so that nothing is left half done.
     """
     ended = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -109,14 +109,14 @@ class Session:
 
     @contextmanager
     def working(self, what: str, parts: str = "") -> Iterator[Callable[[int, int], None]]:
-        """Tell on standard error what is being done, for as long as a block lasts.
+        """Report work in progress on standard error, for as long as a block lasts.
 
-        A terminal shows it with a clock; what is counted also with its rate and the time that the rest takes, which is
-        told as a line every two seconds where no terminal is. Rates are those since the first count: before it
-        programs were compiled.
+        A terminal shows it with a clock, and counted work also with its rate and the remaining time; without a terminal
+        a line with these is printed every two seconds. Rates are those since the first count: before it programs were
+        compiled.
 
         Args:
-            what: is done; in brackets at its end what is told of a first run.
+            what: the work; in brackets at its end a remark about a first run.
             parts: what is counted, by calls of what this gives: how many are done, of how many.
         """
         from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415

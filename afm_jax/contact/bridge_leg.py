@@ -92,7 +92,7 @@ class Passage(NamedTuple):
     time_us: Float[Array, "..."]
     """Time taken; meaningless where the energy is not positive."""
     dissipated_aj: Float[Array, "..."]
-    """Energy that the contact's dissipative forces took, without the cantilever's own damping."""
+    """Energy lost to the contact's dissipative forces, without the cantilever's own damping."""
 
 
 class Along(NamedTuple):

@@ -517,7 +517,7 @@ class Collisions(NamedTuple):
         parts.append(self.capture_speed_reason or f"Capture speed: {capture:.6g} nm/us.")
         parts.append(
             f"The junction forms at a gap of {junction['forms_gap_nm']:.4g} nm and breaks at "
-            f"{junction['breaks_gap_nm']:.4g} nm; hysteresis takes {junction['hysteresis_aj']:.4g} aJ: "
+            f"{junction['breaks_gap_nm']:.4g} nm; hysteresis dissipates {junction['hysteresis_aj']:.4g} aJ: "
             f"{junction['bridge_hysteresis_aj']:.4g} in the bridge, {junction['junction_hysteresis_aj']:.4g} in the "
             "junction."
         )
@@ -533,7 +533,7 @@ _COLUMNS = (
     *("time_in_contact_us", "time_in_junction_us", "deepest_gap_nm"),
     *("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj", "end_energy_aj"),
 )
-"""What is told of a tip."""
+"""Columns of a tip."""
 _MOST_PRINTED = 40
 """Tips in the printed table at most."""
 
@@ -604,7 +604,7 @@ def _rows(found: dict[str, np.ndarray]) -> list[dict[str, Any]]:
 def _reason(capture_speed_nm_per_us: float) -> str | None:
     """Say why there is no capture speed, if there is none."""
     if capture_speed_nm_per_us == 0.0:
-        return "No tip is captured, however slow: the contact gives back what it takes."
+        return "No tip is captured, however slow: the contact dissipates no energy."
     if math.isinf(capture_speed_nm_per_us):
         return "There is no capture speed: tips of every speed that was tried are captured."
     return None

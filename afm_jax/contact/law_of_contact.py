@@ -507,13 +507,13 @@ _MODEL_KEYS = (
     *("worst_error_nm_per_us", "rms_error_nm_per_us", "worst_share_of_top_speed"),
     *("capture_speed_nm_per_us", "converged"),
 )
-"""What is told of a formula: attributes of `ContactLaw`."""
+"""Columns of a formula: attributes of `ContactLaw`."""
 _DELAY_TIMES = ("delay_us", "lag_us", "lead_us", "fitted_us")
 _DELAY_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", *_DELAY_TIMES)
-"""What is told of the delay at a speed: attributes of `ContactDelay`."""
+"""Columns of the delay at a speed: attributes of `ContactDelay`."""
 _DELAY_NUMBERS = ("hertz", "lead_nm", "offset_nm")
 _SHOWN_DELAYS = 9
-"""Speeds at which the delay is told in JSON and text."""
+"""Speeds at which JSON and text give the delay."""
 
 
 def contact_laws(
@@ -651,7 +651,7 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
 def _traced_back(tip: Driven, leaving_aj: Float[Array, ""], rule: _Rule) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the approach speed in nm/us of a tip that leaves with an energy, and how long its contact lasts, in us.
 
-    Retraction, junction and approach are followed against time, so that drag gives back what it took.
+    Retraction, junction and approach are followed against time, so that drag returns the energy that it took.
     """
     nodes, iterations, junction_nodes = rule
     tip = tip._replace(bridge=tip.bridge.reversed())

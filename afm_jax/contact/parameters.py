@@ -9,7 +9,7 @@ EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")
 """The effects of the paper's contact, by the names of scene files and options."""
 
 DRY_EFFECTS = ("van_der_waals", "viscous", "dmt", "hertz")
-"""The effects of which a dry contact has some: one of the last two, which are its solid contact."""
+"""The effects of dry contacts; each has one of the last two, which are its solid contact."""
 
 ALL_EFFECTS = (*EFFECTS, *(name for name in DRY_EFFECTS if name not in EFFECTS))
 """All of them."""
@@ -44,7 +44,7 @@ class ContactParameter:
             value fits start; 0: varied by factors.
         spread: the factor to either side of the paper's value within which fits start.
         evenly: the range within which fits start, evenly; None: as ``width`` or ``spread`` say.
-        serves: the effects of which it needs one to mean anything; none: it is always of use.
+        serves: the effects that use it, one of which must be there; none: it is always used.
         unsure: standard error that is assumed where a fit holds it and nothing better is said: in its unit where there
             is a ``width`` or ``evenly``, else relative; 30 % unless said.
         advice: what to measure so that a fit determines it, if there is more to say than of any.
@@ -257,6 +257,6 @@ CONTACT_RANGES = {parameter.name: parameter.allowed for parameter in (*CONTACT_P
 
 
 def idle_without(name: str, effects: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the effects that a parameter lacks to mean anything; none if it is of use with those given."""
+    """Return the effects that use a parameter and are missing; none if one of those given uses it."""
     serves = next((known.serves for known in (*CONTACT_PARAMETERS, *DRY_PARAMETERS) if known.name == name), ())
     return () if not serves or set(serves) & set(effects) else serves

@@ -245,7 +245,7 @@ def _length_to_event(
 def _length_to_go(state: ContactState, rates: ContactState, distance: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the length h after which the parabola of x has gone a distance d; infinite if never.
 
-    d = x' h + x'' h^2/2, of which h = 2 d/(x' +- sqrt(x'^2 + 2 x'' d)), with the sign of x', is the first root.
+    The first root of d = x' h + x'' h^2/2 is h = 2 d/(x' +- sqrt(x'^2 + 2 x'' d)), with the sign of x'.
     """
     # x'' along the step: in both phases x' is proportional to the gap's rate, whose slope is known
     ratio = rates.x / jnp.where(state.gap_rate == 0.0, 1.0, state.gap_rate)

@@ -1,7 +1,7 @@
 """One impact of a free tip in time: gap, velocity, phase and force on its way through the contact.
 
-The tip's ways through bridge and junction are computed as in `collide`, with the gap or the root s in place of time,
-and told at their Gauss nodes; these crowd where the tip is slow, so that times are not equally spaced.
+The passages through bridge and junction are computed as in `collide`, with the gap or the root s in place of time, and
+given at their Gauss nodes; these crowd where the tip is slow, so that times are not equally spaced.
 """
 
 from typing import NamedTuple

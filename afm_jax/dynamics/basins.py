@@ -1,8 +1,8 @@
-"""Basins of attraction: which start ends where.
+"""Basins of attraction: the motion on which each start ends.
 
-A sample of starts is followed for long; what it comes to are the attractors. Then every start is followed until it is
-at a point of an orbit, is held, or flies away, and drops out; what is left in the end is followed on and told apart
-like the sample. Distances are in drive phase (rad) and velocity over beta omega.
+A sample of starts is followed for long; the motions that it reaches are the attractors. Then every start is followed
+until it is at a point of an orbit, is held, or flies away, and drops out; the rest is followed further and sorted like
+the sample. Distances are in drive phase (rad) and velocity over beta omega.
 """
 
 from typing import Any, NamedTuple
@@ -29,18 +29,18 @@ from afm_jax.units import within_turn
 
 _SAMPLE = 2048
 _LONG = 1000
-"""Impacts after which the motions of a sample are told apart."""
+"""Impacts after which the motions of a sample are distinguished."""
 _SAME = 1e-3
 """Distance below which points are those of one orbit."""
 _POINTS = 64
 """Points of orbits at which starts drop out."""
 _ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
-"""Impacts after each of which starts that have arrived drop out."""
+"""Numbers of impacts after which starts that have arrived drop out."""
 _PART = 8 * LANES
 _ACCURACY = 1e-6
 """Of resolved contacts."""
 _LEFT = 20_000
-"""Starts at most that are told apart one by one in the end."""
+"""Largest number of starts that are distinguished one by one in the end."""
 
 _NOTHING = np.zeros(0)
 
@@ -188,7 +188,7 @@ def basins_of_attraction(
         columns: phases, over the whole drive period.
         rows: rebound speeds.
         speeds_nm_per_us: their range; None: from 0 to four times the platform's top speed, or the capture speed.
-        report: told how many of how many starts have arrived.
+        report: called with how many of how many starts have arrived.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
@@ -407,7 +407,7 @@ def _towards(
 
 
 def _with_names(attractors: list[Attractor]) -> list[Attractor]:
-    """Return attractors whose names tell them apart: "(1,5) a" and "(1,5) b"."""
+    """Return attractors with distinct names: "(1,5) a" and "(1,5) b"."""
     names = [attractor.name for attractor in attractors]
     letters = {name: iter("abcdefghijklmnopqrstuvwxyz") for name in names if names.count(name) > 1}
     told_apart = [f"{name} {next(letters[name], '+')}" if name in letters else name for name in names]

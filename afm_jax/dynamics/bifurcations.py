@@ -1,12 +1,11 @@
-"""Bifurcation diagrams: what motions come to while a parameter is ramped up, and down.
+"""Bifurcation diagrams: the motions on which a tip settles while a parameter is ramped up, and down.
 
-A sweep carries the tip from value to value, which is what makes hysteresis show, and is a long sequence. It is done in
-many lanes at once, each a stretch of neighbouring values: all stretches are ramped side by side, each from a start of
-its own; then every stretch is ramped again from the end of the one before it, for as long as that makes a difference,
-and those behind the ones whose end became another are, too, until none is left. What remains is what one tip that is
-ramped along all values does, where its motion is regular; it carries drive phase and rebound speed from value to value.
-A tip that the platform holds, or that flies away, begins anew at the next value, where it is told to or where there is
-motion (`bouncing_tips`).
+A ramp carries the drive phase and the rebound speed of the tip from value to value, so that hysteresis shows; it is a
+long sequence. Many lanes compute it at once, each a stretch of neighbouring values. First all stretches are ramped side
+by side, each from its own start. Then every stretch is ramped again from the end of the one before it, as far as that
+makes a difference, until no stretch has a new end. Where the motion is regular, the result is that of one tip ramped
+along all values. A tip that the platform holds, or that flies away, begins anew at the next value, at the given start
+or where there is motion (`bouncing_tips`).
 """
 
 from collections import Counter
@@ -84,7 +83,7 @@ class BifurcationDiagram(ResultTuple):
         return "up" if self.upward else "down"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `afm-jax bifurcation --json` tells of one direction."""
+        """Return one direction of the ramp as `afm-jax bifurcation --json` prints it."""
         told = {
             "direction": self.direction,
             "complete": self.complete,
@@ -203,7 +202,7 @@ def bifurcation_diagram(  # noqa: PLR0913
         upward: from the lowest value to the highest, or the other way round.
         impacts: at each value; the last of them are recorded.
         accuracy: of resolved contacts, as for `simulate`.
-        report: told how many of how many values are done, in the first ramp.
+        report: called with how many of how many values are done, in the first ramp.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
@@ -269,7 +268,7 @@ def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: R
         fresh: tips that begin there.
         impacts: at each value.
         accuracy: of resolved contacts.
-        report: told how many of how many values are done.
+        report: called with how many of how many values are done.
     """
     count = len(fresh.time_us)
     length = -(-count // _STRETCHES)

@@ -1,4 +1,4 @@
-"""Which of many scenes have a stable single-impact orbit of which order, and its peak amplitude.
+"""Stable single-impact orbits of many scenes: their orders and peak amplitudes.
 
 For every scene and every order N the roots of the closing condition are found; where there is one the orbit is read and
 judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 and 3: drive frequency and amplitude).
@@ -68,7 +68,7 @@ def orbit_verdicts(
         scenes: a batch of scenes with a law or a contact: every parameter has shape (scenes,).
         first_order: lowest order N.
         last_order: highest order N.
-        report: told how many of how many scenes are done.
+        report: called with how many of how many scenes are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
@@ -98,9 +98,9 @@ ORBIT_NUMBERS = (
     "velocity_after_nm_per_us",
     "largest_multiplier",
 )
-"""What is told of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
+"""Columns of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
 DRIVEN_NUMBERS = ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg")
-"""What is told besides of one that base or force drives."""
+"""Further columns of a scene that base or force drives."""
 _ORBITS_AT_ONCE = 2
 """Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
@@ -240,7 +240,7 @@ class StabilityChart(Result):
 
     @property
     def impact_speeds_nm_per_us(self) -> Any:
-        """Approach speeds of the orbits that are told; none of a contact's."""
+        """Approach speeds of the orbits in the output; none of a contact's."""
         speeds = self.verdicts.approach_speed_nm_per_us
         return () if speeds is None else speeds
 
@@ -313,7 +313,7 @@ def stability_chart(
             in the command, of a function the values alone.
         y_values: of the second, likewise: its rows.
         last_order: highest order N that is looked for.
-        report: told how many of how many points are done.
+        report: called with how many of how many points are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.

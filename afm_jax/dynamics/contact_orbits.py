@@ -248,7 +248,7 @@ def single_contact_orbits(
         seen: the scenes, a batch.
         orders: N.
         accuracy: of `simulate`.
-        report: told how far it is, in scenes.
+        report: called with how far it is, in scenes.
 
     Returns:
         ``stable``, ``admissible`` and ``unresolved``, and of the stable orbit, the highest if there are several,

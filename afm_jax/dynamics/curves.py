@@ -55,7 +55,7 @@ _STRAIGHT = 0.98
 _LONGER = 0.998
 """Cosine from which on the next step is longer."""
 _OFF = 0.3
-"""Farthest that a point may lie from its guess, of the step: beyond, it may belong to another curve."""
+"""Farthest that a point may lie from its guess, as a fraction of the step; beyond, it may belong to another curve."""
 _NEAR = 0.1
 """Farthest that the first point of a curve may lie from where an orbit was found."""
 AT_A_ROOT = 1e-7

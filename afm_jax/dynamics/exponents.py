@@ -220,7 +220,7 @@ def lyapunov_spectrum(
         impacts: impacts over which the exponents are taken.
         transient: impacts before.
         accuracy: of resolved contacts, as for `simulate`.
-        report: told how many of how many motions are done.
+        report: called with how many of how many motions are done.
 
     Returns:
         A `Lyapunov`; of one scene without the axis of lanes.

@@ -316,7 +316,7 @@ def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> 
 
 
 class LoopFamily(eqx.Module):
-    """Closed loops of a scene of which parameters move: what is solved along a curve of them, and in which units.
+    """Closed loops of a scene whose parameters move: what is solved along a curve of them, and in which units.
 
     Loops of laws and of simulated contacts differ in its four methods. What is static makes a program of its own.
     """

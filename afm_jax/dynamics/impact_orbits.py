@@ -1,4 +1,4 @@
-"""Orbits of m impacts in N drive periods: found from many starts, told apart, polished.
+"""Orbits of m impacts in N drive periods: found from many starts, sorted, polished.
 
 Starts are flown through the map; every window of m of their impacts that takes about N periods is a first guess, and
 Newton's method closes the whole loop (`impact_loop`). What is left are loops that the map flies, each once.
@@ -56,7 +56,7 @@ IMPACT_COLUMNS = (
     *("phase_rad", "velocity_after_nm_per_us", "velocity_before_nm_per_us"),
     *("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us"),
 )
-"""What is told of an impact: attributes of `LoopReading`."""
+"""Columns of an impact: attributes of `LoopReading`."""
 
 
 @public_result(picture="afm_jax.plots.dynamics:many_orbits_figure")
@@ -93,7 +93,7 @@ def multipliers_of(
 
 
 def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
-    """Return what is told of one orbit of several impacts: the first one's numbers, and all in `impacts`."""
+    """Return the row of an orbit of several impacts: the numbers of the first, and all of them in `impacts`."""
     trace, determinant = float(reading.trace[index]), float(reading.determinant[index])
     multipliers = multipliers_of(np.asarray(trace), np.asarray(determinant))
     impacts = impact_rows(reading, index)
@@ -112,7 +112,7 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
 
 
 def impact_rows(reading: LoopReading, index: int | None = None) -> list[dict[str, float]]:
-    """Return what is told of each impact of an orbit; of one of many, or of the only one."""
+    """Return the rows of the impacts of an orbit, one or several."""
     columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
     lists = {name: (values if index is None else values[index]).tolist() for name, values in columns.items()}
     return [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]

@@ -1,6 +1,6 @@
-"""What `afm-jax orbits` tells of the orbits of one scene: rows of plain numbers, tables, and why there is none.
+"""The output of `afm-jax orbits`: orbits of one scene as rows of plain numbers and tables, and why there is none.
 
-An orbit of one impact is a row of `SingleImpactOrbits`; an orbit of several impacts is told with all of them, the first
+An orbit of one impact is a row of `SingleImpactOrbits`; an orbit of several impacts lists all of them, the first
 one's numbers besides (`orbit_facts`).
 """
 
@@ -30,7 +30,7 @@ _OF_A_DRIVEN_TIP = (
     *("deflection_lockin_amplitude_nm", "deflection_lockin_phase_deg"),
     *("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg"),
 )
-"""What is told besides of a tip that base or force drives; the deflection's over a moving base only."""
+"""Further columns of a tip that base or force drives; those of the deflection over a moving base only."""
 _IMPACT_CELLS: dict[str, Cell] = {
     "phase\nrad": "phase_rad",
     "velocity after\nnm/us": "velocity_after_nm_per_us",

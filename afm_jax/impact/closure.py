@@ -5,11 +5,11 @@ assumed approach speed u the law gives the rebound speed w and the delay tau, an
 duration N T - tau ends where the next one begins are *linear* in a = cos(omega t_out), b = sin(omega t_out). Every root
 of a^2 + b^2 = 1 is an orbit. Both signs of eq. 9's root are among them, and nothing else, because w > 0 throughout.
 
-In place of u stands a coordinate of the impact in which the law is smooth up to capture (`Impact.speeds`). Of a formula
-without a delay the condition is a quartic in it, of which no root can be missed. Otherwise it is scanned: every change
-of sign between neighbours of the scan is narrowed, and every pair of roots that it stepped over, seen by the extremum
-between them. Where the impact lasts, speeds and delay need the phase: three passes alternate between the two, close
-enough to find every orbit, and Newton's method closes the map itself from there (`follow_root`).
+In place of u stands a coordinate of the impact in which the law is smooth up to capture (`Impact.speeds`). For a
+formula without a delay the condition is a quartic in it, so that no root can be missed. Otherwise it is scanned: every
+change of sign between neighbours of the scan is narrowed, and every pair of roots that it stepped over, seen by the
+extremum between them. Where the impact lasts, speeds and delay need the phase: three passes alternate between the two,
+close enough to find every orbit, and Newton's method closes the map itself from there (`follow_root`).
 """
 
 from typing import Any, NamedTuple

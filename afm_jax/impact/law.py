@@ -228,7 +228,7 @@ class Law(Impact):
         return jnp.zeros(jnp.shape(approach_speed), bool)
 
     def energy_lost(self, approach_speed: ArrayLike, mass_ng: ArrayLike = 1.0) -> Float[Array, "..."]:
-        """Return the energy an impact takes in aJ, m (u_in^2 - u_out^2)/2; all of it where the tip is captured."""
+        """Return the energy lost in an impact in aJ, m (u_in^2 - u_out^2)/2; all of it where the tip is captured."""
         u = as_argument(approach_speed)
         return 0.5 * as_argument(mass_ng) * (u * u - self.rebound_speed(u) ** 2)
 
@@ -526,7 +526,7 @@ class TabulatedLaw(Law):
         return found[:, 0], found[:, 1]
 
     def for_scene(self) -> "TabulatedLaw":
-        """Return the law alone, without what a fit tells of it besides: what scenes hold."""
+        """Return the law alone, without the other results of a fit: what scenes hold."""
         return self if type(self) is TabulatedLaw else _replaced(self)
 
     def moved(self, unknowns: ArrayLike) -> "TabulatedLaw":

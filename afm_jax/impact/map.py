@@ -224,7 +224,7 @@ def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
 
 
 _IMPACTS_EACH = 8
-"""Impacts after which it is asked whether all tips of a batch have ended."""
+"""Impacts after which the loop checks whether all tips of a batch have ended."""
 
 
 def follow_tip(

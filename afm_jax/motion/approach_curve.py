@@ -137,7 +137,7 @@ def approach_curve(
         longest_periods: drive periods after which a motion counts as not settling; None: 2000, and at least 20 Q.
         accuracy: of each contact, as for `simulate`.
         method: as for `simulate`.
-        report: told after each height how many of how many are done.
+        report: called after each height with how many of how many are done.
 
     Raises:
         ValueError: if nothing or more than the cantilever is driven, the sample moves, or there are no heights.
@@ -178,7 +178,7 @@ def approach_curve(
 
 
 def _only_drive(scene: Scene) -> BaseDrive | ForceDrive:
-    """Return what drives the cantilever of a scene, of which there must be one thing with one frequency.
+    """Return the drive of a scene's cantilever; there must be exactly one, with one frequency.
 
     Raises:
         ValueError: if not; says how to mend it.

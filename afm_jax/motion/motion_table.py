@@ -1,4 +1,4 @@
-"""What `afm-jax simulate` tells of a motion: the JSON object, a summary in lines, contacts and the tip as columns."""
+"""The output of `afm-jax simulate`: the JSON object, a summary in lines, contacts and the tip as columns."""
 
 import math
 from collections.abc import Mapping
@@ -157,8 +157,8 @@ def _over_a_response(payload: Mapping[str, Any]) -> list[str]:
             f"{payload['peak_force_nn']:.4g} nN."
         )
     lines.append(
-        f"Energy of a drive period: {payload['given_by_drives_aj']:.5g} aJ given; "
-        f"{payload['dissipated_in_air_aj']:.5g} taken by air, {payload['dissipated_in_contact_aj']:.5g} by the sample."
+        f"Energy of a drive period: {payload['given_by_drives_aj']:.5g} aJ supplied; "
+        f"{payload['dissipated_in_air_aj']:.5g} lost in air, {payload['dissipated_in_contact_aj']:.5g} in the sample."
     )
     return lines
 

@@ -214,7 +214,7 @@ OBSERVABLES: tuple[Observable, ...] = tuple(
     for row in get_args(hint)
     if isinstance(row, Observable)
 )
-"""The rows of the table, in the order in which they are told."""
+"""The rows of the table, in the order of the output."""
 
 
 def observe(
@@ -499,7 +499,7 @@ def _energy_balance(motion: MotionWindow) -> EnergyBalance:
 
     m z'' + (m Omega/Q) z' + k z = F + f + k z_b, with the contact force F, the drive force f and the base z_b. The gap
     D and the platform z_p split the contact's power, F z' = F D' + F z_p'. Drives give F z_p' + f z' + k z_b z', air
-    dissipates (m Omega/Q) z'^2, and the contact takes -F D', of which conservative forces give their part back.
+    dissipates (m Omega/Q) z'^2, and the contact receives -F D', and returns the part of conservative forces.
     """
     scene, path = motion.scene, motion.path
     cantilever = scene.cantilever

@@ -282,7 +282,7 @@ def chart_figure(chart: StabilityChart) -> Figure:
 
 
 def basins_figure(basins: Basins, scene: Scene | None = None) -> Figure:
-    """Return a picture of which start ends where, with the impacts of the orbits where the scene is known.
+    """Return a picture of the motion on which each start ends, with the impacts of the orbits where the scene is known.
 
     Args:
         basins: of the scene.

@@ -1,8 +1,8 @@
 """Files that hold an impact law: a fit's, a contact's, or a table of speeds that somebody measured.
 
-Three kinds, told apart by what is in them: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
+Three kinds, recognized by their content: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
 with a column of approach speeds, one of rebound speeds, and maybe one of delays, their units in their names. A tip that
-is captured leaves at 0, or nothing is said of how, where a column `captured` says true (as of `collide --out`):
+is captured leaves at 0, or has a blank cell where a column `captured` says true (as of `collide --out`):
 
     # mass_ng = 1.2
     # origin = laser and lamp, March
@@ -36,7 +36,7 @@ _TIME_UNITS = {"us": 1.0, "ns": 1e-3, "ms": 1e3, "s": 1e6}
 _COLUMNS = {"approach_speed": _SPEED_UNITS, "rebound_speed": _SPEED_UNITS, "rebound_speed_error": _SPEED_UNITS}
 _COLUMNS |= {"collision_delay": _TIME_UNITS, "collision_delay_error": _TIME_UNITS}
 _BANDS = ("rebound_low", "rebound_high", "delay_low", "delay_high")
-"""Columns of a fit's law.csv besides: its band, of which a table alone cannot draw."""
+"""Further columns of a fit's law.csv: its band, which cannot be drawn from a table alone."""
 _COLLIDED = ("captured", "outcome", "time_in_", "deepest_gap_", "bridge_", "junction_", "viscous_loss_", "end_energy_")
 """How columns begin that `collide --out` writes besides."""
 _WRITTEN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "rebound_low_nm_per_us", "rebound_high_nm_per_us")
@@ -116,7 +116,7 @@ def _of_json(text: str) -> tuple[TabulatedLaw, Mapping[str, Any]]:
         if wrong is not None:
             raise ValueError(wrong)
         if not contents.get("valid"):
-            raise ValueError("the fit is not valid, so that its law means nothing; give a valid one")
+            raise ValueError("the fit is not valid, and neither is its law; give a valid one")
         law, mend = contents.get("law"), "fit again with `afm-jax fit TABLE --out DIR`"
         if not isinstance(law, dict) or not isinstance(law.get("numbers"), dict):
             raise ValueError(f"is a fit without a law; {mend}")
@@ -177,7 +177,7 @@ def _law_of_columns(
     if mass is None and "spring_constant_n_per_m" in numbers:
         if "frequency_khz" not in numbers:
             raise ValueError(
-                "`spring_constant_n_per_m` tells a mass with `# frequency_khz = ` only: add it, or mass_ng"
+                "`spring_constant_n_per_m` gives a mass only together with `# frequency_khz = `: add it, or mass_ng"
             )
         mass = effective_mass_ng(numbers["spring_constant_n_per_m"], numbers["frequency_khz"])
     delay = values.get("collision_delay")

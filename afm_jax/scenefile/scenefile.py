@@ -86,8 +86,8 @@ Driven = TypeVar("Driven", Platform, BaseDrive, ForceDrive)
 _SAME_FREQUENCY = 1e-12
 """Relative distance of two frequencies that only rounding makes different."""
 MASS_ASSUMED = (
-    "1 ng assumed: nothing says the tip's mass, on which hang all energies and speeds of a contact; give mass_ng or "
-    "spring_constant_n_per_m"
+    "1 ng assumed: the file does not give the tip's mass, and all energies and speeds of a contact depend on it; give "
+    "mass_ng or spring_constant_n_per_m"
 )
 
 

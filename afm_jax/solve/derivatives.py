@@ -206,7 +206,7 @@ def halved(
 
 
 def bracketed_root(function: Callable[[float], float], low: float, high: float, *, tolerance: float) -> float:
-    """Return where a continuous function is 0 between two numbers, either of which may be the larger.
+    """Return where a continuous function is 0 between two numbers, in either order.
 
     Args:
         function: from a number to a number.
@@ -270,7 +270,7 @@ def by_tangents(
     Args:
         function: a plain function of module level that returns a pytree of arrays, a value a tip, differentiable as it
             stands.
-        arguments: pytrees of arrays: numbers for all tips, or one value a tip, of which only this tip's results depend.
+        arguments: pytrees of arrays: numbers for all tips, or one value for each tip, which only its own results use.
             At least one has an axis of tips.
         small: whether the batch is so small that forward passes along all numbers are quick; else reverse mode goes
             back through the function itself where more than a few numbers move.

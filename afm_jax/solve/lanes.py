@@ -29,7 +29,7 @@ LANES = 512
 WIDTHS = (1, 16, 128, LANES)
 """Sizes of blocks: few, so that few programs are compiled."""
 Report = Callable[[int, int], object]
-"""Told how many of how many lanes are done."""
+"""Called with how many of how many lanes are done."""
 
 
 def filled(values: Any, size: int) -> Any:
@@ -62,7 +62,7 @@ def in_blocks(
         lanes: the tree of all lanes, at least one.
         block: lanes of a block; of fewer lanes there is one smaller block.
         widths: sizes that a smaller block may have, in ascending order.
-        report: told how far it is, from the second block on.
+        report: called with how far it is, from the second block on.
     """
     count = len(jax.tree.leaves(lanes)[0])
     width = next((width for width in widths if width >= min(count, block)), block)

@@ -4,7 +4,7 @@
 implicit function theorem, dx/dp = -(df/dx)^-1 df/dp. `newton_rows` solves for many guesses in NumPy where f is itself a
 program, such as a simulation: each round evaluates the rows that are still open, and no others.
 
-A search over a batch of slots of which few hold a guess names those by `where`. A step that must not leave the domain
+In a batch of slots with few guesses `where` names the slots that hold one. A step that must not leave the domain
 of f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`.
 """
 

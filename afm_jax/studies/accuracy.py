@@ -145,7 +145,7 @@ class EquationOfMotion(eqx.Module):
 
 
 class AccuracyProblem(NamedTuple):
-    """A value of some tips as a function of parameters; errors are told of value and gradient.
+    """A value of some tips as a function of parameters; the study gives errors of value and gradient.
 
     Attributes:
         what: the value in words, with its unit.
@@ -191,7 +191,7 @@ def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[s
 
     Args:
         problem: "map", "collide", or a scene's file or preset.
-        contacts: of a scene: the arrival of which contact is compared.
+        contacts: of a scene: number of the contact whose arrival is compared.
         quick: few settings, each measured once: to see that it works.
 
     Returns:

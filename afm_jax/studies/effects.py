@@ -305,7 +305,7 @@ def study_effects(
         accuracy: relative accuracy of the amplitudes that is wanted.
         duration_us: how long to follow it at most; None: 400 drive periods.
         only: names of the effects to look at; None: all.
-        report: told how many of how many scenes, with and without an effect, are done.
+        report: called with how many of how many scenes, with and without an effect, are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.

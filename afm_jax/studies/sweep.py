@@ -435,8 +435,8 @@ _COLLISION_VARIABLES = (
         time_in_junction_us="with the solids joined",
         deepest_gap_nm="smallest gap",
         bridge_hysteresis_aj="energy that the bridge takes",
-        junction_hysteresis_aj="energy that the junction takes",
-        viscous_loss_aj="energy that viscosity takes",
+        junction_hysteresis_aj="energy lost in the junction",
+        viscous_loss_aj="energy lost to viscosity",
     ),
     Variable("captured", "the tip stays at the sample", "bool"),
     Variable("outcome", "how the collision ended", "int8", codes=_codes(CollisionOutcome)),
@@ -743,7 +743,7 @@ class SweepRun(NamedTuple):
 
 
 Progress = Callable[[int, int], object]
-"""Told how many of how many points are done."""
+"""Called with how many of how many points are done."""
 
 
 def run_plan(
@@ -887,7 +887,7 @@ def sweep(  # noqa: PLR0913
         workers: processes; above 1 a local Dask cluster is started, which needs the extra `sweep`, and a script that
             calls this below `if __name__ == "__main__":`.
         scheduler: address of a Dask scheduler whose workers do the work, "tcp://...".
-        report: told how many of how many points are done.
+        report: called with how many of how many points are done.
 
     Returns:
         The results with a coordinate for every parameter, units, and the whole input as attributes; from a folder they

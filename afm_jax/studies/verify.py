@@ -73,7 +73,7 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True)
 class Verification:
-    """All comparisons, and of which states."""
+    """All comparisons, and the states they were made at."""
 
     checks: list[Check]
     states: int

@@ -160,7 +160,7 @@ def calibrate(
         temperature_k: of lever and air, a number or a pair with its error; None: the file's, else 296 +- 3.
         length_um: of a rectangular lever, likewise; with the width it gives k by Sader's method.
         width_um: of a rectangular lever, likewise.
-        scale_error: relative error of the deflection's scale, of which k by equipartition has twice as much; force
+        scale_error: relative error of the deflection's scale; that of k by equipartition is twice as large; force
             curves repeat a scale to some per cent.
         static: the deflection was calibrated by the slope of a force curve (static InvOLS), not by the mode itself.
 
@@ -380,7 +380,7 @@ def _judged(e: Calibration) -> Calibration:
         reasons.append(f"The spring constant is not calibrated: {doubt}; {how}.")
     notes = {
         f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural.value > 2e4,
-        "The phase rises through the resonance: it was taken with the opposite sign.": e.phase_reversed,
+        "The phase rises through the resonance: its sign was reversed.": e.phase_reversed,
         f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": e.model == "power" and coarse,
         f"The spring constants contradict each other: {doubt}.": doubt is not None,
     }

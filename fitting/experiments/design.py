@@ -26,7 +26,7 @@ from fitting.simulated.experiment import Drives
 
 AMPLITUDES = ("both", "peak", "lockin")
 _EXACT = (
-    "The quality factor is taken as exactly known, which makes every forecast too good: give it with its error, such "
+    "The quality factor is assumed to be exact, which makes every forecast too good: give it with its error, such "
     "as '40 +- 2'."
 )
 _PRINTED = {

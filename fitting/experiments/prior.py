@@ -35,8 +35,8 @@ class Prior(Result):
     Attributes:
         problem: the model, its parameters and the uncertain quantities of the instrument.
         values: the expected values in the problem's order.
-        information: Fisher information of everything known so far, shape (p, p): measurements and constraints; 0 in a
-            direction of which nothing is known.
+        information: Fisher information of everything known so far, shape (p, p): measurements and constraints; 0 in an
+            unknown direction.
         free_frequency_khz: of the cantilever.
         quality_factor: of the cantilever; None: no air damping.
         mass_ng: of the cantilever; None: not known.

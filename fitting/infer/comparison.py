@@ -160,16 +160,16 @@ def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _verdict(rows: list[dict[str, Any]]) -> str:
-    """Return what tells the models apart, and whether the best one is any good."""
+    """Return by what the models differ, and whether the best one explains the data."""
     first, *others = (f"{row['model']}: {_meaning(row['model'])}" for row in rows)
     said = _sufficient(rows)
     if "delta_aic" in rows[1] and "delta_aic" in rows[0]:
         gap = rows[1]["delta_aic"]
-        said = f"The measurement tells plainly: {first}, not {others[0]} (AIC lower by {gap:.0f})."
+        said = f"The measurement decides for {first} against {others[0]} (AIC lower by {gap:.0f})."
         if gap < _PLAIN:
             said = f"The measurement favours {first} over {others[0]} (AIC lower by {gap:.1f}), not conclusively."
         if gap < _EVEN:
-            said = f"The measurement does not tell {first} from {others[0]} (AIC differs by {gap:.1f})."
+            said = f"The measurement does not distinguish {first} from {others[0]} (AIC differs by {gap:.1f})."
     if not rows[0]["valid"]:
         said += f" But the fit of {rows[0]['model']} is not valid itself."
     return said

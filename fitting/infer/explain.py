@@ -2,8 +2,8 @@
 
 `fit_lasting` reads as the fit runs: the formula's minimum is searched for; smooth functions beside the formula, what
 the corrections of impacts leave out and the instrument are freed with it, rows are weighed and their orbits searched
-for anew until chi2 stays; outliers are left out where that is asked for; residuals that run together over the speed
-widen the smooth functions. The covariance of everything, (J^T J)^-1, is where the law's band, intervals and
+for anew until chi2 stays; outliers are left out on request; residuals that are correlated over the speed widen the
+smooth functions. The covariance of everything, (J^T J)^-1, is where the law's band, intervals and
 correlations come from.
 """
 

@@ -46,7 +46,7 @@ def fit(  # noqa: PLR0913
 
     Args:
         table: from `read_table`, the path of a file, or a data frame as `AmplitudeTable.from_dataframe` takes it; what
-            it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to
+            it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q without error is assumed to
             be known to 5 % where impacts last, and exactly by the instantaneous laws. Several of them: one law for all,
             each with nuisances of its own.
         model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),

@@ -1,4 +1,4 @@
-"""What a fit gives: parameters, the law with its band, what impacts take of it, rows, and everything that went in.
+"""What a fit gives: parameters, the law with its band, the energy lost in impacts, rows, and all inputs.
 
 Energies and delta with their intervals (`Loss`), beside the parameters, are the quantities that people ask for.
 """
@@ -158,7 +158,7 @@ class WithInterval:
 
 @dataclass(frozen=True)
 class EnergyLost:
-    """What an impact takes at an approach speed in nm/us, with its 95 % band; None: its mass is not known."""
+    """Energy lost in an impact at an approach speed in nm/us, with its 95 % band; None: its mass is not known."""
 
     approach_speed_nm_per_us: float
     energy_aj: WithInterval | None
@@ -167,7 +167,7 @@ class EnergyLost:
 
 @dataclass(frozen=True)
 class Loss:
-    """What impacts take: energies at three speeds that were measured, and what the printed parameters say.
+    """Energy lost in impacts: at three measured speeds, and by the printed parameters.
 
     Attributes:
         energies: at three speeds, of the law.
@@ -283,7 +283,7 @@ class FitResult(Result):
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
         law: the fitted impact law with its band.
-        loss: what an impact takes: energies, delta, how far formula and law part, the capture speed; None if no speed
+        loss: of an impact: energies, delta, how far formula and law differ, the capture speed; None if no speed
             was reached.
         rows: measured and predicted amplitudes.
         convergence: what the checks of the minimum found.
@@ -380,7 +380,7 @@ def loss_of(
     parameters: Mapping[str, FittedParameter],
     formula: Mapping[str, float] | None,
 ) -> Loss:
-    """Return what impacts take: energies at measured speeds, and what the printed parameters say.
+    """Return the energy lost in impacts: at measured speeds, and by the printed parameters.
 
     Args:
         law: with its errors.

@@ -111,7 +111,7 @@ def weights_of(
 
 
 _FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
-"""Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
+"""Fewest rows of a driven tip, and their smallest share, from which a law of impacts is read off."""
 
 
 def few_left(data: Data, weights: Weights) -> bool:

@@ -158,7 +158,7 @@ class Followed:
     def _steepness(
         self, place: Float[np.ndarray, " k"]
     ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows k"]]:
-        """Return d w^2/d u^2 at every row's approach speed, of which the determinant grows, and its derivatives."""
+        """Return d w^2/d u^2 at every row's approach speed, with which the determinant grows, and its derivatives."""
         theta, speeds = self.model.of_law(place), np.outer([1.0 - _APART, 1.0 + _APART], self.speeds)
         # at once: a contact's law takes as long for many speeds as for few
         found, (apart,) = self.model.law.at(theta, speeds.ravel()), np.diff(speeds**2, axis=0)

@@ -82,7 +82,7 @@ def convergence_of(explained: Explained, optimiser: str, iterations: int) -> Con
         slope, covariance = slope[moves][known], covariance[np.ix_(known, known)]
         distance = float(slope @ covariance @ slope)
         gradient = float(np.max(np.abs(2.0 * slope * np.sqrt(np.diag(covariance))), initial=0.0))
-        reason = None if explained.settled else "which orbits the rows have, and what they count, does not settle"
+        reason = None if explained.settled else "orbits and weights of the rows do not settle"
         if distance >= ENOUGH:
             reason = f"chi2 lies an estimated {distance:.2g} above its minimum"
     return Convergence(reason is None, optimiser, iterations, gradient, distance, reason)

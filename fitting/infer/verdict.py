@@ -49,7 +49,7 @@ _NEGLIGIBLE = 0.3
 """Root mean square of the residuals, in errors, below which their pattern is of no consequence."""
 _FEWEST_NEIGHBOURS = 8
 _FASTEST_KHZ, _SMALLEST_NM = 2e4, 1.0
-"""What no cantilever is faster than, and what amplitude impacts take at least: a bridge alone is that long."""
+"""Highest frequency of a cantilever, and smallest amplitude that has impacts: a bridge alone is that long."""
 _REFUSED = (
     "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
     "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude. The energy of a tap needs "
@@ -195,7 +195,7 @@ def _disagreeing(evidence: Evidence) -> str:
     """Return which tables' laws are not that of the others, in words; nothing where all may have one."""
     pulls = np.array(evidence.pulls)
     far = sorted(np.flatnonzero(pulls * pulls.size < IMPROBABLE), key=lambda t: pulls[t])
-    return "; ".join(f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in far)
+    return "; ".join(f"{evidence.table.labels[t]} differs from the others (probability {pulls[t]:.1g})" for t in far)
 
 
 def value_at_bound(value: float) -> str:
@@ -395,8 +395,8 @@ REASONS: Rules[Evidence] = (
 WARNINGS: Rules[Evidence] = (
     Rule(
         lambda e: [f"{name} = {value:g}" for name, value in _without_error(e) if name not in e.parameters],
-        "{case} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: give "
-        "its error, like `# {case} +- 1`.",
+        "{case} is assumed to be exact. Amplitudes separate the impact's loss from the air's only as well as Q is "
+        "known: give its error, like `# {case} +- 1`.",
     ),
     Rule(
         _assumed,
@@ -437,7 +437,7 @@ WARNINGS: Rules[Evidence] = (
     ),
     Rule(
         lambda e: _lines(e, e.rows.orbits > 1),
-        "Several stable orbits coexist for {case}: the one closest to the measurement was taken.",
+        "Several stable orbits coexist for {case}: the one closest to the measurement was used.",
     ),
     Rule(lambda e: _lines(e, e.rows.near_fold), "Close to a fold, where errors are not linear: {case}."),
     Rule(
@@ -456,4 +456,4 @@ WARNINGS: Rules[Evidence] = (
         "stand as they were measured, say `# rows = in order of time`: drifts are then fitted along.",
     ),
 )
-"""What a reader should know besides."""
+"""What a reader should also know."""

@@ -2,8 +2,8 @@
 
 What a file calls its channels, which way its heights run, in which units and with which zero of the phase differs from
 instrument to instrument. Here it becomes `offset_nm` (height of the sample over the cantilever's rest position, growing
-towards the tip), `lockin_amplitude_nm`, `phase_lag_deg` (behind the drive) and a branch; what was assumed on the way is
-said, what is missing is asked for by the option that gives it.
+towards the tip), `lockin_amplitude_nm`, `phase_lag_deg` (behind the drive) and a branch; remarks state the
+assumptions, and a message about a missing quantity names the option that gives it.
 """
 
 import re
@@ -155,9 +155,9 @@ def read_curves(
         path: the file; its format is recognised by its content.
         columns: which channel becomes which column, as `parse_columns` takes it, where names and units do not tell;
             `offset_nm=1/2` where approach and retract are two channels.
-        drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: taken as "base", and said.
-        phase_sense: "lag" of a phase that grows as the tip lags more, "lead" of its opposite; None: told by the curve
-            where it can. A factor of the phase in `columns` says that it is a lag then.
+        drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: "base" is assumed, with a note.
+        phase_sense: "lag" of a phase that grows as the tip lags more, "lead" of its opposite; None: determined from the
+            curve if possible. A factor of the phase in `columns` says that it is a lag then.
         bin_nm: width of the bins of height in the table of a curve, 0 to merge equal heights only; None: rows as they
             are, or where heights repeat or are not in order bins of five rows or a 200th of a branch.
         numbers: what the file does not say, or says wrongly: the keys of `OPTIONS`, each a number or a pair with its
@@ -227,7 +227,7 @@ def _refuse_modes(recording: Recording) -> None:
     if channel is not None:
         raise TableError(
             f"{recording.source}: holds a channel {channel!r}, which is none of amplitude modulation (tapping) of one "
-            "mode; its amplitude and phase tell no energy of a tap"
+            "mode; its amplitude and phase do not give the energy of a tap"
         )
 
 
@@ -287,11 +287,11 @@ def _joined(recording: Recording, segments: list[Segment], wanted: Mapping[str, 
 
 
 _NO_PHASE = "There is no phase, so that the energy of a tap has an upper bound only"
-_INVERTED = "Sign: the amplitude is negative (an inverted channel) and was taken with the opposite sign."
+_INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
 _FEWEST, _JUMPS = 20, 0.05
 """Rows, and median step of the heights, of their range, from which they are no ramp."""
 _MIXED = (
-    "Direction: heights jump to and fro, so that approach and retract cannot be told apart: all rows are taken as one "
+    "Direction: heights jump to and fro, so that approach and retract cannot be distinguished: all rows are one "
     "branch; else give a column branch."
 )
 
@@ -319,7 +319,7 @@ def _source(
             notes.append(f"Sign: {suited[0]} grows away from the sample in this format; the offset is its negative.")
     unit, usual = source.unit or recording.units.get(source.channel, ""), "deg" if role == "phase_lag_deg" else "nm"
     if not unit:
-        notes.append(f'Unit: {source.channel} has none and is taken in {usual}; else `columns="{role}=NAME:UNIT"`.')
+        notes.append(f'Unit: {source.channel} has none; {usual} is assumed; else `columns="{role}=NAME:UNIT"`.')
     return replace(source, unit=checked_unit(unit or usual, role, source.channel, recording.source))
 
 
@@ -451,7 +451,7 @@ def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Map
         for branch, look in looks.items()
         if look.slope is not None
     ]
-    how = f"slope of the steepest settled part ({' and '.join(parts)}), taken as 1 nm per nm (a hard sample)"
+    how = f"slope of the steepest settled part ({' and '.join(parts)}), assumed to be 1 nm per nm (a hard sample)"
     return Known(scale, f"nm/{unit}", f"measured: {how}; unit {unit}", scale * slope[1] / abs(slope[0]))
 
 
@@ -467,7 +467,8 @@ def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]
     if np.ptp(list(levels.values())) > JUMP * max(levels.values()):
         jumps.append("is " + " and ".join(f"{level:.4g} {unit} in the {branch}" for branch, level in levels.items()))
     reasons = [
-        f"The free amplitude {jump}: the drive or the demodulation changed while the curve was taken." for jump in jumps
+        f"The free amplitude {jump}: the drive or the demodulation changed while the curve was recorded."
+        for jump in jumps
     ]
     if away is not None:
         far, near = (f"{amplitude:.4g} {unit}" for amplitude in away)
@@ -503,7 +504,7 @@ def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
 
 
 def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
-    """Return the height of the tip's rest position, as far as that can be told, else 0; add it to what is known."""
+    """Return the height of the tip's rest position if it can be determined, else 0; add it to what is known."""
     given, level = curve.known.get("offset_origin_nm"), curve.number("free_amplitude_nm")
     onsets = [look.onset_nm for branch, look in sorted(looks.items()) if look.onset_nm is not None]
     if given is not None:
@@ -518,7 +519,7 @@ def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
 _ASSUMED_ORIGIN_NM = 1.0
 """Error of an origin read off the curve: attraction moves the contact by about so much."""
 _RADIANS_DEG = 30.0
-"""How near to the free tip's lag its phase, taken for radians, must be to be told as such."""
+"""How near to the free tip's lag its phase, read as radians, must be to be recognized as such."""
 
 
 def _add_phase(
@@ -537,8 +538,8 @@ def _add_phase(
         known["phase_sense"] = Known("lag", "", f"option: the file's phase is a {stated}")
     if not {"drive_frequency_khz", "free_frequency_khz", "quality_factor"} <= set(known):
         if not stated:
-            notes.append(f"Sign: a larger phase is taken as a larger lag; {SENSE_OPTION} says which it is.")
-        notes.append("Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it.")
+            notes.append(f"Sign: a larger phase is assumed to be a larger lag; {SENSE_OPTION} states the sign.")
+        notes.append("Zero: the phase has the instrument's own zero; free frequency and Q would determine it.")
         return SENSES.get(stated, 1.0) * phase
     readings = _phase_readings(curve, looks)
     lag, free = float(readings.free_lag_deg[0]), phase[curve.free]

@@ -95,7 +95,7 @@ def parse_text(data: bytes, name: str) -> Recording:
     runs = np.zeros(len(ways))
     if any("neaspec" in comment.lower() for _, comment in comments):
         kind, away, runs = "neaSNOM text", ("Z",), columns.get("Run", runs)
-        remarks = ("The columns carry no units: heights are taken in m, amplitudes in nm, phases in rad.",)
+        remarks = ("The columns carry no units: heights are assumed in m, amplitudes in nm, phases in rad.",)
         pixels = re.findall(r"\d+", header.get("Pixel Area (X, Y, Z)", "")) or [len(ways)]
         declared = int(np.prod([int(pixel) for pixel in pixels[:3]]))
         if len(ways) % max(declared, 1) or len(ways) < declared:
@@ -264,7 +264,7 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     known = known_from(header)
     warm = number_in(header.get("Cantilever temperature", ""))
     if warm is not None and -100.0 < warm[0] < 500.0:
-        origin = "header: Cantilever temperature, taken in degrees Celsius"
+        origin = "header: Cantilever temperature, assumed in degrees Celsius"
         known["temperature_k"] = Known(warm[0] + 273.15, "K", origin)
     segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
     return Recording("NanoSurf .nid", name, segments, units, known, settings=header)
@@ -313,7 +313,7 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
     if said is not None and said[0] > 0.0 and (said[0] < 1e-5 or "nm_per_volt" in known):
         # in volts, or in metres where tiny
         factor, how = (1e9, "m") if said[0] < 1e-5 else (float(known["nm_per_volt"].value), "V, times AmpInvOLS")
-        known["free_amplitude_nm"] = Known(said[0] * factor, "nm", f"note: FreeAirAmplitude, taken in {how}")
+        known["free_amplitude_nm"] = Known(said[0] * factor, "nm", f"note: FreeAirAmplitude, assumed in {how}")
     return numbers, labels, header, known
 
 

@@ -103,7 +103,7 @@ class PhaseReadings(NamedTuple):
 
     @property
     def known_zero(self) -> bool:
-        """Whether the free tip, or a statement, tells the zero of the phase."""
+        """Whether the free tip, or a statement, determines the zero of the phase."""
         return bool(self.seen_free.any()) or self.zero is not None
 
     def zero_deg(self, sign: float) -> Rows:
@@ -142,7 +142,7 @@ class PhaseReadings(NamedTuple):
 
     @property
     def detuning(self) -> float:
-        """The largest factor of a sin Delta in the energy, all that hangs on the sign: 1 - s^2 under a force."""
+        """The largest factor of a sin Delta in the energy, all that depends on the sign: 1 - s^2 under a force."""
         gamma = self._gamma
         factor = np.real(gamma)
         if self.drive == "base":
@@ -172,7 +172,7 @@ class PhaseReadings(NamedTuple):
             return int(np.sum((start < -_SURE * error) & (self.ratio > LEAST_RATIO)))
 
     def sign_by_energy(self) -> float | None:
-        """Return the sign with which taps take energy where they would give it away with the other.
+        """Return the sign with which taps lose energy where they would gain it with the other.
 
         0: with both signs many would; None: the energies do not tell.
         """
@@ -277,31 +277,31 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
     reason, rows = "", readings.giving_energy_away(sign)
     if by_energy == 0.0:
         reason = (
-            "with either sign of the phase taps would give energy away: frequency, Q, the drive (force or base) or the "
+            "with either sign of the phase taps would gain energy: frequency, Q, the drive (force or base) or the "
             "phase is wrong"
         )
     elif by_energy is not None and by_energy != sign:
         reason = (
-            f"the phase was said to {'lag' if sign > 0.0 else 'lead'}, but {rows} taps would give energy away then, "
-            f"and with the other sign they do not: {SENSE_OPTION}"
+            f"the phase was stated to {'lag' if sign > 0.0 else 'lead'}, but then {rows} taps would gain energy, and "
+            f"with the other sign they do not: {SENSE_OPTION}"
         )
     elif origin == "unknown":
         reason = (
-            "off resonance energies depend on the sign of the phase, and the curve does not tell whether it lags or "
-            f"leads: say {SENSE_OPTION}"
+            "off resonance energies depend on the sign of the phase, and the curve does not show whether it lags or "
+            f"leads: state it by {SENSE_OPTION}"
         )
     return PhaseSense(sign, zero, origin, _notes(readings, sign, origin, zero), reason)
 
 
 _HOW = {
-    "energy": "with the other sign taps would give energy away",
+    "energy": "with the other sign taps would gain energy",
     "order": "attraction reaches farther than repulsion",
-    "zero": "only so it fits the zero that is stated",
+    "zero": "only then it agrees with the stated zero",
 }
 
 
 def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -> tuple[str, ...]:
-    """Return what is to be said of sign and zero."""
+    """Return the notes on sign and zero."""
     free, leads = readings.seen_free, sign < 0.0
     reads = "no row of the free tip has a phase"
     if free.any():
@@ -309,13 +309,15 @@ def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -
         reads = f"the free tip reads {turned(zero_deg + sign * lag):.1f} deg where its lag is {lag:.1f}"
     notes = []
     if origin in {"assumed", "unknown"}:
-        both = "with the other sign energies are nearly the same, and attractive is repulsive; " * (origin == "assumed")
+        both = "with the other sign energies are nearly the same, and attractive and repulsive are exchanged; " * (
+            origin == "assumed"
+        )
         taken = f"the phase {'leads' if leads else 'lags'}, which is assumed"
-        notes.append(f"Sign: {reads}: {taken}; {both}say {SENSE_OPTION}.")
+        notes.append(f"Sign: {reads}: {taken}; {both}state it by {SENSE_OPTION}.")
     elif leads and origin != "stated":
-        notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and was taken with the opposite sign.")
+        notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and its sign was reversed.")
     quarters = round(zero_deg / 90.0)
     if quarters and abs(turned(zero_deg - 90.0 * quarters)) < _NEAR_DEG:
         off = f"the instrument's zero is {90 * quarters:+d} degrees off"
-        notes.append(f"Zero: {reads}: {off}, and was set by the free tip.")
+        notes.append(f"Zero: {reads}: {off}; the free tip determines it.")
     return tuple(notes)

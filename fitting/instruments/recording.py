@@ -69,7 +69,7 @@ class Segment:
 
     Attributes:
         curve: which curve of the file, from 1.
-        branch: "approach", "retract", or empty: to be told by the height's direction.
+        branch: "approach", "retract", or empty: determined from the height's direction.
         channels: numbers by channel name, in the units of `Recording.units`.
     """
 
@@ -229,7 +229,7 @@ def refuse_other_modes(settings: Mapping[str, str], source: str) -> None:
         if bimodal or strict or ((_MODE_KEYS.fullmatch(name) or name in _STRICT_KEYS) and _OTHER_MODES.search(others)):
             raise TableError(
                 f"{source}: was recorded in the mode {printable(value)!r} ({printable(key)}), not in amplitude "
-                "modulation (tapping); its amplitude and phase tell no energy of a tap"
+                "modulation (tapping); its amplitude and phase do not give the energy of a tap"
             )
 
 

@@ -3,8 +3,8 @@
 Orbits are those of the fits' program (`fitting.predict.orbit`), over the table of an impact that loses nothing and
 takes no time. What an impact really does to the squared rebound speed and to the delay is free for every row: with
 coordinate, phase of arrival and delay these are five unknowns for the three gaps of an orbit and up to three readings
-(peak and lock-in amplitude, phase), of which the least squares are taken. What air, spring and the platform's motion do
-during the contact is that of a Hertz contact as long as the delay, for want of a law that tells lead and offset apart.
+(peak and lock-in amplitude, phase), found by least squares. Air, spring and the platform's motion act as during a Hertz
+contact that is as long as the delay, since no law separates lead and offset.
 """
 
 import numpy as np

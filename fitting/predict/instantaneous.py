@@ -17,7 +17,7 @@ from fitting.predict.orbit import Local, Row, platform_and_cantilever, shown
 
 
 class Seen(NamedTuple):
-    """What is read of a row, and of which orbit.
+    """The readings of a row, and the orbit they belong to.
 
     Attributes:
         readings: peak and lock-in amplitude in nm and phase in degrees; without an orbit no amplitude, and the phase

@@ -6,7 +6,7 @@ give w^2 and the delay without its leads, T, at any speed, and the table that or
     w^2 = u^2 - [(1 - r^2) u^2 + c sqrt(u^2 + q) + epsilon] exp(L(ln u))
     T = a u^(-1/5) - d/u - P(ln u)/u,    tau = T - b (1/w - 1/u) + f (1/w^2 - 1/u^2)
 
-L and P are Gaussian processes, values of which are unknowns with priors N(0, 1); q and f too have priors of a width
+L and P are Gaussian processes, whose values are unknowns with priors N(0, 1); q and f too have priors of a width
 that full contacts say. The unknowns of losses are 1 - r^2, c and ln epsilon (epsilon itself where impacts are
 instantaneous, for there it may vanish); of the delay ln a, b and d.
 """

@@ -79,7 +79,7 @@ def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
 
 
 def _table_sections(result: FitResult) -> list[ReportSection]:
-    """Return each of several tables' pull, what it has to itself, and what an impact takes."""
+    """Return each of several tables' pull, what it has to itself, and the energy lost in an impact."""
     sections, pulls, own = [], [], []
     for one in result.tables:
         pulls.append([one.name, f"{one.used}/{one.rows}", f"{one.chi2:.1f}/{one.readings}", known(one.pull, ".2f")])
@@ -88,12 +88,12 @@ def _table_sections(result: FitResult) -> list[ReportSection]:
         head = ["table", "rows used", "chi2/readings", "pull"]
         sections.append(ReportSection("Tables", [Table("Tables", head, pulls), Text(PULLS)]))
     if own:
-        head = ["table", "of its own", "value", "std. error", "95 % interval"]
+        head = ["table", "its nuisance", "value", "std. error", "95 % interval"]
         sections.append(ReportSection("Nuisances", [Table("Of each table", head, own, words=(head[1], head[-1]))]))
     losses = losses_in_words(result) if result.valid else []
     if losses:
-        head = ["what an impact takes", "95 % interval"]
-        sections.append(ReportSection("Losses", [Table("What an impact takes", head, losses, words=head)]))
+        head = ["loss of an impact", "95 % interval"]
+        sections.append(ReportSection("Losses", [Table("Energy lost in an impact", head, losses, words=head)]))
     return sections
 
 
@@ -121,7 +121,7 @@ def _sampled(posterior: Posterior) -> ReportSection:
     head = ["parameter", "mean", "from", "to"]
     said = "95 % credible intervals (posterior, flat priors):"
     if posterior.method == "gaussian":
-        worth = f"of 120, weighted to chi2, {posterior.chains.effective_samples[0]:.0f} count"
+        worth = f"weighted to chi2, {posterior.chains.effective_samples[0]:.0f} of 120 are effective"
         said = f"95 % intervals of samples of the Gaussian around the fit ({worth}):"
     wrong = [f"Not converged: {reason}" for reason in posterior.reasons]
     return ReportSection("Posterior", [Text(said), Table("By parameter", head, rows), Bullets(wrong)])
@@ -193,7 +193,7 @@ def write_report(
 
 
 def fit_page(result: FitResult, report: Report, pictures: Sequence[bytes]) -> str:
-    """Return the page of a fit: its report with pictures, remarks of the tables, and what the fit was told.
+    """Return the page of a fit: its report with pictures, remarks of the tables, and the fit's options.
 
     Args:
         result: the fit.

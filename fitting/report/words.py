@@ -23,7 +23,7 @@ def known_in_words(known: WithInterval, unit: str = "") -> str:
 
 
 def losses_in_words(result: FitResult) -> list[list[str]]:
-    """Return what an impact takes, row by row: what, and how much with its 95 % interval.
+    """Return the losses of an impact, row by row: the name, and the value with its 95 % interval.
 
     The energy at three speeds, delta of the printed epsilon, and the capture speed.
     """
@@ -60,7 +60,7 @@ def parting_in_words(result: FitResult) -> str:
     if loss is None or loss.formula_off is None or loss.formula_off_at_nm_per_us is None or loss.formula_off <= _EXACT:
         return ""
     return (
-        "The law has besides what its formula leaves out: the formula with these parameters is off by at most "
+        "The law contains what its formula leaves out: the formula with these parameters deviates from it by at most "
         f"{percent(loss.formula_off)} of u_out, at {loss.formula_off_at_nm_per_us:.3g} nm/us."
     )
 

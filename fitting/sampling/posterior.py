@@ -207,7 +207,7 @@ def log_density_of(explained: Explained) -> LogDensity:
         # what is not determined has no covariance
         covariance = covariance * np.outer(slope, slope)
     if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance / np.trace(covariance))[0] < 1e-15:
-        raise ValueError(f"the data hardly tell {', '.join(model.names)} apart: hold one fixed, or constrain it")
+        raise ValueError(f"the data hardly distinguish {', '.join(model.names)}: hold one fixed, or constrain it")
     return LogDensity(explained, parameters, errors, middle, np.linalg.cholesky(covariance))
 
 

@@ -53,7 +53,7 @@ class TableError(ValueError):
 
 @dataclass
 class Faults:
-    """Faults of a table, of which the one that comes first in the file is reported and the others are counted.
+    """Faults of a table: the first one in the file is reported, and the others are counted.
 
     Attributes:
         source: the table's name, as it begins every message.
@@ -122,7 +122,7 @@ class Column:
         name: its name in the file.
         kind: what its numbers must be: "number" (any finite one), "not negative", "positive", "whole" (1, 2, 3, ...) or
             "flag" (0, 1).
-        meaning: what its numbers become; empty: the name. Columns of one meaning are aliases, of which a file has one.
+        meaning: what its numbers become; empty: the name. Columns of one meaning are aliases; a file has one.
         needed: what it gives, in a word, if every file needs a column that gives it; else empty.
         required: whether every row needs it.
         error: the name of the column that holds its standard errors, for a measured column.

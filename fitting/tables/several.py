@@ -23,7 +23,7 @@ from fitting.tables.table import (
 
 @dataclass(frozen=True)
 class SeveralTables:
-    """Tables of one tip on one sample; what is asked of a single table can be asked of all their rows.
+    """Tables of one tip on one sample, with the methods of a single table for all their rows.
 
     Attributes:
         tables: at least two.

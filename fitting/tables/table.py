@@ -17,7 +17,7 @@ measured column says that this was not measured. A column ``no_orbit`` marks by 
 steady single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank. Comments such as ``#
 tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
 known of the instrument. ``# rows = in order of time`` says that the rows stand as they were measured, so that a slow
-drift of phase and amplitude is told from what they mean. Other comments are kept as remarks.
+drift of phase and amplitude can be fitted. Other comments are kept as remarks.
 
 A cantilever that is driven itself over a sample at rest (a tapping or amplitude-phase-distance curve) says so::
 
@@ -160,7 +160,7 @@ def columns_of(table: "AmplitudeTable") -> dict[str, Any]:
 
 
 def required(columns: Collection[str]) -> tuple[Column, ...]:
-    """Return the columns of which every row needs a number, of those that a table has."""
+    """Return the columns of a table in which every row needs a number."""
     return tuple(column for column in _COLUMNS if column.required and column.name in columns)
 
 

@@ -124,7 +124,7 @@ def noise_of(curve: TappingCurve, found: Energies) -> Pairs:
 FEWEST_FREE_ROWS = 3
 """Rows that are off the sample; fewer may be those of first contact, and are not taken for the free tip's."""
 _ANY_ZERO_DEG, _WIDE_ZERO_DEG = 90.0, 1000.0
-"""Errors of a zero of the phase of which nothing is known, and of one that free rows tell: theirs is far smaller."""
+"""Errors of a zero of the phase that is unknown, and of one that free rows determine: theirs is far smaller."""
 _WIDE_DRIFTS = {"phase_drift_deg": 30.0, "free_amplitude_drift": 0.3}
 """Errors of drifts that rows of the free tip at both ends determine."""
 _STEP = 1e-4
@@ -227,7 +227,7 @@ COMMON = ("free_frequency_khz", "quality_factor", "harmonics_factor")
 
 
 class Lever:
-    """Curves of one lever, and the least squares that tells their instrument without the rows in contact.
+    """Curves of one lever, and the least squares that determines their instrument without the rows in contact.
 
     Attributes:
         curves: the curves.
@@ -238,7 +238,7 @@ class Lever:
     """
 
     def __init__(self, curves: Sequence[TappingCurve], free: Sequence[Mask]):
-        """Find the instrument of curves of which the same is stated of their lever."""
+        """Find the instrument of curves with the same statements on their lever."""
         self.curves = tuple(curves)
         self.free = tuple(_of_free_tip(*pair) for pair in zip(curves, free, strict=True))
         lever = (self.curves[0].free_frequency_khz, self.curves[0].quality_factor)
@@ -512,11 +512,11 @@ def _smoothed(
 _FAR, _MOST_OUTLIERS = 4.0, 0.2
 """Residual in standard errors from which a row is excluded, and share of rows that may be."""
 _ALLOWED = 3.0
-"""Standard errors within which an energy of less than nothing is chance."""
+"""Standard errors within which a negative energy is chance."""
 MEASURED, BRACKET = 0.5, 0.1
 """Half of a band over its middle up to which an energy is measured; lower over upper end from which it is bracketed."""
 HEADLINE = (0.95, 0.9, 0.8, 0.7, 0.5)
-"""Amplitudes, of the free one, at which a reader is told the energy."""
+"""Amplitudes, as fractions of the free one, at which the output gives the energy."""
 
 
 def said_of(low: float, high: float) -> str:
@@ -545,7 +545,7 @@ class EnergyCurve:
         noise_aj: standard error of that but for the instrument.
         by_instrument: its change by every unknown of the instrument, in standard errors of what is known beforehand,
             shape (points, unknowns).
-        certain: whether the place is far enough from first contact to be told from it.
+        certain: whether the place is far enough from first contact to be distinguished from it.
     """
 
     amplitude_ratio: Float[np.ndarray, " points"]
@@ -622,7 +622,7 @@ class EnergyFunctions:
         rows_chi2: of the rows about their functions.
         rows_freedom: number of these rows less what their functions take.
         scale: what the rows' own errors were multiplied by, the largest of the branches.
-        possible: whether an instrument as stated makes no energy of the lever's curves less than nothing.
+        possible: whether some instrument as stated leaves no energy of the lever's curves negative.
     """
 
     lever: Lever
@@ -679,7 +679,7 @@ def energies_along(
 
 
 def _along(lever: Lever, number: int, stretches: Sequence[np.ndarray], repulsive: Mask) -> EnergyFunctions:
-    """Return the energies along the branches of one curve, their bands not yet told."""
+    """Return the energies along the branches of one curve, without their bands."""
     # where the instrument's search did not settle there is no energy
     stretches = stretches if lever.minimum.settled else ()
     curve, at = lever.curves[number], lever.instrument(number)
@@ -796,7 +796,7 @@ def _at(
 def positive_bands(
     estimate: Rows, noise: Rows, certain: Mask, by_instrument: Float[np.ndarray, "rows unknowns"]
 ) -> tuple[Rows, Rows, bool]:
-    """Return bands of 95 % of energies none of which is less than nothing, and whether there may be such energies.
+    """Return bands of 95 % of energies that are nowhere negative, and whether such energies exist.
 
     With E(a) = t at one point, E(a') of another has the mean E^' + (t - E^) G(a', a)/G(a, a) and a variance: t may be
     what leaves each mean + 3 standard deviations >= 0.
@@ -848,10 +848,10 @@ def _densest(mean: float, error: float, low: float, high: float) -> tuple[float,
 
 
 def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
-    """Return the energy of a curve that hangs least on the free frequency, relative to itself, and where.
+    """Return the energy of a curve that depends least on the free frequency, relative to itself, and where.
 
     It is the middle of its band, beside how much of it a standard error of the frequency, as known, is; None where no
-    energy is above nothing.
+    energy is positive.
     """
     with_frequency = functions.lever.minimum.covariance[0]
     found = [
@@ -989,7 +989,7 @@ def one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve,
     def jacobian(x: np.ndarray) -> np.ndarray:
         """Return the changes at the likeliest readings with the groups' energies.
 
-        At others slopes hang on how the energies scatter, and pull Q and f0 to where all of them are smaller.
+        At others slopes depend on the scatter of the energies, and pull Q and f0 to where all of them are smaller.
         """
         noise, there = off(x)[1], energies(smooth, lever.instrument(0, x))
         missing = (x[count:][group] - there.energy_aj[rows]) / (noise / scale) ** 2

@@ -1,7 +1,7 @@
 """Maps: energy of a tap and virial in every pixel of an image of amplitude and phase, with their errors.
 
-Pixels are rows of `energies`. The free tip must be recorded with the image: nothing else tells the zero of the phase,
-on which every energy hangs.
+Pixels are rows of `energies`. The free tip must be recorded with the image: every energy depends on the zero of
+the phase, which nothing else determines.
 """
 
 import enum
@@ -31,7 +31,7 @@ _USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 _USUAL_ZERO_DEG = 0.2
 """Standard error of the free tip's phase where it is given without one."""
 _DECIDING = 4096
-"""Pixels that tell the sign of the phase, evenly chosen."""
+"""Pixels that determine the sign of the phase, evenly chosen."""
 _BLOCK = 1 << 16
 """Pixels that are computed at once, for the memory."""
 _UNITS = {
@@ -67,7 +67,7 @@ class TappingMap(JudgedResult):
         source: path of the image's file, or where else it is from.
         drive: "force" on the tip, or its "base".
         unit: of energies and virials, "aJ", or "nm^2" where the spring constant is not known: energies over it.
-        energy: energy that a tap takes, in `unit`.
+        energy: energy lost in a tap, in `unit`.
         energy_error: standard errors of the energies from each pixel's own noise.
         virial: mean of force times height, positive where attraction prevails.
         virial_error: standard errors of the virials from each pixel's own noise.
@@ -77,7 +77,7 @@ class TappingMap(JudgedResult):
         common: parts of `energy_common_error` by what they come from, with their signs.
         reasons: why the energies must not be used; empty if they may.
         size_m: height and width of the image in m, or None.
-        known: what was taken for the instrument, with where it comes from.
+        known: the assumed numbers of the instrument, with their origins.
         notes: what was assumed.
     """
 

@@ -61,7 +61,7 @@ def tapping_report(result: Tapping) -> Report:
         *_thresholds(result),
         *_speeds(result),
         ReportSection("Impact law", [Text(law, "lines" if result.law else "")], "Impact law"),
-        ReportSection("What the numbers take for granted", [Bullets(result.assumptions, "Assumed:")], "Assumptions"),
+        ReportSection("What the numbers assume", [Bullets(result.assumptions, "Assumed:")], "Assumptions"),
     ]
     if result.warnings:
         sections.append(ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"))
@@ -119,9 +119,9 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     least = result.least_on_frequency
     if least is not None:
         lines.append(
-            f"  hangs least on the free frequency at A/A0 = {least['amplitude_ratio']:.3f} "
-            f"({result.branches[least['branch']].name}): {_band_in_words(*least['interval95_aj'])} aJ, of which the "
-            f"error of the frequency is {least['by_frequency_aj']:.2g}"
+            f"  depends least on the free frequency at A/A0 = {least['amplitude_ratio']:.3f} "
+            f"({result.branches[least['branch']].name}): {_band_in_words(*least['interval95_aj'])} aJ; the "
+            f"frequency contributes an error of {least['by_frequency_aj']:.2g}"
         )
     energy = Table(
         "Energy of a tap by the amplitude over the free one: value and standard error where measured, else the band of "
@@ -139,8 +139,8 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
         ]
         for one in functions.nuisances
     ]
-    caption = "What is known of the instrument beforehand, and with its free rows"
-    instrument = Table(caption, ["instrument, from what is stated and free rows", "given", "fitted"], known)
+    caption = "The instrument as stated, and fitted to its free rows"
+    instrument = Table(caption, ["instrument, from statements and free rows", "given", "fitted"], known)
     return [
         ReportSection("Energy along the branches", [energy, *_lines(lines)], "Energy"),
         ReportSection("Instrument", [instrument, *_lines([f"  rows about smooth energies: {chi2}"])]),
@@ -162,7 +162,9 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
     fit, epsilon = result.fit, result.epsilon
     if fit is None or not result.described:
         return []
-    assumed = "If every tap of a branch took the same (assumed: along A sqrt(A0^2 - A^2) the curve cannot test it):"
+    assumed = (
+        "Assuming that every tap of a branch loses the same energy (the curve cannot test it along A sqrt(A0^2 - A^2)):"
+    )
     cells = []
     for i, group in enumerate(result.groups):
         value, error, ends = result.constant(i)
@@ -203,7 +205,7 @@ def _speeds(result: Tapping) -> list[ReportSection]:
     here = np.isfinite(found.approach_speed_nm_per_us)
     u, error = found.approach_speed_nm_per_us[here], found.approach_speed_error_nm_per_us[here]
     if not here.any():
-        return [ReportSection("Speeds of the impacts", [Text("Impact speeds: known to 25 % or better in no row.")])]
+        return [ReportSection("Speeds of the impacts", [Text("Impact speeds cannot be determined from this curve.")])]
     known = f"known to {percent(float(np.median(error / u)))} in the median"
     words = f"Impact speeds: {u.min():.3g} to {u.max():.3g} nm/us in {len(u)} rows, {known}"
     return [ReportSection("Speeds of the impacts", [Text(words)], "Speeds")]

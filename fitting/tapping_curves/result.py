@@ -122,7 +122,7 @@ class Tapping(JudgedResult):
         functions: the energy as a smooth function along each branch, the instrument cut off from it.
         scale_errors: whether errors are multiplied where the rows scatter more.
         followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
-        bound_aj: energy that a tap takes at most, where only the amplitude was recorded; else None.
+        bound_aj: upper bound of the energy lost in a tap, where only the amplitude was recorded; else None.
         hysteresis: changes of the motion that come at different heights on approach and retract.
         speeds: speeds of the impacts; None where there is no energy.
         law: the fit of the impact law, or None.
@@ -162,7 +162,7 @@ class Tapping(JudgedResult):
 
     @property
     def why_not_constant(self) -> str:
-        """Why one energy a branch does not explain the rows; empty where it does."""
+        """Why one energy for each branch does not explain the rows; empty where it does."""
         return next(iter(judge([NO_CONSTANT], self)), "")
 
     @property
@@ -177,17 +177,17 @@ class Tapping(JudgedResult):
 
     @property
     def warnings(self) -> list[str]:
-        """What a reader should know besides."""
+        """What a reader should also know."""
         return judge(WARNINGS, self)
 
     @property
     def assumptions(self) -> list[str]:
-        """What the numbers take for granted."""
+        """What the numbers assume."""
         return judge(ASSUMPTIONS, self)
 
     @property
     def energy(self) -> dict[str, Any]:
-        """The energy if every tap took the same: `value`, `standard_error`, `interval95` in aJ, `kind`, where from.
+        """The energy if every tap loses the same: `value`, `standard_error`, `interval95` in aJ, `kind`, `reason`.
 
         It makes no curve valid: along a sqrt(1 - a^2) with a = A/A0 the curve cannot test the assumption. Where one
         energy does not explain the rows `value` is None and `reason` says why.
@@ -216,7 +216,7 @@ class Tapping(JudgedResult):
 
     @property
     def described(self) -> bool:
-        """Whether one energy a branch describes the rows."""
+        """Whether one energy for each branch describes the rows."""
         return not self.why_not_constant
 
     @property
@@ -238,7 +238,7 @@ class Tapping(JudgedResult):
 
     @property
     def least_on_frequency(self) -> dict[str, Any] | None:
-        """The energy that hangs least on the free frequency, and where; None where none is above nothing."""
+        """The energy that depends least on the free frequency, and where; None where no energy is positive."""
         return least_on_frequency(self.functions)
 
     @property
@@ -284,7 +284,7 @@ class Tapping(JudgedResult):
 
     @property
     def epsilon(self) -> dict[str, Any]:
-        """2 E/m in nm^2/us^2: what a tap takes, as the impact law counts it."""
+        """2 E/m in nm^2/us^2: the energy lost in a tap, in the units of the impact law."""
         names, factor = ("value", "standard_error", "interval95"), 2.0 / self.mass_ng
         return {name: None if self.energy[name] is None else factor * np.array(self.energy[name]) for name in names}
 

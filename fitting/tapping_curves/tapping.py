@@ -105,7 +105,7 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     if not 1.0 / _FARTHEST < ratio.min() <= ratio.max() < _FARTHEST:
         raise TableError(
             f"{name}: driven at {ratio.max():.3g} times the free frequency, as a higher mode is, or in another unit; "
-            "energies are told of a lever that is driven near its first resonance"
+            "energies are given only for a lever that is driven near its first resonance"
         )
     quality = np.nan_to_num(table.quality_factor or 0.0)
     if not quality:
@@ -223,7 +223,7 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, stated: float, off
 
 
 def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> TappingCurve:
-    """Return a curve that knows no zero of the phase but that of its free rows, if what is stated tells no more.
+    """Return a curve whose zero of the phase is that of its free rows, if the statements determine it no better.
 
     A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q
     given, and says so: taken for knowledge besides, it would count both twice.
@@ -240,7 +240,7 @@ def _with_zero_of_free_rows(curve: TappingCurve, remarks: tuple[str, ...]) -> Ta
 
 
 def _check_range(curve: TappingCurve, zero: float) -> None:
-    """Check that no row of a force on the tip lags by what no tap that takes energy does.
+    """Check that no row under a force on the tip has a lag that would mean a tap that gains energy.
 
     Raises:
         TableError: naming the first row that lags by less than 0 or more than 180 degrees, by more than 20.
@@ -251,7 +251,7 @@ def _check_range(curve: TappingCurve, zero: float) -> None:
         row = int(np.argmax(beyond))
         raise TableError(
             f"{printable(curve.source)}, line {curve.lines[row]}: lags by {curve.lag_deg[row]:.1f} degrees (free tip's "
-            f"zero {zero:.1f}), outside 0 to 180, as {beyond.sum()} of {curve.rows} rows do: no tap that takes energy "
+            f"zero {zero:.1f}), outside 0 to 180, as {beyond.sum()} of {curve.rows} rows do: no tap that loses energy "
             "does; mend the phase or leave its cell blank"
         )
 

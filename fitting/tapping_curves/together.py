@@ -80,7 +80,7 @@ class TappingTogether(JudgedResult):
 
     @property
     def agreement_p_value(self) -> float | None:
-        """Probability that what is stated of one instrument and its free rows disagree more; None if not to be told."""
+        """Probability of a larger disagreement among statements and free rows of one instrument; None if unknown."""
         if self.lever is None or not self.lever.minimum.degrees_of_freedom:
             return None
         return self.lever.minimum.p_value
@@ -169,7 +169,7 @@ def _same_lever(curves: Sequence[Tapping]) -> None:
             if first != other:
                 said = f"states the {ORIGINS.get(name, name)} as {other}, {curves[0].table.source} as {first}"
                 raise TableError(
-                    f"{one.table.source}: {said}; several curves are taken as of one lever: state the same in all, or "
+                    f"{one.table.source}: {said}; several curves must be of one lever: state the same in all, or "
                     "analyse them one by one"
                 )
 

@@ -1,4 +1,4 @@
-"""What makes the energy of a tap no measurement, what a reader should know besides, and what is taken for granted.
+"""What makes the energy of a tap no measurement, what a reader should also know, and what is assumed.
 
 The rules look at a `Tapping`. Its energy is given in two ways, as one number for each branch and as a function along
 it; `NO_CONSTANT` and `NO_FUNCTIONS` say why one of them is not given, `REASONS` why neither is.
@@ -67,23 +67,23 @@ def _followed(e: Any) -> list[str]:
 
 NO_CONSTANT: tuple[Rule[Any], ...] = (
     Rule(lambda e: e.fit is None, "no branch has enough rows of taps that come every period for one energy"),
-    Rule(lambda e: not e.fit.minimum.settled, "the search for one energy a branch does not settle"),
+    Rule(lambda e: not e.fit.minimum.settled, "the fit of one energy for each branch does not converge"),
     Rule(
         lambda e: e.fit.scale == 1.0 and e.fit.minimum.p_value < IMPROBABLE,
-        "one energy a branch does not describe the rows (chi2 {e.fit.minimum.chi2:.0f} for "
+        "one energy for each branch does not describe the rows (chi2 {e.fit.minimum.chi2:.0f} for "
         "{e.fit.minimum.degrees_of_freedom} degrees of freedom, probability {e.fit.minimum.p_value:.1g})",
     ),
     Rule(
         lambda e: e.fit.scale > LARGEST_SCALE,
-        "one energy a branch describes the rows only with errors {e.fit.scale:.1f} times as large",
+        "one energy for each branch describes the rows only with errors {e.fit.scale:.1f} times as large",
     ),
-    Rule(lambda e: _torn(e.fit), "for one energy a branch {case}"),
+    Rule(lambda e: _torn(e.fit), "one energy for each branch contradicts the instrument: {case}"),
     Rule(
         _followed,
-        f"the rows follow their order in the table about one energy, as a {{case}} would make them: {_SAY_SO}",
+        f"residuals of one energy for each branch follow the order of the rows, as with a {{case}}: {_SAY_SO}",
     ),
 )
-"""Why one energy a branch does not explain the rows; the first that applies."""
+"""Why one energy for each branch does not explain the rows; the first that applies."""
 
 
 def _changes_of_free_tip(e: Any, rows: np.ndarray, along: np.ndarray) -> Iterator[tuple[str, float, float, float, str]]:
@@ -164,23 +164,23 @@ def _bracketed(e: Any) -> list[str]:
 NO_FUNCTIONS: tuple[Rule[Any], ...] = (
     Rule(
         lambda e: not e.functions.lever.minimum.settled,
-        "the least squares of the instrument, from what is stated and free rows, does not settle",
+        "the fit of the instrument to statements and free rows does not converge",
     ),
     Rule(
         lambda e: e.largest is None,
         "no branch has enough rows in contact for an energy of a tap",
     ),
-    Rule(lambda e: _torn(e.functions), "the energy along the branches has no instrument as given: {case}"),
+    Rule(lambda e: _torn(e.functions), "no instrument as stated explains the energy along the branches: {case}"),
     Rule(
         lambda e: e.functions.scale > (LARGEST_SCALE if e.scale_errors else _LARGEST_UNASKED_SCALE),
-        "the rows scatter {e.functions.scale:.1f} times as much about a smooth energy as their errors say",
+        "rows scatter about a smooth energy by {e.functions.scale:.1f} times their errors",
     ),
     Rule(_drifting, "{case}"),
     Rule(_not_flat, "{case}"),
     Rule(
         lambda e: not e.functions.possible,
-        "the instrument contradicts the curve: with no frequency, Q and zero of the phase as stated are all energies "
-        "above nothing, and no sample gives energy",
+        "the instrument contradicts the curve: with every frequency, Q and zero of the phase within the stated errors "
+        "some tap would gain energy, and no sample gives energy",
     ),
     Rule(
         lambda e: e.curve.phase_zero_deg is None and not e.functions.lever.free[e.functions.number].any(),
@@ -196,7 +196,7 @@ REASONS: Rules[Any] = [
         Rule(lambda e: [e.curve.phase.reason] if e.curve.phase.reason else [], "{case}"),
         Rule(
             lambda e: not e.curve.has_phase and e.bound_aj is not None,
-            "without a phase the curve gives no more than an upper bound of the energy of a tap",
+            "without a phase the curve gives only an upper bound of the energy of a tap",
         ),
         Rule(lambda e: [e.why_not_functions] if e.why_not_functions else [], "{case}"),
     )
@@ -205,7 +205,7 @@ REASONS: Rules[Any] = [
 
 
 def _scaled(e: Any) -> list[tuple[str, float]]:
-    fits = {"one energy a branch": e.fit, "a smooth energy": e.functions}
+    fits = {"one energy for each branch": e.fit, "a smooth energy": e.functions}
     return [(what, fit.scale) for what, fit in fits.items() if fit and fit.scale > 1.0] if e.valid else []
 
 
@@ -216,20 +216,19 @@ WARNINGS: Rules[Any] = [
     ),
     Rule(
         _scaled,
-        "the rows scatter {case[1]:.2g} times more about {case[0]} than their errors say: its errors are multiplied by "
-        "that",
+        "rows scatter about {case[0]} by {case[1]:.2g} times their errors: its errors are multiplied by that",
     ),
     Rule(
         lambda e: [len(e.set_aside)] if e.set_aside else [],
         "{case} of {e.curve.rows} rows are excluded; the column `note` of the table of rows says why",
     ),
 ]
-"""What a reader should know besides."""
+"""What a reader should also know."""
 
 
 def _spring_constant(e: Any) -> list[str]:
     if e.curve.over_spring_constant:
-        return ["spring constant not known: energies and virials are over it, in nm^2 (aJ over N/m)"]
+        return ["spring constant not known: energies and virials are divided by it, in nm^2 (aJ over N/m)"]
     return [f"spring constant {e.curve.spring_constant_n_per_m} N/m"]
 
 
@@ -243,8 +242,7 @@ def _lag(e: Any) -> list[str]:
 
 
 def _usual(e: Any) -> list[str]:
-    usual = ", ".join(f"{ORIGINS[name]} to {100.0 * USUAL_ERRORS[name]:g} %" for name in e.curve.assumed)
-    return [usual] if usual else []
+    return [f"no error given for {ORIGINS[name]}; {100.0 * USUAL_ERRORS[name]:g} % assumed" for name in e.curve.assumed]
 
 
 ASSUMPTIONS: Rules[Any] = [
@@ -253,21 +251,21 @@ ASSUMPTIONS: Rules[Any] = [
         "free frequency {e.curve.free_frequency_khz} kHz, Q {e.curve.quality_factor}, {case}, calibration "
         "{e.curve.tip_calibration}",
     ),
-    Rule(_usual, "given without an error, so usual ones: {case}"),
+    Rule(_usual, "{case}"),
     (
-        Rule(lambda e: e.curve.time is None, "the drive stays as it is along the curve"),
+        Rule(lambda e: e.curve.time is None, "the drive does not change along the curve"),
         Rule(
             lambda e: free_ends(e.curve, e.rows.free),
-            "phase and free amplitude drift evenly along the rows, as free rows at both ends tell",
+            "phase and free amplitude drift evenly along the rows; free rows at both ends measure the drift",
         ),
         Rule(
             lambda _: True,
-            f"phase and free amplitude drift evenly along the rows, usually by {USUAL_DRIFTS['phase_drift_deg']:g} "
-            f"degrees and {100.0 * USUAL_DRIFTS['free_amplitude_drift']:g} %",
+            f"phase and free amplitude drift evenly along the rows, by {USUAL_DRIFTS['phase_drift_deg']:g} degrees and "
+            f"{100.0 * USUAL_DRIFTS['free_amplitude_drift']:g} % (assumed standard errors)",
         ),
     ),
     Rule(lambda e: list(e.curve.phase.notes), "{case}"),
     Rule(_lag, "{case}"),
-    Rule(lambda _: True, "harmonics were not measured: those of one brief impact a period, to 10 %"),
+    Rule(lambda _: True, "harmonics were not measured; those of one brief impact in each period are assumed, to 10 %"),
 ]
-"""What the numbers take for granted."""
+"""What the numbers assume."""

@@ -165,7 +165,7 @@ def lockin(
         # the first harmonic that sampling turns into a slow line; the k-th of a bounce is 3/(4 k^2)
         largest_share=max(SHARE, 0.75 / (order * (period / float(np.median(np.diff(time))) - 1.0)) ** 2),
     )
-    warnings = ["The phase takes time 0 as when the platform is highest."]
+    warnings = ["The phase assumes that the platform is highest at time 0."]
     unseen = ", ".join(str(n) for n in orders[np.isnan(size)])
     if unseen:
         warnings.append(f"The trace is too short to see the drive's frequency over {unseen}.")
