@@ -80,6 +80,12 @@ def test_slopes_and_the_inverse_are_derivatives():
     w = law.rebound_speed(at)
     assert float(jax.grad(law.approach_speed)(w)) == pytest.approx(1.0 / float(law.rebound_slope(at)), rel=1e-12)
 
+    def rebound_at_20(scale):
+        return TabulatedLaw(u, odd(u) * scale).rebound_speed(20.0)
+
+    difference = (rebound_at_20(1.0 + 1e-5) - rebound_at_20(1.0 - 1e-5)) / 2e-5
+    assert float(jax.jit(jax.grad(rebound_at_20))(1.0)) == pytest.approx(float(difference), rel=1e-7)
+
 
 def test_it_says_where_it_is_extrapolated():
     law = table_of(WET, low=1.5, high=200.0)

@@ -359,9 +359,8 @@ class TabulatedLaw(Law):
     A law that is known with errors has deviations: changes of its numbers, one for each of several independent unknowns
     of unit variance (`with_errors`), from which `sample` draws laws.
 
-    Columns are numbers, not traced; what is made of them is, so that a law may be differentiated by its numbers, and
-    laws of as many rows share one compiled program. Each array's last axis is the spline's; batches of laws have axes
-    in front of it.
+    Every number is traced, so that a law may be differentiated by them, and laws of as many rows share one compiled
+    program. Each array's last axis is the spline's; batches of laws have axes in front of it.
 
     Args:
         approach_speed_nm_per_us: u_in, at least four, increasing, shape (rows,).
@@ -417,28 +416,33 @@ class TabulatedLaw(Law):
         check_kind("delay", delay, CollisionDelay | None)
         if delay is not None and late is None:
             raise ValueError("`delay` needs the column `collision_delay_us`, which the table does not have")
-        if capture_speed_nm_per_us is None:
-            capture = _capture_speed(u, w, held)
+        given, numpy = capture_speed_nm_per_us, _numpy_of(u, w, late, capture_speed_nm_per_us, delay)
+        if given is None:
+            capture = _capture_speed(u, w, held, numpy)
         else:
-            check_parameter("capture_speed_nm_per_us", capture_speed_nm_per_us, "not negative")
-            capture = float(np.asarray(capture_speed_nm_per_us))
-            if not held <= capture < u[0]:
+            check_parameter("capture_speed_nm_per_us", given, "not negative")
+            capture = numpy.asarray(as_parameter(given))
+            if not any(map(is_traced, (capture, u))) and not held <= float(capture) < float(u[0]):
                 raise ValueError(
-                    f"`capture_speed_nm_per_us` must lie below the slowest tip that leaves, {u[0]:g} nm/us"
+                    f"`capture_speed_nm_per_us` must lie below the slowest tip that leaves, {float(u[0]):g} nm/us"
                     + (f", and not below the fastest that is captured, {held:g} nm/us" if held else "")
-                    + f", but is {capture:g}"
+                    + f", but is {float(capture):g}"
                 )
-        scale = np.sqrt(u[0] * u[-1])
-        place = _place(np.sqrt((u - capture) * (u + capture)), scale)
+        r, viscous_loss = _closest_formula(u, w, capture, numpy)
+        scale = numpy.sqrt(u[0] * u[-1])
+        place = _place(numpy.sqrt((u - capture) * (u + capture)), scale)
+        count = min(place.shape[0], most_knots)
         # of more rows than knots every so many is one, first and last among them
-        chosen = np.round(np.linspace(0, len(place) - 1, min(len(place), most_knots))).astype(int)
-        self.capture, self.scale_nm_per_us, self.knots = map(jnp.asarray, (capture, scale, place[chosen]))
-        self.r, self.viscous_loss = map(jnp.asarray, _closest_formula(u, w, capture))
+        knots = place[np.round(np.linspace(0, place.shape[0] - 1, count)).astype(int)]
         if late is not None and delay is None:
-            delay = _closest_delay(u, w, late)
-        self.delay = delay  # pyright: ignore[reportIncompatibleMethodOverride]
-        self.loss_spline, self.delay_spline = map(jnp.asarray, self._splines(u, w, late, capture))
+            delay = closest_delay(u, w, late, numpy)
+        beside = _Beside(knots, scale, r, viscous_loss, delay)
+        loss, late_spline = _splines(u, w, late, capture, beside, numpy)
+        self.capture, self.r, self.viscous_loss = map(jnp.asarray, (capture, r, viscous_loss))
+        self.scale_nm_per_us, self.knots = jnp.asarray(scale), jnp.asarray(knots)
+        self.loss_spline, self.delay_spline = jnp.asarray(loss), jnp.asarray(late_spline)
         self.slowest_nm_per_us, self.fastest_nm_per_us = jnp.asarray(u[0]), jnp.asarray(u[-1])
+        self.delay = delay  # pyright: ignore[reportIncompatibleMethodOverride]
         self.mass_ng = None if mass_ng is None else as_parameter(mass_ng)
         self.origin = Origin(origin)
         self.deviations = None
@@ -473,57 +477,37 @@ class TabulatedLaw(Law):
         """
         law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
         u, w, late, captured, _ = _free_rows(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
-        by_rebound = np.asarray(rebound_changes, float)
+        numpy = _numpy_of(u, w, late, rebound_changes, delay_changes, capture_changes, law.capture, law.delay)
+        by_rebound = numpy.asarray(rebound_changes, float)
         if by_rebound.ndim != 2 or by_rebound.shape[1] != captured + len(u):
             raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
-        nothing = np.zeros((len(by_rebound), 1))
-        by_delay = nothing if delay_changes is None else np.asarray(delay_changes, float)[:, captured:]
-        by_capture = nothing[:, 0] if capture_changes is None else np.asarray(capture_changes, float)
+        by_rebound, nothing = by_rebound[:, captured:], numpy.zeros((by_rebound.shape[0], 1))
+        by_delay = nothing if delay_changes is None else numpy.asarray(delay_changes, float)[:, captured:]
+        by_capture = nothing[:, 0] if capture_changes is None else numpy.asarray(capture_changes, float)
         extrapolated = options.get("capture_speed_nm_per_us") is None
-        capture = np.asarray(law.capture)
+        # the formula beside the table and the splines' knots stay as they are
+        numbers = law.knots, law.scale_nm_per_us, law.r, law.viscous_loss
+        knots, scale, r, viscous_loss = map(numpy.asarray, numbers)
+        beside = _Beside(knots, scale, r, viscous_loss, law.delay)
+        capture = numpy.asarray(law.capture)
 
-        def moved(side: float, by_rebound: Any, by_delay: Any, by_capture: Any) -> tuple[Any, ...]:
-            rebound, held = w + side * by_rebound, capture + side * by_capture
-            if extrapolated:
-                held = _capture_speed(u, rebound, 0.0)
-            # the formula beside the table and the splines' knots stay as they are
-            return held, *law._splines(u, rebound, None if late is None else late + side * by_delay, held)
+        def along(by_rebound: Any, by_delay: Any, by_capture: Any) -> dict[str, Any]:
+            ends = []
+            for side in (-_SMALL, _SMALL):
+                rebound, held = w + side * by_rebound, capture + side * by_capture
+                if extrapolated:
+                    held = _capture_speed(u, rebound, 0.0, numpy)
+                delayed = None if late is None else late + side * by_delay
+                ends.append((held, *_splines(u, rebound, delayed, held, beside, numpy)))
+            names = ("capture", "loss_spline", *(("delay_spline",) if late is not None else ()))
+            return {name: (end - start) / (2.0 * _SMALL) for name, start, end in zip(names, *ends, strict=False)}
 
-        each = zip(by_rebound[:, captured:], by_delay, by_capture, strict=True)
-        ends = [[moved(side, *change) for side in (-_SMALL, _SMALL)] for change in each]
-        names = ("capture", "loss_spline", *(("delay_spline",) if late is not None else ()))
-        deviations = {
-            name: jnp.asarray([(end[k] - start[k]) / (2.0 * _SMALL) for start, end in ends])
-            for k, name in enumerate(names)
-        }
+        changes = by_rebound, by_delay, by_capture
+        if numpy is jnp:
+            return _replaced(law, deviations=jax.vmap(along)(*changes))
+        each = [along(*change) for change in zip(*changes, strict=True)]
+        deviations = {name: jnp.asarray([one[name] for one in each]) for name in each[0]}
         return _replaced(law, deviations=deviations)
-
-    def _splines(self, u: Any, w: Any, late: Any, capture: Any) -> tuple[Any, Any]:
-        """Return the natural splines of loss and delay through rows, or of more rows than knots the closest ones.
-
-        Args:
-            u: approach speeds in nm/us.
-            w: rebound speeds.
-            late: delays in us; None: instantaneous impacts.
-            capture: the capture speed.
-        """
-        knots, scale, r, viscous_loss = map(np.asarray, (self.knots, self.scale_nm_per_us, self.r, self.viscous_loss))
-        square = (u - capture) * (u + capture)
-        loss = np.log(w * w / (square * (r**2 - viscous_loss / (u + capture))))
-        left = np.zeros_like(loss)
-        if late is not None and self.delay is not None:
-            hertz, lead, offset = (np.asarray(getattr(self.delay, name)) for name in _OF_DELAY)
-            left = late - (hertz * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u)
-        place, numbers = _place(np.sqrt(square), scale), _natural(knots)
-        cubes = np.maximum(place[:, None] - knots, 0.0) ** 3
-        # by their values at the knots
-        by_values = np.column_stack([np.ones_like(place), place - knots[0], cubes]) @ numbers
-        values = np.stack([loss, left], axis=1)
-        if place.shape == knots.shape:
-            found = numbers @ np.linalg.solve(by_values, values)
-        else:
-            found = numbers @ np.linalg.lstsq(by_values, values, rcond=None)[0]
-        return found[:, 0], found[:, 1]
 
     def for_scene(self) -> "TabulatedLaw":
         """Return the law alone, without the other results of a fit: what scenes hold."""
@@ -647,10 +631,7 @@ class TabulatedLaw(Law):
         """Return speeds and delay where u and v = sqrt(u^2 - u_c^2), in nm/us, are both known."""
         place = _place(v, self.scale_nm_per_us)
         cubes = _cubes(self.knots, place)
-        total = u + self.capture
-        # u_out^2/(u^2 - u_c^2) of the formula with this capture speed
-        formula = self.r**2 - self.viscous_loss / jnp.where(total > 0.0, total, 1.0)
-        rebound = v * jnp.sqrt(formula)
+        rebound = v * jnp.sqrt(_formula(u, self.capture, self.r, self.viscous_loss))
         rebound = rebound * jnp.exp(0.5 * _spline_of(self.loss_spline, self.knots, place, cubes))
         if self.delay is None:
             return Speeds(u, rebound, jnp.zeros_like(rebound))
@@ -847,9 +828,9 @@ class Origin:
 class _FreeRows(NamedTuple):
     """The rows of a table whose tips leave: approach and rebound speed in nm/us, delay in us; and those before them."""
 
-    u: Float[np.ndarray, " n"]
-    w: Float[np.ndarray, " n"]
-    delay: Float[np.ndarray, " n"] | None
+    u: Array
+    w: Array
+    delay: Array | None
     captured: int
     """How many slower rows are captured."""
     held: float
@@ -857,7 +838,7 @@ class _FreeRows(NamedTuple):
 
 
 def _free_rows(approach: Any, rebound: Any, delay: Any) -> _FreeRows:
-    """Return the rows of a table whose tips leave, its columns checked.
+    """Return the rows of a table whose tips leave, its columns checked as far as their numbers are known.
 
     Raises:
         ValueError: as `TabulatedLaw`.
@@ -867,37 +848,53 @@ def _free_rows(approach: Any, rebound: Any, delay: Any) -> _FreeRows:
     late = None if delay is None else _column("collision_delay_us", delay, len(u))
     if len(u) < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds, but has {len(u)}")
-    fall = np.flatnonzero(np.diff(u) <= 0.0)
+    if is_traced(u):
+        return _FreeRows(u, w, late, 0, 0.0)
+    speeds = np.asarray(u)
+    fall = np.flatnonzero(np.diff(speeds) <= 0.0)
     if fall.size:
-        first, second = u[fall[0]], u[fall[0] + 1]
+        first, second = speeds[fall[0]], speeds[fall[0] + 1]
         raise ValueError(
             f"`approach_speed_nm_per_us` must increase from row to row, but {second:g} follows {first:g} in row "
             f"{fall[0] + 2}"
         )
-    if u[0] <= 0.0:
-        raise ValueError(f"`approach_speed_nm_per_us` must be positive, but is {u[0]:g} in row 1")
-    captured = _captured_rows(u, w)
+    if speeds[0] <= 0.0:
+        raise ValueError(f"`approach_speed_nm_per_us` must be positive, but is {speeds[0]:g} in row 1")
+    captured = 0 if is_traced(w) else _captured_rows(speeds, np.asarray(w))
     if len(u) - captured < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds that leave, but has {len(u) - captured}")
-    held = float(u[captured - 1]) if captured else 0.0
-    return _FreeRows(u[captured:], w[captured:], None if late is None else late[captured:], captured, held)
+    late = None if late is None else late[captured:]
+    held = float(speeds[captured - 1]) if captured else 0.0
+    return _FreeRows(_known(u[captured:]), _known(w[captured:]), _known(late), captured, held)
 
 
-def _column(name: str, values: Any, rows: int | None = None) -> Float[np.ndarray, " rows"]:
-    """Return a column of a table, checked: finite numbers, and as many as there are speeds.
+def _known(column: Any) -> Any:
+    """Return a column as NumPy's where its numbers are known."""
+    return column if column is None or is_traced(column) else np.asarray(column)
+
+
+def _numpy_of(*values: Any) -> Any:
+    """Return JAX's NumPy where a value is traced, else NumPy itself: what is computed once is not compiled."""
+    return jnp if any(map(is_traced, jax.tree.leaves(values))) else np
+
+
+def _column(name: str, values: Any, rows: int | None = None) -> Any:
+    """Return a column of a table as an array, checked: finite numbers, and as many as there are speeds.
 
     Raises:
         ValueError: if they are something else.
     """
-    numbers = np.asarray(as_real(name, values), float)
-    if numbers.ndim != 1:
-        raise ValueError(f"`{name}` must be a column of numbers, but has shape {numbers.shape}")
-    bad = np.flatnonzero(~np.isfinite(numbers))
-    if bad.size:
-        raise ValueError(f"`{name}` must be finite numbers, but is {numbers[bad[0]]} in row {bad[0] + 1}")
-    if rows is not None and numbers.shape != (rows,):
-        raise ValueError(f"`{name}` must have a number for each of the {rows} speeds, but has {numbers.shape[0]}")
-    return numbers
+    column = as_parameter(jnp.asarray(values) if isinstance(values, list | tuple) else values)
+    if not is_traced(column):
+        numbers = as_real(name, column)
+        if numbers.ndim != 1:
+            raise ValueError(f"`{name}` must be a column of numbers, but has shape {numbers.shape}")
+        bad = np.flatnonzero(~np.isfinite(numbers))
+        if bad.size:
+            raise ValueError(f"`{name}` must be finite numbers, but is {numbers[bad[0]]} in row {bad[0] + 1}")
+    if rows is not None and column.shape != (rows,):
+        raise ValueError(f"`{name}` must have a number for each of the {rows} speeds, but has {column.shape[0]}")
+    return column
 
 
 def _captured_rows(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> int:
@@ -912,7 +909,7 @@ def _captured_rows(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> in
     return stays.size
 
 
-def _capture_speed(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"], held: float) -> float:
+def _capture_speed(u: Any, w: Any, held: float, numpy: Any) -> Any:
     """Return the capture speed in nm/us that a table points to.
 
     That of u_out^2 = a u^2 - c u - b by linear least squares, slow rows counting most; with c = 0 where that is no law.
@@ -922,37 +919,51 @@ def _capture_speed(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"], held:
         u: approach speeds in nm/us.
         w: rebound speeds.
         held: the fastest approach that is captured, 0 without one.
+        numpy: NumPy or JAX's.
     """
-    ratio, weight = (w / u) ** 2, u[0] / u
-    columns = [np.ones_like(u), -weight, -(weight**2)]
+    low = u[0]
+    ratio, one = (w / u) ** 2, numpy.ones_like(u)
+    columns = [one, -low / u, -((low / u) ** 2)]
+    weight = low / u
 
     def fitted(chosen: list[Any]) -> Any:
-        return np.linalg.lstsq(np.stack(chosen, axis=1) * weight[:, None], ratio * weight, rcond=None)[0]
+        return numpy.linalg.lstsq(numpy.stack(chosen, axis=1) * weight[:, None], ratio * weight, rcond=None)[0]
 
     a, c, b = fitted(columns)
-    if not (a > 0.0 and b > -_NOTHING and c >= 0.0):
-        (a, b), c = fitted(columns[::2]), 0.0
-    speed = 0.0
-    if a > 0.0 and b > -_NOTHING and c * c + 4.0 * a * b > 0.0 and max(b, c) > _NOTHING:
-        speed = u[0] * (c + np.sqrt(c * c + 4.0 * a * max(b, _NOTHING))) / (2.0 * a)
-    most = np.sqrt(max((u[0] - w[0]) * (u[0] + w[0]), 0.0))
-    return float(np.clip(speed, held, max(most, held)))
+    flat_a, flat_b = fitted(columns[::2])
+    curved = (a > 0.0) & (b > -_NOTHING) & (c >= 0.0)
+    a, c, b = numpy.where(curved, a, flat_a), numpy.where(curved, c, 0.0), numpy.where(curved, b, flat_b)
+    there = (a > 0.0) & (c * c + 4.0 * a * b > 0.0) & (b > -_NOTHING)
+    root = numpy.sqrt(numpy.where(there, c * c + 4.0 * a * numpy.maximum(b, _NOTHING), 1.0))
+    found = low * numpy.where(
+        there & ((c > _NOTHING) | (b > _NOTHING)), (c + root) / (2.0 * numpy.where(there, a, 1.0)), 0.0
+    )
+    most = numpy.maximum((u[0] - w[0]) * (u[0] + w[0]), 0.0)
+    most = numpy.where(most > 0.0, numpy.sqrt(numpy.where(most > 0.0, most, 1.0)), 0.0)
+    return numpy.clip(found, held, numpy.maximum(most, held))
 
 
 _NOTHING = 1e-12
 """Share of the squared approach speed below which a loss by adhesion or viscosity is rounding."""
 
 
-def _closest_formula(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"], capture: float) -> tuple[float, float]:
+def _closest_formula(u: Any, w: Any, capture: Any, numpy: Any) -> tuple[Any, Any]:
     """Return r and c of the formula with a capture speed that is closest to a table, in relative squared speeds."""
-    columns = np.stack([np.ones_like(u), -1.0 / (u + capture)], axis=1)
+    square = (u - capture) * (u + capture)
+    columns = numpy.stack([numpy.ones_like(u), -1.0 / (u + capture)], axis=1)
     # relative to the rebound of the table
-    weight = (u - capture) * (u + capture) / (w * w)
-    kept, viscous = np.linalg.lstsq(columns * weight[:, None], np.ones_like(u), rcond=None)[0]
+    weight = square / (w * w)
+    kept, viscous = numpy.linalg.lstsq(columns * weight[:, None], numpy.ones_like(u), rcond=None)[0]
     # a loss that grows with the speed alone, and no more than all there is at capture
-    if viscous > 0.0 and kept > 0.0 and viscous < 2.0 * kept * capture:
-        return float(np.sqrt(kept)), float(viscous)
-    return float(np.sqrt(np.sum(weight) / np.sum(weight**2))), 0.0
+    good = (viscous > 0.0) & (kept > 0.0) & (viscous < 2.0 * kept * capture)
+    alone = numpy.sum(weight) / numpy.sum(weight**2)
+    return numpy.sqrt(numpy.where(good, kept, alone)), numpy.where(good, viscous, 0.0)
+
+
+def _formula(u: Any, capture: Any, r: Any, viscous_loss: Any, numpy: Any = jnp) -> Any:
+    """Return u_out^2/(u^2 - u_c^2) of a formula with the capture speed u_c: r^2 - c/(u + u_c)."""
+    total = u + capture
+    return r**2 - viscous_loss / numpy.where(total > 0.0, total, 1.0)
 
 
 def _place(v: Any, scale: Any) -> Any:
@@ -960,8 +971,8 @@ def _place(v: Any, scale: Any) -> Any:
     return v / (v + scale)
 
 
-def _cubes(knots: Float[Array, "... knots"], place: Array) -> Array:
-    return jnp.maximum(place[..., None] - knots, 0.0) ** 3
+def _cubes(knots: Any, place: Any, numpy: Any = jnp) -> Any:
+    return numpy.maximum(place[..., None] - knots, 0.0) ** 3
 
 
 def _spline_of(
@@ -975,28 +986,69 @@ def _spline(spline: Float[Array, "... numbers"], knots: Float[Array, "... knots"
     return _spline_of(spline, knots, place, _cubes(knots, place))
 
 
-def _natural(knots: Float[np.ndarray, " knots"]) -> Float[np.ndarray, "numbers knots"]:
-    """Return what makes a natural spline's numbers of its values at the knots."""
-    h, one = np.diff(knots), np.eye(len(knots))
+def _natural(knots: Any, numpy: Any) -> Any:
+    """Return what makes a natural spline's numbers of its values at the knots, shape (numbers, knots)."""
+    count = knots.shape[0]
+    h = numpy.diff(knots)
+    one = numpy.eye(count)
     steep = (one[1:] - one[:-1]) / h[:, None]
     # second derivatives, 0 at both ends
-    inner = np.diag(2.0 * (h[:-1] + h[1:])) + np.diag(h[1:-1], 1) + np.diag(h[1:-1], -1)
-    bend = np.pad(np.linalg.solve(inner, 6.0 * (steep[1:] - steep[:-1])), ((1, 1), (0, 0)))
-    third = np.pad(np.diff(bend, axis=0) / h[:, None], ((1, 1), (0, 0)))
+    inner = numpy.diag(2.0 * (h[:-1] + h[1:])) + numpy.diag(h[1:-1], 1) + numpy.diag(h[1:-1], -1)
+    bend = numpy.pad(numpy.linalg.solve(inner, 6.0 * (steep[1:] - steep[:-1])), ((1, 1), (0, 0)))
+    third = numpy.pad(numpy.diff(bend, axis=0) / h[:, None], ((1, 1), (0, 0)))
     first = steep[0] - h[0] * bend[1] / 6.0
-    return np.concatenate([one[:1], first[None], np.diff(third, axis=0) / 6.0])
+    return numpy.concatenate([one[:1], first[None], numpy.diff(third, axis=0) / 6.0])
 
 
-def _closest_delay(
-    u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"], delay: Float[np.ndarray, " n"]
-) -> CollisionDelay:
+class _Beside(NamedTuple):
+    """What a table's splines are written beside: knots, scale of the speed, the closest formula and its delay."""
+
+    knots: Any
+    scale: Any
+    r: Any
+    viscous_loss: Any
+    delay: CollisionDelay | None
+
+
+def _splines(u: Any, w: Any, late: Any, capture: Any, beside: _Beside, numpy: Any) -> tuple[Any, Any]:
+    """Return the natural splines of loss and delay through a table's rows, or of more rows than knots the closest ones.
+
+    Args:
+        u: approach speeds in nm/us.
+        w: rebound speeds.
+        late: delays in us; None: instantaneous impacts.
+        capture: the capture speed.
+        beside: what the splines are written beside.
+        numpy: NumPy or JAX's.
+    """
+    knots, scale, r, viscous_loss, delay = beside
+    square = (u - capture) * (u + capture)
+    loss = numpy.log(w * w / (square * _formula(u, capture, r, viscous_loss, numpy)))
+    left = numpy.zeros_like(loss)
+    if late is not None and delay is not None:
+        hertz, lead, offset = (numpy.asarray(getattr(delay, name)) for name in _OF_DELAY)
+        left = late - (hertz * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u)
+    place, numbers = _place(numpy.sqrt(square), scale), _natural(knots, numpy)
+    shapes = [numpy.ones_like(place)[:, None], (place - knots[0])[:, None], _cubes(knots, place, numpy)]
+    # by their values at the knots
+    by_values, values = numpy.concatenate(shapes, axis=1) @ numbers, numpy.stack([loss, left], axis=1)
+    if place.shape == knots.shape:
+        found = numbers @ numpy.linalg.solve(by_values, values)
+    else:
+        found = numbers @ numpy.linalg.lstsq(by_values, values, rcond=None)[0]
+    return found[:, 0], found[:, 1]
+
+
+def closest_delay(u: Any, w: Any, delay: Any, numpy: Any = jnp) -> CollisionDelay:
     """Return the delay formula closest to a table's delays in us, by linear least squares; speeds in nm/us."""
-    columns = np.stack([u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u], axis=1)
-    hertz, lead, offset = np.linalg.lstsq(columns, delay, rcond=None)[0]
-    if hertz > 0.0:
-        return CollisionDelay(hertz, lead, offset)
+    columns = numpy.stack([u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u], axis=1)
+    hertz, lead, offset = numpy.linalg.lstsq(columns, delay, rcond=None)[0]
     # a Hertz time must be one: where the three tell none, alone
-    return CollisionDelay(max(np.sum(columns[:, 0] * delay) / np.sum(columns[:, 0] ** 2), 0.0), 0.0, 0.0)
+    good = hertz > 0.0
+    alone = numpy.maximum(numpy.sum(columns[:, 0] * delay) / numpy.sum(columns[:, 0] ** 2), 0.0)
+    return CollisionDelay(
+        *(numpy.where(good, one, other) for one, other in ((hertz, alone), (lead, 0.0), (offset, 0.0)))
+    )
 
 
 def impact_law_of(scene: Scene) -> Law:
