@@ -35,8 +35,8 @@ def accuracy(
     Args:
         session: for progress.
         study: what is measured.
-        contacts: for a scene: the arrival of which contact is compared.
-        quick: few and small measurements: to see that it works.
+        contacts: for a scene: number of the contact whose arrival is compared.
+        quick: few and small measurements, to check that it works.
     """
     if study not in ("map", "collide"):
         # what is wrong with a file is said at once, and what it leaves to be assumed

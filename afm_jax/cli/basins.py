@@ -20,7 +20,7 @@ def basins(
     speeds_nm_per_us: Annotated[tuple[float, float] | None, Ends(), "--speeds", "LOW:HIGH"] = None,
     draws: Annotated[int, IntRange(2)] = 20,
 ) -> Output:
-    """Find on which motion each start of a scene ends.
+    """Find the motion on which each start of a scene ends.
 
     A start is a drive phase and a speed at which the tip leaves the platform, at most four times the platform's top
     speed unless --speeds says otherwise. Attractors are named (m,N), m impacts in N drive periods, chaotic (the larger

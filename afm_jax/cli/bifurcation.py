@@ -22,15 +22,15 @@ def bifurcation(  # noqa: PLR0913
     ordinate: Literal["height", "phase", "impact_speed"] = "height",
     draws: Annotated[int, IntRange(2)] = 20,
 ) -> Output:
-    """Ramp a parameter and record on which motion the tip settles at each of its values.
+    """Ramp a parameter and record the motion on which the tip settles at each of its values.
 
-    The tip is carried from value to value with its drive phase and rebound speed. It starts, and starts again where the
-    sample held it or it flew away, at the file's [start]; without one on a stable single-impact orbit of the order
-    nearest to resonance (of a contact: of the law closest to it), else leaving the sample upward. The output gives the
-    motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last impacts. With
-    --out bifurcation.csv (a row a value), impacts.csv (a row an impact; of an orbit each once), strobe.csv (heights
-    whenever the platform is highest) and a picture. With --law it also gives the fraction of the fit's draws with the
-    same motion. Exit code 3 if no motion went on anywhere.
+    The tip is carried from value to value with its drive phase and rebound speed. It starts at the file's [start];
+    without one on a stable single-impact orbit of the order nearest to resonance (of a contact: of the law closest to
+    it), else leaving the sample upward. Where the sample held it or it flew away it starts again in the same way. The
+    output gives the motion at each value, (m,N): m impacts in N drive periods, irregular, stuck or free; and its last
+    impacts. With --out bifurcation.csv (one row per value), impacts.csv (one row per impact; each impact of an orbit
+    once), strobe.csv (heights whenever the platform is highest) and a picture. With --law also the fraction of the
+    fit's draws with the same motion. Exit code 3 if no motion went on anywhere.
 
     Args:
         session: for progress and messages.
@@ -38,7 +38,7 @@ def bifurcation(  # noqa: PLR0913
         parameter: a parameter of the scene file and its values.
         both: ramp up and then down, so that hysteresis shows.
         down: ramp down instead of up.
-        impacts: at every value.
+        impacts: impacts at every value.
         ordinate: what the picture draws of an impact.
         draws: laws drawn from the fit for the bands.
     """

@@ -18,7 +18,7 @@ class CalibrationOptions:
         length_um: length of a rectangular lever, '225 +- 2' with its error: Sader's method.
         width_um: its width.
         temperature_k: of lever and air [default: the file's, 296 +- 3].
-        scale_error: relative error of the deflection's scale (its sensitivity), of which k has twice as much.
+        scale_error: relative error of the deflection's scale (its sensitivity); that of k is twice as large.
     """
 
     averages: Positive | None = None

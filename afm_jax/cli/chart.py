@@ -23,19 +23,19 @@ def chart(
     orders: Annotated[int, IntRange(1, 100)] = 8,
     draws: Annotated[int, IntRange(2)] = 20,
 ) -> Output:
-    """Chart over two parameters of a scene which single-impact orbits exist, are stable and coexist.
+    """Chart the single-impact orbits that exist, are stable and coexist, over two parameters of a scene.
 
-    Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
-    if there are several) the peak amplitude and the size of the larger multiplier. A contact's orbits are closed by
-    simulation from those of the law closest to it: chart a thousand points, not a million; where none closes the point
-    is unresolved. With --law the fraction of the fit's draws in which an orbit is stable is given, too. With --out
-    chart.csv and a picture. Exit code 3 if there is no admissible orbit at all.
+    The output says for every point and order whether an orbit is admissible and whether one is stable. For the stable
+    one (the highest, if there are several) it gives the peak amplitude and the size of the larger multiplier. Orbits of
+    a contact are closed by simulation, from those of the law closest to it: chart a thousand points, not a million. A
+    point is unresolved where none closes. With --law also the fraction of the fit's draws in which an orbit is stable.
+    With --out chart.csv and a picture. Exit code 3 if there is no admissible orbit at all.
 
     Args:
         session: for progress.
         scene: the scene.
         x: a parameter of the scene file: the chart's columns.
-        y: another one: its rows.
+        y: a second one: the chart's rows.
         orders: highest order N.
         draws: laws drawn from the fit for the bands.
     """

@@ -33,10 +33,10 @@ def collide(
 ) -> Output:
     """Let free tips collide with a sample at rest, through liquid bridge and solid junction.
 
-    The contact is the paper's, or that of SCENE.toml, changed by the options. Of every speed: rebound speed, collision
-    delay, whether the tip is captured, times, deepest gap, and where the energy went; and the capture speed. With
-    --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are; exit code 3 if the
-    integration does not resolve one. With --make-law the law that the contact amounts to.
+    The contact is the paper's, or that of SCENE.toml, changed by the options. The output gives the capture speed, and
+    for every speed the rebound speed, the collision delay, whether the tip is captured, times, deepest gap, and where
+    the energy went. With --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are;
+    exit code 3 if the integration does not resolve a collision. --make-law computes the impact law of the contact.
 
     Args:
         session: for progress.
@@ -44,11 +44,11 @@ def collide(
         speeds: approach speeds in nm/us: 12,15,20 or start:stop:step as 12:200:10 (with the stop where it fits), or
             both. Left out: 20 speeds from 1.1 times the capture speed to 200.
         accuracy: wanted relative accuracy of the rebound speed.
-        make_law: make the impact law that the contact amounts to, in place of a table of collisions: with --out
-            law.json and law.csv, which scene files and --law take, and the formulas closest to it.
+        make_law: compute the impact law of the contact instead of a table of collisions: with --out law.json and
+            law.csv, which scene files and --law read, and the formulas closest to it.
         speed_range: with --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed to
             250.
-        points: with --make-law: number of speeds that formulas are fitted to; 512 without.
+        points: with --make-law: number of speeds that formulas are fitted to; else 512.
         **contact: what is changed of the contact.
     """
     for option, value in (("--speed-range", speed_range), ("--points", points)):

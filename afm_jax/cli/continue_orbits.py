@@ -32,9 +32,9 @@ def follow(
         session: for progress.
         scene: the scene.
         order: drive periods of the orbit.
-        impacts: impacts in them; 0: the tip meets nothing.
+        impacts: impacts in these periods; 0: the free motion.
         parameter: a parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.
-        second: another one: the special points are followed as curves in both.
+        second: a second parameter: special points are followed as curves in both.
     """
     if not isinstance(scene.scene.interaction, Contact):
         refuse_other_than_law(scene)

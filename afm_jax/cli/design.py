@@ -46,29 +46,28 @@ def planned(  # noqa: PLR0913
 ) -> Output:
     """Choose the drives to measure next, and forecast how well the law will then be known.
 
-    Say what is known: the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r,
-    --epsilon, ...), or a fit of what was measured so far (--fit); and what can be driven: every combination of
-    orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
-    itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
-    or 170:190:1. With --out design.csv, .json and .png. Exit code 3 if no drive can be planned with, or the points do
-    not determine the law.
+    Give the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r, --epsilon, ...), or a fit
+    of what was measured so far (--fit). Candidates are all combinations of orders, frequencies, amplitudes and offsets;
+    with --drive force or base (the cantilever is driven, amplitude and lag are read) all combinations of frequencies,
+    free amplitudes and heights. LISTs are numbers and ranges, 1,2,5 or 170:190:1. With --out design.csv, .json and
+    .png. Exit code 3 if no candidate can be used, or the points do not determine the law.
 
     Args:
         session: for progress.
-        orders: drive periods an impact; else 1-4, or 1 where the tip is driven.
+        orders: drive periods from impact to impact; else 1-4, or 1 where the tip is driven.
         detunings: drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 where
             the tip is driven, else 1.02:1.1:0.02.
         amplitudes_nm: drive amplitudes, else 2,4,7,10; or free ones, else 40,80.
         offsets_nm: offsets; else -1,0,1.
         heights: where the tip is driven, in place of offsets: distances of the sample as shares of each free amplitude;
             else 0.1:0.9:0.1.
-        largest_nm: peak amplitude that the instrument takes.
+        largest_nm: largest peak amplitude that the instrument can measure.
         points: how many to choose.
-        interest: parameters to be known well, as r,epsilon; else the law's.
+        interest: parameters to determine, as r,epsilon; else the law's.
         noise: relative error of an amplitude.
-        phase_noise_deg: error of a lag, tip driven.
-        amplitudes: what is read of a point.
-        uncertainty: how far the law may be off where no fit says.
+        phase_noise_deg: error of a lag where the tip is driven.
+        amplitudes: the readings of a point.
+        uncertainty: error of the law that is assumed where no fit gives one.
         fit: a fit to add to, as `afm-jax fit --json` writes it, or its folder.
         model: what will be fitted; else law+delay, or the fit's.
         mass_ng: effective mass of the tip.

@@ -23,18 +23,18 @@ def effects(
 ) -> Output:
     """Say what each effect of a scene changes and costs.
 
-    Each effect is left out, absent from the program, and the steady motion compared with that of the full scene: peak
-    and lock-in amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the
-    scene's default one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared.
-    Costs are times to compute a drive period, the median of several runs. With --out effects.csv, effects.json,
-    effects.png and reduced.toml, the scene without what the accuracy does not need, and its start.
+    Each effect is left out in turn, and the steady motion is compared with that of the full scene: peak and lock-in
+    amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the scene's default
+    one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared. Costs are times
+    to compute a drive period, the median of several runs. With --out effects.csv, effects.json, effects.png and
+    reduced.toml: the scene, and its start, without the effects that the accuracy does not need.
 
     Args:
         session: for progress.
         scene: the scene.
-        accuracy: wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?
-        duration_us: how long to follow each scene at most, in us.
-        only: the effects to look at; all if left out.
+        accuracy: wanted accuracy of the amplitudes, 1% or 0.01; the output names the effects that it does not need.
+        duration_us: longest time to follow each scene, in us.
+        only: the effects to study; else all.
     """
     start = scene.start or as_in_file(scene.scene, default_start(scene.scene))
     what = "simulating with and without each effect (every program compiles for some seconds)"

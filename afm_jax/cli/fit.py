@@ -48,14 +48,14 @@ def fit(  # noqa: PLR0913
 ) -> Output | None:
     """Fit the impact law to a table of vibration amplitudes, or one law to several tables.
 
-    The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
-    order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
-    with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
-    counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
-    offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
-    ones, and the report says how far each is from the others (its deviation). With --out the report: fit.html, fit.txt,
-    fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not converged, not explained by
-    the model, or a parameter not identified.
+    The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns order,
+    drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each with its
+    ..._error_nm; a column no_orbit marks by 1 drives at which the tip did not settle; phase_deg is used if present.
+    With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm, offset_nm,
+    lockin_amplitude_nm and phase_lag_deg. Several tables have one law; their nuisances are separate or shared
+    (--share), and the report gives each table's pull: the distance between its law and that of the others, in
+    standard deviations. With --out the report: fit.html, fit.txt, fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3
+    if the result is not valid: not converged, not explained by the model, or a parameter not identified.
 
     Args:
         session: for progress and messages.
@@ -63,23 +63,25 @@ def fit(  # noqa: PLR0913
         model: restitution: a restitution without adhesion (r); law: a restitution with adhesion (r, epsilon); viscous:
             a loss linear in speed with adhesion (epsilon, viscous_loss); full: a restitution, a loss linear in speed
             and adhesion (r, epsilon, viscous_loss); each with the collision delay, which amplitudes near resonance need
-            (+delay); contact: physical parameters through the resolved contact, of tapping curves on resonance too.
+            (+delay); contact: physical parameters through the resolved contact, of tapping curves 3 to 10 % above
+            resonance.
         noise: relative error of amplitudes without one, such as 1%.
         quality_factor: instead of the table's; '40 +- 2', or none: no air damping.
-        scale_errors: take the errors as relative: scale them, by 3 at most, until chi2/dof is 1.
-        robust: leave outliers out, one row in ten at most.
-        free: the parameters that are fitted, if not all that are not fixed; of a contact, if left out,
+        scale_errors: treat the errors as relative: scale them, by 3 at most, until chi2/dof is 1.
+        robust: leave out outliers, at most one row in ten.
+        free: the parameters to fit; else all that are not fixed, and of a contact
             relative_humidity,adhesion_energy_j_per_m2,viscosity_pa_s,modulus_gpa.
         fixed: hold a parameter at a value.
-        constraints: what is known beforehand: quality_factor, offset_origin_nm, tip_calibration, drive_calibration,
-            free_frequency_khz, phase_zero_deg, phase_drift_deg, free_amplitude_drift, or a parameter of the model; of a
-            contact also one that is held, at the value then.
-        no: contact: effects that it does not have.
-        compare: fit the rival models too and say what the table can tell.
-        posterior: credible intervals, too, by the no-U-turn sampler (extra `nuts`); where impacts last, of a Gaussian
-            around the fit.
+        constraints: a value known beforehand, with its error: of quality_factor, offset_origin_nm, tip_calibration,
+            drive_calibration, free_frequency_khz, phase_zero_deg, phase_drift_deg, free_amplitude_drift, or of a
+            parameter of the model; of a contact also of a parameter that is held at that value.
+        no: of a contact: effects to leave out.
+        compare: fit the rival models too and say which of them the table distinguishes.
+        posterior: also give credible intervals, by the no-U-turn sampler (extra `nuts`); where impacts last, from a
+            Gaussian around the fit.
         seed: seed of the random numbers.
-        share: of several tables: nuisances (of --constrain) that all have in common, or all; else each has its own.
+        share: of several tables: the nuisances (see --constrain) that they have in common, or all; else each table has
+            its own.
         example: fit the bundled table instead of a file.
     """
     if example == bool(tables):

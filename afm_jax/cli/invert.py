@@ -22,10 +22,10 @@ def inversion(
 ) -> Output:
     """Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
 
-    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses u_in^2 - u_out^2 are then set on
-    straight lines over (1, u_in), a viscous loss, and (1, u_in^2), a restitution. Rows that give nothing are named,
-    with the reason. With --out invert.csv, .json and .png. Exit code 3 if the rows determine no line, or none
-    explains them.
+    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. Straight lines are then fitted to the losses
+    u_in^2 - u_out^2, over (1, u_in) for a viscous loss and over (1, u_in^2) for a restitution. Rows without a result
+    are listed with the reason. With --out invert.csv, .json and .png. Exit code 3 if the rows determine no line, or no
+    line explains them.
 
     Args:
         session: for progress.

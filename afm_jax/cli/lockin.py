@@ -19,13 +19,13 @@ def lockin_of_trace(
     drive_frequency_khz: Positive | None = None,
     order: Annotated[int, IntRange(1, 8)] = 1,
 ) -> Output:
-    """Read amplitude and phase of a deflection in time at the drive's frequency over N, and over 1 to 8 besides.
+    """Read amplitude and phase of a deflection in time at the drive's frequency over N, and over 1 to 8.
 
     TRACE is text with the columns time_us (or time_ms, time_s) and deflection_nm (the tip's height), separated by
-    commas, tabs, semicolons or spaces. The phase takes time 0 as when the platform is highest.
-    Amplitudes are integrals over whole periods, errors the scatter of up to twelve parts of the trace. Exit code 3 if
-    the trace is not periodic at order N: the scatter, or the amplitude at another order, is above 2 % of that at N.
-    With --out lockin.csv, .json and .png.
+    commas, tabs, semicolons or spaces. The phase assumes that the platform is highest at time 0. Amplitudes are
+    integrals over whole periods, errors the scatter of up to twelve parts of the trace. Exit code 3 if the trace is not
+    periodic at order N: the scatter, or the amplitude at another order, is above 2 % of that at N. With --out
+    lockin.csv, .json and .png.
 
     Args:
         trace: the file.

@@ -22,21 +22,21 @@ def lyapunov(
     parameter: Annotated[str | None, "P=a:b:n"] = None,
     draws: Annotated[int, IntRange(2)] = 20,
 ) -> Output:
-    """Compute Lyapunov exponents by QR of the impact map's exact Jacobians; a contact's come from its simulation.
+    """Compute Lyapunov exponents by QR of the impact map's exact Jacobians; for contacts, of the simulation's.
 
-    Of a motion that has come to an orbit they are the logarithms of its multipliers. A tip that rests on the platform
-    forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start]; without
-    one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it if it is
-    unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves the sample
-    upward. An orbit is reported only if it is stable. With --law there is a band for the larger exponent, begun without
-    [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 where every motion ends before enough
-    impacts.
+    Exponents of a motion that has reached an orbit are the logarithms of its multipliers. A tip that rests on the
+    platform forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start];
+    without one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it
+    if it is unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves
+    the sample upward. An orbit is reported only if it is stable. With --law the larger exponent has a band, whose
+    motions do not use [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 if every motion
+    ends before enough impacts.
 
     Args:
         session: for progress.
         scene: the scene.
         impacts: impacts to average over.
-        transient: impacts before.
+        transient: impacts before these.
         parameter: a parameter of the scene file and its values, one motion each.
         draws: laws drawn from the fit for the bands.
     """

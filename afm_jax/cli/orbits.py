@@ -25,12 +25,13 @@ def orbits(
 ) -> Output:
     """Find all single-impact orbits of a scene with a law, or with --impacts orbits of several impacts.
 
-    Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
-    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase and lag
-    at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and orbits.png. Exit
-    code 3 if none is admissible. With --impacts every impact is listed, the hardest first. A contact's orbits are
-    listed like this, too: an impact lasts from the formation of the bridge to its rupture (of a dry contact: while its
-    forces act); phase and velocity are those at rupture. The search may miss orbits of a contact, never of a law.
+    The output gives for every orbit impact phase and velocities, peak and lock-in amplitude of the height, whether it
+    is stable, and whether it is admissible (its flight stays above the platform). If base or force drive, it also gives
+    amplitude, phase and lag at the drive's frequency, and the deflection against a moving base. With --impacts it lists
+    every impact, the hardest first. Orbits of a contact are listed in the same way: an impact lasts from the formation
+    of the bridge to its rupture (of a dry contact: while its forces act); phase and velocity are those at rupture. The
+    search may miss orbits of a contact, of a law with delay, and of several impacts. With --out orbits.csv and
+    orbits.png. Exit code 3 if none is admissible.
 
     Args:
         session: for progress and messages.

@@ -15,22 +15,22 @@ class ReadingOptions:
     """How an instrument's file becomes rows of a table, as `fitting.read_curves` takes it.
 
     Attributes:
-        columns: which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as
-            offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and retract
-            in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.
+        columns: the channel of each column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as
+            offset_nm=Z:um,lockin_amplitude_nm=Amp:V. Files without a head have numbered channels; approach and retract
+            in two channels are APPROACH/RETRACT: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.
         drive: what drives the tip: a piezo at its base (assumed without this option), or a force (photothermal,
             magnetic).
-        phase_sense: whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the
-            readings decide where they can.
+        phase_sense: whether the phase grows (lag) or falls (lead) as the tip lags further behind its drive; else the
+            readings decide if they can.
         nm_per_volt: sensitivity of an amplitude in volts; `slope`: such that the amplitude falls by 1 nm per nm in
             contact.
         bin_nm: width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins of
             five rows where heights repeat or are not in order.
-        drive_frequency_khz: frequency of the drive; where nothing says it, the free frequency.
+        drive_frequency_khz: frequency of the drive; else that of the file, or the free frequency.
         free_frequency_khz: natural frequency of the free cantilever, '90 +- 0.01' with its error.
         quality_factor: its quality factor, '200 +- 5' with its error.
-        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are
-            over it, in nm^2.
+        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; if unknown,
+            energies are divided by it, in nm^2.
         free_amplitude_nm: amplitude of the free tip; else the median of the rows far from the sample.
         offset_origin_nm: height (growing towards the tip) at which the sample is at the tip's rest position.
         amplitude_error_nm: standard error of every amplitude; else the scatter of the free rows.
@@ -62,11 +62,11 @@ def curves_of_a_file(
     """Read amplitude and phase against height out of an instrument's file.
 
     FILE is neaSNOM text, WSxM curves, an Asylum .ibw ramp, a NanoSurf .nid or Nanonis .dat file, or text separated by
-    tabs, semicolons, commas or blanks, with a head or without (--columns). Says what was found, where each number
-    comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
-    fit`; of a file of several curves one table each, TABLE_1.csv and so on. Repeated and unordered heights become bins.
-    Curves that must not be used (a free amplitude that jumps) are refused by name, and the exit code is 3. Package
-    extra for .ibw: `pip install 'afm-jax[instruments]'`.
+    tabs, semicolons, commas or blanks, with a head or without (--columns). The output says where each number comes
+    from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax fit`; a file of
+    several curves gives a table for each, TABLE_1.csv and so on. Repeated and unordered heights become bins. Curves
+    that must not be used (a free amplitude that jumps) are refused by name, with exit code 3. Extra for .ibw: `pip
+    install 'afm-jax[instruments]'`.
 
     Args:
         session: of the call.

@@ -50,32 +50,32 @@ def simulation(  # noqa: PLR0913
 ) -> Output:
     """Follow a scene in time: contacts, amplitudes, phases, forces, energies.
 
-    SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The start is the
-    file's [start]; without one the tip starts on the single-impact orbit that the law with delay predicts, if there is
-    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth, at the
-    drive's frequency and at the response's, which is 1/N of it where the motion repeats after N drive periods. With
-    --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
-    exit code 3 if the simulation broke off.
+    SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The tip starts at
+    the file's [start]; without one on the single-impact orbit that the law with delay predicts, if there is one.
+    Amplitudes are read over the last response period if the motion has settled, else over the last fifth of the time:
+    at the drive's frequency, and at the response's, which is 1/N of it if the motion repeats after N drive periods.
+    With --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a
+    result; exit code 3 if the simulation broke off.
 
-    With --heights the sample goes through heights over the rest position of a cantilever driven by [force] or [base],
-    and back: amplitude and lag against height, each followed from the motion before until it settles (--periods at
-    most). With --out curve.csv, with noise as `afm-jax tapping` reads it, curve_points.csv without, curve.json and
-    curve.png; exit code 3 if the tip settles at no height.
+    With --heights the cantilever is driven by [force] or [base], and the sample moves through heights over its rest
+    position and back. The output is amplitude and lag against height; at each height the motion is followed from the
+    one before until it settles (--periods at most). With --out curve.csv, with noise, as `afm-jax tapping` reads it;
+    curve_points.csv, without noise; curve.json and curve.png. Exit code 3 if the tip settles at no height.
 
     Args:
         session: for progress and files.
         scene: the scene.
         heights: record an approach curve, both ways: heights of the sample in nm, negative below the rest position.
-        duration_us: how long to follow the scene, in us.
-        periods: how long, in periods of the drive. Without a duration the end is where the motion has settled, after
-            2000 of them at most.
-        harmonics: multiples of the response frequency omega/N at which amplitude and phase are read, besides the
-            drive's (N times it), which always is.
-        accuracy: of every resolved contact: relative of the rebound speed.
+        duration_us: time to follow the scene, in us.
+        periods: the same in periods of the drive. Without either the simulation ends when the motion has settled, or
+            after 2000 periods.
+        harmonics: multiples of the response frequency omega/N at which amplitude and phase are read; they are always
+            read at the drive's.
+        accuracy: relative accuracy of the rebound speed of every resolved contact.
         samples: write trace.csv into --out, too: the deflection over the last response periods at equal steps of time,
             as `afm-jax lockin` reads it.
-        noise: with --heights: of the amplitudes in curve.csv; else 0.3%.
-        phase_noise_deg: with --heights: of the lags in curve.csv; else 0.2.
+        noise: with --heights: noise of the amplitudes in curve.csv; else 0.3%.
+        phase_noise_deg: with --heights: noise of the lags in curve.csv; else 0.2.
     """
     if duration_us is not None and periods is not None:
         raise click.UsageError("--duration-us and --periods say the same: give one of them")

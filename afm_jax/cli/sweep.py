@@ -34,7 +34,7 @@ def sweep(
     plot: bool = False,
     law: Path | None = None,
 ) -> Output:
-    r"""Compute many scenes over the grid of SWEEP.toml, into DIR/sweep.zarr; call it again to go on after a fault.
+    r"""Compute many scenes over the grid of SWEEP.toml into DIR/sweep.zarr; after a fault, the same call continues.
 
     \b
     scene = "scene.toml"                  # or a preset
@@ -50,13 +50,13 @@ def sweep(
     count = 500
     seed = 1
 
-    The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
-    are kept, whatever happens. One sweep at a time: what two write into one folder is undefined.
+    `xarray.open_zarr` opens the results. Other workers give the same numbers except for last digits. Finished chunks
+    are kept, whatever happens. Only one sweep at a time may write into a folder.
 
     Args:
         session: for progress; its folder holds the results.
         sweep: the file.
-        workers: processes of this machine that share its cores, by Dask; 1: this one alone.
+        workers: number of processes that share this machine's cores, by Dask; 1: this process alone.
         scheduler: a Dask scheduler whose workers do the work.
         plot: draw a sweep of one or two axes, sweep.png.
         law: as of other commands.

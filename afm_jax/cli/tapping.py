@@ -33,26 +33,26 @@ def energy_of_taps(  # noqa: PLR0913
     scale_errors: bool = False,
     **reading: Any,
 ) -> Output:
-    """Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
+    """Determine the energy of a tap from a tapping curve, and above resonance the impact law.
 
     CURVE is a table of amplitude and phase against height (`# drive = force` or base, columns drive_frequency_khz,
     free_amplitude_nm, offset_nm, lockin_amplitude_nm, phase_lag_deg with their errors, retract), or an instrument's
-    file, as for `afm-jax read`. Energy, thresholds and hysteresis, attractive or repulsive branch, impact speeds where
-    they can be known; then the law from the rows with fast impacts, or why not and what to record instead. With --out
-    the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law. Several files, or a file of
-    several curves, are taken as of one lever: frequency and Q are fitted to all, the scatter from curve to curve stands
-    beside the errors, with --out in together.html, .txt, .json, .png; each curve has a folder of its own.
-    Exit code 3 if the energy of a tap is not determined.
+    file, as for `afm-jax read`. The output gives the energy along the attractive and the repulsive branch, thresholds,
+    hysteresis, and impact speeds if they can be determined; then the law from the rows with fast impacts, or why there
+    is none and what to record instead. With --out the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and
+    that of the law. Several files, or several curves of a file, are assumed to be of one lever: frequency and Q are
+    fitted to all of them, and the scatter from curve to curve stands beside the errors (with --out together.html, .txt,
+    .json, .png, and a folder for each curve). Exit code 3 if the energy of a tap is not determined.
 
     Args:
         session: for progress and files.
         curve_files: files.
         noise: relative error of amplitudes without one, such as 1%.
         curve: only this curve of an instrument's file.
-        model: of the law, as for `afm-jax fit`.
+        model: model of the law, as for `afm-jax fit`.
         example: analyse the bundled raw file, simulated with the defects of real ones.
-        no_law: leave the impact law out: energy, thresholds and speeds only, at once.
-        scale_errors: multiply the rows' errors where they scatter more (up to three times), instead of refusing their
+        no_law: do not fit the impact law: energy, thresholds and speeds only.
+        scale_errors: multiply the rows' errors (by 3 at most) where rows scatter more, instead of refusing their
             energy.
         **reading: as `ReadingOptions`.
     """

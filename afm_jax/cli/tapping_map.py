@@ -18,19 +18,19 @@ class ImagingOptions:
 
     Attributes:
         drive: what is driven.
-        phase_sense: whether the phase grows as the tip lags behind its drive more (lag), or falls (lead); else the
-            readings decide where they can.
-        drive_frequency_khz: frequency of the drive; where nothing says it, the free frequency.
+        phase_sense: whether the phase grows (lag) or falls (lead) as the tip lags further behind its drive; else the
+            readings decide if they can.
+        drive_frequency_khz: frequency of the drive; else the free frequency.
         free_frequency_khz: natural frequency of the free cantilever, '90 +- 0.01' with its error.
         quality_factor: its quality factor, '200 +- 5' with its error.
-        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are
-            over it, in nm^2.
+        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; if unknown,
+            energies are divided by it, in nm^2.
         free_amplitude_nm: amplitude of the free tip, as the instrument reads it, '13.4 +- 0.1'.
         free_phase_deg: phase of the free tip, as the instrument reads it, '90 +- 0.05' [its error: 0.2].
         nm_per_volt: sensitivity of an amplitude in volts.
         tip_calibration: true over stated amplitude; '1 +- 0.02'.
-        amplitude_error_nm: standard error of a pixel's.
-        phase_error_deg: standard error of a pixel's.
+        amplitude_error_nm: standard error of a pixel's amplitude.
+        phase_error_deg: standard error of a pixel's phase.
     """
 
     drive: Literal["base", "force"] = "base"
@@ -56,22 +56,22 @@ def map_of_an_image(
     formats: Annotated[Sequence[Literal["npz", "gsf", "zarr"]], "--format"] = ("npz",),
     **imaging: Any,
 ) -> Output:
-    """Read the energy of a tap and the virial off every pixel of an image of amplitude and phase.
+    """Determine the energy of a tap and the virial at every pixel of an image of amplitude and phase.
 
     IMAGE is a NumPy file (.npz with the arrays amplitude and phase, or .npy of the two), text of numbers with
-    amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw
-    (`pip install 'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs
-    its program on the file). Needed are amplitude and phase of the free tip, at the same drive. Each pixel has its own
-    error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said once.
-    Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
-    With --out map.png, .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the
-    median energy is below zero or only bracketed, or the sense of the phase decides and is not known.
+    amplitude, PHASE_IMAGE then the phase, or an instrument's file with channels of both: Asylum .ibw (`pip install
+    'afm-jax[instruments]'`), and all that Gwyddion reads (`pip install 'afm-jax[gwyddion]'`, which runs its program on
+    the file). Amplitude and phase of the free tip at the same drive are required. Each pixel has its own error; the
+    common error (spring constant, frequency, Q, calibration, free amplitude and phase) is given once. Pixels out of
+    range (amplitude above the free one, energy below zero beyond its error) are masked and counted. With --out map.png,
+    .json, .txt and the arrays. Exit code 3 if most pixels are out of range, the median energy is below zero or only
+    bracketed, or the unknown sense of the phase decides.
 
     Args:
         session: of the call.
         image: the file.
         phase_image: the phase, if in a file of its own.
-        columns: which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.
+        columns: the image of each quantity, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.
         formats: of the arrays written into --out (gsf: for Gwyddion); may be given several times.
         **imaging: as `ImagingOptions`.
     """
