@@ -10,8 +10,7 @@ from collections.abc import Callable
 
 import click
 
-from afm_jax.scenefile.tables import cut_short
-from afm_jax.words import shown
+from afm_jax.words import cut_short, shown
 
 _OWN_PACKAGES = ("afm_jax", "fitting")
 _NUMERICAL_PACKAGES = frozenset(

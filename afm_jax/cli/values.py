@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.session import add_note
-from afm_jax.scenefile.tables import cut_short
+from afm_jax.words import cut_short
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
