@@ -46,7 +46,6 @@ With [base] or [force] the platform may rest: without `amplitude_nm` and frequen
 import os
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -342,9 +341,9 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
     numbers, delay = table.numbers("r"), tables.get("interaction.delay")
     if delay is None:
         return table.build(ImpactLaw, **numbers)
-    # what has a default may be left out
-    required = (field.name for field in fields(CollisionDelay) if field.default is MISSING)
-    parameters = delay.numbers(*required) | {"corrections": delay.truth("corrections", usual=True)}
+    parameters = delay.numbers("hertz", "lead_nm", "offset_nm") | {
+        "corrections": delay.truth("corrections", usual=True)
+    }
     return table.build(ImpactLaw, **numbers, delay=delay.build(CollisionDelay, **parameters))
 
 
@@ -455,9 +454,8 @@ def check_start(start: Start, scene: Scene) -> None:
         ValueError: if it cannot; says why.
     """
     height = start.height_above_platform_nm
-    check_parameter("phase_deg", start.phase_deg, "finite")
-    check_parameter("velocity_nm_per_us", start.velocity_nm_per_us, "finite")
-    check_parameter("height_above_platform_nm", height, "finite")
+    for name, value in start._asdict().items():
+        check_parameter(name, value, "finite")
     if scene.interaction is None:
         return
     if isinstance(scene.interaction, Law):
