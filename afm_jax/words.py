@@ -183,3 +183,21 @@ def shown(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(sign if sign.isprintable() or sign in "\n\t" else repr(sign)[1:-1] for sign in text)
+
+
+def printable(text: str) -> str:
+    """Return a text that fits on one line of a message: escaped where it holds line breaks or control characters.
+
+    What is far longer than names are is cut in its middle.
+    """
+    short = cut_short(text, _LONGEST_NAME)
+    return short if short.isprintable() else repr(short)
+
+
+_LONGEST_NAME = 300
+
+
+def cut_short(text: str, length: int) -> str:
+    """Return a text without its middle where it is longer than a number of letters."""
+    half = (length - 5) // 2
+    return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"

@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import Tone
+from afm_jax.apparatus.drives import ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.trigonometry import sine_cosine
+from afm_jax.impact.law import ImpactLaw
 from tests.reference_examples import scene
 from tests.reference_flight import free_flight, mp, platform_motion
 
@@ -150,3 +152,13 @@ def test_the_top_speed_of_a_platform_counts_its_second_tone():
     assert float(platform.top_speed_nm_per_us) == pytest.approx(expected, rel=1e-14)
     assert speeds.max() <= expected
     assert speeds.max() > 2e-3 * np.pi * 4.0 * 180.0
+
+
+def test_a_platform_at_rest_needs_neither_amplitude_nor_frequency():
+    lever, rest = Cantilever(90.0, 40.0), Platform(offset_nm=-30.0)
+    # as of a scene file: phases count in the drive that moves, or in the free frequency
+    for force, frequency in ((ForceDrive(1.0, 91.0), 91.0), (None, 90.0)):
+        platform = Scene(lever, rest, ImpactLaw(0.9), force=force).platform
+        assert (float(platform.frequency_khz), float(platform.position(3.0))) == (frequency, -30.0)
+    with pytest.raises(ValueError, match="`frequency_khz` must be positive, but is 0"):
+        Platform(4.0)

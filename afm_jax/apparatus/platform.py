@@ -71,8 +71,7 @@ class MovingSurface(eqx.Module):
 
     def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return height in nm and velocity in nm/us at a time in us."""
-        motion = self.motion(time_us)
-        return motion.position, motion.velocity
+        return self.motion(time_us)[:2]
 
     def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return the height in nm at a time in us."""

@@ -37,21 +37,14 @@ class Scene(eqx.Module):
 
     __repr__ = readable
 
-    def __init__(
-        self,
-        cantilever: Cantilever,
-        platform: Platform,
-        interaction: Any = None,
-        base: BaseDrive | None = None,
-        force: ForceDrive | None = None,
-    ) -> None:
-        """Keep the parts; a platform at rest without a frequency has that of base, force or cantilever."""
+    def __post_init__(self):
+        platform = self.platform
         if isinstance(platform, Platform) and platform.takes_any_frequency:
-            frequency = getattr(base or force or cantilever, "frequency_khz", platform.frequency_khz)
-            platform = eqx.tree_at(lambda part: part.frequency_khz, platform, frequency)
-        self.cantilever, self.platform, self.base, self.force = cantilever, platform, base, force
-        # of the law of a fit the law alone
-        self.interaction = interaction.for_scene() if hasattr(interaction, "for_scene") else interaction
+            frequency = getattr(self.base or self.force or self.cantilever, "frequency_khz", platform.frequency_khz)
+            self.platform = eqx.tree_at(lambda part: part.frequency_khz, platform, frequency)
+        if hasattr(self.interaction, "for_scene"):
+            # of the law of a fit the law alone
+            self.interaction = self.interaction.for_scene()
 
     def __check_init__(self):
         kinds = {"cantilever": Cantilever, "platform": Platform, "base": BaseDrive, "force": ForceDrive}

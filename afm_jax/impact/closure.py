@@ -240,8 +240,8 @@ def near_fold(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
     """Return Y^2 (cosine^2 + sine^2 - determinant^2) without a delay: a quartic in Y/(beta omega)."""
-    cantilever, platform, _, order = problem
-    law = _law_of(problem)
+    cantilever, platform, law, order = problem
+    assert isinstance(law, ImpactLaw)  # the formula alone makes a quartic  # noqa: S101
     flight = _returning_flight(cantilever, order * platform.period_us)
     top_speed = platform.top_speed_nm_per_us
     square = (law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2) / top_speed**2
@@ -251,11 +251,6 @@ def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
     cosine, sine = _instantaneous(approach, rebound, jnp.array([0.0, 1.0, 0.0]), flight, platform)
     quartic = _squared(cosine) + _squared(sine)
     return quartic.at[2].add(-(flight.closing**2))
-
-
-def _law_of(problem: OrbitProblem) -> ImpactLaw:
-    assert isinstance(problem.impact, ImpactLaw)  # the formula alone makes a quartic  # noqa: S101
-    return problem.impact
 
 
 class _ReturningFlight(NamedTuple):
@@ -404,13 +399,10 @@ def coordinates_of_roots(problem: OrbitProblem, scan: Scan = FINE) -> Coordinate
     """
     problem = lax.stop_gradient(problem)
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
-    coordinate, found, complete = _quartic_roots(problem) if _is_quartic(problem) else _scanned_roots(problem, scan)
+    # the closing condition is a quartic of the formula without a delay alone
+    quartic = isinstance(problem.impact, ImpactLaw) and not problem.impact.delayed
+    coordinate, found, complete = _quartic_roots(problem) if quartic else _scanned_roots(problem, scan)
     return Coordinates(jnp.where(found, coordinate, harmless_coordinate(problem)), found & driven, complete)
-
-
-def _is_quartic(problem: OrbitProblem) -> bool:
-    """Say whether the closing condition is a quartic: that of the formula without a delay."""
-    return isinstance(problem.impact, ImpactLaw) and not problem.impact.delayed
 
 
 def first_seen(coordinate: Any, found: Any) -> Any:

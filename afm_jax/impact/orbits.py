@@ -4,10 +4,10 @@
 condition (`closure`) are approach speeds; `orbit_state` makes of a root the motion, the flight between two impacts;
 `is_admissible` says whether the flight passes through the platform, `is_stable` judges by the map's Jacobian (eq. 8);
 at the end stands what an experiment reads of the flight: peak height, lock-in amplitude and phase. Fits take the same
-functions for impacts of every kind (`coordinates_of_roots`, `is_steady`, `amplitudes`).
+functions for impacts of every kind (`coordinates_of_roots`, `steady_orbits`, `amplitudes`).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -351,25 +351,14 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     """
     problem = lax.stop_gradient(problem)
     roots = find_roots(problem, COARSE)
-    judged = jax.vmap(is_steady, in_axes=(0, 0, 0, None))
-    steady, readings = judged(roots.place, roots.found, roots.slopes, problem)
+
+    def judged(place: OrbitPlace, found: Bool[Array, ""], slopes: Float[Array, "5 2"] | None) -> Any:
+        state = orbit_state(place, problem)
+        steady = is_admissible(found, state, problem) & is_stable(place, slopes, state, problem)
+        return steady, _readings(state, problem)
+
+    steady, readings = jax.vmap(judged)(roots.place, roots.found, roots.slopes)
     return SteadyOrbits(roots.place, steady, roots.near_fold, readings, roots.slopes)
-
-
-def is_steady(
-    place: OrbitPlace, found: Bool[Array, ""], slopes: Float[Array, "5 2"] | None, problem: OrbitProblem
-) -> tuple[Bool[Array, ""], Float[Array, " 3"]]:
-    """Say whether a root is a steady motion, admissible and stable, and return its readings as of `SteadyOrbits`.
-
-    Args:
-        place: the root.
-        found: whether there is one.
-        slopes: of `FollowedRoot`.
-        problem: what it is an orbit of.
-    """
-    state = orbit_state(place, problem)
-    steady = is_admissible(found, state, problem) & is_stable(place, slopes, state, problem)
-    return steady, _readings(state, problem)
 
 
 def is_stable(

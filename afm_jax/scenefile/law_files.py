@@ -17,7 +17,7 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -25,16 +25,18 @@ import numpy as np
 from afm_jax.checks import checked
 from afm_jax.impact.law import CollisionDelay, TabulatedLaw, law_of_dict
 from afm_jax.saved import FIT_FORMAT, why_no_fit
-from afm_jax.scenefile.tables import SceneError, printable, read_text
+from afm_jax.scenefile.tables import SceneError, read_text
 from afm_jax.strict_json import strict_json
 from afm_jax.units import effective_mass_ng
 from afm_jax.whole_files import write_whole
+from afm_jax.words import printable
 
 FORMAT, FORMAT_VERSION = "afm-jax law", 1
 _SPEED_UNITS = {"nm_per_us": 1.0, "um_per_s": 1e-3, "mm_per_s": 1.0, "m_per_s": 1e3}
 _TIME_UNITS = {"us": 1.0, "ns": 1e-3, "ms": 1e3, "s": 1e6}
-_COLUMNS = {"approach_speed": _SPEED_UNITS, "rebound_speed": _SPEED_UNITS, "rebound_speed_error": _SPEED_UNITS}
-_COLUMNS |= {"collision_delay": _TIME_UNITS, "collision_delay_error": _TIME_UNITS}
+_COLUMNS = ("approach_speed", "rebound_speed", "rebound_speed_error", "collision_delay", "collision_delay_error")
+_COLUMN = re.compile(r"(approach_speed|rebound_speed(?:_error)?|collision_delay(?:_error)?)(?:_(.*))?")
+"""A column's kind and its unit."""
 _BANDS = ("rebound_low", "rebound_high", "delay_low", "delay_high")
 """Further columns of a fit's law.csv: its band, which cannot be drawn from a table alone."""
 _COLLIDED = ("captured", "outcome", "time_in_", "deepest_gap_", "bridge_", "junction_", "viscous_loss_", "end_energy_")
@@ -132,47 +134,38 @@ def _of_json(text: str) -> tuple[TabulatedLaw, Mapping[str, Any]]:
 
 
 def _of_csv(text: str) -> TabulatedLaw:
-    settings: dict[str, str] = {}
-    lines = []
-    for number, line in enumerate(text.splitlines(), 1):
-        if line.lstrip().startswith("#"):
-            key, equals, value = line.lstrip(" #\t").partition("=")
-            if equals:
-                settings[key.strip()] = value.strip()
-        elif line.strip():
-            lines.append((number, line))
+    rows = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    comments = [line.lstrip("# \t").partition("=") for _, line in rows if line.startswith("#")]
+    settings = {key.strip(): value.strip() for key, equals, value in comments if equals}
+    lines = [(number, line) for number, line in rows if not line.startswith("#")]
     if not lines:
         raise ValueError("is empty: a law needs a column of approach speeds and one of rebound speeds")
     delimiter = next((mark for mark in (",", ";", "\t") if mark in lines[0][1]), ",")
-    names = [cell.strip() for cell in next(csv.reader([lines[0][1]], delimiter=delimiter))]
+    names, *cells = (
+        [cell.strip() for cell in row] for row in csv.reader((line for _, line in lines), delimiter=delimiter)
+    )
     columns = _columns_of(names)
-    values: dict[str, list[float]] = {kind: [] for kind, _, _ in columns}
-    for number, line in lines[1:]:
-        cells = next(csv.reader([line], delimiter=delimiter))
-        if len(cells) != len(names):
-            raise ValueError(f"line {number} has {len(cells)} values for {len(names)} columns")
-        stays = "captured" in names and cells[names.index("captured")].strip().lower() == "true"
-        for kind, place, unit in columns:
-            empty = stays and kind != "approach_speed" and not cells[place].strip()
-            values[kind].append(0.0 if empty else _number(cells[place], names[place], number) * unit)
-    numbers = {key: _setting(key, settings[key]) for key in _NUMBERS if key in settings}
-    law = _law_of_columns({kind: np.array(column) for kind, column in values.items()}, numbers, settings)
-    return _as_corrected(law, settings.get("corrections", "true"))
+    values: dict[str, list[float]] = {kind: [] for kind in columns}
+    for (number, _), row in zip(lines[1:], cells, strict=True):
+        if len(row) != len(names):
+            raise ValueError(f"line {number} has {len(row)} values for {len(names)} columns")
+        stays = "captured" in names and row[names.index("captured")].lower() == "true"
+        for kind, (place, unit) in columns.items():
+            empty = stays and kind != "approach_speed" and not row[place]
+            value = 0.0 if empty else _number(row[place], f"line {number}: `{names[place]}`")
+            values[kind].append(value * _units_of(kind)[unit])
+    return _law_of_columns({kind: np.array(column) for kind, column in values.items()}, settings)
 
 
-def _as_corrected(law: TabulatedLaw, corrections: str) -> TabulatedLaw:
-    """Return a law with or without what happens while an impact lasts."""
+def _law_of_columns(values: Mapping[str, np.ndarray], settings: Mapping[str, str]) -> TabulatedLaw:
+    """Return the law of columns and of what the comments say of it."""
+    numbers = {key: _number(settings[key], f"`# {key}`") for key in _NUMBERS if key in settings}
+    for key, value in numbers.items():
+        if not (math.isfinite(value) and value >= 0.0):
+            raise ValueError(f"`# {key}` must be finite and not negative, but is {settings[key]}")
+    corrections = settings.get("corrections", "true")
     if corrections not in ("true", "false"):
         raise ValueError(f"`# corrections` must be true or false, but is {corrections!r}")
-    if law.delay is None or corrections == "true":
-        return law
-    delay = CollisionDelay(law.delay.hertz, law.delay.lead_nm, law.delay.offset_nm, corrections=False)
-    return eqx.tree_at(lambda law: law.delay, law, delay)
-
-
-def _law_of_columns(
-    values: Mapping[str, np.ndarray], numbers: Mapping[str, float], settings: Mapping[str, str]
-) -> TabulatedLaw:
     mass = numbers.get("mass_ng")
     if mass is None and "spring_constant_n_per_m" in numbers:
         if "frequency_khz" not in numbers:
@@ -194,79 +187,59 @@ def _law_of_columns(
         if column is not None and not (np.isfinite(column).all() and (column >= 0.0).all()):
             raise ValueError("errors must be finite and not negative")
     if all(column is None for column in errors):
-        return TabulatedLaw(*columns, **options)
-    rows = len(columns[0])
-    of_rebound, of_delay = (np.zeros(rows) if column is None else column for column in errors)
-    # every reading has its own error
-    none = np.zeros((rows, rows))
-    return TabulatedLaw.with_errors(
-        *columns,
-        rebound_changes=np.concatenate([np.diag(of_rebound), none]),
-        delay_changes=None if columns[2] is None else np.concatenate([none, np.diag(of_delay)]),
-        **options,
-    )
+        law = TabulatedLaw(*columns, **options)
+    else:
+        rows = len(columns[0])
+        of_rebound, of_delay = (np.zeros(rows) if column is None else column for column in errors)
+        # every reading has its own error
+        none = np.zeros((rows, rows))
+        law = TabulatedLaw.with_errors(
+            *columns,
+            rebound_changes=np.concatenate([np.diag(of_rebound), none]),
+            delay_changes=None if columns[2] is None else np.concatenate([none, np.diag(of_delay)]),
+            **options,
+        )
+    if law.delay is None or corrections == "true":
+        return law
+    delay = CollisionDelay(law.delay.hertz, law.delay.lead_nm, law.delay.offset_nm, corrections=False)
+    return eqx.tree_at(lambda law: law.delay, law, delay)
 
 
-def _columns_of(names: list[str]) -> list[tuple[str, int, float]]:
-    """Return kind, place and unit of the columns that a law's table has."""
-    found: dict[str, tuple[str, int, float]] = {}
-    units: dict[str, str] = {}
+def _columns_of(names: list[str]) -> dict[str, tuple[int, str]]:
+    """Return place and unit of the columns that a law's table has, by their kinds."""
+    columns: dict[str, tuple[int, str]] = {}
     for place, name in enumerate(names):
-        kind, unit = _kind_of(name)
-        if kind is None:
+        matched = _COLUMN.fullmatch(name)
+        if matched is None and name.startswith((*_BANDS, *_COLLIDED)):
             continue
-        if kind in found:
-            raise ValueError(f"has two columns of {kind}: {names[found[kind][1]]} and {name}")
-        found[kind], units[kind] = (kind, place, _COLUMNS[kind][unit]), unit
-    missing = [kind for kind in ("approach_speed", "rebound_speed") if kind not in found]
+        if matched is None:
+            known = ", ".join(_COLUMNS)
+            raise ValueError(f"column {printable(name)} is none of a law's; it has {known}, each with its unit")
+        kind, unit = matched.groups()
+        units = _units_of(kind)
+        if unit is None:
+            raise ValueError(f"column {name}: the unit is missing; use {name}_{next(iter(units))}")
+        if unit not in units:
+            raise ValueError(f"column {printable(name)}: the unit is not known; use one of {', '.join(units)}")
+        if kind in columns:
+            raise ValueError(f"has two columns of {kind}: {names[columns[kind][0]]} and {name}")
+        columns[kind] = place, unit
+    missing = [kind for kind in ("approach_speed", "rebound_speed") if kind not in columns]
     if missing:
         raise ValueError(f"has no column {missing[0]}_nm_per_us; it has {', '.join(names)}")
-    speeds = {kind: unit for kind, unit in units.items() if _COLUMNS[kind] is _SPEED_UNITS}
+    speeds = {kind: unit for kind, (_, unit) in columns.items() if "speed" in kind}
     if len(set(speeds.values())) > 1:
-        told = " and ".join(f"{kind} in {unit}" for kind, unit in speeds.items())
-        raise ValueError(f"has speeds in mixed units, {told}: write all in one")
-    return list(found.values())
+        mixed = " and ".join(f"{kind} in {unit}" for kind, unit in speeds.items())
+        raise ValueError(f"has speeds in mixed units, {mixed}: write all in one")
+    return columns
 
 
-def _kind_of(name: str) -> tuple[str | None, str]:
-    """Return what a column is, None if it is nothing of a law, and its unit."""
-    for kind, units in _COLUMNS.items():
-        unit = name.removeprefix(f"{kind}_")
-        if unit in units and unit != name:
-            return kind, unit
-    if any(name == kind for kind in _COLUMNS):
-        usual = "nm_per_us" if _COLUMNS[name] is _SPEED_UNITS else "us"
-        raise ValueError(f"column {name}: the unit is missing; use {name}_{usual}")
-    quantity = re.match(r"(approach|rebound)_speed(_error)?_|collision_delay(_error)?_", name)
-    if quantity:
-        units = _SPEED_UNITS if "speed" in name else _TIME_UNITS
-        raise ValueError(f"column {printable(name)}: the unit is not known; use one of {', '.join(units)}")
-    if name.startswith((*_BANDS, *_COLLIDED)):
-        return None, ""
-    raise ValueError(f"column {printable(name)} is none of a law's; it has {', '.join(_COLUMNS)}, each with its unit")
+def _units_of(kind: str) -> Mapping[str, float]:
+    return _SPEED_UNITS if "speed" in kind else _TIME_UNITS
 
 
-def _number(cell: str, name: str, line: int) -> float:
+def _number(text: str, what: str) -> float:
     try:
-        return float(cell)
+        return float(text)
     except ValueError:
-        _fail(f"line {line}: `{name}` must be a number, but is {cell.strip()!r}")
-
-
-def _setting(key: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        _fail(f"`# {key}` must be a number, but is {text!r}")
-    if not (math.isfinite(value) and value >= 0.0):
-        _fail(f"`# {key}` must be finite and not negative, but is {text}")
-    return value
-
-
-def _fail(message: str) -> NoReturn:
-    raise ValueError(message)
-
-
-def law_beside(scene_file: str, given: str) -> TabulatedLaw:
-    """Return the law of a file that a scene file names, its path relative to the scene file's folder."""
-    return load_law(Path(scene_file).parent / given)
+        raise ValueError(f"{what} must be a number, but is {text!r}") from None

@@ -7,7 +7,7 @@ or force make of the free tip, `force.free_amplitude_nm`, sets their amplitude, 
 
 import difflib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -118,18 +118,22 @@ def check_ranges(scene: Scene, *ranges: ParameterRange) -> None:
     Raises:
         ValueError: if not; one line that names what exists, or what is wrong with an end.
     """
-    values = parameter_values(scene)
-    for given in ranges:
-        if given.path not in values:
-            nearest = difflib.get_close_matches(given.path, values, n=1)
-            meant = f"did you mean {nearest[0]}? " if nearest else ""
-            raise ValueError(f"the scene has no parameter `{given.path}`; {meant}it has {', '.join(values)}")
+    _check_paths(scene, [given.path for given in ranges])
     places = [_leaf_path(given.path) for given in ranges]
     if len(set(places)) < len(places):
         raise ValueError(f"the ranges {' and '.join(map(str, ranges))} change the same parameter: give two different")
     for given in ranges:
         for end in (given.low, given.high):
             scene_of_tables(_tables_with(scene, given.path, end), str(given))
+
+
+def _check_paths(scene: Scene, paths: Sequence[str]) -> None:
+    existing = parameter_values(scene)
+    for path in paths:
+        if path not in existing:
+            nearest = difflib.get_close_matches(path, existing, n=1)
+            meant = f"did you mean {nearest[0]}? " if nearest else ""
+            raise ValueError(f"the scene has no parameter `{path}`; {meant}it has {', '.join(existing)}")
 
 
 def _leaf_path(path: str) -> str:
@@ -165,23 +169,14 @@ def scene_family(scene: Scene, *paths: str) -> Callable[..., Scene]:
     Raises:
         ValueError: if the scene lacks one, with what it has.
     """
-    existing = parameter_values(scene)
-    for path in paths:
-        if path not in existing:
-            raise ValueError(f"the scene has no parameter `{path}`; it has {', '.join(existing)}")
+    _check_paths(scene, paths)
     if len(set(paths)) < len(paths):
         raise ValueError(f"a parameter is named twice: {', '.join(paths)}")
-    of_contact = [path for path in paths if path.startswith("interaction.") and _is_contact(scene)]
-    contact = _contact_family(scene, tuple(path.partition(".")[2] for path in of_contact)) if of_contact else None
 
     def at(*values: ArrayLike) -> Scene:
         if len(values) != len(paths):
             raise TypeError(f"there are {len(values)} values for {len(paths)} parameters: {', '.join(paths)}")
-        given = dict(zip(paths, values, strict=True))
-        made = with_numbers(scene, {path: value for path, value in given.items() if path not in of_contact})
-        if contact is not None:
-            made = eqx.tree_at(lambda part: part.interaction, made, contact(*(given[path] for path in of_contact)))
-        return made
+        return with_numbers(scene, dict(zip(paths, values, strict=True)))
 
     return at
 
@@ -201,30 +196,25 @@ def scene_batch(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
     return jax.vmap(scene_family(scene, *values))(*columns)
 
 
-def _is_contact(scene: Scene) -> bool:
-    return hasattr(scene.interaction, "forces")
-
-
-def _contact_family(scene: Scene, names: tuple[str, ...]) -> Callable[..., object]:
-    # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
-
-    numbers = contact_parameters(scene.interaction)
-    effects = scene.interaction.effects
-    return lambda *values: Contact.of(effects, **(numbers | dict(zip(names, values, strict=True))))
-
-
 def with_numbers(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
-    """Return a scene with numbers of cantilever, drives and law replaced, by their paths; they may be traced."""
-    # the cantilever first: reduced frequencies are in its unit; free amplitudes last, which hang on both
+    """Return a scene with some of its numbers replaced, by their paths; the new ones may be traced."""
     unknowns = [path for path in values if path.startswith(UNKNOWN)]
     if unknowns:
         steps = jnp.zeros(scene.interaction.unknowns)
         for path in unknowns:
             steps = steps.at[int(path.removeprefix(UNKNOWN)) - 1].set(values[path])
         scene = eqx.tree_at(lambda parts: parts.interaction, scene, scene.interaction.moved(steps))
-    values = {path: value for path, value in values.items() if path not in unknowns}
+    of_contact = [path for path in values if path.startswith("interaction.") and hasattr(scene.interaction, "forces")]
+    if of_contact:
+        # only here, so that scenes with a law do without the contact's modules
+        from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
+
+        contact = scene.interaction
+        numbers = contact_parameters(contact) | {path.partition(".")[2]: values[path] for path in of_contact}
+        made = type(contact).of(contact.effects, **numbers)
+        scene = eqx.tree_at(lambda parts: parts.interaction, scene, made)
+    # the cantilever first: reduced frequencies are in its unit; free amplitudes last, which hang on both
+    values = {path: value for path, value in values.items() if path not in (*unknowns, *of_contact)}
     for path in sorted(
         values, key=lambda path: (path.endswith("free_amplitude_nm"), not path.startswith("cantilever"))
     ):

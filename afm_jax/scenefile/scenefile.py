@@ -46,7 +46,6 @@ With [base] or [force] the platform may rest: without `amplitude_nm` and frequen
 import os
 import tomllib
 from collections.abc import Mapping
-from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -56,14 +55,14 @@ import tomli_w
 from jaxtyping import ArrayLike
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
+from afm_jax.apparatus.drives import SAME_FREQUENCY, BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, check_mass, drive_of
 from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
 from afm_jax.checks import check_parameter, checked
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law, TabulatedLaw, law_of_dict
 from afm_jax.motion.record import State
-from afm_jax.scenefile.law_files import law_beside
+from afm_jax.scenefile.law_files import load_law
 from afm_jax.scenefile.presets import PRESETS, STARTS
 from afm_jax.scenefile.tables import (
     INNER_TABLES,
@@ -75,16 +74,14 @@ from afm_jax.scenefile.tables import (
     Start,
     advise_table,
     in_words,
-    printable,
     read_text,
 )
 from afm_jax.whole_files import write_whole
+from afm_jax.words import printable
 
 Excited = TypeVar("Excited", BaseDrive, ForceDrive)
 Driven = TypeVar("Driven", Platform, BaseDrive, ForceDrive)
 
-_SAME_FREQUENCY = 1e-12
-"""Relative distance of two frequencies that only rounding makes different."""
 MASS_ASSUMED = (
     "1 ng assumed: the file does not give the tip's mass, and all energies and speeds of a contact depend on it; give "
     "mass_ng or spring_constant_n_per_m"
@@ -257,15 +254,13 @@ def _scene_of(tables: dict[str, SceneTable]) -> Scene:
 def _platform_of(
     tables: Mapping[str, SceneTable], cantilever: Cantilever, excitation: BaseDrive | ForceDrive | None
 ) -> Platform:
-    """Return the platform; a resting one under another drive takes that drive's frequency if it has none of its own."""
+    """Return the platform, which under another drive may rest without a frequency of its own."""
     table = tables["platform"]
     may_rest = excitation is not None and "platform.second" not in tables
-    needed = () if may_rest else ("amplitude_nm",)
-    numbers = {"amplitude_nm": 0.0} | table.numbers(*needed)
-    has_frequency = "frequency_khz" in numbers or "reduced_frequency" in numbers
-    if excitation is not None and may_rest and numbers["amplitude_nm"] == 0.0 and not has_frequency:
-        return table.build(Platform, **numbers, frequency_khz=excitation.frequency_khz)
-    platform = table.build(Platform, **_with_frequency(table, numbers, cantilever))
+    numbers = table.numbers(*(() if may_rest else ("amplitude_nm",)))
+    if may_rest and not numbers.get("amplitude_nm") and not {"frequency_khz", "reduced_frequency"} & set(numbers):
+        return table.build(Platform, **numbers)
+    platform = table.build(Platform, **_with_frequency(table, {"amplitude_nm": 0.0} | numbers, cantilever))
     return _with_second(tables, "platform", platform, cantilever)
 
 
@@ -276,28 +271,28 @@ def _excitation_of(
     table = tables.get(name)
     if table is None:
         return None
-    numbers = _tone_of_excitation(table, name, kind, cantilever)
-    drive = _with_second(tables, name, table.build(kind, **numbers), cantilever)
+    drive = _with_second(tables, name, table.build(kind, **_tone(table, name, cantilever)), cantilever)
     table.build(check_steady_response, cantilever, drive.tones, name)
     return drive
 
 
-def _tone_of_excitation(
-    table: SceneTable, name: str, kind: type[BaseDrive | ForceDrive], cantilever: Cantilever
-) -> dict[str, float]:
-    """Return the numbers of a tone of base or force, with its own amplitude in place of the free tip's height."""
+def _tone(table: SceneTable, name: str, cantilever: Cantilever) -> dict[str, float]:
+    """Return the numbers of a tone of a drive, with its own amplitude in place of the free tip's height."""
     amplitude, free = _amplitude(name), "free_amplitude_nm"
     if amplitude in table.values and free in table.values:
         table.fail(f"has both {amplitude} and {free}; give one of them")
     given = free if free in table.values else amplitude
-    numbers = _with_frequency(table, table.numbers(given), cantilever)
+    numbers = table.numbers(given)
     table.build(check_parameter, given, numbers[given], "not negative")
+    numbers = _with_frequency(table, numbers, cantilever)
     if given == free:
         # the tone's amplitude only says that it moves
         tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
         table.build(check_steady_response, cantilever, (tone,), name)
-        per_height = float(drive_per_free_height(cantilever, numbers["frequency_khz"], kind))
-        numbers[amplitude] = numbers.pop(free) * per_height
+        kind = ForceDrive if name == "force" else BaseDrive
+        numbers[amplitude] = numbers.pop(free) * float(
+            drive_per_free_height(cantilever, numbers["frequency_khz"], kind)
+        )
     return numbers
 
 
@@ -306,14 +301,8 @@ def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, can
     table = tables.get(f"{name}.second")
     if table is None:
         return drive
-    key = _amplitude(name)
-    if isinstance(drive, Platform):
-        numbers = table.numbers(key)
-        table.build(check_parameter, key, numbers[key], "not negative")
-        numbers = _with_frequency(table, numbers, cantilever)
-    else:
-        numbers = _tone_of_excitation(table, name, type(drive), cantilever)
-    second = table.build(Tone, numbers.pop(key), **numbers)
+    numbers = _tone(table, name, cantilever)
+    second = table.build(Tone, numbers.pop(_amplitude(name)), **numbers)
     if _same_frequency(drive, second):
         table.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
     return eqx.tree_at(lambda drive: drive.second, drive, second, is_leaf=lambda leaf: leaf is None)
@@ -321,17 +310,19 @@ def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, can
 
 def _with_frequency(table: SceneTable, numbers: dict[str, float], cantilever: Cantilever) -> dict[str, float]:
     """Return a drive's numbers with `frequency_khz`, whichever way the table gives it."""
-    reduced = numbers.get("reduced_frequency")
-    if reduced is not None and "frequency_khz" in numbers:
-        table.fail("has both frequency_khz and reduced_frequency; give one of them")
-    if reduced is None and "frequency_khz" not in numbers:
-        table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
-    if reduced is None:
-        return numbers
-    table.build(check_parameter, "reduced_frequency", reduced, "positive")
-    others = {key: value for key, value in numbers.items() if key != "reduced_frequency"}
-    # omega / 2 Omega
-    return {**others, "frequency_khz": 2.0 * reduced * float(cantilever.frequency_khz)}
+    reduced = numbers.pop("reduced_frequency", None)
+    if (reduced is None) == ("frequency_khz" not in numbers):
+        both = reduced is not None
+        table.fail(
+            "has both frequency_khz and reduced_frequency; give one of them"
+            if both
+            else "the drive frequency is missing; add frequency_khz or reduced_frequency"
+        )
+    if reduced is not None:
+        table.build(check_parameter, "reduced_frequency", reduced, "positive")
+        # omega / 2 Omega
+        numbers["frequency_khz"] = 2.0 * reduced * float(cantilever.frequency_khz)
+    return numbers
 
 
 def _interaction_of(tables: dict[str, SceneTable]) -> Any:
@@ -350,9 +341,9 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
     numbers, delay = table.numbers("r"), tables.get("interaction.delay")
     if delay is None:
         return table.build(ImpactLaw, **numbers)
-    # what has a default may be left out
-    required = (field.name for field in fields(CollisionDelay) if field.default is MISSING)
-    parameters = delay.numbers(*required) | {"corrections": delay.truth("corrections", usual=True)}
+    parameters = delay.numbers("hertz", "lead_nm", "offset_nm") | {
+        "corrections": delay.truth("corrections", usual=True)
+    }
     return table.build(ImpactLaw, **numbers, delay=delay.build(CollisionDelay, **parameters))
 
 
@@ -366,7 +357,7 @@ def _tabulated(table: SceneTable) -> TabulatedLaw:
     if source == "file":
         if not isinstance(given, str):
             table.fail(f"must be the path of a law's file, as text, but is {in_words(given)}", "file")
-        return table.build(law_beside, table.source, given)
+        return table.build(load_law, Path(table.source).parent / given)
     if not isinstance(given, dict):
         table.fail(f"must be a table, [interaction.table], but is {in_words(given)}", "table")
     try:
@@ -387,7 +378,7 @@ def _drive_table(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[st
 
 
 def _same_frequency(drive: Platform | BaseDrive | ForceDrive, second: Tone) -> bool:
-    return bool(np.all(np.isclose(drive.frequency_khz, second.frequency_khz, rtol=_SAME_FREQUENCY, atol=0.0)))
+    return bool(np.all(np.isclose(drive.frequency_khz, second.frequency_khz, rtol=SAME_FREQUENCY, atol=0.0)))
 
 
 def _amplitude(name: str) -> str:
@@ -463,9 +454,8 @@ def check_start(start: Start, scene: Scene) -> None:
         ValueError: if it cannot; says why.
     """
     height = start.height_above_platform_nm
-    check_parameter("phase_deg", start.phase_deg, "finite")
-    check_parameter("velocity_nm_per_us", start.velocity_nm_per_us, "finite")
-    check_parameter("height_above_platform_nm", height, "finite")
+    for name, value in start._asdict().items():
+        check_parameter(name, value, "finite")
     if scene.interaction is None:
         return
     if isinstance(scene.interaction, Law):

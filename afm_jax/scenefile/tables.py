@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
 from afm_jax.whole_files import read_whole
+from afm_jax.words import printable
 
 _FREQUENCY = ("frequency_khz", "reduced_frequency")
 _MOTION = ("amplitude_nm", *_FREQUENCY, "phase_deg")
@@ -239,34 +240,7 @@ class SceneTable(NamedTuple):
 
 def in_words(value: Any) -> str:
     """Return what a value in a TOML file is, short enough for a message."""
-    match value:
-        case bool():
-            return "true" if value else "false"
-        case str():
-            return "a text"
-        case list():
-            return "a list"
-        case dict():
-            return "a table"
-        case int() | float():
-            return "a number"
-        case _:
-            return "a date or time"
-
-
-def printable(text: str) -> str:
-    """Return a text that fits on one line of a message: escaped where it holds line breaks or control characters.
-
-    What is far longer than names are is cut in its middle.
-    """
-    short = cut_short(text, _LONGEST_NAME)
-    return short if short.isprintable() else repr(short)
-
-
-_LONGEST_NAME = 300
-
-
-def cut_short(text: str, length: int) -> str:
-    """Return a text without its middle where it is longer than a number of letters."""
-    half = (length - 5) // 2
-    return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    words = {str: "a text", list: "a list", dict: "a table", int: "a number", float: "a number"}
+    return words.get(type(value), "a date or time")

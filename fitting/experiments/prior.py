@@ -15,7 +15,7 @@ from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.results import Result, public_result
-from afm_jax.scenefile.tables import printable
+from afm_jax.words import printable
 from fitting.infer.result import FitResult
 from fitting.models import Problem, check_constraints
 from fitting.parameters import MODELS, NUISANCE_NAMES, model_parameters, paper_values

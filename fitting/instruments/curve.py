@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 
 from afm_jax.checks import checked
 from afm_jax.results import JudgedResult, public_result
-from afm_jax.scenefile.tables import printable
 from afm_jax.strict_json import plain
+from afm_jax.words import printable
 from fitting.instruments.bins import binned, error_of, faults_of_order, usual_width, ways_of
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import (

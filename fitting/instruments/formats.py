@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import MOST_VALUES
+from afm_jax.words import printable
 from fitting.instruments.recording import (
     UNITS,
     Known,

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import LARGEST_BYTES
+from afm_jax.words import printable
 from fitting.instruments.columns import ColumnSource, checked_unit, parse_columns
 from fitting.instruments.formats import igor_wave, is_igor
 from fitting.instruments.recording import (

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.scenefile.tables import printable
+from afm_jax.words import printable
 from fitting.tables.csv_text import NUMBER, TableError
 
 _SIZES = {

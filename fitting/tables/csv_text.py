@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.saved import why_no_fit
-from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import read_whole
+from afm_jax.words import printable
 
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from afm_jax.checks import checked, in_float64
-from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
+from afm_jax.words import printable
 from fitting.instruments.curve import zero_of_free_rows
 from fitting.instruments.lag import AS_STATED, PhaseReadings, PhaseSense, sense_of_phase, turned
 from fitting.parameters import USUAL_ERRORS
