@@ -43,4 +43,4 @@ def basins(
         if scene.unknowns is not None:
             band = drawn_shares(scene.scene, result, scene.unknowns, draws=draws)
             result = result._replace(share_interval95=band)
-    return Output.of(result, files={"basins.png": picture_of("dynamics:basins_figure", result, scene.scene)})
+    return Output.of(result, files={"basins.png": picture_of("dynamics:basins_figure", result)})

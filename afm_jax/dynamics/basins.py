@@ -50,6 +50,7 @@ class Attractor(NamedTuple):
 
     ``phase_rad``, in [0, 2 pi), and ``velocity_nm_per_us``: of an orbit, just after each of its impacts; else empty.
     ``approach_speed_nm_per_us``: of its impacts, or of the last ones that were seen of an irregular motion.
+    ``rebound_speed_nm_per_us``: of an orbit's impacts, off the platform.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Attractor(NamedTuple):
     phase_rad: Float[np.ndarray, " impacts"]
     velocity_nm_per_us: Float[np.ndarray, " impacts"]
     approach_speed_nm_per_us: Float[np.ndarray, " seen"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " impacts"] = _NOTHING
 
 
 @public_result(picture="afm_jax.plots.dynamics:basins_figure", rows="table")
@@ -223,9 +225,12 @@ def basins_of_attraction(
     share = count[order] / label.size
 
     def in_lab(attractor: Attractor) -> Attractor:
-        moved = np.asarray(seen.response(attractor.phase_rad / finder.omega)[1])
-        phase = within_turn(attractor.phase_rad + ahead, 2.0 * np.pi)
-        return attractor._replace(phase_rad=phase, velocity_nm_per_us=attractor.velocity_nm_per_us + moved)
+        time, velocity = attractor.phase_rad / finder.omega, attractor.velocity_nm_per_us
+        return attractor._replace(
+            phase_rad=within_turn(attractor.phase_rad + ahead, 2.0 * np.pi),
+            velocity_nm_per_us=velocity + np.asarray(seen.response(time)[1]),
+            rebound_speed_nm_per_us=velocity - np.asarray(_velocity(scene.platform, time)),
+        )
 
     return Basins(
         phase_rad=phase,

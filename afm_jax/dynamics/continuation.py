@@ -97,7 +97,7 @@ class Continuation(ResultTuple):
     curves: tuple[SpecialCurve, ...]
     rejected: int
     """Orbits found to begin with whose flights pass through the surface; not followed."""
-    family: LoopFamily
+    family: LawLoops | ContactLoops
     law_parameters: tuple[str, ...] | None = None
     """Names of the law's uncertain parameters, which give the errors that follow; None: the law is known exactly."""
     amplitude_errors: tuple[Float[np.ndarray, " points"], ...] | None = None
@@ -312,7 +312,7 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
                 raise ValueError(f"{given}: {problem}{hint}") from None
 
 
-def _family(scene: Scene, order: int, ranges: Sequence[ParameterRange]) -> LoopFamily:
+def _family(scene: Scene, order: int, ranges: Sequence[ParameterRange]) -> LawLoops | ContactLoops:
     """Return the loops of a scene over the ranges of some parameters; the unit of speeds is 1 nm/us."""
     low, high = (jnp.asarray([getattr(given, end) for given in ranges]) for end in ("low", "high"))
     paths, driven = tuple(given.path for given in ranges), driven_part(scene)

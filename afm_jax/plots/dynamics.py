@@ -12,16 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import surface_of
-from afm_jax.dynamics.basins import Attractor, Basins
+from afm_jax.dynamics.basins import Basins
 from afm_jax.dynamics.bifurcations import BifurcationDiagram, Ramps
 from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.dynamics.exponents import Lyapunov
 from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
 from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.impact.orbits import SingleImpactOrbits
-from afm_jax.motion.record import State, to_gap
 from afm_jax.plots.picture_style import (
     ACCENT,
     BLUE,
@@ -281,12 +278,10 @@ def chart_figure(chart: StabilityChart) -> Figure:
     return figure
 
 
-def basins_figure(basins: Basins, scene: Scene | None = None) -> Figure:
-    """Return a picture of the motion on which each start ends, with the impacts of the orbits where the scene is known.
+def basins_figure(basins: Basins) -> Figure:
+    """Return a picture of the motion on which each start ends, with the impacts of the orbits.
 
-    Args:
-        basins: of the scene.
-        scene: whose platform tells with which rebound speed the orbits leave it.
+    Orbits that are faster than all starts have a mark at the edge.
     """
     figure = new_figure(8.4, 6.0)
     axes: Axes = figure.subplots()
@@ -301,22 +296,11 @@ def basins_figure(basins: Basins, scene: Scene | None = None) -> Figure:
         if index < number
     ]
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xticks=range(0, 361, 90))
-    if scene is not None:
-        handles += [_mark_orbits(axes, basins.attractors[:number], scene)]
+    top, style = edges[1][-1], {"color": "white", "markeredgecolor": "black", "ms": 11.0, "zorder": 5}
+    for attractor in basins.attractors[:number]:
+        for phase, speed in zip(np.degrees(attractor.phase_rad), attractor.rebound_speed_nm_per_us, strict=True):
+            axes.plot(phase, min(speed, top), "o" if speed <= top else "^", clip_on=False, **style)
+    handles += [Line2D([], [], ls="", marker="o", label="impacts of the orbits", **style)]
     label_axes(axes, x="drive phase at the start (deg)", y=r"rebound speed at the start (nm/$\mu$s)")
     figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=11, frameon=False)
     return figure
-
-
-def _mark_orbits(axes: Axes, attractors: Sequence[Attractor], scene: Scene) -> Line2D:
-    """Mark the impacts of orbits, at the edge where they are faster than all starts; return the legend's mark."""
-    top = axes.get_ylim()[1]
-    surface, response = surface_of(scene)
-    omega = drive_of(scene).angular_frequency
-    style = {"color": "white", "markeredgecolor": "black", "ms": 11.0, "clip_on": False, "zorder": 5}
-    for attractor in attractors:
-        state = State(attractor.phase_rad / omega, np.zeros_like(attractor.phase_rad), attractor.velocity_nm_per_us)
-        speeds = np.asarray(to_gap(surface, response, state)[1])
-        for phase, speed in zip(np.degrees(attractor.phase_rad), speeds, strict=True):
-            axes.plot(phase, min(speed, top), "o" if speed <= top else "^", **style)
-    return Line2D([], [], ls="", marker="o", label="impacts of the orbits", **{**style, "clip_on": True})
