@@ -70,7 +70,7 @@ def simulation(  # noqa: PLR0913
         periods: how long, in periods of the drive. Without a duration the end is where the motion has settled, after
             2000 of them at most.
         harmonics: multiples of the response frequency omega/N at which amplitude and phase are read, besides the
-            drive's (N times it), which always is.
+            drive's (N times it), which always is; 1 if left out.
         accuracy: of every resolved contact: relative of the rebound speed.
         samples: write trace.csv into --out, too: the deflection over the last response periods at equal steps of time,
             as `afm-jax lockin` reads it.
