@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax import Cantilever, ForceDrive, ImpactLaw, Platform, Scene, iterate_map, map_jacobian
+from afm_jax import Cantilever, ForceDrive, ImpactLaw, Platform, Scene
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.driven import driven_by
 from afm_jax.contact.junction import Phase
@@ -19,8 +19,10 @@ from afm_jax.scenefile.scenefile import load_scene, save_scene
 from afm_jax.studies import accuracy
 from afm_jax.studies import timing as own_process
 from tests import reference_contact as exact
+from tests import reference_map
 from tests.answers import answer, table
 from tests.reference_driven_contact import DrivenContact, follow
+from tests.reference_flight import Parameters
 from tests.run_here import answered_with, run_here
 
 SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
@@ -36,16 +38,30 @@ def course():
     return follow(SYSTEM, *SYSTEM.start(**START), contacts=25)
 
 
-def test_the_reference_of_the_map_is_the_closed_form():
+def test_the_reference_of_the_map_is_that_of_mpmath():
     problem = accuracy.impact_times(6)
     scene = load_scene("figure2")
+    cantilever, platform, law = scene.cantilever, scene.platform, scene.interaction
+    known = Parameters(
+        frequency_khz=float(cantilever.frequency_khz),
+        quality_factor=None,
+        amplitude_nm=float(platform.amplitude_nm),
+        drive_frequency_khz=float(platform.frequency_khz),
+        offset_nm=float(platform.offset_nm),
+        r=float(law.r),
+        epsilon=float(law.epsilon),
+    )
     _, tips = problem.begin(problem.at)
     speeds = tips.rate + scene.platform.velocity(tips.time_us)
-    slopes = jax.vmap(lambda time, speed: map_jacobian(scene, time, speed)[0])(tips.time_us, speeds)
-    # eqs. 5 and 7 in float64: a few roundings
-    np.testing.assert_allclose(problem.exact[1], np.asarray(slopes), rtol=1e-11, atol=1e-12)
-    times = [iterate_map(scene, *start, 1).time_us[0] for start in zip(tips.time_us, speeds, strict=True)]
-    np.testing.assert_allclose(problem.exact[0], np.array(times), rtol=0.0, atol=1e-14)
+    for tip, guess in enumerate(problem.exact[0]):
+        start = float(tips.time_us[tip]), float(speeds[tip])
+        # times of up to 10 us, and slopes, to a few roundings
+        assert guess == pytest.approx(float(reference_map.next_impact(known, *start, float(guess)).time_us), abs=1e-14)
+        slopes = reference_map.map_jacobian(known, *start, float(guess))
+        np.testing.assert_allclose(
+            problem.exact[1][tip], [float(slopes[0, 0]), float(slopes[0, 1])], rtol=1e-11, atol=1e-12
+        )
+    assert max(problem.doubt) < 1e-12
 
 
 def test_the_reference_of_collisions_is_that_of_mpmath():
@@ -84,9 +100,9 @@ def test_rivals_follow_straight_and_turning_contacts(course, rival: str):
     )
     tips = accuracy.tips_at(Phase.BRIDGE, driven.forms_nm, -rates, arrivals)
     if rival == "SciPy":
-        programs = accuracy.ScipyPrograms(motion)
+        programs, numbers = accuracy.scipy_programs(motion), accuracy.numbers_of(motion)
         alone = [jax.tree.map(lambda part, tip=tip: np.asarray(part)[tip], tips) for tip in (0, 1)]
-        ends = [accuracy.by_scipy(programs, programs.vector(motion), tip, 1, 1e-9) for tip in alone]
+        ends = [accuracy.by_scipy(programs, numbers, tip, 1, 1e-9) for tip in alone]
         rebounds, left = ([float(getattr(end, name)) for end in ends] for name in ("rate", "time_us"))
     else:
         problem = accuracy.rebound_speeds(2)._replace(begin=lambda _: (motion, tips))

@@ -25,12 +25,12 @@ def accuracy(
 ) -> Output:
     """Show errors of a value and of its gradient against the time they take, beside SciPy and Diffrax.
 
-    map: the time of the next impact, by start and velocity; errors are against 50 digits (needs mpmath, extra
-    `verify`). collide: the rebound speed of the paper's contact, by speed and viscosity; errors are against a
-    quadrature converged to rounding. SCENE.toml (or a preset's name): the arrival of one of the first contacts,
-    however the scene is driven, by the start's velocity; errors are against the finest setting. SciPy's DOP853 and
-    Diffrax's Dopri8 follow the same equations phase by phase, each ended by an event. Some minutes. With --out
-    accuracy.csv, accuracy.json and accuracy.png.
+    map: the time of the next impact, by start and velocity; errors are against the finest root tolerance. collide: the
+    rebound speed of the paper's contact, by speed and viscosity; errors are against a quadrature converged to rounding.
+    SCENE.toml (or a preset's name): the arrival of one of the first contacts, however the scene is driven, by the
+    start's velocity; errors are against the finest setting. SciPy's DOP853 and Diffrax's Dopri8 follow the same
+    equations phase by phase, each ended by an event. Some minutes. With --out accuracy.csv, accuracy.json and
+    accuracy.png.
 
     Args:
         session: for progress.

@@ -31,7 +31,7 @@ def basins(
     Args:
         session: for progress.
         scene: the scene.
-        grid: drive phases x rebound speeds, as 300x300.
+        grid: drive phases x rebound speeds; 300x300 if left out.
         speeds_nm_per_us: range of the rebound speed, in nm/us.
         draws: laws drawn from the fit for the bands.
     """

@@ -23,7 +23,12 @@ CONTACT_OPTIONS = (
 )
 """What is changed of a scene's contact or of the paper's."""
 _PRIOR_OPTIONS = (
-    *(_number(name, f"{PARAMETERS[name].meaning}, {PARAMETERS[name].unit}; else the paper's.") for name in LAW_NAMES),
+    *(
+        _number(
+            name, f"{', '.join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))}; else the paper's."
+        )
+        for name in LAW_NAMES
+    ),
     *(
         click.Option(
             [option_of(each.name)],

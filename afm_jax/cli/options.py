@@ -53,8 +53,8 @@ def described(place: str) -> tuple[str, tuple[click.Parameter, ...]]:
 
 
 def _sentence(text: str) -> str:
-    words = " ".join(text.split())
-    return words[:1].upper() + words[1:]
+    text = " ".join(text.split())
+    return text[:1].upper() + text[1:]
 
 
 def _arguments(node: Any) -> Iterator[tuple[str, Any, ast.expr | None, bool]]:
@@ -90,7 +90,12 @@ def _parameter(name: str, annotation: ast.expr, value: ast.expr | None, bare: bo
     if plain is bool:
         return click.Option([name, *spelled, option_of(name)], is_flag=True, help=meaning)
     if several or default is not None:
-        more |= {"default": default, "multiple": several}
+        # of several values help says it in words
+        more |= {
+            "default": default,
+            "multiple": several,
+            "show_default": default != "" and not isinstance(default, tuple),
+        }
     return click.Option([name, *spelled, option_of(name)], required=value is None, help=meaning, **more)
 
 

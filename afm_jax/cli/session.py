@@ -95,7 +95,11 @@ class Session:
         cache = start_jax(self.tell)
         if self.verbose:
             counts = count_programs()
-            click.get_current_context().call_on_close(lambda: self.tell(_counted(**counts)))
+            click.get_current_context().call_on_close(
+                lambda: self.tell(
+                    f"{counts['read']} compiled programs were read, {counts['asked'] - counts['read']} were compiled"
+                )
+            )
         return cache
 
     def tell(self, message: str) -> None:
@@ -143,7 +147,9 @@ class Session:
             progress.update(number, completed=done, total=total)
             told = f"{done} of {total} {parts}"
             if task.speed and task.time_remaining:
-                told += f", {_rate(task.speed)} a second, about {_duration(float(task.time_remaining))} left"
+                rate = f"{task.speed:,.0f}" if task.speed >= 10.0 else f"{task.speed:.2g}"
+                left = float(task.time_remaining)
+                told += f", {rate} a second, about {f'{left:.0f} s' if left < 120.0 else f'{left / 60.0:.0f} min'} left"
             task.description = f"{shown(what.partition(' (')[0])}: {told}"
             if progress.disable and time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
                 last = time.monotonic()
@@ -237,18 +243,6 @@ def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | Non
             f"{folder}: cannot write there ({error.strerror}); choose another folder", ctx=ctx, param=parameter
         ) from error
     return folder
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
-
-
-def _rate(per_second: float) -> str:
-    return f"{per_second:,.0f}" if per_second >= 10.0 else f"{per_second:.2g}"
-
-
-def _counted(asked: int, read: int) -> str:
-    return f"{read} compiled programs were read, {asked - read} were compiled"
 
 
 def _broken(text: str, width: int) -> str:

@@ -69,8 +69,8 @@ def simulation(  # noqa: PLR0913
         duration_us: time to follow the scene, in us.
         periods: the same in periods of the drive. Without either the simulation ends when the motion has settled, or
             after 2000 periods.
-        harmonics: multiples of the response frequency omega/N at which amplitude and phase are read; they are always
-            read at the drive's.
+        harmonics: multiples of the response frequency omega/N at which amplitude and phase are read; else 1; they
+            are always read at the drive's.
         accuracy: relative accuracy of the rebound speed of every resolved contact.
         samples: write trace.csv into --out, too: the deflection over the last response periods at equal steps of time,
             as `afm-jax lockin` reads it.

@@ -72,7 +72,7 @@ def map_of_an_image(
         image: the file.
         phase_image: the phase, if in a file of its own.
         columns: the image of each quantity, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.
-        formats: of the arrays written into --out (gsf: for Gwyddion); may be given several times.
+        formats: of the arrays written into --out (gsf: for Gwyddion), else npz; may be given several times.
         **imaging: as `ImagingOptions`.
     """
     result = tapping_map(read_images(image, phase_image, columns=columns), **imaging)

@@ -237,36 +237,25 @@ class Fixed(ValueKind):
     """A parameter held at a value: NAME=VALUE."""
 
     name = "value"
+    form, count = "NAME=VALUE such as modulus_gpa=80", 1
 
-    def read(self, text: str) -> tuple[str, float]:
-        """Return name and value."""
+    def read(self, text: str) -> tuple[str, Any]:
+        """Return the name before an equals sign, and the number after it, or the numbers around +-."""
+        name, _, numbers = text.partition("=")
         try:
-            name, (value,) = _assigned(text)
+            values = parse_around_plus_minus(numbers)
         except ValueError as error:
-            raise ValueError(f"must be NAME=VALUE such as modulus_gpa=80, but is {text}") from error
-        return name, value
+            raise ValueError(f"must be {self.form}, but is {text}") from error
+        if not name.strip() or len(values) != self.count:
+            raise ValueError(f"must be {self.form}, but is {text}")
+        return name.strip().replace("-", "_"), values[0] if self.count == 1 else tuple(values)
 
 
-class Constraint(ValueKind):
+class Constraint(Fixed):
     """What is known of a parameter: NAME=VALUE+-ERROR."""
 
     name = "constraint"
-
-    def read(self, text: str) -> tuple[str, tuple[float, float]]:
-        """Return name, value and standard error."""
-        try:
-            name, (value, error) = _assigned(text)
-        except ValueError as fault:
-            raise ValueError(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {text}") from fault
-        return name, (value, error)
-
-
-def _assigned(text: str) -> tuple[str, list[float]]:
-    """Return the name before an equals sign and the numbers after it."""
-    name, _, numbers = text.partition("=")
-    if not name.strip():
-        raise ValueError("names no parameter")
-    return name.strip().replace("-", "_"), parse_around_plus_minus(numbers)
+    form, count = "NAME=VALUE+-ERROR such as tip_calibration=1+-0.02", 2
 
 
 class Names(ValueKind):

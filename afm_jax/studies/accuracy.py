@@ -5,7 +5,7 @@ and the arrival of one of the first contacts of any scene. Each is a function of
 setting of this package, by SciPy's DOP853 with events (gradients by central differences), and by Diffrax's Dopri8 with
 its Event (gradients by differentiation). The two rivals know the equation of motion of each phase
 (`EquationOfMotion`), not that flights have a closed form, nor that a contact can be gone through leg by leg. Errors are
-achieved ones, against a reference that none of the methods is.
+achieved ones, against the closed form or quadrature in its finest setting.
 
 Runs in a process of its own on one core (`afm_jax.studies.timing.run_in_own_process`).
 """
@@ -14,7 +14,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import diffrax
@@ -200,7 +199,7 @@ def measured(problem: str, *, contacts: int = 10, quick: bool = False) -> dict[s
         `reference_error`, `reference_gradient_error`.
 
     Raises:
-        ValueError: if a scene's tip has fewer contacts, or mpmath is missing (map).
+        ValueError: if a scene's tip has fewer contacts.
     """
     tips, repetitions = (20, 1) if quick else (500, 5)
     tolerances = {f"tolerance {each:g}": each for each in ((1e-8,) if quick else (1e-6, 1e-8, 1e-10, 1e-12))}
@@ -313,12 +312,12 @@ def _scipy_rows(problem: AccuracyProblem, tolerances: Mapping[str, float]) -> It
     begin = jax.jit(problem.begin)
     template, starts = begin(problem.at)
     tips = np.unique(np.linspace(0, starts.x.size - 1, _FEW).astype(int)).tolist()
-    programs, at = ScipyPrograms(template), np.asarray(problem.at)
+    programs, at = scipy_programs(template), np.asarray(problem.at)
 
     def value(tip: int, parameters: np.ndarray, tolerance: float) -> np.ndarray:
         motion, starts = begin(jnp.asarray(parameters))
         start = jax.tree.map(lambda part: np.asarray(part)[tip], starts)
-        vector = jax.block_until_ready(programs.vector(motion))
+        vector = jax.block_until_ready(numbers_of(motion))
         began = time.perf_counter()
         end = by_scipy(programs, vector, start, problem.crossings, tolerance)
         return np.array([problem.read(end), time.perf_counter() - began])
@@ -332,60 +331,45 @@ def _scipy_rows(problem: AccuracyProblem, tolerances: Mapping[str, float]) -> It
             value(tips[0], at, tolerance)
             found = np.array([[value(tip, place, tolerance) for place in places] for tip in tips])
         except ValueError as failure:
-            yield from (
-                _row(of, "SciPy DOP853", name, math.nan, math.nan, reason=str(failure)) for of in ("value", "gradient")
-            )
+            for of in ("value", "gradient"):
+                yield _row(of, "SciPy DOP853", name, math.nan, math.nan, reason=str(failure))
             continue
         values, seconds = np.moveaxis(found, -1, 0)
         slopes = (values[:, 1 : 1 + at.size] - values[:, 1 + at.size :]) / (2.0 * step)
         spent = np.mean(seconds[:, 0]), np.mean(np.sum(seconds[:, 1:], axis=1))
-        for of, each, error in zip(
-            ("value", "gradient"), spent, problem.errors(values[:, 0], slopes, tips), strict=True
-        ):
+        errors = problem.errors(values[:, 0], slopes, tips)
+        for of, each, error in zip(("value", "gradient"), spent, errors, strict=True):
             yield _row(of, "SciPy DOP853", name, float(each) / problem.events, error)
 
 
-class ScipyPrograms:
-    """What SciPy calls, compiled once: functions of a motion's numbers in a vector."""
-
-    def __init__(self, template: EquationOfMotion):
-        """Take the structure of a motion; its numbers are an argument of the programs."""
-        numbers, rest = eqx.partition(template, eqx.is_inexact_array)
-        _, unravel = ravel_pytree(numbers)
-
-        def of(vector: Array) -> EquationOfMotion:
-            return eqx.combine(unravel(vector), rest)
-
-        self.after = jax.jit(lambda vector, tip, risen: of(vector).after(tip, risen))
-        self.levels = jax.jit(lambda vector, phase: of(vector).levels(phase))
-        self.flight = jax.jit(lambda vector: _flight_numbers(of(vector)))
-        self.rates = {
-            phase: jax.jit(lambda vector, y, phase=phase: jnp.stack(of(vector).rates(phase, *y)))
-            for phase in (Phase.BRIDGE, Phase.JUNCTION)
-        }
-
-    @staticmethod
-    def vector(motion: EquationOfMotion) -> Array:
-        """Return the numbers of a motion."""
-        return ravel_pytree(eqx.filter(motion, eqx.is_inexact_array))[0]
+def numbers_of(motion: EquationOfMotion) -> Array:
+    """Return the numbers of a motion as a vector."""
+    return ravel_pytree(eqx.filter(motion, eqx.is_inexact_array))[0]
 
 
-def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
-    """Return Omega^2, Omega/Q, the longest step, offset and ramp of the surface, and its cosines as rows."""
-    cantilever, surface = motion.cantilever, motion.surface
-    assert cantilever is not None  # it flies  # noqa: S101
-    assert surface is not None  # noqa: S101
-    waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in surface.waves])
-    own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, Phase.DRY)
-    return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
+def scipy_programs(template: EquationOfMotion) -> dict[str, Callable[..., Any]]:
+    """Return what SciPy calls, compiled once: functions of the numbers of motions like this one."""
+    numbers, rest = eqx.partition(template, eqx.is_inexact_array)
+    _, unravel = ravel_pytree(numbers)
+
+    def of(vector: Array) -> EquationOfMotion:
+        return eqx.combine(unravel(vector), rest)
+
+    return {
+        "after": jax.jit(lambda vector, tip, risen: of(vector).after(tip, risen)),
+        "levels": jax.jit(lambda vector, phase: (*of(vector).levels(phase), _longest_step(of(vector), phase))),
+        "rates": jax.jit(lambda vector, phase, y: jnp.stack(of(vector).rates(phase, *y))),
+    }
 
 
-def by_scipy(programs: ScipyPrograms, vector: Array, tip: Tip, crossings: int, tolerance: float) -> Tip:
+def by_scipy(
+    programs: Mapping[str, Callable[..., Any]], vector: Array, tip: Tip, crossings: int, tolerance: float
+) -> Tip:
     """Follow a tip from phase to phase, each ended by an event of `solve_ivp`.
 
     Args:
-        programs: of motions like this one.
-        vector: this motion's numbers (`ScipyPrograms.vector`).
+        programs: of motions like this one (`scipy_programs`).
+        vector: this motion's numbers (`numbers_of`).
         tip: at the beginning of a phase.
         crossings: how often it arrives at the sample or leaves it.
         tolerance: relative; the absolute one is a thousandth of it.
@@ -396,89 +380,39 @@ def by_scipy(programs: ScipyPrograms, vector: Array, tip: Tip, crossings: int, t
     for _ in range(_MOST_PHASES * crossings):
         if tip.crossings >= crossings:
             return tip
-        down, up = (float(level) for level in programs.levels(vector, tip.phase))
-        through = _flown_by_scipy if int(tip.phase) == Phase.DRY else _touched_by_scipy
-        risen, ended = through(programs, vector, tip, (down, up), tolerance)
-        tip = jax.tree.map(np.asarray, programs.after(vector, ended, risen))
+        phase = jnp.asarray(tip.phase)
+        down, up, longest = (float(each) for each in programs["levels"](vector, phase))
+        ends: list[Any] = [lambda _, y, down=down: y[0] - down]
+        ends += [lambda _, y, up=up: y[0] - up] if math.isfinite(up) else []
+        for event, direction in zip(ends, (-1.0, 1.0), strict=False):
+            vars(event).update(terminal=True, direction=direction)
+        # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
+        with np.errstate(all="ignore"):
+            path = solve_ivp(
+                lambda _, y, phase=phase: np.asarray(programs["rates"](vector, phase, y)),
+                (0.0, _LONGEST_US if phase == Phase.DRY else _LONGEST_TOUCH_US),
+                [float(tip.x), float(tip.rate), float(tip.time_us)],
+                method="DOP853",
+                rtol=tolerance,
+                atol=1e-3 * tolerance,
+                max_step=longest,
+                events=ends,
+            )
+        if path.status != 1:
+            raise ValueError(f"SciPy ended without an event: {path.message}")
+        met = next(place for place, times in enumerate(path.t_events) if len(times))
+        _, rate, now = (np.asarray(part) for part in path.y_events[met][0])
+        ended = tip._replace(rate=rate, time_us=now)
+        tip = jax.tree.map(np.asarray, programs["after"](vector, ended, np.asarray(met == 1)))
         if not np.isfinite(tip.rate):
             raise ValueError(f"the sample captures the tip that arrives at {float(tip.arrived_us):.6g} us")
     raise ValueError(f"the sample holds the tip that arrives at {float(tip.arrived_us):.6g} us")
 
 
-def _touched_by_scipy(
-    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
-) -> tuple[np.ndarray, Tip]:
-    """Return whether a phase of a contact ends at the gap that the tip rises to, and the tip there."""
-    rates, (down, up) = programs.rates[Phase(int(tip.phase))], levels
-    ends: list[Any] = [lambda _, y: y[0] - down]
-    ends += [lambda _, y: y[0] - up] if math.isfinite(up) else []
-    for event, direction in zip(ends, (-1.0, 1.0), strict=False):
-        vars(event).update(terminal=True, direction=direction)
-    state = [float(tip.x), float(tip.rate), float(tip.time_us)]
-    met, _, (_, rate, now) = _to_event(lambda _, y: np.asarray(rates(vector, y)), state, ends, tolerance)
-    return np.asarray(met == 1), tip._replace(rate=np.asarray(rate), time_us=np.asarray(now))
-
-
-def _flown_by_scipy(
-    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
-) -> tuple[np.ndarray, Tip]:
-    """Return that the tip has fallen, and the tip at the end of its flight: in the lab, in plain numbers."""
-    *numbers, rows = programs.flight(vector)
-    square, friction, longest, offset, ramp = (float(number) for number in numbers)
-    waves, start = np.asarray(rows).tolist(), float(tip.time_us)
-
-    def height(now: float) -> float:
-        moved = sum(c * math.cos(omega * now) + s * math.sin(omega * now) for c, s, omega in waves)
-        return offset + ramp * now + moved
-
-    def speed(now: float) -> float:
-        return ramp + sum(o * (s * math.cos(o * now) - c * math.sin(o * now)) for c, s, o in waves)
-
-    def gap(flown: float, y: Any) -> float:
-        return y[0] - height(start + flown) - levels[0]
-
-    def rates(_: float, y: Any) -> tuple[float, float]:
-        return y[1], -square * y[0] - friction * y[1]
-
-    vars(gap).update(terminal=True, direction=-1.0)
-    state = [float(tip.x) + height(start), float(tip.rate) + speed(start)]
-    _, flown, (_, velocity) = _to_event(rates, state, [gap], tolerance, (_LONGEST_US, longest))
-    rate = velocity - speed(start + flown)
-    return np.zeros((), bool), tip._replace(rate=np.asarray(rate), time_us=np.asarray(start + flown))
-
-
-def _to_event(
-    rates: Callable[[float, Any], Any],
-    state: list[float],
-    events: list[Any],
-    tolerance: float,
-    longest: tuple[float, float] = (_LONGEST_TOUCH_US, np.inf),
-) -> tuple[int, float, np.ndarray]:
-    """Return which event ends a phase, when, and the state there; `longest` are the phase's length and its steps'.
-
-    Raises:
-        ValueError: if none does.
-    """
-    # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
-    with np.errstate(all="ignore"):
-        path = solve_ivp(
-            rates,
-            (0.0, longest[0]),
-            state,
-            method="DOP853",
-            rtol=tolerance,
-            atol=1e-3 * tolerance,
-            max_step=longest[1],
-            events=events,
-        )
-    if path.status != 1:
-        raise ValueError(f"SciPy ended without an event: {path.message}")
-    met = next(place for place, times in enumerate(path.t_events) if len(times))
-    return met, float(path.t_events[met][0]), path.y_events[met][0]
-
-
 _ROOT_TOLERANCES_US = (1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-13)
 """Of the search for an impact, the last one its default."""
+_FINEST_US = 1e-15, 1e-14
+"""References of impacts with a law: the better one first."""
 
 
 def impact_times(tips: int) -> AccuracyProblem:
@@ -503,20 +437,21 @@ def impact_times(tips: int) -> AccuracyProblem:
         return motion, tips_at(Phase.DRY, jnp.zeros_like(rate), rate, now)
 
     at = jnp.zeros(2)
-    guesses = jax.jit(solve)(_ROOT_TOLERANCES_US[-1], at)
-    return AccuracyProblem(
+    exact, coarser = (_value_and_slopes(partial(solve, each), at) for each in _FINEST_US)
+    problem = AccuracyProblem(
         what="time of the next impact (us)",
         relative=False,
         at=at,
         solve=solve,
         settings={f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US},
-        reference="50 digits",
-        exact=_fifty_digits(scene, starts, speeds, guesses),
-        doubt=(1e-45, 1e-20),
+        reference="root tolerance 1e-15 us",
+        exact=exact,
+        doubt=(0.0, 0.0),
         begin=begin,
         crossings=1,
         read=lambda tip: tip.arrived_us,
     )
+    return problem._replace(doubt=problem.errors(*coarser))
 
 
 def tips_at(phase: Phase, x: Any, rate: Any, now: Any) -> Tip:
@@ -526,38 +461,6 @@ def tips_at(phase: Phase, x: Any, rate: Any, now: Any) -> Tip:
     start = like(jnp.asarray(now, rate.dtype))
     none = jnp.zeros(rate.shape, jnp.int32)
     return Tip(none + jnp.int32(phase), like(x), rate, start, start, none)
-
-
-def _fifty_digits(scene: Scene, starts: Values, speeds: Values, guesses: Values) -> tuple[Values, Slopes]:
-    """Return times of the next impact of an undamped tip and their slopes by start and velocity, from 50 digits.
-
-    The gap is z_1 cos(Omega (t - t_1)) + v_1/Omega sin(Omega (t - t_1)) - sigma - beta cos(omega t) (eqs. 2 to 4).
-
-    Raises:
-        ValueError: if mpmath is not installed.
-    """
-    try:
-        mp: Any = import_module("mpmath").mp
-    except ModuleNotFoundError:
-        raise ValueError("mpmath is not installed; add it with: pip install 'afm-jax[verify]'") from None
-    platform = scene.platform
-    numbers = (scene.cantilever.angular_frequency, platform.angular_frequency, platform.amplitude_nm)
-    with mp.workdps(50):
-        free, omega, beta, sigma = (mp.mpf(float(each)) for each in (*numbers, platform.offset_nm))
-
-        def gap(now: Any, begun: Any, speed: Any) -> Any:
-            flown = free * (now - begun)
-            left = sigma + beta * mp.cos(omega * begun)
-            return left * mp.cos(flown) + speed / free * mp.sin(flown) - sigma - beta * mp.cos(omega * now)
-
-        def exact(*tip: Array) -> list[float]:
-            guess, *place = (mp.mpf(float(part)) for part in tip)
-            root = mp.findroot(lambda now: gap(now, *place), guess)
-            closing, *others = (mp.diff(gap, (root, *place), order) for order in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
-            return [float(root), *(float(-other / closing) for other in others)]
-
-        rows = np.array([exact(*tip) for tip in zip(guesses, starts, speeds, strict=True)])
-    return rows[:, 0], rows[:, 1:]
 
 
 _SPEEDS_NM_PER_US = (12.0, 200.0)
@@ -635,7 +538,7 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
         law = scene.interaction
         arrival = partial(law_arrival, scene, world, contacts)
         settings: Mapping[str, Any] = {f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US}
-        references, reference = (1e-15, 1e-14), "root tolerance 1e-15 us"
+        references, reference = _FINEST_US, "root tolerance 1e-15 us"
     else:
         driven, spans = driven_by(scene.interaction, scene.cantilever, surface), scene.interaction.spans
         longest = start.time_us + _LONGEST_US * contacts
