@@ -288,7 +288,7 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
     elif origin == "unknown":
         reason = (
             "off resonance energies depend on the sign of the phase, and the curve does not show whether it lags or "
-            f"leads: state it by {SENSE_OPTION}"
+            f"leads: say {SENSE_OPTION}"
         )
     return PhaseSense(sign, zero, origin, _notes(readings, sign, origin, zero), reason)
 
@@ -313,7 +313,7 @@ def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -
             origin == "assumed"
         )
         taken = f"the phase {'leads' if leads else 'lags'}, which is assumed"
-        notes.append(f"Sign: {reads}: {taken}; {both}state it by {SENSE_OPTION}.")
+        notes.append(f"Sign: {reads}: {taken}; {both}say {SENSE_OPTION}.")
     elif leads and origin != "stated":
         notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and its sign was reversed.")
     quarters = round(zero_deg / 90.0)
