@@ -114,11 +114,11 @@ class Platform(MovingSurface):
 
     def __check_init__(self):
         check_parameter("amplitude_nm", self.amplitude_nm, "not negative")
-        if not self.takes_any_frequency:
-            check_parameter("frequency_khz", self.frequency_khz, "positive")
         check_parameter("offset_nm", self.offset_nm, "finite")
         check_parameter("offset_rate_nm_per_us", self.offset_rate_nm_per_us, "finite")
         check_kind("second", self.second, Tone | None)
+        if not self.takes_any_frequency:
+            check_parameter("frequency_khz", self.frequency_khz, "positive")
 
     @property
     def takes_any_frequency(self) -> bool:
