@@ -37,8 +37,9 @@ def test_a_diagram_draws_the_impact_speeds_of_coco():
     diagram = bifurcation_diagram(scene, "force.amplitude_nn", np.array(sorted(COCO)), impacts=600)
     assert diagram.verdicts.names() == ["(1,1)"] * len(COCO)
     (ramp,) = diagram.plot(ordinate="impact_speed").axes[0].lines
-    np.testing.assert_allclose(ramp.get_xdata(), sorted(COCO))
-    np.testing.assert_allclose(ramp.get_ydata(), [COCO[force] for force in sorted(COCO)], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(ramp.get_xdata()), sorted(COCO))
+    speeds = [COCO[force] for force in sorted(COCO)]
+    np.testing.assert_allclose(np.asarray(ramp.get_ydata()), speeds, rtol=0, atol=1e-9)
     with pytest.raises(ValueError, match="`ordinate` must be one of height, phase, impact_speed"):
         diagram.plot(ordinate="speed")
 
