@@ -38,7 +38,8 @@ def test_a_diagram_draws_the_impact_speeds_of_coco():
     assert diagram.verdicts.names() == ["(1,1)"] * len(COCO)
     (ramp,) = diagram.plot(ordinate="impact_speed").axes[0].lines
     np.testing.assert_allclose(np.asarray(ramp.get_xdata()), sorted(COCO))
-    np.testing.assert_allclose(np.asarray(ramp.get_ydata()), [COCO[force] for force in sorted(COCO)], rtol=0, atol=1e-9)
+    speeds = [COCO[force] for force in sorted(COCO)]
+    np.testing.assert_allclose(np.asarray(ramp.get_ydata()), speeds, rtol=0, atol=1e-9)
     with pytest.raises(ValueError, match="`ordinate` must be one of height, phase, impact_speed"):
         diagram.plot(ordinate="speed")
 
