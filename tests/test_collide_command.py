@@ -70,7 +70,7 @@ def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any], out
 
 def test_picture_shows_curve_capture_delay_and_losses(paper: dict[str, Any]):
     rows = [dict(zip(COLUMNS, row, strict=True)) for row in zip(*(paper[name] for name in COLUMNS), strict=True)]
-    panels = Collisions(rows, paper["capture_speed_nm_per_us"], None, {}, []).plot().axes
+    panels = Collisions(rows, paper["capture_speed_nm_per_us"], {}).plot().axes
     drawn = [{line.get_label(): np.asarray(line.get_ydata())[1:] for line in axes.lines} for axes in panels]
     np.testing.assert_array_equal(drawn[0]["contact"], paper["rebound_speed_nm_per_us"][1:])
     np.testing.assert_array_equal(next(iter(drawn[1].values())), paper["collision_delay_us"][1:])

@@ -17,7 +17,6 @@ over Gauss nodes (`collocate`), or Diffrax's steps (`pass_in_steps`). `go_in` an
 tips, `turn_in_bridge` is the impact of a tip that never reaches the junction.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -261,7 +260,13 @@ def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
         # of a push that does not change on the way
         start_nm = way.course.at(jnp.zeros_like(way.total_aj))[0]
         guess = guess - way.tip.mass_ng * drive.push(way.begin_us) * (at.gap_nm - start_nm)
-    spent, before, spending = _repeated(again, (guess, guess, guess), 0 if way.quiet else iterations)
+    state, count = (guess, guess, guess), 0 if way.quiet else iterations
+    if count > _WRITTEN_OUT:
+        state = lax.fori_loop(0, count, again, state)
+    else:
+        for number in range(count):
+            state = again(number, state)
+    spent, before, spending = state
     kinetic = at.available_aj - spent
     speed, time_slope = way.speed_and_time_slope(at.path_nm, kinetic)
     lost = at.drag * speed
@@ -279,21 +284,10 @@ def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
     )
 
 
-def _repeated(step: Callable[[Any, Any], Any], state: Any, count: int) -> Any:
-    if count > _WRITTEN_OUT:
-        return lax.fori_loop(0, count, step, state)
-    for number in range(count):
-        state = step(number, state)
-    return state
-
-
-def pass_by_collocation(way: Way, nodes: int, iterations: int) -> Passage:
-    """Return the passage by collocation; where nothing is spent, by one quadrature of the time."""
-    if not way.quiet:
-        return collocate(way, nodes, iterations).passage
+def _pass_conserving(way: Way, nodes: int) -> Passage:
+    """Return the passage where nothing is spent: one quadrature of the time, its nodes in a loop of one small body."""
     points, weights, _ = gauss_nodes(nodes)
 
-    # the nodes in a loop of one small body
     def add(total, node):
         at = way.along(node[0])
         return total + node[1] * way.speed_and_time_slope(at.path_nm, at.available_aj)[1], None
@@ -357,7 +351,7 @@ def retract_through_bridge(tip: Driven, energy_aj: Float[Array, "..."], setting:
 
     # twice: roughly, for the energy at its end and so for its margin, then as the setting says
     trial = out(jnp.full_like(energy_aj, _TRIAL_MARGIN))
-    end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
+    end = trial.total_aj - trial.end_potential_aj if trial.quiet else collocate(trial, 6, 1).passage.energy_aj
     return _pass_bridge(out(margin_of(end, pull_at(tip, tip.ends_nm))), setting)
 
 
@@ -373,9 +367,9 @@ def _pass_bridge(way: Way, setting: Setting) -> Passage:
         return way.end(nothing, nothing)
     size = setting.inward if way.inward else setting.outward
     if way.quiet:
-        return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
+        return _pass_conserving(way, max(size, setting.junction_nodes))
     if setting.rule == "collocation":
-        return pass_by_collocation(way, size, setting.iterations)
+        return collocate(way, size, setting.iterations).passage
     return pass_in_steps(way, size, setting.solver)
 
 
@@ -399,37 +393,31 @@ def go_out(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
     return leg._replace(holds=leg.holds & (state.gap_rate > 0.0) & (gaps[1] < gaps[0]))
 
 
-def driven_way(driven: Driven, gaps: tuple[Array, Array], state: ContactState, *, inward: bool) -> Way:
-    """Return the way of a tip from a state at the outer (`inward`) or at the inner one of two gaps."""
+def _cross(
+    driven: Driven, gaps: tuple[Array, Array], state: ContactState, setting: QuickSetting, nodes: int, *, inward: bool
+) -> Leg:
+    """Return the leg of a tip from a state at the outer (`inward`) or at the inner one of two gaps to the other one."""
     outer, inner = gaps
     start = 0.5 * driven.mass_ng * state.gap_rate**2
-    at_outer = start
+    at_outer, pull, slowest = start, pull_at(driven, outer), _SLOWEST * start
     if not inward:
         at_outer = start + driven.potential(inner) - driven.potential(outer)
         if driven.drive is not None:
             at_outer = at_outer + driven.mass_ng * driven.drive.push(state.time_us) * (outer - inner)
-    pull = -driven.bridge.force(outer) * outer
     margin = lax.stop_gradient(margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30)))
-    return way_through(driven, gaps, start, margin, inward=inward, begin_us=state.time_us)
-
-
-def _cross(
-    driven: Driven, gaps: tuple[Array, Array], state: ContactState, setting: QuickSetting, nodes: int, *, inward: bool
-) -> Leg:
-    slowest = _SLOWEST * 0.5 * driven.mass_ng * state.gap_rate**2
-    way = driven_way(driven, gaps, state, inward=inward)._replace(slowest_aj=slowest)
-    collocation = collocate(way, nodes, setting.iterations)
+    way = way_through(driven, gaps, start, margin, inward=inward, begin_us=state.time_us)
+    collocation = collocate(way._replace(slowest_aj=slowest), nodes, setting.iterations)
     end = collocation.passage
     leaving = jnp.sqrt(2.0 * driven.inverse_mass * end.energy_aj)
     holds = setting.suffices(collocation.change_aj / collocation.kinetic_aj, collocation.time_slope, end.time_us)
     return Leg(
         state=ContactState(
-            x=(gaps[1] if inward else gaps[0]) + jnp.zeros_like(leaving),
+            x=(inner if inward else outer) + jnp.zeros_like(leaving),
             gap_rate=-leaving if inward else leaving,
             time_us=state.time_us + end.time_us,
             viscous_loss_aj=state.viscous_loss_aj + end.dissipated_aj,
         ),
-        deepest_gap_nm=gaps[1] + jnp.zeros_like(leaving),
+        deepest_gap_nm=inner + jnp.zeros_like(leaving),
         holds=holds & jnp.all(collocation.kinetic_aj > slowest, axis=0) & (leaving > 0.0),
     )
 

@@ -145,7 +145,7 @@ def collide(
     # one axis of tips inside, the speeds' own shape outside
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
     tips = contact, mass, speeds.ravel()
-    result = by_tangents(_quick, *tips, small=speeds.size <= LANES, many_steps=_careful, setting=setting)
+    result = by_tangents(_quick, *tips, small=speeds.size <= LANES, many_steps=_in_many_steps, setting=setting)
     if not any(leaf.ndim for leaf in jax.tree.leaves(contact)):
         require_junction(contact, result.outcome != CollisionOutcome.NO_JUNCTION)
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
@@ -430,11 +430,16 @@ def _quick(
     return _in_blocks(contact, mass, speeds, setting)
 
 
-@compiled_quickly(static_argnames="setting")
-def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting) -> Collision:
-    """Return the collisions of a batch in many steps, whatever the setting, turning points in the bridge included."""
-    del setting
+@compiled_quickly()
+def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"]) -> Collision:
+    """Return the collisions of a batch in many steps, turning points in the bridge included."""
     return _in_blocks(contact, mass, speeds, CAREFUL)[0]
+
+
+def _in_many_steps(contact: Contact, mass: Array, speeds: Array, setting: Setting) -> Collision:
+    # one program, whatever the setting that did not suffice
+    del setting
+    return _careful(contact, mass, speeds)
 
 
 def _in_blocks(
@@ -463,16 +468,12 @@ class Collisions(NamedTuple):
         rows: one dict a tip, the fields of `Collision` as numbers, None where there is none; `outcome` a sentence and
             `outcome_name` a word or two.
         capture_speed_nm_per_us: None where it is not a number.
-        capture_speed_reason: a sentence where it is None or 0, else None.
         junction: where it forms and breaks, and its hysteresis.
-        unresolved: the sentences of collisions without a valid result.
     """
 
     rows: list[dict[str, Any]]
     capture_speed_nm_per_us: float | None
-    capture_speed_reason: str | None
     junction: dict[str, float]
-    unresolved: list[str]
 
     text, plot = Result.text, Result.plot
     _picture = "afm_jax.plots.collisions:collisions_figure"
@@ -480,8 +481,16 @@ class Collisions(NamedTuple):
     @property
     def reason(self) -> str | None:
         """Why not every collision has a result; None where all have."""
-        failed = self.unresolved
+        failed = [row["outcome"] for row in self.rows if row["captured"] is None]
         return f"{len(failed)} of {len(self.rows)} collisions: {failed[0]}" if failed else None
+
+    @property
+    def capture_speed_reason(self) -> str | None:
+        """Why there is no capture speed, or why it is 0; None where it is a speed."""
+        if self.capture_speed_nm_per_us is None:
+            return "There is no capture speed: tips of every speed that was tried are captured."
+        none_captured = "No tip is captured, however slow: the contact gives back what it takes."
+        return None if self.capture_speed_nm_per_us else none_captured
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax collide`."""
@@ -565,13 +574,10 @@ def collisions(
     junction = _junction(contact)
     rows = _rows(collide_in_blocks(contact, chosen, mass_ng, accuracy=accuracy, method=method))
     numbers = {name: float(getattr(junction, name)) for name in (*junction._fields, "hysteresis_aj")}
-    invalid = [row["outcome"] for row in rows if row["captured"] is None]
     return Collisions(
         rows=rows,
         capture_speed_nm_per_us=capture if math.isfinite(capture) else None,
-        capture_speed_reason=_reason(capture),
         junction={name: value for name, value in numbers.items() if name not in ("exists", "forms_root")},
-        unresolved=invalid,
     )
 
 
@@ -599,12 +605,3 @@ def _rows(found: dict[str, np.ndarray]) -> list[dict[str, Any]]:
             row |= dict.fromkeys(ONLY_FREE)
         rows.append(row)
     return rows
-
-
-def _reason(capture_speed_nm_per_us: float) -> str | None:
-    """Say why there is no capture speed, if there is none."""
-    if capture_speed_nm_per_us == 0.0:
-        return "No tip is captured, however slow: the contact dissipates no energy."
-    if math.isinf(capture_speed_nm_per_us):
-        return "There is no capture speed: tips of every speed that was tried are captured."
-    return None

@@ -60,18 +60,19 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
 
 
 class Stretch(NamedTuple):
-    """A stretch of the way of a free tip through the junction at Gauss nodes, counted from the turning point."""
+    """A stretch of a free tip's way at Gauss nodes, its times counted from its beginning."""
 
     time_us: Float[Array, " nodes"]
     gap_nm: Float[Array, " nodes"]
-    speed: Float[Array, " nodes"]
+    velocity: Float[Array, " nodes"]
+    """Rate of the gap in nm/us; 0 marks places that are never reached."""
     duration_us: Float[Array, ""]
 
 
 def stretch_in_junction(
     tip: Driven, level: Float[Array, ""], turn: Float[Array, ""], end: Float[Array, ""], nodes: int
 ) -> Stretch:
-    """Return the stretch between the turning point and another point, which may be one too.
+    """Return the stretch from the turning point to another point, which may be one too.
 
     Args:
         tip: a free tip.

@@ -29,7 +29,7 @@ from rich.table import Table
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import Cell, columns_of, printed_table
-from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
+from afm_jax.contact.bridge_leg import collocate, margin_of, pull_at, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
@@ -657,14 +657,14 @@ def _traced_back(tip: Driven, leaving_aj: Float[Array, ""], rule: _Rule) -> tupl
     tip = tip._replace(bridge=tip.bridge.reversed())
     forms, ends = tip.forms_nm, tip.ends_nm
     on, off = tip.junction.forms_gap_nm, tip.junction.breaks_gap_nm
-    margin = margin_of(leaving_aj, tip.bridge.force(ends) * -ends)
+    margin = margin_of(leaving_aj, pull_at(tip, ends))
     retract = way_through(tip, (ends, off), leaving_aj, margin, inward=True)
-    out = pass_by_collocation(retract, nodes, iterations)
+    out = collocate(retract, nodes, iterations).passage
     formed = out.energy_aj + tip.elastic_aj
     inside = pass_through_junction(tip, formed, junction_nodes)
     arriving = formed + tip.potential(on) - tip.potential(forms)
-    margin = margin_of(jnp.maximum(arriving, 0.0), tip.bridge.force(forms) * -forms)
-    approach = pass_by_collocation(way_through(tip, (forms, on), formed, margin, inward=False), nodes, iterations)
+    margin = margin_of(jnp.maximum(arriving, 0.0), pull_at(tip, forms))
+    approach = collocate(way_through(tip, (forms, on), formed, margin, inward=False), nodes, iterations).passage
     speed = jnp.sqrt(2.0 * jnp.maximum(approach.energy_aj, 1e-12) / tip.mass_ng)
     return speed, out.time_us + inside.time_us + approach.time_us
 

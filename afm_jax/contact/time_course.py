@@ -4,19 +4,17 @@ The passages through bridge and junction are computed as in `collide`, with the 
 given at their Gauss nodes; these crowd where the tip is slow, so that times are not equally spaced.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from afm_jax.checks import as_parameter, check_parameter, check_scalar, checked, refuse_float32
-from afm_jax.contact.bridge_leg import Way, collocate, margin_of, way_through
+from afm_jax.contact.bridge_leg import Way, collocate, margin_of, pull_at, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase, require_junction
-from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
+from afm_jax.contact.junction_leg import Stretch, stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import halved
 from afm_jax.solve.lanes import compiled_quickly
@@ -44,15 +42,6 @@ class TimeCourse(ResultTuple):
     force_nn: Float[np.ndarray, " points"]
     """Force of the sample on the tip; attraction is negative."""
     captured: bool
-
-
-class _Leg(NamedTuple):
-    """A part of the course: times from its start, and its whole duration; speeds of 0 mark places never reached."""
-
-    time: Float[Array, " nodes"]
-    gap: Float[Array, " nodes"]
-    velocity: Float[Array, " nodes"]
-    duration: Float[Array, ""]
 
 
 @checked
@@ -85,17 +74,16 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
 @compiled_quickly()
 def _course(
     contact: Contact, speed: Float[Array, ""], mass: Float[Array, ""]
-) -> tuple[Junction, list[_Leg], Float[Array, "3"]]:
+) -> tuple[Junction, list[Stretch], Float[Array, "3"]]:
     """Return the four legs, and kinetic energies where the junction forms and breaks with the rebound speed."""
     junction = find_junction(contact)
     tip = free_tip(contact, junction, mass)
     solid = tip.solid
     forms, breaks = tip.forms_nm, tip.ends_nm
-    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, breaks))
     start = 0.5 * mass * speed * speed
 
     inward, on = _crossing(
-        way_through(tip, (forms, junction.forms_gap_nm), start, margin_of(start, pull_in), inward=True)
+        way_through(tip, (forms, junction.forms_gap_nm), start, margin_of(start, pull_at(tip, forms)), inward=True)
     )
     level = solid.work(junction.forms_root) + on / solid.energy_scale_aj
     loading, unloading = _junction_legs(tip, level)
@@ -110,24 +98,23 @@ def _course(
     end = end_at(breaks)
     # a tip that does not get out stops at the gap to which its energy just suffices
     stop = jnp.where(end > 0.0, breaks, halved(lambda gap: end_at(gap) > 0.0, junction.breaks_gap_nm, breaks)[0])
-    outward, left = _crossing(way_out(stop, margin_of(jnp.maximum(end, 0.0), pull_out)))
+    outward, left = _crossing(way_out(stop, margin_of(jnp.maximum(end, 0.0), pull_at(tip, breaks))))
     rebound = jnp.where((off > 0.0) & (end > 0.0), jnp.sqrt(2.0 * jnp.maximum(left, 0.0) / mass), 0.0)
     return junction, [inward, loading, unloading, outward], jnp.stack([on, off, rebound])
 
 
-def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
+def _crossing(way: Way) -> tuple[Stretch, Float[Array, ""]]:
     """Return a crossing of the bridge and the kinetic energy at its end; of no length where nothing acts before."""
     if not way.tip.bridge.spans:
         nothing = jnp.zeros(_NODES)
-        return _Leg(nothing, nothing, nothing, jnp.zeros(())), way.total_aj - way.end_potential_aj
+        return Stretch(nothing, nothing, nothing, jnp.zeros(())), way.total_aj - way.end_potential_aj
     collocation = collocate(way, _NODES, _ITERATIONS)
     end = collocation.passage
-    return _Leg(
-        collocation.lasted_us, collocation.at.gap_nm, -way.sense * collocation.speed, end.time_us
-    ), end.energy_aj
+    velocity = -way.sense * collocation.speed
+    return Stretch(collocation.lasted_us, collocation.at.gap_nm, velocity, end.time_us), end.energy_aj
 
 
-def _junction_legs(tip: Driven, level: Float[Array, ""]) -> tuple[_Leg, _Leg]:
+def _junction_legs(tip: Driven, level: Float[Array, ""]) -> tuple[Stretch, Stretch]:
     """Return the ways from the formation of the junction to the turning point, and from there to the fold."""
     solid = tip.solid
     turn = turning_root(solid, level)
@@ -138,14 +125,12 @@ def _junction_legs(tip: Driven, level: Float[Array, ""]) -> tuple[_Leg, _Leg]:
     out = stretch_in_junction(tip, level, turn, jnp.where(breaks, fold, stop), _NODES)
     into = stretch_in_junction(tip, level, turn, tip.junction.forms_root, _NODES)
     # the way in is the way out of the same energy, backwards
-    return (
-        _Leg(into.duration_us - into.time_us[::-1], into.gap_nm[::-1], -into.speed[::-1], into.duration_us),
-        _Leg(out.time_us, out.gap_nm, out.speed, out.duration_us),
-    )
+    backwards = into.duration_us - into.time_us[::-1], into.gap_nm[::-1], -into.velocity[::-1], into.duration_us
+    return Stretch(*backwards), out
 
 
 def _joined(
-    contact: Contact, junction: Junction, speed: float, legs: list[_Leg], energies: Float[np.ndarray, "3"]
+    contact: Contact, junction: Junction, speed: float, legs: list[Stretch], energies: Float[np.ndarray, "3"]
 ) -> TimeCourse:
     """Return the legs one after the other, with free flight before and, for a tip that leaves, after them."""
     forms, breaks = float(contact.bridge_forms_nm), max(float(contact.bridge_breaks_nm), float(junction.breaks_gap_nm))
@@ -156,10 +141,10 @@ def _joined(
     begin = 0.0
     _, off, rebound = energies
     for phase, leg in zip((Phase.BRIDGE, Phase.JUNCTION, Phase.JUNCTION, Phase.BRIDGE), legs, strict=True):
-        if not leg.duration > 0.0 or (leg is legs[-1] and off <= 0.0):
+        if not leg.duration_us > 0.0 or (leg is legs[-1] and off <= 0.0):
             continue
-        parts.append((phase, begin + np.asarray(leg.time), np.asarray(leg.gap), np.asarray(leg.velocity)))
-        begin += float(leg.duration)
+        parts.append((phase, begin + np.asarray(leg.time_us), np.asarray(leg.gap_nm), np.asarray(leg.velocity)))
+        begin += float(leg.duration_us)
     captured = not rebound > 0.0
     if not captured:
         after = np.array([begin, begin + flight / rebound])

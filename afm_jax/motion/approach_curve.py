@@ -6,13 +6,13 @@ shows. A tip that is captured on the way, as laws with adhesion capture slow one
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.scene import Scene, drive_of, require_one_frequency
@@ -25,6 +25,7 @@ from afm_jax.motion.observe import Observables, observe
 from afm_jax.motion.record import MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import is_stuck, settled, window_of
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
+from afm_jax.motion.start import state
 from afm_jax.motion.trajectory import DensePath, dense_path
 from afm_jax.outcomes import OutcomeInWords
 from afm_jax.results import ResultTuple, public_result
@@ -123,7 +124,6 @@ def approach_curve(
     both_ways: bool = True,
     longest_periods: int | None = None,
     accuracy: float = DEFAULT_ACCURACY,
-    method: str = "collocation",
     report: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> ApproachCurve:
     """Return amplitude and lag of a driven tip at a series of heights of the sample, each followed until it repeats.
@@ -136,7 +136,6 @@ def approach_curve(
         both_ways: go back through the heights as well.
         longest_periods: drive periods after which a motion counts as not settling; None: 2000, and at least 20 Q.
         accuracy: of each contact, as for `simulate`.
-        method: as for `simulate`.
         report: called after each height with how many of how many are done.
 
     Raises:
@@ -153,9 +152,10 @@ def approach_curve(
     check_count("longest_periods", longest_periods)
     if both_ways:
         course = np.concatenate([course, course[-2::-1]])
-    settings = {"accuracy": accuracy, "method": method}
-    readings = []
-    for reading in _followed(scene, course, longest_periods, settings):
+    motion, readings = _free_motion(scene, float(course[0])), []
+    for height in course.tolist():
+        reading, end = _at_height(scene, motion, height, longest_periods, accuracy)
+        motion = motion._replace(lost=True) if end is None else Motion(height, end)
         readings.append(reading)
         report(len(readings), len(course))
     columns: dict[str, Any] = dict(zip(HeightReading._fields, map(np.array, zip(*readings, strict=True)), strict=True))
@@ -204,25 +204,14 @@ def _free_height_nm(scene: Scene) -> float:
     return float(drive.tones[0].amplitude / drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive)))
 
 
-def _followed(
-    scene: Scene, course: Float[np.ndarray, " points"], longest_periods: int, settings: dict[str, Any]
-) -> Iterator[HeightReading]:
-    """Give what is read at each height, one after the other."""
-    motion = _free_motion(scene, float(course[0]))
-    for height in course.tolist():
-        reading, end = _at_height(scene, motion, height, longest_periods, settings)
-        motion = motion._replace(lost=True) if end is None else Motion(height, end)
-        yield reading
-
-
 def _free_motion(scene: Scene, height_nm: float) -> Motion:
     """Return the free tip in its steady motion over a sample at a height, or as far up as does not touch it."""
     _, response = surface_of(scene)
     assert response is not None  # something drives the tip  # noqa: S101
     times = np.linspace(0.0, drive_of(scene).period_us, _TIMES)
     top = times[np.argmax(np.asarray(response.position_and_velocity(times)[0]))]
-    state = _state(top, *response.position_and_velocity(top))
-    return Motion(min(height_nm, -_free_height_nm(scene) - _felt_nm(scene) - _CLEARANCE_NM), state)
+    start = state(top, *map(float, response.position_and_velocity(top)))
+    return Motion(min(height_nm, -_free_height_nm(scene) - _felt_nm(scene) - _CLEARANCE_NM), start)
 
 
 def _felt_nm(scene: Scene) -> float:
@@ -230,12 +219,8 @@ def _felt_nm(scene: Scene) -> float:
     return float(scene.interaction.bridge_forms_nm) if isinstance(scene.interaction, Contact) else 0.0
 
 
-def _state(*parts: ArrayLike) -> State:
-    return State(*(jnp.asarray(part, float) for part in parts))
-
-
 def _at_height(
-    scene: Scene, begin: Motion, height_nm: float, longest_periods: int, settings: dict[str, Any]
+    scene: Scene, begin: Motion, height_nm: float, longest_periods: int, accuracy: float
 ) -> tuple[HeightReading, State | None]:
     """Return what is read at a height, and the tip at the top of its swing there; None where it does not fly any more.
 
@@ -244,7 +229,7 @@ def _at_height(
         begin: where to come from.
         height_nm: of the sample over the rest position.
         longest_periods: drive periods after which the motion counts as not settling.
-        settings: of `follow_long`.
+        accuracy: of each contact.
     """
     period_us = drive_of(scene).period_us
     start, here = begin.state, _with_sample(scene, height_nm, 0.0)
@@ -253,7 +238,7 @@ def _at_height(
         periods = math.ceil(abs(height_nm - begin.height_nm) / (_MOVED * _free_height_nm(scene)))
         rate = (height_nm - begin.height_nm) / (periods * period_us)
         moving = _with_sample(scene, begin.height_nm - rate * float(start.time_us), rate)
-        on_the_way = follow_long(moving, start, periods * period_us, **settings)
+        on_the_way = follow_long(moving, start, periods * period_us, accuracy=accuracy)
         reading = _why_over(on_the_way)
         if reading is None:
             end_us = float(on_the_way.simulation.final.time_us)
@@ -271,7 +256,7 @@ def _at_height(
         verdict = settled(here, motion, tolerance=TOLERANCE)
         return verdict.settled and (verdict.periods == 1 or settled(here, motion, tolerance=_STRICTER).settled)
 
-    run = follow_long(here, start, longest_periods * period_us, enough=over, **settings)
+    run = follow_long(here, start, longest_periods * period_us, enough=over, accuracy=accuracy)
     reading = _why_over(run)
     if reading is not None:
         return reading, None
@@ -307,7 +292,7 @@ def _top_of_swing(dense: DensePath, from_us: float, to_us: float, period_us: flo
     top = int(np.argmax(heights))
     if not np.isfinite(heights[top]):
         return None
-    return _state(path.time_us[top] % period_us, path.position_nm[top], path.velocity_nm_per_us[top])
+    return state(path.time_us[top] % period_us, path.position_nm[top], path.velocity_nm_per_us[top])
 
 
 def _reading_of(seen: Observables, *, deflection: bool) -> HeightReading:

@@ -138,16 +138,14 @@ def why_over(piece: Piece) -> str | None:
     return f"the sample captures the tip (at {held_since(piece.motion):.4g} us)" if piece.stuck else None
 
 
-def follow_long(  # noqa: PLR0913
+def follow_long(
     scene: Scene,
     start: State,
     duration_us: float,
     *,
     until_settled: bool = False,
     enough: Callable[[Simulation], bool] = lambda _: False,
-    piece_contacts: int | None = None,
     accuracy: float = DEFAULT_ACCURACY,
-    method: str = "collocation",
     report: Callable[[float, int], None] | None = None,
 ) -> LongRun:
     """Return a scene followed for a duration, or until it has settled or is enough if that is earlier.
@@ -159,9 +157,7 @@ def follow_long(  # noqa: PLR0913
         until_settled: end with the piece in which the motion has settled, or some periods after the sample has come to
             hold the tip.
         enough: asked after every piece of the motion so far: whether to stop.
-        piece_contacts: contacts of a piece; None: what some periods of the fastest motion have room for.
         accuracy: of `simulate`.
-        method: of `simulate`.
         report: called after every piece with the time reached in us and the number of contacts so far.
 
     Raises:
@@ -169,13 +165,13 @@ def follow_long(  # noqa: PLR0913
     """
     surface, _ = surface_of(scene)
     fastest = max(float(scene.cantilever.angular_frequency), float(surface.fastest_angular_frequency))
-    piece_us = _PIECE_PERIODS * 2.0 * math.pi / fastest if piece_contacts is None else math.inf
+    piece_us = _PIECE_PERIODS * 2.0 * math.pi / fastest
 
     def run(state: State, length_us: float) -> Simulation:
-        room = (piece_contacts or _ROOM) if length_us <= piece_us * _LITTLE else None
-        return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy, method=method)
+        room = _ROOM if length_us <= piece_us * _LITTLE else None
+        return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy)
 
-    count, pieces, whole, verdict = 0, [], None, None
+    count, pieces, whole = 0, [], None
     for piece in follow_in_pieces(scene, start, float(start.time_us) + duration_us, run, piece_us=piece_us):
         if until_settled and piece.stuck:
             piece = _shortened(scene, piece, run)  # noqa: PLW2901
@@ -183,15 +179,10 @@ def follow_long(  # noqa: PLR0913
         whole = joined(pieces)
         if report is not None:
             report(float(whole.final.time_us), len(whole.contacts.kind))
-        if until_settled:
-            verdict = settled(scene, whole)
-            if verdict.settled or piece.stuck:
-                break
-        if enough(whole):
-            verdict = None
+        if enough(whole) or (until_settled and (piece.stuck or settled(scene, whole).settled)):
             break
     assert whole is not None  # there is one piece at least  # noqa: S101
-    return LongRun(whole, settled(scene, whole) if verdict is None else verdict, count)
+    return LongRun(whole, settled(scene, whole), count)
 
 
 def _shortened(scene: Scene, piece: Piece, run: Run) -> Piece:

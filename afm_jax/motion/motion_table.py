@@ -14,7 +14,7 @@ from afm_jax.motion.observe import OBSERVABLES, Observables, why_absent
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
 from afm_jax.motion.settle import Window
 from afm_jax.motion.trajectory import DensePath
-from afm_jax.results import Result
+from afm_jax.results import Result, known_columns
 
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
@@ -192,23 +192,13 @@ def lines_of(payload: Mapping[str, Any]) -> list[str]:
 
 
 def _contact_columns(simulation: Simulation) -> dict[str, list[Any]]:
-    """Return the columns of all contacts; times of what did not happen are None."""
-    contacts = simulation.contacts
-    table = {name: value for name, value in contacts._asdict().items() if name != "detail"}
-    if contacts.detail is not None:
-        table |= contacts.detail._asdict()
-    columns = {name: np.asarray(column)[: int(simulation.count)].tolist() for name, column in table.items()}
-    columns["kind"] = [ContactKind(kind).name.lower() for kind in columns["kind"]]
-    left_again = [kind != "held" for kind in columns["kind"]]
-    for name, values in columns.items():
-        if name.startswith(("departure", "rebound")):
-            happened = left_again
-        elif name in ("junction_forms_us", "junction_breaks_us"):
-            happened = columns["junctions"]
-        else:
-            continue
-        columns[name] = [value if flag else None for value, flag in zip(values, happened, strict=True)]
-    return columns
+    """Return the columns of all contacts; times of what did not happen are NaN."""
+    columns = {
+        name.removeprefix("contacts_").removeprefix("detail_"): column[: int(simulation.count)].tolist()
+        for name, (column, _) in known_columns(simulation).items()
+        if name.startswith("contacts_")
+    }
+    return columns | {"kind": [ContactKind(kind).name.lower() for kind in columns["kind"]]}
 
 
 def stretch_written(simulation: Simulation, window: Window) -> tuple[float, float]:

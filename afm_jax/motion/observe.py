@@ -31,7 +31,7 @@ from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import FlightEnds, highest_of_flight
-from afm_jax.motion.record import ContactKind, Contacts, Simulation, State, contacts_left, to_gap
+from afm_jax.motion.record import ContactKind, Contacts, Simulation, State, contacts_left, to_gap, with_response
 from afm_jax.motion.settle import Settled, Window, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
@@ -636,11 +636,9 @@ def _peaks(
 ) -> Float[Array, " flights"]:
     """Return the largest heights in the lab of flights."""
     duration = end_us - start_us
-    if response is not None:
-        steady, rate = response.position_and_velocity(start_us)
-        position_nm, velocity_nm_per_us = position_nm - steady, velocity_nm_per_us - rate
-    ends = cantilever.propagator(duration)(position_nm, velocity_nm_per_us)
-    flights = FlightEnds(start_us, duration, position_nm, velocity_nm_per_us, *ends)
+    _, position, velocity = with_response(response, State(start_us, position_nm, velocity_nm_per_us), -1.0)
+    ends = cantilever.propagator(duration)(position, velocity)
+    flights = FlightEnds(start_us, duration, position, velocity, *ends)
     return jax.vmap(lambda flight: highest_of_flight(cantilever, flight, response))(flights)
 
 

@@ -152,16 +152,21 @@ def contacts_left(simulation: Simulation) -> Bool[np.ndarray, " rows"]:
     return np.isin(np.asarray(simulation.contacts.kind), (ContactKind.IMPACT, ContactKind.CHATTER))
 
 
+def with_response(response: Surface | None, state: State, sign: float = 1.0) -> State:
+    """Return a state with the steady response to drives of base and tip added to it, or with a sign of -1 taken off."""
+    if response is None:
+        return state
+    steady, rate = response.position_and_velocity(state.time_us)
+    return State(state.time_us, state.position_nm + sign * steady, state.velocity_nm_per_us + sign * rate)
+
+
 @jax.jit
 def to_gap(
     surface: Platform | Surface, response: Surface | None, state: State
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
     """Return gap in nm and gap rate in nm/us of a state in the lab; arrays of any shape."""
     height, speed = surface.position_and_velocity(state.time_us)
-    position, velocity = jnp.asarray(state.position_nm), jnp.asarray(state.velocity_nm_per_us)
-    if response is not None:
-        steady, rate = response.position_and_velocity(state.time_us)
-        position, velocity = position - steady, velocity - rate
+    _, position, velocity = with_response(response, state, -1.0)
     return position - height, velocity - speed
 
 
@@ -171,11 +176,8 @@ def to_lab(
 ) -> State:
     """Return the state in the lab of a gap in nm and its rate in nm/us; arrays of any shape."""
     height, speed = surface.position_and_velocity(time_us)
-    position, velocity = jnp.asarray(gap_nm) + height, jnp.asarray(gap_rate) + speed
-    if response is not None:
-        steady, rate = response.position_and_velocity(time_us)
-        position, velocity = position + steady, velocity + rate
-    return State(jnp.asarray(time_us), position, velocity)
+    free = State(jnp.asarray(time_us), jnp.asarray(gap_nm) + height, jnp.asarray(gap_rate) + speed)
+    return with_response(response, free)
 
 
 def contacts_in_lab(

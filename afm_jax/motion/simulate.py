@@ -13,7 +13,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, is_traced, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase, end_of_contact, explain_missing_junction, find_junction
+from afm_jax.contact.junction import Phase, end_of_contact, find_junction, require_junction
 from afm_jax.contact.settings import driven_setting_of
 from afm_jax.impact.law import Law
 from afm_jax.motion.contact_motion import follow_contacts, has_just_left
@@ -24,6 +24,7 @@ from afm_jax.motion.record import (
     Simulation,
     State,
     to_gap,
+    with_response,
 )
 from afm_jax.motion.start import default_start
 from afm_jax.solve.lanes import power_of_two
@@ -123,23 +124,18 @@ def _follow_free(
         until: time of the end in us.
     """
     del surface
-    position, velocity = start.position_nm, start.velocity_nm_per_us
-    if response is not None:
-        steady, rate = response.position_and_velocity(start.time_us)
-        position, velocity = position - steady, velocity - rate
-    position, velocity = scene.cantilever.propagator(until - start.time_us)(position, velocity)
-    if response is not None:
-        steady, rate = response.position_and_velocity(until)
-        position, velocity = position + steady, velocity + rate
-    none = jnp.zeros((0,), position.dtype)
+    _, position, velocity = with_response(response, start, -1.0)
+    free = scene.cantilever.propagator(until - start.time_us)(position, velocity)
+    final = with_response(response, State(until, *free))
+    none = jnp.zeros((0,), until.dtype)
     count = jnp.zeros((), jnp.int32)
-    sane = jnp.isfinite(position) & jnp.isfinite(velocity)
+    sane = jnp.isfinite(final.position_nm) & jnp.isfinite(final.velocity_nm_per_us)
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START).astype(jnp.int32)
     return Simulation(
         start=start,
         contacts=Contacts(none.astype(jnp.int32), *[none] * 9, detail=None),
         count=count,
-        final=State(until, position, velocity),
+        final=final,
         phase=jnp.full_like(count, Phase.DRY),
         held=jnp.zeros((), bool),
         outcome=outcome,
@@ -175,8 +171,7 @@ def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface 
     if any(is_traced(leaf) for leaf in leaves):
         return
     junction = find_junction(scene.interaction)
-    if not bool(junction.exists):
-        raise ValueError(f"the contact has no junction: {explain_missing_junction(scene.interaction)}")
+    require_junction(scene.interaction, junction.exists)
     gap, rate = to_gap(surface, response, start)
     leaves = has_just_left(surface, end_of_contact(scene.interaction), start.time_us, gap, rate)
     if not (bool(leaves) or float(gap) > float(junction.forms_gap_nm)):

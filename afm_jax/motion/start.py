@@ -16,7 +16,7 @@ from afm_jax.contact.junction import end_of_contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.record import State
+from afm_jax.motion.record import State, with_response
 
 _HIGHEST_ORDER = 200
 _NEWTON_STEPS = 30
@@ -117,9 +117,8 @@ def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
 def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | None:
     """Return where a flight that leaves the platform first has a gap; None if it does not rise that far."""
     surface, response = surface_of(scene)
-    # the free motion, which lacks the steady response
     position, leaving = (float(part) for part in surface.position_and_velocity(time))
-    free = velocity - (0.0 if response is None else float(response.velocity(time)))
+    free = float(with_response(response, state(time, position, velocity), -1.0).velocity_nm_per_us)
     duration, v = gap / (free - leaving), free
     for _ in range(_NEWTON_STEPS):
         height, speed = (float(part) for part in surface.position_and_velocity(time + duration))
@@ -131,7 +130,7 @@ def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | No
         if abs(step) < 1e-13:
             break
     end = time + duration
-    v += 0.0 if response is None else float(response.velocity(end))
+    v = float(with_response(response, state(end, 0.0, v)).velocity_nm_per_us)
     return state(end, float(scene.platform.position(end)) + gap, v)
 
 
