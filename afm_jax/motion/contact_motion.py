@@ -139,7 +139,7 @@ def follow_contacts(  # noqa: PLR0913
     begun = _at_start(driven, start.time_us, *to_gap(surface, response, start), rows=max_contacts)
     end = _at_end(driven, begun, until, setting, rounds=max_rounds, reverse=reverse)
     state, phase = end.tip.state, end.tip.phase
-    row = jax.vmap(ravel_pytree(ContactRow(end.contacts, end.arrival, end.tip))[1])(end.rows)
+    row = jax.vmap(_as_vector(ContactRow(end.contacts, end.arrival, end.tip))[1])(end.rows)
     return Simulation(
         start=start,
         contacts=_contacts(row, scene, surface, response, driven),
@@ -202,7 +202,7 @@ def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, row
     none, zero = jnp.zeros_like(phase), jnp.zeros_like(time_us)
     start = ContactState(gap_nm, rate, time_us, zero)
     tip = TipInContact.at_start(start, phase)
-    columns = ravel_pytree(ContactRow(none, start, tip))[0].size
+    columns = _as_vector(ContactRow(none, start, tip))[0].size
     return ContactTip(
         tip=tip,
         arrival=start,
@@ -258,7 +258,7 @@ def _round(driven: Driven, course: ContactTip, *, until_us: Array, setting: Driv
         tip = _where(again, TipInContact.arriving(driven, arrival, jnp.ones_like(again)), tip)
     place = jnp.where(ends & ~full, course.contacts, room)
     kind = jnp.where(leaves, ContactKind.IMPACT, ContactKind.HELD).astype(course.contacts.dtype)
-    row, _ = ravel_pytree(ContactRow(kind, arrival, tip))
+    row, _ = _as_vector(ContactRow(kind, arrival, tip))
     return ContactTip(
         tip=tip,
         arrival=arrival,
@@ -474,6 +474,11 @@ def _repetition(
     return again, _where(again, Repeats(repeats.times + 1, departed.time_us, departed.gap_rate), over)
 
 
+def _as_vector(row: ContactRow) -> tuple[Array, Any]:
+    """Return a contact as one vector of floats, and the function that makes a contact of such a vector again."""
+    return ravel_pytree(jax.tree.map(lambda part: part.astype(row.arrival.x.dtype), row))
+
+
 def _contacts(
     row: ContactRow, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
 ) -> Contacts:
@@ -488,7 +493,7 @@ def _contacts(
     depth = junction.shift_nm - jnp.where(touched, tip.deepest_gap_nm, 0.0)
     force = jnp.where(touched, scene.interaction.solid.force(depth), 0.0)
     detail = ContactDetail(
-        junctions=tip.junctions,
+        junctions=tip.junctions.astype(jnp.int32),
         junction_forms_us=tip.junction_forms_us,
         junction_breaks_us=tip.junction_breaks_us,
         time_in_junction_us=tip.time_in_junction_us,
