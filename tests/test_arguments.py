@@ -66,7 +66,7 @@ START = afm.State(jnp.asarray(0.0), jnp.asarray(5.0), jnp.asarray(80.0))
 TWO = np.array([1.0, 2.0])
 PAPER, NO_JUNCTION = afm.Contact.paper(), afm.Contact.paper(adhesion_energy_j_per_m2=0.05)
 WET = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 181.8), PAPER)
-RAMP = afm.Platform(2.0, 180.0, offset_rate_nm_per_us=1e-3)
+RAMP = afm.Platform(amplitude_nm=2.0, frequency_khz=180.0, offset_rate_nm_per_us=1e-3)
 RANGE = ParameterRange("platform.amplitude_nm", 1.0, 2.0)
 
 
