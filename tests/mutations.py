@@ -168,7 +168,7 @@ MUTATIONS = {
     ),
     "JKR work without its last term": Mutation("(0.4 * cube - SLOPE){ + 1.0 => })", JUNCTION),
     "junction at the JKR stiffness of half the load": Mutation("(6.0 * cube - {3.0 => 1.5} * math", JUNCTION),
-    "dissipation left out of the time": Mutation("at.available_aj{ - state[0] => })", COLLISIONS),
+    "dissipation left out of the time": Mutation("at.available_aj{ - spent_and_time[0] => })", COLLISIONS),
     "energy lost where it is gained": Mutation("- self.end_potential_aj {- => +} spent", COLLISIONS),
     "collocation that integrates from the end": Mutation("integrals[:, 0] = {roots + 1.0 => 1.0 - roots}", COLLOCATION),
     "time in the junction counted once": Mutation("{2.0 *  => }inside + rests", COLLISIONS),
@@ -252,7 +252,7 @@ MUTATIONS = {
         "tests/test_impact_orbits.py::test_orbits_repeat_when_they_are_flown",
     ),
     "sum of the exponents with the wrong sign": Mutation(
-        "sums.determinant {- => +} sums.growth",
+        "np.stack([growth, determinant {- => +} growth]",
         "tests/test_lyapunov.py::test_the_larger_exponent_is_the_growth_of_neighbouring_motions",
     ),
     "slow impacts' padding of peak and lock-in as if independent": Mutation(
@@ -309,7 +309,7 @@ MUTATIONS = {
         "tests/test_contact_legs.py::test_the_few_get_what_each_would_alone[3]",
     ),
     "a lane's own tangent taken off": Mutation(
-        "total = total {+ => -} slopes[:, place] * tangent",
+        "total = total {+ => -} slopes[:, place] * along",
         f"{SOLVE}test_derivatives_of_a_batch_are_found_forward_and_transposed[True]",
     ),
     "an absent number that spreads": Mutation(

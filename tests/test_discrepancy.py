@@ -267,4 +267,4 @@ def test_the_loss_is_said_in_energies_and_delta():
     assert said["energy lost at 20 nm/us"] == "300.0 aJ (296.1 to 303.9), 1872 eV (1848 to 1897)"
     assert said["delta = m epsilon/2"] == "80.0 aJ (76.1 to 83.9), 499 eV (475 to 524)"
     assert pytest.approx(6.241509, abs=1e-6) == EV_PER_AJ
-    assert "off by at most 0.4 % of u_out, at 24 nm/us" in parting_in_words(made_fit("law", loss=loss))
+    assert "deviates from it by at most 0.4 % of u_out, at 24 nm/us" in parting_in_words(made_fit("law", loss=loss))

@@ -117,7 +117,7 @@ def test_a_loss_that_vanishes_is_held_and_no_reason_against_a_minimum(model, tab
 def test_errors_hold_the_share_of_an_uncertain_quality_factor(table, law):
     """The Fisher matrix in blocks: var(r) = exact + (what Q leaves to r)^2/(what all say of Q)."""
     exact = fit(dataclasses.replace(table, quality_factor_error=None), model="law")
-    assert any("taken as exact" in warning for warning in exact.warnings)
+    assert any("assumed to be exact" in warning for warning in exact.warnings)
     jacobian = differenced(table, values_of(law))[:-1]  # without the constraint
     of_law, of_q = jacobian[:, :2], jacobian[:, 2]
     inverse = np.linalg.inv(of_law.T @ of_law)

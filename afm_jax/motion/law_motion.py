@@ -274,6 +274,18 @@ class Bed(NamedTuple):
         """Return the push in nm/us^2 and its rate in nm/us^3."""
         return jax.jvp(self.push, (time_us,), (jnp.ones_like(time_us),))
 
+    def time_pressed(self, time_us: Float[Array, ""]) -> Float[Array, ""]:
+        """Return for how long after a time in us the push stays positive, whatever the phase of the waves."""
+        surface, decay, square = self.surface, self.cantilever.decay_rate, self.cantilever.angular_frequency**2
+        rate, reach = surface.offset_rate_nm_per_us, surface.reach_nm
+        waves = surface.largest_acceleration_nm_per_us2 + (
+            2.0 * decay * surface.fastest_angular_frequency * reach + square * reach
+        )
+        least = square * (surface.offset_nm + rate * time_us) + 2.0 * decay * rate - waves
+        sinks = rate < 0.0
+        lasts = jnp.where(sinks, least / jnp.where(sinks, -square * rate, 1.0), jnp.inf)
+        return jnp.where(least >= 0.0, lasts, 0.0)
+
 
 class Release(NamedTuple):
     """When the surface lets a resting tip go."""
@@ -315,7 +327,7 @@ def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""
         met = step <= jnp.maximum(DEFAULT_ROOT_TOLERANCE_US, resolution * jnp.abs(time))
         lifted = met & ((rate < -bend * shortest) | (push < -bend * shortest**2))
         step = jnp.where(met & ~lifted, shortest, step)
-        return time + step, lifted, steps + 1
+        return time + jnp.maximum(step, still.time_pressed(time)), lifted, steps + 1
 
     none = jnp.zeros_like(begin, dtype=bool)
     time, lifted, steps = lax.while_loop(searching, advance, (begin, none, jnp.zeros_like(begin, dtype=jnp.int32)))
