@@ -100,9 +100,9 @@ def test_rivals_follow_straight_and_turning_contacts(course, rival: str):
     )
     tips = accuracy.tips_at(Phase.BRIDGE, driven.forms_nm, -rates, arrivals)
     if rival == "SciPy":
-        programs, numbers = accuracy.scipy_programs(motion), accuracy.numbers_of(motion)
+        programs = accuracy.ScipyPrograms(motion)
         alone = [jax.tree.map(lambda part, tip=tip: np.asarray(part)[tip], tips) for tip in (0, 1)]
-        ends = [accuracy.by_scipy(programs, numbers, tip, 1, 1e-9) for tip in alone]
+        ends = [accuracy.by_scipy(programs, programs.vector(motion), tip, 1, 1e-9) for tip in alone]
         rebounds, left = ([float(getattr(end, name)) for end in ends] for name in ("rate", "time_us"))
     else:
         problem = accuracy.rebound_speeds(2)._replace(begin=lambda _: (motion, tips))

@@ -312,12 +312,12 @@ def _scipy_rows(problem: AccuracyProblem, tolerances: Mapping[str, float]) -> It
     begin = jax.jit(problem.begin)
     template, starts = begin(problem.at)
     tips = np.unique(np.linspace(0, starts.x.size - 1, _FEW).astype(int)).tolist()
-    programs, at = scipy_programs(template), np.asarray(problem.at)
+    programs, at = ScipyPrograms(template), np.asarray(problem.at)
 
     def value(tip: int, parameters: np.ndarray, tolerance: float) -> np.ndarray:
         motion, starts = begin(jnp.asarray(parameters))
         start = jax.tree.map(lambda part: np.asarray(part)[tip], starts)
-        vector = jax.block_until_ready(numbers_of(motion))
+        vector = jax.block_until_ready(programs.vector(motion))
         began = time.perf_counter()
         end = by_scipy(programs, vector, start, problem.crossings, tolerance)
         return np.array([problem.read(end), time.perf_counter() - began])
@@ -342,34 +342,47 @@ def _scipy_rows(problem: AccuracyProblem, tolerances: Mapping[str, float]) -> It
             yield _row(of, "SciPy DOP853", name, float(each) / problem.events, error)
 
 
-def numbers_of(motion: EquationOfMotion) -> Array:
-    """Return the numbers of a motion as a vector."""
-    return ravel_pytree(eqx.filter(motion, eqx.is_inexact_array))[0]
+class ScipyPrograms:
+    """What SciPy calls, compiled once: functions of a motion's numbers in a vector."""
+
+    def __init__(self, template: EquationOfMotion):
+        """Take the structure of a motion; its numbers are an argument of the programs."""
+        numbers, rest = eqx.partition(template, eqx.is_inexact_array)
+        _, unravel = ravel_pytree(numbers)
+
+        def of(vector: Array) -> EquationOfMotion:
+            return eqx.combine(unravel(vector), rest)
+
+        self.after = jax.jit(lambda vector, tip, risen: of(vector).after(tip, risen))
+        self.levels = jax.jit(lambda vector, phase: of(vector).levels(phase))
+        self.flight = jax.jit(lambda vector: _flight_numbers(of(vector)))
+        self.rates = {
+            phase: jax.jit(lambda vector, y, phase=phase: jnp.stack(of(vector).rates(phase, *y)))
+            for phase in (Phase.BRIDGE, Phase.JUNCTION)
+        }
+
+    @staticmethod
+    def vector(motion: EquationOfMotion) -> Array:
+        """Return the numbers of a motion."""
+        return ravel_pytree(eqx.filter(motion, eqx.is_inexact_array))[0]
 
 
-def scipy_programs(template: EquationOfMotion) -> dict[str, Callable[..., Any]]:
-    """Return what SciPy calls, compiled once: functions of the numbers of motions like this one."""
-    numbers, rest = eqx.partition(template, eqx.is_inexact_array)
-    _, unravel = ravel_pytree(numbers)
-
-    def of(vector: Array) -> EquationOfMotion:
-        return eqx.combine(unravel(vector), rest)
-
-    return {
-        "after": jax.jit(lambda vector, tip, risen: of(vector).after(tip, risen)),
-        "levels": jax.jit(lambda vector, phase: (*of(vector).levels(phase), _longest_step(of(vector), phase))),
-        "rates": jax.jit(lambda vector, phase, y: jnp.stack(of(vector).rates(phase, *y))),
-    }
+def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
+    """Return Omega^2, Omega/Q, the longest step, offset and ramp of the surface, and its cosines as rows."""
+    cantilever, surface = motion.cantilever, motion.surface
+    assert cantilever is not None  # it flies  # noqa: S101
+    assert surface is not None  # noqa: S101
+    waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in surface.waves])
+    own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, Phase.DRY)
+    return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
 
 
-def by_scipy(
-    programs: Mapping[str, Callable[..., Any]], vector: Array, tip: Tip, crossings: int, tolerance: float
-) -> Tip:
+def by_scipy(programs: ScipyPrograms, vector: Array, tip: Tip, crossings: int, tolerance: float) -> Tip:
     """Follow a tip from phase to phase, each ended by an event of `solve_ivp`.
 
     Args:
-        programs: of motions like this one (`scipy_programs`).
-        vector: this motion's numbers (`numbers_of`).
+        programs: of motions like this one.
+        vector: this motion's numbers (`ScipyPrograms.vector`).
         tip: at the beginning of a phase.
         crossings: how often it arrives at the sample or leaves it.
         tolerance: relative; the absolute one is a thousandth of it.
@@ -380,33 +393,85 @@ def by_scipy(
     for _ in range(_MOST_PHASES * crossings):
         if tip.crossings >= crossings:
             return tip
-        phase = jnp.asarray(tip.phase)
-        down, up, longest = (float(each) for each in programs["levels"](vector, phase))
-        ends: list[Any] = [lambda _, y, down=down: y[0] - down]
-        ends += [lambda _, y, up=up: y[0] - up] if math.isfinite(up) else []
-        for event, direction in zip(ends, (-1.0, 1.0), strict=False):
-            vars(event).update(terminal=True, direction=direction)
-        # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
-        with np.errstate(all="ignore"):
-            path = solve_ivp(
-                lambda _, y, phase=phase: np.asarray(programs["rates"](vector, phase, y)),
-                (0.0, _LONGEST_US if phase == Phase.DRY else _LONGEST_TOUCH_US),
-                [float(tip.x), float(tip.rate), float(tip.time_us)],
-                method="DOP853",
-                rtol=tolerance,
-                atol=1e-3 * tolerance,
-                max_step=longest,
-                events=ends,
-            )
-        if path.status != 1:
-            raise ValueError(f"SciPy ended without an event: {path.message}")
-        met = next(place for place, times in enumerate(path.t_events) if len(times))
-        _, rate, now = (np.asarray(part) for part in path.y_events[met][0])
-        ended = tip._replace(rate=rate, time_us=now)
-        tip = jax.tree.map(np.asarray, programs["after"](vector, ended, np.asarray(met == 1)))
+        down, up = (float(level) for level in programs.levels(vector, tip.phase))
+        through = _flown_by_scipy if int(tip.phase) == Phase.DRY else _touched_by_scipy
+        risen, ended = through(programs, vector, tip, (down, up), tolerance)
+        tip = jax.tree.map(np.asarray, programs.after(vector, ended, risen))
         if not np.isfinite(tip.rate):
             raise ValueError(f"the sample captures the tip that arrives at {float(tip.arrived_us):.6g} us")
     raise ValueError(f"the sample holds the tip that arrives at {float(tip.arrived_us):.6g} us")
+
+
+def _touched_by_scipy(
+    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
+) -> tuple[np.ndarray, Tip]:
+    """Return whether a phase of a contact ends at the gap that the tip rises to, and the tip there."""
+    rates, (down, up) = programs.rates[Phase(int(tip.phase))], levels
+    ends: list[Any] = [lambda _, y: y[0] - down]
+    ends += [lambda _, y: y[0] - up] if math.isfinite(up) else []
+    for event, direction in zip(ends, (-1.0, 1.0), strict=False):
+        vars(event).update(terminal=True, direction=direction)
+    state = [float(tip.x), float(tip.rate), float(tip.time_us)]
+    met, _, (_, rate, now) = _to_event(lambda _, y: np.asarray(rates(vector, y)), state, ends, tolerance)
+    return np.asarray(met == 1), tip._replace(rate=np.asarray(rate), time_us=np.asarray(now))
+
+
+def _flown_by_scipy(
+    programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
+) -> tuple[np.ndarray, Tip]:
+    """Return that the tip has fallen, and the tip at the end of its flight: in the lab, in plain numbers."""
+    *numbers, rows = programs.flight(vector)
+    square, friction, longest, offset, ramp = (float(number) for number in numbers)
+    waves, start = np.asarray(rows).tolist(), float(tip.time_us)
+
+    def height(now: float) -> float:
+        moved = sum(c * math.cos(omega * now) + s * math.sin(omega * now) for c, s, omega in waves)
+        return offset + ramp * now + moved
+
+    def speed(now: float) -> float:
+        return ramp + sum(o * (s * math.cos(o * now) - c * math.sin(o * now)) for c, s, o in waves)
+
+    def gap(flown: float, y: Any) -> float:
+        return y[0] - height(start + flown) - levels[0]
+
+    def rates(_: float, y: Any) -> tuple[float, float]:
+        return y[1], -square * y[0] - friction * y[1]
+
+    vars(gap).update(terminal=True, direction=-1.0)
+    state = [float(tip.x) + height(start), float(tip.rate) + speed(start)]
+    _, flown, (_, velocity) = _to_event(rates, state, [gap], tolerance, (_LONGEST_US, longest))
+    rate = velocity - speed(start + flown)
+    return np.zeros((), bool), tip._replace(rate=np.asarray(rate), time_us=np.asarray(start + flown))
+
+
+def _to_event(
+    rates: Callable[[float, Any], Any],
+    state: list[float],
+    events: list[Any],
+    tolerance: float,
+    longest: tuple[float, float] = (_LONGEST_TOUCH_US, np.inf),
+) -> tuple[int, float, np.ndarray]:
+    """Return which event ends a phase, when, and the state there; `longest` are the phase's length and its steps'.
+
+    Raises:
+        ValueError: if none does.
+    """
+    # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
+    with np.errstate(all="ignore"):
+        path = solve_ivp(
+            rates,
+            (0.0, longest[0]),
+            state,
+            method="DOP853",
+            rtol=tolerance,
+            atol=1e-3 * tolerance,
+            max_step=longest[1],
+            events=events,
+        )
+    if path.status != 1:
+        raise ValueError(f"SciPy ended without an event: {path.message}")
+    met = next(place for place, times in enumerate(path.t_events) if len(times))
+    return met, float(path.t_events[met][0]), path.y_events[met][0]
 
 
 _ROOT_TOLERANCES_US = (1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-13)
