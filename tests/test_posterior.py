@@ -141,7 +141,7 @@ def log_density(law) -> LogDensity:
 def test_parameters_that_are_one_have_no_space(law, tie):
     explained = explained_of(law)
     tied = tie * np.repeat(explained.end.jacobian[:, :1], 3, axis=1)
-    with pytest.raises(ValueError, match="hardly tell r, epsilon, quality_factor apart"):
+    with pytest.raises(ValueError, match="hardly distinguish r, epsilon, quality_factor"):
         log_density_of(dataclasses.replace(explained, end=explained.end._replace(jacobian=tied)))
 
 
