@@ -41,7 +41,7 @@ PARAMETERS |= {"ParameterRange", "TabulatedLaw", "Tone"}
 ROOT = Path(__file__).parent.parent
 DRAWN_BELOW = {"Comparison", "Continuation", "Design", "FitResult", "Inversion", "LockinResult"}
 DRAWN_BELOW |= {"StabilityChart"}
-DRAWN_ELSEWHERE = {"Basins", "ContactDelay", "BifurcationDiagram", "Tapping", "TappingMap"}
+DRAWN_ELSEWHERE = {"Basins", "ContactDelay", "BifurcationDiagram", "Lyapunov", "Tapping", "TappingMap"}
 """What is drawn in its own way, from parts that belong together: these are made by computations."""
 SIZES = {"rows": 7, "points": 5, "p": 2, "columns": 3, "orders": 2, "scenes": 21}
 

@@ -492,15 +492,17 @@ class TabulatedLaw(Law):
         capture = numpy.asarray(law.capture)
 
         def along(by_rebound: Any, by_delay: Any, by_capture: Any) -> dict[str, Any]:
-            ends = []
-            for side in (-_SMALL, _SMALL):
+            # no rebound, and no distance from capture, changes by more than 1 %
+            relative = numpy.abs(numpy.append(by_rebound, by_capture)) / numpy.append(w, u[0] - capture)
+            small, ends = _SMALL / numpy.maximum(1.0, 100.0 * _SMALL * numpy.max(relative)), []
+            for side in (-small, small):
                 rebound, held = w + side * by_rebound, capture + side * by_capture
                 if extrapolated:
                     held = _capture_speed(u, rebound, 0.0, numpy)
                 delayed = None if late is None else late + side * by_delay
                 ends.append((held, *_splines(u, rebound, delayed, held, beside, numpy)))
             names = ("capture", "loss_spline", *(("delay_spline",) if late is not None else ()))
-            return {name: (end - start) / (2.0 * _SMALL) for name, start, end in zip(names, *ends, strict=False)}
+            return {name: (end - start) / (2.0 * small) for name, start, end in zip(names, *ends, strict=False)}
 
         changes = by_rebound, by_delay, by_capture
         if numpy is jnp:
