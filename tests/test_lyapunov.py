@@ -40,6 +40,16 @@ def found():
 
 
 @pytest.mark.slow
+def test_the_picture_has_a_dot_a_motion_and_the_band(found):
+    band = np.column_stack([np.zeros(4), np.ones(4)])
+    (axes,) = found._replace(larger_interval95=band).plot().axes
+    smaller, larger = axes.lines[:2]
+    np.testing.assert_array_equal(np.asarray(larger.get_ydata()), found.exponents_per_impact[:, 0])
+    np.testing.assert_array_equal(np.asarray(smaller.get_ydata()), found.exponents_per_impact[:, 1])
+    assert np.ptp(axes.collections[0].get_paths()[0].vertices[:, 1]) == 1.0
+
+
+@pytest.mark.slow
 def test_exponents_of_orbits_are_the_logarithms_of_their_multipliers(found):
     assert found.verdicts.names()[:3] == ["(1,1)"] * 3
     for lane, reduced in enumerate(REGULAR):
