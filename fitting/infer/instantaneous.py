@@ -24,7 +24,7 @@ _BY_OPTAX, _SAME = 2, 1e-3
 """Of these by Optax, the others by damped steps, and by Optax where one of those ends at a lower chi2."""
 _SOFT = 5.0
 """Residual of a row from which it counts linearly in the screening."""
-_FINE, _NEAR, _STEPS = 1e-16, 1e-6, 60
+_FINE, _NEAR, _STEPS = 1e-16, 1e-4, 60
 """Estimated distance of chi2 to its minimum at the end, and where only chi2 is compared; damped steps at most."""
 _APART, _HARDLY_WORSE = 5.0, 4.0
 """Errors by which another minimum differs, and the rise of chi2 up to which it may be the true one."""

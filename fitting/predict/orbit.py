@@ -327,7 +327,7 @@ def starts_of(
 
 def _in_blocks(program, table: AnyLaw, drive: str, *trees):
     """Return what a program makes of rows, a fixed number at a time."""
-    count, block = len(jax.tree.leaves(trees)[0]), BLOCK if isinstance(table, LawTable) else 2 * BLOCK
+    count, block = len(jax.tree.leaves(trees)[0]), BLOCK if isinstance(table, LawTable) else 4 * BLOCK
     parts = []
     for first in range(0, count, block):
         some = np.minimum(np.arange(first, first + block), count - 1)
