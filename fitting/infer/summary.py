@@ -182,27 +182,31 @@ def summary_of(
 def intervals_of(fitted: Fitted, closest: Closest) -> list[Interval]:
     """Return the 95 % interval of every parameter.
 
-    By profile likelihood of instantaneous laws, of epsilon where that is less than three errors from 0, and of a
+    By profile likelihood of instantaneous laws, of epsilon that is less than three errors from 0, and of a
     contact's parameter that is known to no factor of seven; else linear, in the unknown where that is a contact's.
     """
     model, covariance = fitted.explained.model, covariance_of_unknowns(fitted.explained)
     formula, intervals = isinstance(model.law, FormulaLaw), []
     # the error of a logarithm from which on an end may be far away
     positive = [name for name in model.law.own if not parameter_called(name).width]
-    bounded = {"epsilon": 1.0 / _PROFILED} if formula else dict.fromkeys(positive, _VAGUE)
+    bounded = ["epsilon"] if formula else positive
     for name, value, error in zip(closest.names, closest.values.tolist(), closest.errors.tolist(), strict=True):
         place = model.names.index(name) if name in model.names else None
         variance = np.inf if place is None else covariance[place, place]
+        far = _PROFILED * error < value if formula else variance < _VAGUE**2
         if not np.isfinite(error):
             intervals.append(Interval(None, None, UNDETERMINED))
-        elif is_of_one_table(name) or (model.law.lasting and (name not in bounded or variance < bounded[name] ** 2)):
+        elif is_of_one_table(name) or (model.law.lasting and (name not in bounded or far)):
             ends = value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error
             if place is not None and not formula and name in model.law.own:
                 here, reach = fitted.explained.end.theta[place], TWO_SIDED_95 * float(np.sqrt(variance))
                 ends = model.law.value_of(name, here - reach), model.law.value_of(name, here + reach)
             intervals.append(linear_interval(parameter_called(name), *map(float, ends)))
         else:
-            intervals.append(_profile_of(fitted, name, float(np.sqrt(variance))))
+            found = _profile_of(fitted, name, float(np.sqrt(variance)))
+            # the value is the closest formula's, not the unknown's
+            low, high = found.low and min(found.low, value), found.high and max(found.high, value)
+            intervals.append(replace(found, low=low, high=high))
     return intervals
 
 
