@@ -45,6 +45,12 @@ def _slopes_of_values() -> Float[np.ndarray, "knots knots"]:
 _SLOPES = _slopes_of_values()
 
 
+def _cubic(x: Any) -> tuple[Any, ...]:
+    """Return what a cubic at x between 0 and 1 weighs its value and slope at 0, and those at 1, with."""
+    to_right = x * x * (3.0 - 2.0 * x)
+    return 1.0 - to_right, x * (1.0 - x) ** 2, to_right, -x * x * (1.0 - x)
+
+
 class LawTable(Impact):
     """What an impact does at a coordinate: see the module.
 
@@ -91,8 +97,7 @@ class LawTable(Impact):
         approach = jnp.sqrt(self.capture**2 + excess**2)
         left = jnp.clip(jnp.floor(lax.stop_gradient(coordinate)), 0, KNOTS - 2).astype(int)
         x = coordinate - left.astype(coordinate.dtype)
-        to_right = x * x * (3.0 - 2.0 * x)
-        ends = jnp.stack([1.0 - to_right, x * (1.0 - x) ** 2, to_right, -x * x * (1.0 - x)])
+        ends = _cubic(x)
 
         def spline(numbers: Float[AnyArray, "2 knots"]) -> Float[Array, ""]:
             value, slope = numbers
@@ -111,10 +116,9 @@ def coordinate_of(approach_speed: Float[np.ndarray, "..."], capture: float) -> F
 def weights_at(coordinate: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n knots"]:
     """Return what the splines of a table weigh the values at the knots with, at coordinates."""
     left = np.clip(np.floor(coordinate), 0, KNOTS - 2).astype(int)
-    x = (coordinate - left)[:, None]
-    to_right, values = x * x * (3.0 - 2.0 * x), np.eye(KNOTS)
-    found = (1.0 - to_right) * values[left] + to_right * values[left + 1]
-    return found + x * (1.0 - x) ** 2 * _SLOPES[left] - x * x * (1.0 - x) * _SLOPES[left + 1]
+    ends, values = _cubic((coordinate - left)[:, None]), np.eye(KNOTS)
+    found = ends[0] * values[left] + ends[1] * _SLOPES[left]
+    return found + ends[2] * values[left + 1] + ends[3] * _SLOPES[left + 1]
 
 
 def table_of(
