@@ -489,7 +489,7 @@ class Collisions(NamedTuple):
         """Why there is no capture speed, or why it is 0; None where it is a speed."""
         if self.capture_speed_nm_per_us is None:
             return "There is no capture speed: tips of every speed that was tried are captured."
-        none_captured = "No tip is captured, however slow: the contact gives back what it takes."
+        none_captured = "No tip is captured, however slow: the contact dissipates no energy."
         return None if self.capture_speed_nm_per_us else none_captured
 
     def to_dict(self) -> dict[str, Any]:

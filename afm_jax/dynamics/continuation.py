@@ -261,7 +261,7 @@ def continue_orbits(
     given = parse_range(given, counted=False)
     second = None if second is None else parse_range(second, counted=False)
     ranges = (given,) if second is None else (given, second)
-    driven_part(scene)
+    driven_part(scene)  # refuses a scene whose motions cannot repeat
     _check(scene, order, impacts, ranges)
     if second is not None:
         value = parameter_values(scene)[second.path]
