@@ -49,6 +49,7 @@ def main() -> None:
     """Measure what the arguments ask for, print the table, and write the page if all of it was measured."""
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("--beside", type=Path, metavar="DIR", help="another checkout: its times, and the ratio to them")
+    parser.add_argument("--card", action="store_true", help="also on the accelerator that JAX finds, batches undivided")
     parser.add_argument("--only", metavar="WORD", help="rows whose names contain this")
     parser.add_argument("--repeats", type=int, default=5, help="runs of each row, after a first one")
     options = parser.parse_args()
@@ -57,9 +58,12 @@ def main() -> None:
         if not (options.beside / "afm_jax" / "__main__.py").is_file():
             parser.error(f"--beside: {options.beside} holds no checkout of afm-jax; name the folder above its afm_jax")
         trees["beside"] = options.beside.resolve()
+    if options.card:
+        trees["card"] = ROOT
     facts = machine(trees)
-    rows = [*python_rows(trees, options), *command_rows(trees, options), *rows_of_scipy(options)]
-    table = [facts, "", *markdown(rows, beside="beside" in trees)]
+    commands = {label: tree for label, tree in trees.items() if label != "card"}
+    rows = [*python_rows(trees, options), *command_rows(commands, options), *rows_of_scipy(options)]
+    table = [facts, "", *markdown(rows, [label for label in trees if label != "here"])]
     sys.stdout.write("\n".join(table) + "\n")
     if options.only is None:
         begin, end = MARKS
@@ -95,7 +99,7 @@ def python_rows(trees: Mapping[str, Path], options: argparse.Namespace) -> Itera
     """Give the rows of `tests.benchmarks.tasks`, in microseconds of an event."""
     names = [name for name in ROWS if options.only is None or options.only in name]
     with contextlib.ExitStack() as stack:
-        workers = {label: stack.enter_context(_worker(tree)) for label, tree in trees.items()} if names else {}
+        workers = {label: stack.enter_context(_worker(label, tree)) for label, tree in trees.items()} if names else {}
         for name in names:
             say(name)
             first = {label: _ask(worker, "prepare", name) for label, worker in workers.items()}
@@ -114,7 +118,7 @@ def python_rows(trees: Mapping[str, Path], options: argparse.Namespace) -> Itera
 
 
 @contextlib.contextmanager
-def _worker(tree: Path) -> Iterator[subprocess.Popen[str]]:
+def _worker(label: str, tree: Path) -> Iterator[subprocess.Popen[str]]:
     """Give a process that does the work of a tree, on one core: how many JAX uses is settled when it is imported."""
     pinned = hasattr(os, "sched_setaffinity")
     allowed = os.sched_getaffinity(0) if pinned else set()
@@ -126,7 +130,7 @@ def _worker(tree: Path) -> Iterator[subprocess.Popen[str]]:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env=_environment(tree),
+            env=_environment(tree) | ({"JAX_PLATFORMS": ""} if label == "card" else {}),
         )
     finally:
         if pinned:
@@ -200,15 +204,14 @@ def rows_of_scipy(options: argparse.Namespace) -> Iterator[Row]:
             yield {"what": what, "unit": "µs", "here": 1e6 * seconds}
 
 
-def markdown(rows: Sequence[Row], *, beside: bool) -> list[str]:
-    """Return the table; a row that the other tree cannot run has no ratio."""
-    headings = ["what", "median", *(("beside", "ratio") if beside else ()), "first time, s"]
+def markdown(rows: Sequence[Row], others: Sequence[str]) -> list[str]:
+    """Return the table, with a column and its ratio for each other label; what it cannot run has no ratio."""
+    headings = ["what", "median", *(word for label in others for word in (label, "ratio")), "first time, s"]
     lines = [f"| {' | '.join(headings)} |", "|---" * len(headings) + "|"]
     for row in rows:
         cells = [row["what"], _cell(row, "here")]
-        if beside:
-            known = "here" in row and "beside" in row
-            cells += [_cell(row, "beside"), f"{row['here'] / row['beside']:.2f}" if known else ""]
+        for label in others:
+            cells += [_cell(row, label), f"{row['here'] / row[label]:.2g}" if "here" in row and label in row else ""]
         first = row.get("first")
         lines.append(f"| {' | '.join([*cells, '' if first is None else f'{first:.1f}'])} |")
     return lines

@@ -23,8 +23,8 @@ jax.config.update("jax_enable_x64", val=True)
 jax.config.update("jax_enable_compilation_cache", val=False)
 
 IMPACTS = 20
-BLOCK = 1000
-"""Tips that run together."""
+BLOCKS = {"cpu": 1000}
+"""Tips that run together, as many as the cache of a processor holds; all of them elsewhere."""
 
 
 class Work(NamedTuple):
@@ -48,7 +48,8 @@ def impact_map(tips: int, slopes: str = "") -> Work:
         return jax.lax.scan(impact, start, None, length=IMPACTS)[0]
 
     def last(scene: Any, starts: Any) -> Any:
-        parts = jax.tree.map(lambda part: part.reshape(-1, min(BLOCK, tips)), starts)
+        block = min(BLOCKS.get(jax.default_backend(), tips), tips)
+        parts = jax.tree.map(lambda part: part.reshape(-1, block), starts)
         return jax.lax.map(jax.vmap(lambda start: one(scene, start)), parts)
 
     def total(scene: Any, starts: Any) -> Any:
@@ -139,8 +140,12 @@ ROWS: dict[str, Callable[[], Work]] = {
     "map, 10,000 tips": partial(impact_map, 10_000),
     "map, 10,000 tips, forward derivative": partial(impact_map, 10_000, "forward"),
     "map, 10,000 tips, reverse gradient by all parameters and starts": partial(impact_map, 10_000, "reverse"),
+    "map, 1,000,000 tips": partial(impact_map, 1_000_000),
+    "map, 1,000,000 tips, forward derivative": partial(impact_map, 1_000_000, "forward"),
+    "map, 1,000,000 tips, reverse gradient by all parameters and starts": partial(impact_map, 1_000_000, "reverse"),
     "collide, accuracy 1e-6": partial(collisions, 10_000, accuracy=1e-6),
     "collide, accuracy 1e-9 (default)": partial(collisions, 10_000),
+    "collide, 1,000,000 speeds, accuracy 1e-9": partial(collisions, 1_000_000),
     "collide, collocation, accuracy 1e-9": partial(collisions, 10_000, method="collocation"),
     "collide, accuracy 1e-9, forward derivative": partial(collisions, 10_000, "forward"),
     "collide, accuracy 1e-9, reverse gradient by all parameters and speeds": partial(collisions, 10_000, "reverse"),
