@@ -59,7 +59,7 @@ from afm_jax.apparatus.drives import SAME_FREQUENCY, BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, check_mass, drive_of
 from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
-from afm_jax.checks import check_parameter, checked
+from afm_jax.checks import check_parameter, checked, is_traced
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law, TabulatedLaw, law_of_dict
 from afm_jax.motion.record import State
 from afm_jax.scenefile.law_files import load_law
@@ -162,6 +162,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
             start is impossible in it.
     """
     tables = scene_tables(scene)
+    scene_of_tables(tables, "the scene")
     if start is not None:
         check_start(start, scene)
         tables["start"] = {key: float(value) for key, value in start._asdict().items()}
@@ -169,17 +170,13 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
 
 
 def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
-    """Return a scene as the tables of its file, dicts of numbers; what is absent is left out.
+    """Return a scene as the tables of its file, dicts of numbers, traced ones too; what is absent is left out.
 
     Raises:
         TypeError: if the interaction is neither an impact law nor a contact nor None.
-        ValueError: if the scene is a batch of scenes, its contact is none that a file can hold, a second frequency is
-            equal to the first, or an undamped cantilever is driven at its free frequency.
+        ValueError: if the scene is a batch of scenes, or its contact is none that a file can hold.
     """
     drives = {"platform": scene.platform, "base": scene.base, "force": scene.force}
-    for name, drive in drives.items():
-        if isinstance(drive, BaseDrive | ForceDrive):
-            check_steady_response(scene.cantilever, drive.tones, name)
     return {
         "cantilever": _numbers_of(scene.cantilever, "cantilever"),
         **{name: _drive_table(name, drive) for name, drive in drives.items() if drive is not None},
@@ -258,7 +255,7 @@ def _platform_of(
     table = tables["platform"]
     may_rest = excitation is not None and "platform.second" not in tables
     numbers = table.numbers(*(() if may_rest else ("amplitude_nm",)))
-    if may_rest and not numbers.get("amplitude_nm") and not {"frequency_khz", "reduced_frequency"} & set(numbers):
+    if may_rest and not {"frequency_khz", "reduced_frequency"} & set(numbers) and not numbers.get("amplitude_nm"):
         return table.build(Platform, **numbers)
     platform = table.build(Platform, **_with_frequency(table, {"amplitude_nm": 0.0} | numbers, cantilever))
     return _with_second(tables, "platform", platform, cantilever)
@@ -290,9 +287,7 @@ def _tone(table: SceneTable, name: str, cantilever: Cantilever) -> dict[str, flo
         tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
         table.build(check_steady_response, cantilever, (tone,), name)
         kind = ForceDrive if name == "force" else BaseDrive
-        numbers[amplitude] = numbers.pop(free) * float(
-            drive_per_free_height(cantilever, numbers["frequency_khz"], kind)
-        )
+        numbers[amplitude] = numbers.pop(free) * drive_per_free_height(cantilever, numbers["frequency_khz"], kind)
     return numbers
 
 
@@ -303,7 +298,8 @@ def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, can
         return drive
     numbers = _tone(table, name, cantilever)
     second = table.build(Tone, numbers.pop(_amplitude(name)), **numbers)
-    if _same_frequency(drive, second):
+    both = drive.frequency_khz, second.frequency_khz
+    if not any(map(is_traced, both)) and np.all(np.isclose(*both, rtol=SAME_FREQUENCY, atol=0.0)):
         table.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
     return eqx.tree_at(lambda drive: drive.second, drive, second, is_leaf=lambda leaf: leaf is None)
 
@@ -311,17 +307,14 @@ def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, can
 def _with_frequency(table: SceneTable, numbers: dict[str, float], cantilever: Cantilever) -> dict[str, float]:
     """Return a drive's numbers with `frequency_khz`, whichever way the table gives it."""
     reduced = numbers.pop("reduced_frequency", None)
-    if (reduced is None) == ("frequency_khz" not in numbers):
-        both = reduced is not None
-        table.fail(
-            "has both frequency_khz and reduced_frequency; give one of them"
-            if both
-            else "the drive frequency is missing; add frequency_khz or reduced_frequency"
-        )
+    if reduced is not None and "frequency_khz" in numbers:
+        table.fail("has both frequency_khz and reduced_frequency; give one of them")
     if reduced is not None:
         table.build(check_parameter, "reduced_frequency", reduced, "positive")
         # omega / 2 Omega
-        numbers["frequency_khz"] = 2.0 * reduced * float(cantilever.frequency_khz)
+        numbers["frequency_khz"] = 2.0 * reduced * cantilever.frequency_khz
+    if "frequency_khz" not in numbers:
+        table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
     return numbers
 
 
@@ -354,12 +347,12 @@ def _tabulated(table: SceneTable) -> TabulatedLaw:
     if others:
         table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
     given = table.values[source]
-    if source == "file":
-        if not isinstance(given, str):
-            table.fail(f"must be the path of a law's file, as text, but is {in_words(given)}", "file")
+    of_file = source == "file"
+    kind, must = (str, "the path of a law's file, as text") if of_file else (dict, "a table, [interaction.table]")
+    if not isinstance(given, kind):
+        table.fail(f"must be {must}, but is {in_words(given)}", source)
+    if of_file:
         return table.build(load_law, Path(table.source).parent / given)
-    if not isinstance(given, dict):
-        table.fail(f"must be a table, [interaction.table], but is {in_words(given)}", "table")
     try:
         return table.build(law_of_dict, given)
     except (KeyError, TypeError) as error:
@@ -371,14 +364,8 @@ def _drive_table(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[st
     second = drive.second
     if second is None:
         return table
-    if _same_frequency(drive, second):
-        raise ValueError(f"the second frequency of `{name}` is that of the first: add the two up to one cosine")
     amplitude = {_amplitude(name): _number_of(second.amplitude, _amplitude(name))}
     return {**table, "second": {**amplitude, **_numbers_of(second, f"{name}.second")}}
-
-
-def _same_frequency(drive: Platform | BaseDrive | ForceDrive, second: Tone) -> bool:
-    return bool(np.all(np.isclose(drive.frequency_khz, second.frequency_khz, rtol=SAME_FREQUENCY, atol=0.0)))
 
 
 def _amplitude(name: str) -> str:
@@ -427,12 +414,14 @@ def _numbers_of(part: eqx.Module, table: str) -> dict[str, Any]:
     }
 
 
-def _number_of(value: ArrayLike, key: str) -> float:
-    """Return a parameter as a number.
+def _number_of(value: ArrayLike, key: str) -> Any:
+    """Return a parameter as a number; a traced one as it is.
 
     Raises:
         ValueError: if it is an array of numbers.
     """
+    if is_traced(value):
+        return value
     number = np.asarray(value)
     if number.ndim:
         raise ValueError(f"`{key}` has shape {number.shape}, but a scene file holds one scene: save them one by one")
