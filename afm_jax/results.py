@@ -10,6 +10,7 @@ import importlib
 import io
 import math
 import types
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, dataclass_transform, get_args
@@ -163,9 +164,9 @@ def public_result(
 
 def text_of(self: Any) -> str:
     """Return a result in at most 20 lines: a field each, arrays by their range, outcomes in words."""
-    return "\n".join(
-        [f"{type(self).__name__}:", *(f"  {name:<{_widest(self)}}  {text}" for name, text in _lines(self))]
-    )
+    lines = _lines(self)
+    widest = max((len(name) for name, _ in lines), default=0)
+    return "\n".join([f"{type(self).__name__}:", *(f"  {name:<{widest}}  {text}" for name, text in lines)])
 
 
 def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
@@ -276,11 +277,8 @@ def _needed(package: str, extra: str) -> Any:
     try:
         return importlib.import_module(package)
     except ModuleNotFoundError as error:
-        if error.name != package:
-            raise
-        raise ModuleNotFoundError(
-            f"this needs the package {package}: pip install 'afm-jax[{extra}]'", name=package
-        ) from error
+        hint = f"this needs the package {package}: pip install 'afm-jax[{extra}]'"
+        raise ModuleNotFoundError(hint, name=package) from error
 
 
 def _dimensions(kind: type, name: str, count: int) -> tuple[str, ...]:
@@ -298,10 +296,6 @@ def _annotations(kind: type) -> dict[str, Any]:
     return {name: hint for each in kind.__mro__[::-1] for name, hint in vars(each).get("__annotations__", {}).items()}
 
 
-def _widest(record: Any) -> int:
-    return max((len(name) for name, _ in _lines(record)), default=0)
-
-
 def _lines(record: Any) -> list[tuple[str, str]]:
     """Return names and texts of a record's fields, as many as a text may have lines."""
     words = getattr(type(record), "_words", {})
@@ -313,47 +307,33 @@ def _lines(record: Any) -> list[tuple[str, str]]:
     return [*lines[: MOST_LINES - 2], ("and", names[:_WIDTH])]
 
 
-def _in_words(value: Any, words: type[enum.IntEnum] | None) -> str:  # noqa: PLR0911 (one return a kind of value)
+def _in_words(value: Any, words: type[enum.IntEnum] | None = None) -> str:  # noqa: PLR0911 (one return a kind of value)
     if value is None:
         return "none"
     if is_abstract(value):
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     if is_array(value) or isinstance(value, bool | int | float):
         return _numbers_in_words(np.asarray(value), words)
-    if isinstance(value, str):
-        return " ".join(value.split()) or "''"
+    if isinstance(value, str | Path):
+        return " ".join(str(value).split()) or "''"
     if is_record(value):
-        return _record_in_words(value)
+        return f"{type(value).__name__}({', '.join(f'{name} {_in_words(item)}' for name, item in fields_of(value))})"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_in_words(item, None)}" for key, item in value.items()) or "nothing"
+        return ", ".join(f"{key} {_in_words(item)}" for key, item in value.items()) or "nothing"
     if isinstance(value, list | tuple):
-        if all(isinstance(item, str | bool | int | float) for item in value):
-            return "; ".join(_in_words(item, None) for item in value[:_SHOWN]) + _more(len(value)) or "nothing"
-        return f"{len(value)} of {type(value[0]).__name__}"
-    if isinstance(value, Path):
-        return str(value)
+        more = [f"and {len(value) - _SHOWN} more"] * (len(value) > _SHOWN)
+        return "; ".join([*map(_in_words, value[:_SHOWN]), *more]) or "nothing"
     return "a function" if callable(value) else type(value).__name__
-
-
-def _record_in_words(record: Any) -> str:
-    values = dict(fields_of(record))
-    error = values.get("standard_error")
-    if "value" in values:
-        return _in_words(values["value"], None) + (f" +- {error:.2g}" if isinstance(error, float) else "")
-    if all(
-        isinstance(item, str | bool | int | float | None) or getattr(item, "ndim", 1) == 0 for item in values.values()
-    ):
-        return (
-            f"{type(record).__name__}({', '.join(f'{name} {_in_words(item, None)}' for name, item in values.items())})"
-        )
-    return f"{type(record).__name__} of {', '.join(values)}"
 
 
 def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> str:
     flat = array.ravel()
     shape = "" if array.ndim < 2 and flat.size <= _SHOWN else f"({', '.join(map(str, array.shape))}) "
     if words is not None:
-        return shape + _outcomes_in_words(flat, words)
+        names = {int(each): each.name.lower().replace("_", " ") for each in words}
+        if flat.size == 1:
+            return getattr(words(flat[0]), "sentence", names[flat[0]]) if flat[0] in names else str(flat[0])
+        return shape + ", ".join(f"{count} {names.get(n, n)}" for n, count in Counter(flat.tolist()).items())
     if flat.dtype.kind not in "biufc":
         return f"{shape}{flat.dtype}"
     if flat.size <= _SHOWN:
@@ -369,25 +349,7 @@ def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> st
     return f"{shape}{ends}" + (f", {unknown} not known" if unknown and finite.size else "")
 
 
-def _outcomes_in_words(flat: np.ndarray, words: type[enum.IntEnum]) -> str:
-    numbers_of_words = {int(each) for each in words}
-    if flat.size == 1:
-        number = int(flat[0])
-        if number not in numbers_of_words:
-            return str(number)
-        return getattr(words(number), "sentence", words(number).name.lower().replace("_", " "))
-    numbers, counts = np.unique(flat, return_counts=True)
-    names = [words(int(n)).name.lower().replace("_", " ") if int(n) in numbers_of_words else str(n) for n in numbers]
-    return ", ".join(f"{count} {name}" for name, count in zip(names, counts.tolist(), strict=True)) or "nothing"
-
-
 def _one(value: Any, unknown: str = "not known") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, float) and math.isnan(value):
-        return unknown
-    return f"{value:.6g}"
-
-
-def _more(count: int) -> str:
-    return f"; and {count - _SHOWN} more" if count > _SHOWN else ""
+    return unknown if value != value else f"{value:.6g}"  # noqa: PLR0124 (NaN alone is not itself)

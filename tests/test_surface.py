@@ -53,7 +53,7 @@ def test_what_is_not_there_costs_nothing():
     for scene, count in (
         (Scene(lever, PLATFORM), 2),
         (Scene(lever, Platform(0.0, 180.0), base=BASE), 2),
-        (Scene(lever, platform, None, other, ForceDrive(1.0, 180.0)), 1),
+        (Scene(lever, platform, None, other, ForceDrive(1.0, 180.0)), 3),
         (Scene(lever, platform, force=ForceDrive(0.0, 70.0)), 1),
     ):
         motion, _ = surface_of(scene)

@@ -644,7 +644,8 @@ class TabulatedLaw(Law):
         v, _ = lax.stop_gradient(read_backwards(self, safe))
         beyond = jnp.where(leaves, implicit_root(_rebound_misfit, v, (self, safe)), 0.0)
         square = beyond**2 + self.capture**2
-        return jnp.sqrt(jnp.where(square > 0.0, square, 1.0)) * (square > 0.0)
+        positive = square > 0.0
+        return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
 @jax.jit

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -249,34 +249,33 @@ def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) ->
     if frame.response is None:
         return {"peak_amplitude_nm": peak, "lockin_amplitude_nm": amplitude, "lockin_phase_deg": angle}
 
-    drive_amplitude, drive_angle = _lockin(state, problem, at_drive=True)
+    free, at_drive = _phasor(amplitude, angle), _phasor(*_lockin(state, problem, at_drive=True))
 
-    def along_and_across(size: Float[Array, ""], degrees: Float[Array, ""], wave: Wave | None) -> tuple[Array, Array]:
-        """Return x and y of Re((x + i y) exp(i nu t)) of the free motion, with a wave of the drive's added to it."""
-        along, across = size * jnp.cos(jnp.deg2rad(degrees)), size * jnp.sin(jnp.deg2rad(degrees))
-        return (along, across) if wave is None else (along + wave.cosine, across - wave.sine)
-
-    def read(motion: Wave) -> tuple[Float[Array, ""], ...]:
-        """Return peak, readings at omega/N and at omega, and the lag, of the free motion with another one added."""
-        with_motion, free = (along_and_across(amplitude, angle, wave) for wave in (motion, None))
+    def read(motion: Wave, peak: str, of: str = "") -> dict[str, Float[Array, ""]]:
+        """Return the readings of the free motion with another one added, at omega/N and at omega, and the lag."""
+        wave = lax.complex(motion.cosine, -motion.sine)
         # the drive's frequency is the response's for N = 1 alone; the scene's own clock is ahead by the frame's phase
-        along, across = (jnp.where(order == 1.0, *parts) for parts in zip(with_motion, free, strict=True))
-        size, behind = size_and_lag(along, across, frame.phase_rad, order)
-        at_drive = along_and_across(drive_amplitude, drive_angle, motion)
-        drive_size, drive_behind = size_and_lag(*at_drive, frame.phase_rad)
-        _, lag = size_and_lag(*at_drive, frame.drive_phase_rad)
-        phases = within_turn(-behind, 360.0 / order), within_turn(-drive_behind, 360.0)
-        peak = highest_of_flight(cantilever, state.flight, _alone(motion))
-        return peak, size, phases[0], drive_size, phases[1], lag
+        at_response, driven = jnp.where(order == 1.0, free + wave, free), at_drive + wave
+        size, behind = size_and_lag(at_response.real, at_response.imag, frame.phase_rad, order)
+        drive_size, drive_behind = size_and_lag(driven.real, driven.imag, frame.phase_rad)
+        return {
+            peak: highest_of_flight(cantilever, state.flight, _alone(motion)),
+            f"{of}lockin_amplitude_nm": size,
+            f"{of}lockin_phase_deg": within_turn(-behind, 360.0 / order),
+            f"{of}drive_lockin_amplitude_nm": drive_size,
+            f"{of}drive_lockin_phase_deg": within_turn(-drive_behind, 360.0),
+            "phase_lag_deg": size_and_lag(driven.real, driven.imag, frame.drive_phase_rad)[1],
+        }
 
-    names = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
-    peak, *readings, lag = read(frame.response)
-    readings_of_height = {"peak_amplitude_nm": peak, "phase_lag_deg": lag} | dict(zip(names, readings, strict=True))
-    if frame.base is None:
-        return readings_of_height
-    peak, *readings, lag = read(frame.response + -frame.base)
-    of_deflection = {f"deflection_{name}": value for name, value in zip(names, readings, strict=True)}
-    return readings_of_height | {"peak_deflection_nm": peak, "phase_lag_deg": lag} | of_deflection
+    readings = read(frame.response, "peak_amplitude_nm")
+    if frame.base is not None:
+        readings |= read(frame.response + -frame.base, "peak_deflection_nm", "deflection_")
+    return readings
+
+
+def _phasor(size: Float[Array, ""], degrees: Float[Array, ""]) -> Complex[Array, ""]:
+    """Return x + i y of the motion Re((x + i y) exp(i nu t))."""
+    return lax.complex(size * jnp.cos(jnp.deg2rad(degrees)), size * jnp.sin(jnp.deg2rad(degrees)))
 
 
 def _alone(wave: Wave) -> Surface:

@@ -273,7 +273,7 @@ def _excitation_of(
     return drive
 
 
-def _tone(table: SceneTable, name: str, cantilever: Cantilever) -> dict[str, float]:
+def _tone(table: SceneTable, name: str, cantilever: Cantilever) -> dict[str, Any]:
     """Return the numbers of a tone of a drive, with its own amplitude in place of the free tip's height."""
     amplitude, free = _amplitude(name), "free_amplitude_nm"
     if amplitude in table.values and free in table.values:
@@ -304,7 +304,7 @@ def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, can
     return eqx.tree_at(lambda drive: drive.second, drive, second, is_leaf=lambda leaf: leaf is None)
 
 
-def _with_frequency(table: SceneTable, numbers: dict[str, float], cantilever: Cantilever) -> dict[str, float]:
+def _with_frequency(table: SceneTable, numbers: dict[str, Any], cantilever: Cantilever) -> dict[str, Any]:
     """Return a drive's numbers with `frequency_khz`, whichever way the table gives it."""
     reduced = numbers.pop("reduced_frequency", None)
     if reduced is not None and "frequency_khz" in numbers:
@@ -447,37 +447,31 @@ def check_start(start: Start, scene: Scene) -> None:
         check_parameter(name, value, "finite")
     if scene.interaction is None:
         return
-    if isinstance(scene.interaction, Law):
-        check_parameter("height_above_platform_nm", height, "not negative")
-        if height == 0.0:
-            _check_leaves(start, scene.platform)
+    law = isinstance(scene.interaction, Law)
+    if abs(height) <= _TOUCHING_NM and (law or not scene.interaction.spans):
+        # a tip at rest on the platform rides until the platform lets go
+        moving = float(scene.platform.velocity(start.phase_deg / 360.0 * float(scene.platform.period_us)))
+        if start.velocity_nm_per_us < moving:
+            raise ValueError(
+                f"`velocity_nm_per_us` must not be below the platform's {moving:.6g} where the tip starts on it, but "
+                f"is {start.velocity_nm_per_us:.6g}: start faster or higher"
+            )
         return
-    # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.scenefile.contact import junction_of  # noqa: PLC0415
-
-    if not scene.interaction.spans and abs(height) <= _TOUCHING_NM:
-        _check_leaves(start, scene.platform)
+    if law:
+        check_parameter("height_above_platform_nm", height, "not negative")
         return
     if height <= 0.0:
         raise ValueError(
             f"`height_above_platform_nm` must be positive, but is {height:g}: the tip would start inside the sample"
         )
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.scenefile.contact import junction_of  # noqa: PLC0415
+
     junction = junction_of(scene.interaction)
     forms = float(junction.forms_gap_nm)
     if bool(junction.exists) and height <= forms:
         raise ValueError(
             f"`height_above_platform_nm` must be above {forms:.6g}, where the solid junction forms, but is {height:g}"
-        )
-
-
-def _check_leaves(start: Start, platform: Platform) -> None:
-    """Check that a tip on the platform does not move into it; one at rest on it rides until the platform lets go."""
-    time_us = start.phase_deg / 360.0 * float(platform.period_us)
-    moving = float(platform.velocity(time_us))
-    if start.velocity_nm_per_us < moving:
-        raise ValueError(
-            f"`velocity_nm_per_us` must not be below the platform's {moving:.6g} where the tip starts on it, but is "
-            f"{start.velocity_nm_per_us:.6g}: start faster or higher"
         )
 
 
