@@ -183,9 +183,8 @@ def _law_of_columns(values: Mapping[str, np.ndarray], settings: Mapping[str, str
         check_parameter(kind, column, "not negative")
     if errors:
         # every reading has its own
-        of_rebound, of_delay = (np.diag(errors.get(kind, nothing)) for kind in kinds)
-        changes = np.concatenate([of_rebound, 0.0 * of_rebound]), np.concatenate([0.0 * of_delay, of_delay])
-        options |= {"rebound_changes": changes[0], "delay_changes": None if delay is None else changes[1]}
+        changes, rows = np.diag(np.concatenate([errors.get(kind, nothing) for kind in kinds])), len(nothing)
+        options |= {"rebound_changes": changes[:, :rows], "delay_changes": None if delay is None else changes[:, rows:]}
         law = TabulatedLaw.with_errors(*columns, **options)
     else:
         law = TabulatedLaw(*columns, **options)

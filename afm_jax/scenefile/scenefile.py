@@ -47,7 +47,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -78,9 +78,6 @@ from afm_jax.scenefile.tables import (
 )
 from afm_jax.whole_files import write_whole
 from afm_jax.words import printable
-
-Excited = TypeVar("Excited", BaseDrive, ForceDrive)
-Driven = TypeVar("Driven", Platform, BaseDrive, ForceDrive)
 
 MASS_ASSUMED = (
     "1 ng assumed: the file does not give the tip's mass, and all energies and speeds of a contact depend on it; give "
@@ -240,72 +237,51 @@ def _model_of(table: SceneTable) -> str:
 def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     table = tables["cantilever"]
     cantilever = table.build(Cantilever, **table.numbers("frequency_khz"))
-    base = _excitation_of(tables, "base", BaseDrive, cantilever)
-    force = _excitation_of(tables, "force", ForceDrive, cantilever)
-    platform = _platform_of(tables, cantilever, base or force)
+    base, force = (_drive_of(tables, name, cantilever) for name in ("base", "force"))
+    platform = _drive_of(tables, "platform", cantilever, may_rest=(base or force) is not None)
     interaction = _interaction_of(tables)
     tables["interaction"].build(check_mass, interaction, cantilever)
     return tables["platform"].build(Scene, cantilever, platform, interaction, base, force)
 
 
-def _platform_of(
-    tables: Mapping[str, SceneTable], cantilever: Cantilever, excitation: BaseDrive | ForceDrive | None
-) -> Platform:
-    """Return the platform, which under another drive may rest without a frequency of its own."""
-    table = tables["platform"]
-    may_rest = excitation is not None and "platform.second" not in tables
-    numbers = table.numbers(*(() if may_rest else ("amplitude_nm",)))
-    if may_rest and not {"frequency_khz", "reduced_frequency"} & set(numbers) and not numbers.get("amplitude_nm"):
-        return table.build(Platform, **numbers)
-    platform = table.build(Platform, **_with_frequency(table, {"amplitude_nm": 0.0} | numbers, cantilever))
-    return _with_second(tables, "platform", platform, cantilever)
+_KINDS: dict[str, Any] = {"platform": Platform, "base": BaseDrive, "force": ForceDrive}
 
 
-def _excitation_of(
-    tables: Mapping[str, SceneTable], name: str, kind: type[Excited], cantilever: Cantilever
-) -> Excited | None:
-    """Return base or force; its amplitude may be given as that of the free tip's height, `free_amplitude_nm`."""
-    table = tables.get(name)
+def _drive_of(tables: Mapping[str, SceneTable], name: str, cantilever: Cantilever, *, may_rest: bool = False) -> Any:
+    """Return platform, base or force, with its second frequency if it has one; None if the file does not have it.
+
+    Args:
+        tables: of the file.
+        name: of the drive's table.
+        cantilever: reduced frequencies are in its unit, free amplitudes those of its tip.
+        may_rest: whether it may be without amplitude and frequency, as a platform under another drive.
+    """
+    table, of_second = tables.get(name), tables.get(f"{name}.second")
     if table is None:
         return None
-    drive = _with_second(tables, name, table.build(kind, **_tone(table, name, cantilever)), cantilever)
-    table.build(check_steady_response, cantilever, drive.tones, name)
+    numbers = _tone(table, name, cantilever, may_rest=may_rest and of_second is None)
+    if of_second is not None:
+        own = _tone(of_second, name, cantilever)
+        second = numbers["second"] = of_second.build(Tone, own.pop(_amplitude(name)), **own)
+        both = numbers["frequency_khz"], second.frequency_khz
+        if not any(map(is_traced, both)) and np.all(np.isclose(*both, rtol=SAME_FREQUENCY, atol=0.0)):
+            of_second.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
+    drive = table.build(_KINDS[name], **numbers)
+    if name != "platform":
+        table.build(check_steady_response, cantilever, drive.tones, name)
     return drive
 
 
-def _tone(table: SceneTable, name: str, cantilever: Cantilever) -> dict[str, Any]:
-    """Return the numbers of a tone of a drive, with its own amplitude in place of the free tip's height."""
+def _tone(table: SceneTable, name: str, cantilever: Cantilever, *, may_rest: bool = False) -> dict[str, Any]:
+    """Return the numbers of a drive's cosine, with its own amplitude and frequency, whichever way the table gives them.
+
+    The amplitude may be given as that of the free tip's height, `free_amplitude_nm`, the frequency as a reduced one.
+    """
     amplitude, free = _amplitude(name), "free_amplitude_nm"
     if amplitude in table.values and free in table.values:
         table.fail(f"has both {amplitude} and {free}; give one of them")
     given = free if free in table.values else amplitude
-    numbers = table.numbers(given)
-    table.build(check_parameter, given, numbers[given], "not negative")
-    numbers = _with_frequency(table, numbers, cantilever)
-    if given == free:
-        # the tone's amplitude only says that it moves
-        tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
-        table.build(check_steady_response, cantilever, (tone,), name)
-        kind = ForceDrive if name == "force" else BaseDrive
-        numbers[amplitude] = numbers.pop(free) * drive_per_free_height(cantilever, numbers["frequency_khz"], kind)
-    return numbers
-
-
-def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, cantilever: Cantilever) -> Driven:
-    """Return a drive with the second frequency that its file gives it, if any."""
-    table = tables.get(f"{name}.second")
-    if table is None:
-        return drive
-    numbers = _tone(table, name, cantilever)
-    second = table.build(Tone, numbers.pop(_amplitude(name)), **numbers)
-    both = drive.frequency_khz, second.frequency_khz
-    if not any(map(is_traced, both)) and np.all(np.isclose(*both, rtol=SAME_FREQUENCY, atol=0.0)):
-        table.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
-    return eqx.tree_at(lambda drive: drive.second, drive, second, is_leaf=lambda leaf: leaf is None)
-
-
-def _with_frequency(table: SceneTable, numbers: dict[str, Any], cantilever: Cantilever) -> dict[str, Any]:
-    """Return a drive's numbers with `frequency_khz`, whichever way the table gives it."""
+    numbers = table.numbers(*(() if may_rest else (given,)))
     reduced = numbers.pop("reduced_frequency", None)
     if reduced is not None and "frequency_khz" in numbers:
         table.fail("has both frequency_khz and reduced_frequency; give one of them")
@@ -313,8 +289,17 @@ def _with_frequency(table: SceneTable, numbers: dict[str, Any], cantilever: Cant
         table.build(check_parameter, "reduced_frequency", reduced, "positive")
         # omega / 2 Omega
         numbers["frequency_khz"] = 2.0 * reduced * cantilever.frequency_khz
-    if "frequency_khz" not in numbers:
+    if "frequency_khz" not in numbers and not (may_rest and not numbers.get(amplitude)):
         table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
+    if given == free:
+        table.build(check_parameter, free, numbers[free], "not negative")
+        # the tone's amplitude only says that it moves
+        tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
+        table.build(check_steady_response, cantilever, (tone,), name)
+        per_height = drive_per_free_height(cantilever, numbers["frequency_khz"], _KINDS[name])
+        numbers[amplitude] = numbers.pop(free) * per_height
+    elif amplitude in numbers:
+        table.build(check_parameter, amplitude, numbers[amplitude], "not negative")
     return numbers
 
 
@@ -327,17 +312,20 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
         from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
         from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
 
-        effects = table.texts("effects")
+        effects = table.value("effects", _are_texts, 'a list of texts alone, ["..."]')
         return table.build(make_contact, EFFECTS if effects is None else effects, table.numbers())
     if "file" in table.values or "table" in table.values:
         return _tabulated(table)
     numbers, delay = table.numbers("r"), tables.get("interaction.delay")
     if delay is None:
         return table.build(ImpactLaw, **numbers)
-    parameters = delay.numbers("hertz", "lead_nm", "offset_nm") | {
-        "corrections": delay.truth("corrections", usual=True)
-    }
+    corrections = delay.value("corrections", lambda value: isinstance(value, bool), "true or false")
+    parameters = delay.numbers("hertz", "lead_nm", "offset_nm") | {"corrections": corrections is not False}
     return table.build(ImpactLaw, **numbers, delay=delay.build(CollisionDelay, **parameters))
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, str) for entry in value)
 
 
 def _tabulated(table: SceneTable) -> TabulatedLaw:
@@ -346,13 +334,10 @@ def _tabulated(table: SceneTable) -> TabulatedLaw:
     others = [key for key in table.values if key not in ("model", source)]
     if others:
         table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
-    given = table.values[source]
-    of_file = source == "file"
-    kind, must = (str, "the path of a law's file, as text") if of_file else (dict, "a table, [interaction.table]")
-    if not isinstance(given, kind):
-        table.fail(f"must be {must}, but is {in_words(given)}", source)
-    if of_file:
-        return table.build(load_law, Path(table.source).parent / given)
+    if source == "file":
+        path = table.value("file", lambda value: isinstance(value, str), "the path of a law's file, as text")
+        return table.build(load_law, Path(table.source).parent / path)
+    given = table.value("table", lambda value: isinstance(value, dict), "a table, [interaction.table]")
     try:
         return table.build(law_of_dict, given)
     except (KeyError, TypeError) as error:
@@ -376,10 +361,8 @@ def _interaction_table(interaction: Any) -> dict[str, Any]:
     if interaction is None:
         return {"model": "none"}
     if isinstance(interaction, TabulatedLaw):
-        if interaction.capture.ndim:
-            raise ValueError(
-                f"the law has shape {interaction.capture.shape}, but a scene file holds one scene: save them one by one"
-            )
+        # a batch is refused
+        _number_of(interaction.capture, "interaction")
         return {"model": "law", "table": interaction.to_dict()}
     if isinstance(interaction, ImpactLaw):
         table: dict[str, Any] = {"model": "law", **_numbers_of(interaction, "interaction")}
@@ -457,13 +440,10 @@ def check_start(start: Start, scene: Scene) -> None:
                 f"is {start.velocity_nm_per_us:.6g}: start faster or higher"
             )
         return
+    # else the tip would start inside the sample
+    check_parameter("height_above_platform_nm", height, "not negative" if law else "above 0")
     if law:
-        check_parameter("height_above_platform_nm", height, "not negative")
         return
-    if height <= 0.0:
-        raise ValueError(
-            f"`height_above_platform_nm` must be positive, but is {height:g}: the tip would start inside the sample"
-        )
     # only here, so that scenes with a law do without the contact's modules
     from afm_jax.scenefile.contact import junction_of  # noqa: PLC0415
 

@@ -187,32 +187,22 @@ class SceneTable(NamedTuple):
         for key in required:
             if key not in self.values:
                 self.fail("missing; add it", key)
-        optional = (key for key in keys_of(self.name, self.model) if key not in (*required, *_NO_NUMBERS))
-        return {key: self._number(key) for key in (*required, *optional) if key in self.values}
+        return {key: self._number(key) for key in self.values if key not in _NO_NUMBERS}
 
-    def texts(self, key: str) -> list[str] | None:
-        """Return the list of texts that the table has under a key; None if the key is left out.
+    def value(self, key: str, good: Callable[[Any], bool], must: str) -> Any:
+        """Return what the table has under a key, if that is good; None if the key is left out.
+
+        Args:
+            key: of the table.
+            good: says whether a value may stand there.
+            must: what it must be, in words.
 
         Raises:
             SceneError: if there is something else.
         """
         value = self.values.get(key)
-        if value is None:
-            return None
-        wrong = [entry for entry in value if not isinstance(entry, str)] if isinstance(value, list) else [value]
-        if wrong:
-            self.fail(f'must be a list of texts, ["..."], but is or holds {in_words(wrong[0])}', key)
-        return value
-
-    def truth(self, key: str, *, usual: bool) -> bool:
-        """Return whether the table has true under a key; the usual answer if the key is left out.
-
-        Raises:
-            SceneError: if there is something else than true or false.
-        """
-        value = self.values.get(key, usual)
-        if not isinstance(value, bool):
-            self.fail(f"must be true or false, but is {in_words(value)}", key)
+        if value is not None and not good(value):
+            self.fail(f"must be {must}, but is {in_words(value)}", key)
         return value
 
     def build(self, kind: Callable[..., Built], *arguments: Any, **parameters: Any) -> Built:
