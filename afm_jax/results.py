@@ -91,11 +91,39 @@ class Result:
 
     def to_pandas(self) -> "DataFrame":
         """Return a result as a table of pandas; rows without a result are left out, numbers without a value NaN."""
-        return _frame(self, self._rows)
+        pandas = _needed("pandas")
+        if self._rows:
+            records: Any = getattr(self, self._rows)
+            records = records() if callable(records) else records
+            if isinstance(records, Mapping):
+                plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
+                return pandas.DataFrame.from_dict(plain, orient="index")
+            return pandas.DataFrame(list(records))
+        columns = {name: array for name, (array, _) in known_columns(self).items()}
+        shapes = [array.shape for array in columns.values() if array.ndim]
+        shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
+        table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
+        table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
+        if len(shape) > 1:
+            table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
+        known = known_rows(self, shape).ravel()
+        return table if known.all() else table[known]
 
     def to_xarray(self) -> "Dataset":
         """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
-        return dataset_of(self)
+        xarray = _needed("xarray")
+        sizes: dict[str, int] = {}
+        variables = {}
+        for name, (array, dimensions) in known_columns(self).items():
+            names: list[str] = []
+            for dimension, size in zip(dimensions, array.shape, strict=True):
+                free = dimension not in names and sizes.setdefault(dimension, size) == size
+                names.append(dimension if free else f"{name}_{dimension}_{len(names)}")
+            # xarray keeps a name for a dimension's own coordinate
+            own = f"{name}_value" if name in names and array.ndim > 1 else name
+            variables[own] = (names, array, {"units": unit_of(name)} if unit_of(name) else {})
+        attributes = {name: value for name, value in fields_of(self) if isinstance(value, str)}
+        return xarray.Dataset(variables, attrs={"result": type(self).__name__} | attributes)
 
     def save(self, path: str | Path) -> None:
         """Write this result as a JSON file, whole or not at all; `afm_jax.load` gives it back."""
@@ -236,48 +264,12 @@ def known_rows(record: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.broadcast_to(told, shape) if told.shape in ((), shape) and shape else np.ones(shape, bool)
 
 
-def dataset_of(self: Any) -> "Dataset":
-    """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
-    xarray = _needed("xarray", "xarray")
-    sizes: dict[str, int] = {}
-    variables = {}
-    for name, (array, dimensions) in known_columns(self).items():
-        names: list[str] = []
-        for dimension, size in zip(dimensions, array.shape, strict=True):
-            free = dimension not in names and sizes.setdefault(dimension, size) == size
-            names.append(dimension if free else f"{name}_{dimension}_{len(names)}")
-        # xarray keeps a name for a dimension's own coordinate
-        own = f"{name}_value" if name in names and array.ndim > 1 else name
-        variables[own] = (names, array, {"units": unit_of(name)} if unit_of(name) else {})
-    attributes = {name: value for name, value in fields_of(self) if isinstance(value, str)}
-    return xarray.Dataset(variables, attrs={"result": type(self).__name__} | attributes)
-
-
-def _frame(self: Any, rows: str) -> "DataFrame":
-    pandas = _needed("pandas", "pandas")
-    if rows:
-        records: Any = getattr(self, rows)
-        records = records() if callable(records) else records
-        if isinstance(records, Mapping):
-            plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
-            return pandas.DataFrame.from_dict(plain, orient="index")
-        return pandas.DataFrame(list(records))
-    columns = {name: array for name, (array, _) in known_columns(self).items()}
-    shapes = [array.shape for array in columns.values() if array.ndim]
-    shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
-    table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
-    table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
-    if len(shape) > 1:
-        table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
-    known = known_rows(self, shape).ravel()
-    return table if known.all() else table[known]
-
-
-def _needed(package: str, extra: str) -> Any:
+def _needed(package: str) -> Any:
+    """Return a package of an extra of the same name."""
     try:
         return importlib.import_module(package)
     except ModuleNotFoundError as error:
-        hint = f"this needs the package {package}: pip install 'afm-jax[{extra}]'"
+        hint = f"this needs the package {package}: pip install 'afm-jax[{package}]'"
         raise ModuleNotFoundError(hint, name=package) from error
 
 

@@ -487,7 +487,7 @@ def _pairs_of_roots(
     left, right, sign = grid[at], grid[at + 2], jnp.sign(value[at + 1])
 
     def closer(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
-        points = jnp.linspace(*found[:2], _INNER, axis=1)
+        points = jnp.linspace(found[0], found[1], _INNER, axis=1)
         values = jax.vmap(jax.vmap(closing_residual, in_axes=(0, None)), in_axes=(0, None))(points, problem)
         lowest = jnp.clip(jnp.argmin(values * sign[:, None], axis=1), 1, _INNER - 2)
 

@@ -130,7 +130,8 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     """
     require_float64(scene)
     impact_law_of(scene)
-    if not is_traced(order) and not (np.ndim(order) == 0 and order >= 1 and float(order).is_integer()):
+    number = np.ones(()) if is_traced(order) else np.asarray(order)
+    if number.ndim or not number >= 1.0 or number % 1.0:
         raise ValueError(f"`order` must be a positive integer, but is {order}")
     frame = free_frame(scene)
     if not is_traced(frame.periodic) and not np.all(frame.periodic):
