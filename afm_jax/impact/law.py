@@ -750,7 +750,7 @@ def axes_of_one(scene: Scene) -> Scene:
     return eqx.tree_at(lambda scene: scene.interaction.deviations, axes, own)
 
 
-_SECANTS = 8
+_SECANTS = 6
 """Evaluations of a law to read it backwards."""
 
 
