@@ -5,7 +5,6 @@ check is skipped, because a compiled program cannot raise.
 """
 
 import collections.abc
-import contextlib
 import dataclasses
 import functools
 import inspect
@@ -13,8 +12,7 @@ import operator
 import os
 import sys
 import types
-from collections.abc import Callable, Iterator
-from contextvars import ContextVar
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
@@ -374,33 +372,16 @@ def refuse_float32(*models: Any) -> None:
     """
     import jax  # noqa: PLC0415
 
-    if not jax.config.read("jax_enable_x64") or _float32_allowed.get():
+    if not jax.config.read("jax_enable_x64"):
         return
     for model in models:
-        if any(map(_is_narrow, jax.tree.leaves(model))):
-            places = jax.tree_util.tree_leaves_with_path(model)
-            narrow = next(jax.tree_util.keystr(path) for path, leaf in places if _is_narrow(leaf))
-            raise RuntimeError(
-                f"{type(model).__name__}{narrow} is a 32-bit float: build the {type(model).__name__.lower()} after "
-                "`jax.config.update('jax_enable_x64', True)`, from 64-bit numbers"
-            )
-
-
-@contextlib.contextmanager
-def float32_allowed() -> Iterator[None]:
-    """Let models of 32-bit floats pass in this block: for measurements of what is left in them."""
-    token = _float32_allowed.set(True)
-    try:
-        yield
-    finally:
-        _float32_allowed.reset(token)
-
-
-_float32_allowed = ContextVar("_float32_allowed", default=False)
-
-
-def _is_narrow(leaf: Any) -> bool:
-    return str(getattr(leaf, "dtype", "")) in _NARROW
+        for path, leaf in jax.tree_util.tree_leaves_with_path(model):
+            if str(getattr(leaf, "dtype", "")) in _NARROW:
+                kind = type(model).__name__
+                raise RuntimeError(
+                    f"{kind}{jax.tree_util.keystr(path)} is a 32-bit float: build the {kind.lower()} after "
+                    "`jax.config.update('jax_enable_x64', True)`, from 64-bit numbers"
+                )
 
 
 _NARROW = {"float16", "bfloat16", "float32"}

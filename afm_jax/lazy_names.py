@@ -65,36 +65,28 @@ def _sign_readably(public: object) -> None:
     """Give a public function, or a class's constructor and methods, a signature whose annotations are short texts."""
     if isinstance(public, FunctionType):
         _sign(public, {})
-    if not inspect.isclass(public):
-        return
-    for owner in public.__mro__:
-        if owner.__module__.split(".")[0] in ("afm_jax", "fitting"):
-            for name in vars(owner):
-                method = getattr(owner, name, None)
-                function = getattr(method, "__func__", method)
-                if isinstance(function, FunctionType):
-                    _sign(function, inspect.get_annotations(owner) if name in ("__init__", "__new__") else {})
+    for owner in public.__mro__ if inspect.isclass(public) else ():
+        for name in vars(owner) if owner.__module__.split(".")[0] in ("afm_jax", "fitting") else ():
+            method = getattr(owner, name, None)
+            function = getattr(method, "__func__", method)
+            if isinstance(function, FunctionType):
+                _sign(function, inspect.get_annotations(owner) if name in ("__init__", "__new__") else {})
 
 
 def _sign(function: FunctionType, fields: dict[str, Any]) -> None:
-    """Set the signature that a function shows; of a constructor with the annotations of the fields that it fills."""
-    signature = inspect.signature(function)
-    if any(isinstance(parameter.annotation, _Words) for parameter in signature.parameters.values()):
-        return
-    function.__signature__ = signature.replace(
-        parameters=[_in_words(parameter, fields) for parameter in signature.parameters.values()],
-        return_annotation=_short(signature.return_annotation),
-    )
+    """Set the signature that a function shows; of a constructor with the annotations of the fields that it fills.
 
-
-def _in_words(parameter: inspect.Parameter, fields: dict[str, Any]) -> inspect.Parameter:
-    """Return a parameter with a short annotation; that of a field's converter says nothing, and takes what is array."""
-    annotation = fields.get(parameter.name, Any) if parameter.annotation is Any else parameter.annotation
-    text = _short(annotation)
-    if fields and isinstance(text, _Words):
-        optional = " | None" if parameter.default is None and "None" not in text else ""
-        text = _Words(_ARRAY.sub("ArrayLike", text) + optional)
-    return parameter.replace(annotation=text)
+    The annotation of a field's converter says nothing, and takes what is array.
+    """
+    signature, parameters = inspect.signature(function), []
+    for parameter in signature.parameters.values():
+        text = _short(fields.get(parameter.name, Any) if parameter.annotation is Any else parameter.annotation)
+        if fields and isinstance(text, _Words):
+            optional = " | None" if parameter.default is None and "None" not in text else ""
+            text = _Words(_ARRAY.sub("ArrayLike", text) + optional)
+        parameters.append(parameter.replace(annotation=text))
+    answer = _short(signature.return_annotation)
+    function.__signature__ = signature.replace(parameters=parameters, return_annotation=answer)
 
 
 def _short(annotation: Any) -> Any:

@@ -10,6 +10,7 @@ import importlib
 import io
 import math
 import types
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, dataclass_transform, get_args
@@ -90,11 +91,39 @@ class Result:
 
     def to_pandas(self) -> "DataFrame":
         """Return a result as a table of pandas; rows without a result are left out, numbers without a value NaN."""
-        return _frame(self, self._rows)
+        pandas = _needed("pandas")
+        if self._rows:
+            records: Any = getattr(self, self._rows)
+            records = records() if callable(records) else records
+            if isinstance(records, Mapping):
+                plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
+                return pandas.DataFrame.from_dict(plain, orient="index")
+            return pandas.DataFrame(list(records))
+        columns = {name: array for name, (array, _) in known_columns(self).items()}
+        shapes = [array.shape for array in columns.values() if array.ndim]
+        shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
+        table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
+        table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
+        if len(shape) > 1:
+            table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
+        known = known_rows(self, shape).ravel()
+        return table if known.all() else table[known]
 
     def to_xarray(self) -> "Dataset":
         """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
-        return dataset_of(self)
+        xarray = _needed("xarray")
+        sizes: dict[str, int] = {}
+        variables = {}
+        for name, (array, dimensions) in known_columns(self).items():
+            names: list[str] = []
+            for dimension, size in zip(dimensions, array.shape, strict=True):
+                free = dimension not in names and sizes.setdefault(dimension, size) == size
+                names.append(dimension if free else f"{name}_{dimension}_{len(names)}")
+            # xarray keeps a name for a dimension's own coordinate
+            own = f"{name}_value" if name in names and array.ndim > 1 else name
+            variables[own] = (names, array, {"units": unit_of(name)} if unit_of(name) else {})
+        attributes = {name: value for name, value in fields_of(self) if isinstance(value, str)}
+        return xarray.Dataset(variables, attrs={"result": type(self).__name__} | attributes)
 
     def save(self, path: str | Path) -> None:
         """Write this result as a JSON file, whole or not at all; `afm_jax.load` gives it back."""
@@ -163,9 +192,9 @@ def public_result(
 
 def text_of(self: Any) -> str:
     """Return a result in at most 20 lines: a field each, arrays by their range, outcomes in words."""
-    return "\n".join(
-        [f"{type(self).__name__}:", *(f"  {name:<{_widest(self)}}  {text}" for name, text in _lines(self))]
-    )
+    lines = _lines(self)
+    widest = max((len(name) for name, _ in lines), default=0)
+    return "\n".join([f"{type(self).__name__}:", *(f"  {name:<{widest}}  {text}" for name, text in lines)])
 
 
 def text_of_parts(parts: "Iterable[str | Table | None]") -> str:
@@ -235,52 +264,13 @@ def known_rows(record: Any, shape: tuple[int, ...]) -> np.ndarray:
     return np.broadcast_to(told, shape) if told.shape in ((), shape) and shape else np.ones(shape, bool)
 
 
-def dataset_of(self: Any) -> "Dataset":
-    """Return the arrays of a result as a data set of xarray, with their units; texts are its attributes."""
-    xarray = _needed("xarray", "xarray")
-    sizes: dict[str, int] = {}
-    variables = {}
-    for name, (array, dimensions) in known_columns(self).items():
-        names: list[str] = []
-        for dimension, size in zip(dimensions, array.shape, strict=True):
-            free = dimension not in names and sizes.setdefault(dimension, size) == size
-            names.append(dimension if free else f"{name}_{dimension}_{len(names)}")
-        # xarray keeps a name for a dimension's own coordinate
-        own = f"{name}_value" if name in names and array.ndim > 1 else name
-        variables[own] = (names, array, {"units": unit_of(name)} if unit_of(name) else {})
-    attributes = {name: value for name, value in fields_of(self) if isinstance(value, str)}
-    return xarray.Dataset(variables, attrs={"result": type(self).__name__} | attributes)
-
-
-def _frame(self: Any, rows: str) -> "DataFrame":
-    pandas = _needed("pandas", "pandas")
-    if rows:
-        records: Any = getattr(self, rows)
-        records = records() if callable(records) else records
-        if isinstance(records, Mapping):
-            plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
-            return pandas.DataFrame.from_dict(plain, orient="index")
-        return pandas.DataFrame(list(records))
-    columns = {name: array for name, (array, _) in known_columns(self).items()}
-    shapes = [array.shape for array in columns.values() if array.ndim]
-    shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
-    table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
-    table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
-    if len(shape) > 1:
-        table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
-    known = known_rows(self, shape).ravel()
-    return table if known.all() else table[known]
-
-
-def _needed(package: str, extra: str) -> Any:
+def _needed(package: str) -> Any:
+    """Return a package of an extra of the same name."""
     try:
         return importlib.import_module(package)
     except ModuleNotFoundError as error:
-        if error.name != package:
-            raise
-        raise ModuleNotFoundError(
-            f"this needs the package {package}: pip install 'afm-jax[{extra}]'", name=package
-        ) from error
+        hint = f"this needs the package {package}: pip install 'afm-jax[{package}]'"
+        raise ModuleNotFoundError(hint, name=package) from error
 
 
 def _dimensions(kind: type, name: str, count: int) -> tuple[str, ...]:
@@ -298,10 +288,6 @@ def _annotations(kind: type) -> dict[str, Any]:
     return {name: hint for each in kind.__mro__[::-1] for name, hint in vars(each).get("__annotations__", {}).items()}
 
 
-def _widest(record: Any) -> int:
-    return max((len(name) for name, _ in _lines(record)), default=0)
-
-
 def _lines(record: Any) -> list[tuple[str, str]]:
     """Return names and texts of a record's fields, as many as a text may have lines."""
     words = getattr(type(record), "_words", {})
@@ -313,47 +299,33 @@ def _lines(record: Any) -> list[tuple[str, str]]:
     return [*lines[: MOST_LINES - 2], ("and", names[:_WIDTH])]
 
 
-def _in_words(value: Any, words: type[enum.IntEnum] | None) -> str:  # noqa: PLR0911 (one return a kind of value)
+def _in_words(value: Any, words: type[enum.IntEnum] | None = None) -> str:  # noqa: PLR0911 (one return a kind of value)
     if value is None:
         return "none"
     if is_abstract(value):
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     if is_array(value) or isinstance(value, bool | int | float):
         return _numbers_in_words(np.asarray(value), words)
-    if isinstance(value, str):
-        return " ".join(value.split()) or "''"
+    if isinstance(value, str | Path):
+        return " ".join(str(value).split()) or "''"
     if is_record(value):
-        return _record_in_words(value)
+        return f"{type(value).__name__}({', '.join(f'{name} {_in_words(item)}' for name, item in fields_of(value))})"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_in_words(item, None)}" for key, item in value.items()) or "nothing"
+        return ", ".join(f"{key} {_in_words(item)}" for key, item in value.items()) or "nothing"
     if isinstance(value, list | tuple):
-        if all(isinstance(item, str | bool | int | float) for item in value):
-            return "; ".join(_in_words(item, None) for item in value[:_SHOWN]) + _more(len(value)) or "nothing"
-        return f"{len(value)} of {type(value[0]).__name__}"
-    if isinstance(value, Path):
-        return str(value)
+        more = [f"and {len(value) - _SHOWN} more"] * (len(value) > _SHOWN)
+        return "; ".join([*map(_in_words, value[:_SHOWN]), *more]) or "nothing"
     return "a function" if callable(value) else type(value).__name__
-
-
-def _record_in_words(record: Any) -> str:
-    values = dict(fields_of(record))
-    error = values.get("standard_error")
-    if "value" in values:
-        return _in_words(values["value"], None) + (f" +- {error:.2g}" if isinstance(error, float) else "")
-    if all(
-        isinstance(item, str | bool | int | float | None) or getattr(item, "ndim", 1) == 0 for item in values.values()
-    ):
-        return (
-            f"{type(record).__name__}({', '.join(f'{name} {_in_words(item, None)}' for name, item in values.items())})"
-        )
-    return f"{type(record).__name__} of {', '.join(values)}"
 
 
 def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> str:
     flat = array.ravel()
     shape = "" if array.ndim < 2 and flat.size <= _SHOWN else f"({', '.join(map(str, array.shape))}) "
     if words is not None:
-        return shape + _outcomes_in_words(flat, words)
+        names = {int(each): each.name.lower().replace("_", " ") for each in words}
+        if flat.size == 1:
+            return getattr(words(flat[0]), "sentence", names[flat[0]]) if flat[0] in names else str(flat[0])
+        return shape + ", ".join(f"{count} {names.get(n, n)}" for n, count in Counter(flat.tolist()).items())
     if flat.dtype.kind not in "biufc":
         return f"{shape}{flat.dtype}"
     if flat.size <= _SHOWN:
@@ -369,25 +341,7 @@ def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> st
     return f"{shape}{ends}" + (f", {unknown} not known" if unknown and finite.size else "")
 
 
-def _outcomes_in_words(flat: np.ndarray, words: type[enum.IntEnum]) -> str:
-    numbers_of_words = {int(each) for each in words}
-    if flat.size == 1:
-        number = int(flat[0])
-        if number not in numbers_of_words:
-            return str(number)
-        return getattr(words(number), "sentence", words(number).name.lower().replace("_", " "))
-    numbers, counts = np.unique(flat, return_counts=True)
-    names = [words(int(n)).name.lower().replace("_", " ") if int(n) in numbers_of_words else str(n) for n in numbers]
-    return ", ".join(f"{count} {name}" for name, count in zip(names, counts.tolist(), strict=True)) or "nothing"
-
-
 def _one(value: Any, unknown: str = "not known") -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, float) and math.isnan(value):
-        return unknown
-    return f"{value:.6g}"
-
-
-def _more(count: int) -> str:
-    return f"; and {count - _SHOWN} more" if count > _SHOWN else ""
+    return unknown if value != value else f"{value:.6g}"  # noqa: PLR0124 (NaN alone is not itself)

@@ -180,8 +180,7 @@ def _array(value: Any) -> dict[str, Any]:
     array: Any = np.asarray(value)
     numbers = np.stack([array.real, array.imag], axis=-1) if array.dtype.kind == "c" else array
     listed = numbers.tolist()
-    if numbers.dtype.kind == "f" and not np.isfinite(numbers).all():
-        listed = _numbers(listed)
+    listed = _numbers(listed) if numbers.dtype.kind == "f" else listed
     kind = {} if isinstance(value, np.ndarray) else {"jax": True}
     return {"array": str(array.dtype), **kind, "shape": list(array.shape), "values": listed}
 
@@ -228,9 +227,9 @@ def _built(kind: type[Any], values: dict[str, Any]) -> Any:
 def _as_array(plain: Mapping[str, Any]) -> Any:
     dtype = np.dtype(plain["array"])
     part = np.dtype(f"f{dtype.itemsize // 2}") if dtype.kind == "c" else dtype
-    values = _all_numbers(plain["values"]) if dtype.kind in "fc" else plain["values"]
     shape = tuple(plain["shape"])
-    array = np.array(values, part).reshape((*shape, 2) if dtype.kind == "c" else shape)
+    # null becomes NaN, "inf" infinite
+    array = np.array(plain["values"], part).reshape((*shape, 2) if dtype.kind == "c" else shape)
     if dtype.kind == "c":
         array = (array[..., 0] + 1j * array[..., 1]).astype(dtype)
     if not plain.get("jax"):
@@ -238,10 +237,6 @@ def _as_array(plain: Mapping[str, Any]) -> Any:
     import jax  # noqa: PLC0415 (reading a table needs no JAX)
 
     return jax.numpy.asarray(array) if jax.config.read("jax_enable_x64") else array
-
-
-def _all_numbers(values: Any) -> Any:
-    return [_all_numbers(value) for value in values] if isinstance(values, list) else _as_number(values)
 
 
 def _as_number(value: float | str | None) -> float:

@@ -21,8 +21,6 @@ LARGEST_BYTES = 1 << 30
 """Of what is read: a device or a pipe without end would fill the memory."""
 MOST_VALUES = LARGEST_BYTES // 8
 """Of what a file says that it holds, in all its columns: as many 64-bit numbers as there are such bytes."""
-MOST_PACKED = 1000
-"""Times its own size that a file may unpack to: more than recorded signals can be compressed."""
 
 
 def read_whole(path: str | os.PathLike[str]) -> bytes:

@@ -119,7 +119,7 @@ MUTATIONS = {
         "{0.5 *  => }self.delay.offset_nm, length", f"{LASTING}test_a_delay_with_an_offset_is_that_of_a_raised_surface"
     ),
     "close pairs of roots stepped over": Mutation(
-        "bottom * dips.middle {< => >} 0.0", f"{LASTING_ORBITS}test_a_close_pair_is_found"
+        "bottom * sign {< => >} 0.0", f"{LASTING_ORBITS}test_a_close_pair_is_found"
     ),
     "misfit as a sum": Mutation(
         "seen.readings {- => +} data.read", f"{FORWARD}test_residuals_are_misfits_in_errors_and_the_constraint"
@@ -204,7 +204,7 @@ MUTATIONS = {
         "(row.approach**2 {- => +} row.rebound**2)", f"{LAW_MOTION}test_the_ledger_of_energy_closes"
     ),
     "reduced frequency of the free one": Mutation(
-        "{2.0 *  => }reduced * float(cantilever.frequency_khz)",
+        "{2.0 *  => }reduced * cantilever.frequency_khz",
         "tests/test_scenefile.py::test_reduced_frequency_counts_in_twice_the_free_frequency",
     ),
     "noise that falls with the amplitude": Mutation(

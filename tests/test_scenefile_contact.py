@@ -82,7 +82,7 @@ def test_loop_is_exact_in_32_bits(path: Path):
 @pytest.mark.parametrize(
     ("contact", "said"),
     [
-        (Contact(Capillary() + CoreRepulsion() + VanDerWaals()), "the contact has capillary, core, van_der_waals, jkr"),
+        (Contact(Capillary() + CoreRepulsion() + VanDerWaals()), "with 'van_der_waals' must hold 'dmt'"),
         (Contact(CoreRepulsion(), junction=Jkr(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),
         (Jkr(), "holds an ImpactLaw or a Contact as interaction, not Jkr"),
         (Contact.paper(relative_humidity=jnp.array([0.4, 0.5])), r"has shape \(2,\), but a scene file holds one scene"),

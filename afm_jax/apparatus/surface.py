@@ -51,7 +51,7 @@ def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
     """Return the surface that a scene's tip sees, and the tip's steady response to the drives of base and tip.
 
     Without such drives the surface is the platform itself. Called outside `jit`, it leaves out cosines whose amplitude
-    is 0 and joins those of one frequency.
+    is 0.
 
     Args:
         scene: any scene.
@@ -76,9 +76,9 @@ def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
             response += [_response(cantilever, tone.wave, push) for tone in moving]
     motion = [wave for wave in platform.waves if not (_is_known_zero(wave.cosine) and _is_known_zero(wave.sine))]
     against = [-wave for wave in response]
-    surface = Surface(platform.offset_nm, platform.offset_rate_nm_per_us, _joined([*motion, *against]))
+    surface = Surface(platform.offset_nm, platform.offset_rate_nm_per_us, (*motion, *against))
     still = jnp.zeros_like(platform.offset_nm)
-    return surface, Surface(still, still, _joined(response))
+    return surface, Surface(still, still, tuple(response))
 
 
 class FreeFrame(NamedTuple):
@@ -303,22 +303,5 @@ def _response(cantilever: Cantilever, wave: Wave, push: Float[Array, "..."]) -> 
     return Wave(size * (d * wave.cosine - g * wave.sine), size * (g * wave.cosine + d * wave.sine), omega)
 
 
-def _joined(waves: list[Wave]) -> tuple[Wave, ...]:
-    """Return waves with those that are known to have one frequency added up."""
-    joined: list[Wave] = []
-    for wave in waves:
-        same = (k for k, other in enumerate(joined) if _is_known_same(wave.angular_frequency, other.angular_frequency))
-        place = next(same, None)
-        if place is None:
-            joined.append(wave)
-        else:
-            joined[place] = joined[place] + wave
-    return tuple(joined)
-
-
 def _is_known_zero(amplitude: Float[Array, "..."]) -> bool:
     return not is_traced(amplitude) and not np.any(np.asarray(amplitude))
-
-
-def _is_known_same(one: Float[Array, "..."], other: Float[Array, "..."]) -> bool:
-    return one is other or (not is_traced(one) and not is_traced(other) and np.array_equal(one, other))

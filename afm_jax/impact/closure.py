@@ -47,8 +47,8 @@ _LEAVING = 0.4
 """Fraction of the drive's period that a leaving tip may take to lose its energy: beyond, no law of impacts holds."""
 _REGULA_FALSI, _BEFORE_NEWTON = 20, 10
 """Steps towards a root of the scalar condition: to its last digit, and to where Newton's method goes on."""
-_SECTIONS = 16
-_GOLDEN = 0.6180339887498949
+_ZOOMS, _INNER = 4, 17
+"""How often an extremum is looked at more closely, and at how many points each time."""
 _SAME = 1e-7
 """Relative difference of approach speeds below which roots are one."""
 
@@ -152,14 +152,9 @@ def speeds_at_place(place: OrbitPlace, problem: OrbitProblem) -> Speeds:
     )
 
 
-def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array, " 2"]:
-    """Return by how much one turn of the map misses its start: height over beta, velocity over beta omega."""
-    return turn_of_map(unknowns, problem)[:2]
-
-
 @jax.jit
-def turn_of_map(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array, " 5"]:
-    """Return what one turn of the map misses its start by (`map_gaps`), and the speeds and the delay of its impact.
+def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array, " 2"]:
+    """Return by how much one turn of the map misses its start: height over beta, velocity over beta omega.
 
     Args:
         unknowns: coordinate and phase of the impact.
@@ -174,20 +169,18 @@ def turn_of_map(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Ar
     position, velocity = flight(height, speed + speeds.rebound)
     height, speed = platform.position_and_velocity(arrival)
     missing = (velocity - speed + speeds.approach) / platform.top_speed_nm_per_us
-    return jnp.stack([(position - height) / platform.amplitude_nm, missing, *speeds])
+    return jnp.stack([(position - height) / platform.amplitude_nm, missing])
 
 
 class FollowedRoot(NamedTuple):
     """An orbit close to a coordinate.
 
-    ``closes``: whether there is one; ``near_fold``: see `NEAR_DOUBLE`; ``slopes``: derivatives of `turn_of_map` by
-    coordinate and phase, shape (5, 2), right to the size of the last step; None unless the impact lasts.
+    ``closes``: whether there is one; ``near_fold``: see `NEAR_DOUBLE`.
     """
 
     place: OrbitPlace
     closes: Bool[Array, ""]
     near_fold: Bool[Array, ""]
-    slopes: Float[Array, "5 2"] | None
 
 
 @jax.jit
@@ -214,18 +207,15 @@ def follow_root(near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Arra
 
     speeds, system = closure(near, problem)
     if not problem.impact.lasts:
-        return FollowedRoot(
-            place_of(near, speeds, system, problem), wanted & system.regular, near_fold(near, problem), None
-        )
+        return FollowedRoot(place_of(near, speeds, system, problem), wanted & system.regular, near_fold(near, problem))
     settings = Newton(_NEWTON, step_tolerance=_CLOSE, residual_tolerance=_CLOSE, unit=longest, damping=damped)
     place = jnp.stack(place_of(near, speeds, system, problem))
-    root = newton(map_gaps, place, problem, settings, where=wanted, extended=turn_of_map)
-    (a, b), (c, d) = root.slopes[:2]
+    root = newton(map_gaps, place, problem, settings, where=wanted)
+    (a, b), (c, d) = root.slopes
     return FollowedRoot(
         place=OrbitPlace(*root.x),
         closes=system.regular & jnp.all(jnp.abs(root.residual) < _CLOSED),
         near_fold=jnp.abs((a * d - b * c) * root.x[0]) < NEAR_DOUBLE * jnp.abs(system.determinant),
-        slopes=root.slopes,
     )
 
 
@@ -359,8 +349,6 @@ class OrbitRoots(NamedTuple):
     """Whether there were no more roots than slots."""
     near_fold: Bool[Array, " slots"]
     """Which roots are near-double."""
-    slopes: Float[Array, "slots 5 2"] | None
-    """Those of `FollowedRoot`."""
 
 
 def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
@@ -378,7 +366,7 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     roots = jax.vmap(follow_root, in_axes=(0, None, 0))(coordinate, problem, wanted)
     found = first_seen(roots.place.coordinate, wanted & roots.closes)
     place = OrbitPlace(jnp.where(found, roots.place.coordinate, coordinate), roots.place.phase)
-    return OrbitRoots(place, found, complete, found & roots.near_fold, roots.slopes)
+    return OrbitRoots(place, found, complete, found & roots.near_fold)
 
 
 class Coordinates(NamedTuple):
@@ -449,7 +437,8 @@ def _scanned_roots(problem: OrbitProblem, scan: Scan) -> Coordinates:
     at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0][::-1]
     real = (jnp.arange(scan.crossings) < jnp.sum(crossing))[::-1]
     crossings = _Brackets(grid[at], grid[at + 1], value[at], value[at + 1], real)
-    root, exists = _narrowed(crossings, _dips(grid, value, brief, scan), problem)
+    pairs = _pairs_of_roots(grid, value, brief, scan, problem)
+    root, exists = _narrowed(jax.tree.map(lambda *parts: jnp.concatenate(parts), crossings, *pairs), problem)
     fastest = jnp.argsort(jnp.where(exists, -root, jnp.inf))[: scan.slots]
     order = fastest[jnp.argsort(jnp.where(exists[fastest], root[fastest], jnp.inf))]
     complete = (jnp.sum(crossing) <= scan.crossings) & (jnp.sum(exists) <= scan.slots)
@@ -478,90 +467,59 @@ class _Brackets(NamedTuple):
     high: Float[Array, " n"]
     real: Bool[Array, " n"]
 
-    def or_empty(self, harmless: Float[Array, ""]) -> "_Brackets":
-        """Return the brackets, those that are none with values 0 at a harmless coordinate."""
-        left, right = (jnp.where(self.real, end, harmless) for end in self[:2])
-        low, high = (jnp.where(self.real, end, 0.0) for end in self[2:4])
-        return _Brackets(left, right, low, high, self.real)
 
+def _pairs_of_roots(
+    grid: Float[Array, " points"],
+    value: Float[Array, " points"],
+    brief: Bool[Array, " points"],
+    scan: Scan,
+    problem: OrbitProblem,
+) -> tuple[_Brackets, _Brackets]:
+    """Return the brackets to the left and to the right of the extrema in which the scan stepped over a pair of roots.
 
-class _Dips(NamedTuple):
-    """Three neighbours of one sign each, the middle one closest to zero: the extremum may lie beyond."""
-
-    ends: _Brackets
-    middle: Float[Array, " n"]
-    """The residual there."""
-
-
-def _dips(
-    grid: Float[Array, " points"], value: Float[Array, " points"], brief: Bool[Array, " points"], scan: Scan
-) -> _Dips:
-    """Return where the scan may have stepped over a pair of roots."""
+    The extremum lies between three neighbours of one sign, the middle one closest to zero. Of points between them the
+    one closest to zero, or furthest beyond, has its neighbours searched in turn.
+    """
     size = jnp.abs(value)
     same = (value[:-2] * value[1:-1] > 0.0) & (value[1:-1] * value[2:] > 0.0)
     dip = same & (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & brief[1:-1]
+    closest, at = lax.top_k(-jnp.where(dip, size[1:-1], jnp.inf), scan.turns)
+    left, right, sign = grid[at], grid[at + 2], jnp.sign(value[at + 1])
 
-    def take(size, _):
-        place = jnp.argmin(size)
-        return size.at[place].set(jnp.inf), (place, jnp.isfinite(size[place]))
+    def closer(_: Any, found: tuple[Array, ...]) -> tuple[Array, ...]:
+        points = jnp.linspace(found[0], found[1], _INNER, axis=1)
+        values = jax.vmap(jax.vmap(closing_residual, in_axes=(0, None)), in_axes=(0, None))(points, problem)
+        lowest = jnp.clip(jnp.argmin(values * sign[:, None], axis=1), 1, _INNER - 2)
 
-    _, (at, real) = lax.scan(take, jnp.where(dip, size[1:-1], jnp.inf), None, length=scan.turns)
-    return _Dips(_Brackets(grid[at], grid[at + 2], value[at], value[at + 2], real), value[at + 1])
+        def taken(array: Array, shift: int = 0) -> Array:
+            return jnp.take_along_axis(array, lowest[:, None] + shift, axis=1)[:, 0]
+
+        return taken(points, -1), taken(points, 1), taken(points), taken(values)
+
+    _, _, middle, bottom = lax.fori_loop(0, _ZOOMS, closer, (left, right, left, value[at]))
+    across = jnp.isfinite(closest) & (bottom * sign < 0.0)
+    return (
+        _Brackets(left, middle, value[at], bottom, across),
+        _Brackets(middle, right, bottom, value[at + 2], across),
+    )
 
 
-def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple[Array, Array]:
-    """Return the root of every bracket, and which there are: of changes of sign, then left and right in every dip.
+def _narrowed(brackets: _Brackets, problem: OrbitProblem) -> tuple[Array, Array]:
+    """Return the root of every bracket, and which there are, by the Illinois method.
 
-    Changes of sign are narrowed by the Illinois method: the newer end stays, the other one loses weight. In a dip a
-    golden section goes to the extremum first, with both inner points at once in the places of the two roots to either
-    side of it. All in one loop, because the residual is compiled for every use of it.
+    The newer end stays, the other one loses weight.
     """
-    residual = jax.vmap(closing_residual, in_axes=(0, None))
-    harmless = harmless_coordinate(problem)
-    count, turns = crossings.left.shape[0], dips.middle.shape[0]
-    sign = jnp.sign(dips.middle)
-    waits = jnp.arange(count + 2 * turns) >= count
-    illinois = _BEFORE_NEWTON if problem.impact.lasts else _REGULA_FALSI
+    real = brackets.real
+    ends = (jnp.where(real, end, harmless_coordinate(problem)) for end in brackets[:2])
+    values = (jnp.where(real, value, 0.0) for value in brackets[2:4])
 
-    def pairs(middle, bottom) -> _Brackets:
-        """Return the brackets to either side of the extrema."""
-        (left, right, low, high, real), across = dips.ends, bottom * dips.middle < 0.0
-        columns = ((left, middle), (middle, right), (low, bottom), (bottom, high), (real & across, real & across))
-        return _Brackets(*(jnp.concatenate(column) for column in columns)).or_empty(harmless)
+    def narrow(_: Any, bracket: tuple[Array, ...]) -> tuple[Array, ...]:
+        left, right, low, high = bracket
+        gap = high - low
+        x = jnp.where(gap == 0.0, left, (left * high - right * low) / jnp.where(gap == 0.0, 1.0, gap))
+        value = jax.vmap(closing_residual, in_axes=(0, None))(x, problem)
+        passed = value * low < 0.0
+        return x, jnp.where(passed, left, right), value, jnp.where(passed, low, 0.5 * high)
 
-    def narrow(step, state):
-        brackets, (a, b) = state
-        points = jnp.stack([b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)])
-        points = jnp.where(step < _SECTIONS, points, 0.5 * (a + b))
-        gap = brackets.high - brackets.low
-        chord = brackets.left * brackets.high - brackets.right * brackets.low
-        x = jnp.where(gap == 0.0, brackets.left, chord / jnp.where(gap == 0.0, 1.0, gap))
-        x = jnp.where(waits & (step <= _SECTIONS), jnp.pad(points.ravel(), (count, 0)), x)
-        value = residual(x, problem)
-        first, second = value[count:].reshape(2, -1) * sign
-        inner = jnp.where(first < second, a, points[0]), jnp.where(first < second, points[1], b)
-        passed = value * brackets.low < 0.0
-        closer = _Brackets(
-            x,
-            jnp.where(passed, brackets.left, brackets.right),
-            value,
-            jnp.where(passed, brackets.low, 0.5 * brackets.high),
-            brackets.real,
-        )
-        either = jax.tree.map(
-            lambda head, tail: jnp.concatenate([head[:count], tail]), brackets, pairs(points[0], value[count:][:turns])
-        )
-        begun = jnp.where(waits, step > _SECTIONS, step < illinois)
-        brackets = jax.tree.map(
-            lambda new, found, old: jnp.where(begun, new, jnp.where(step == _SECTIONS, found, old)),
-            closer,
-            either,
-            brackets,
-        )
-        return brackets, inner
-
-    empty = jax.tree.map(lambda part: jnp.zeros((2 * turns,), part.dtype), dips.ends).or_empty(harmless)
-    begin = jax.tree.map(lambda head, tail: jnp.concatenate([head, tail]), crossings.or_empty(harmless), empty)
-    steps = _SECTIONS + 1 + illinois
-    brackets, _ = lax.fori_loop(0, steps, narrow, (begin, (dips.ends.left, dips.ends.right)))
-    return brackets.left, brackets.real
+    steps = _BEFORE_NEWTON if problem.impact.lasts else _REGULA_FALSI
+    return lax.fori_loop(0, steps, narrow, (*ends, *values))[0], real

@@ -41,12 +41,10 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
-from afm_jax.impact.law import HertzContact, Impact, Law, Speeds, TabulatedLaw
+from afm_jax.impact.law import HertzContact, Impact, Law, Speeds, read_backwards
 
 PASSES = 4
 """Passes from the delay to mid contact and back."""
-_SECANTS = 6
-"""Passes backwards through a law that is a table, whose inverse is found along with the delay."""
 USUAL_LEAD = 1.3
 """Lead b of a tip that keeps its energy over a length, over that length: what comes closest for eight contacts."""
 
@@ -325,51 +323,14 @@ def delay_before(
     """
     leaves = rebound_speed > 0.0
     rebound = jnp.where(leaves, rebound_speed, 1.0)
-    if isinstance(law, TabulatedLaw):
-        return jnp.where(leaves, _delay_of_table(law, rebound, leaving_us, cantilever, surface), 0.0)
+    if not law.lasts:
+        return jnp.where(leaves, law.collision_delay(law.approach_speed(rebound)), 0.0)
 
-    def of_free(free_rebound: Float[Array, ""]) -> Speeds:
-        approach = law.approach_speed(free_rebound)
-        return Speeds(approach, free_rebound, law.collision_delay(approach))
+    def lasting(free: Speeds, delay: Float[Array, ""]) -> Speeds:
+        middle = middle_of_contact(cantilever, surface, leaving_us - 0.5 * delay)
+        return corrected(free, middle, cantilever, law)
 
-    def improve(_, state: Speeds) -> Speeds:
-        free = of_free(state.rebound)
-        middle = middle_of_contact(cantilever, surface, leaving_us - 0.5 * state.delay)
-        lasted = corrected(free, middle, cantilever, law)
-        square = free.rebound**2 + rebound**2 - lasted.rebound**2
-        return Speeds(free.approach, jnp.sqrt(jnp.maximum(square, (0.1 * rebound) ** 2)), lasted.delay)
-
-    begin = of_free(rebound)
-    speeds = lax.fori_loop(0, PASSES, improve, begin) if law.lasts else begin
-    return jnp.where(leaves, speeds.delay, 0.0)
-
-
-def _delay_of_table(
-    law: TabulatedLaw,
-    rebound: Float[Array, ""],
-    leaving_us: Float[Array, ""],
-    cantilever: Cantilever,
-    surface: Platform | Surface,
-) -> Float[Array, ""]:
-    """Return `delay_before` in us of a law that is a table, by secants in ln v that evaluate the table once each."""
-
-    def improve(_, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        place, before, missed, delay = state
-        v = jnp.exp(place)
-        speeds = law.beyond_capture(jnp.sqrt(v * v + law.capture**2), v)
-        if law.lasts:
-            middle = middle_of_contact(cantilever, surface, leaving_us - 0.5 * delay)
-            speeds = corrected(speeds, middle, cantilever, law)
-        miss = jnp.log(speeds.rebound / rebound)
-        apart = place - before
-        # about 1: the rebound is nearly in proportion to v
-        slope = jnp.clip((miss - missed) / jnp.where(apart == 0.0, 1.0, apart), 0.5, 2.0)
-        slope = jnp.where(apart == 0.0, 1.0, slope)
-        return place - miss / slope, place, miss, speeds.delay
-
-    begin = jnp.log(rebound / law.r)
-    nothing = jnp.zeros_like(begin)
-    return lax.fori_loop(0, _SECANTS, improve, (begin, begin, nothing, nothing))[-1]
+    return jnp.where(leaves, read_backwards(law, rebound, lasting)[1], 0.0)
 
 
 _WRITTEN_OUT = 3

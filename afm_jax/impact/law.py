@@ -8,7 +8,7 @@ speeds are relative to the platform and positive.
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -163,21 +163,12 @@ class Law(Impact):
 
     @property
     @abstractmethod
-    def leaves(self) -> Bool[Array, "..."]:
-        """Whether any tip leaves: if not, every impact is a capture."""
-
-    @property
-    @abstractmethod
     def slow_restitution(self) -> Float[Array, "..."]:
         """Coefficient of restitution of the slowest impacts of a law without adhesion: what chatter dies out with."""
 
     @abstractmethod
     def coordinate(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the coordinate Y in nm/us of an impact that comes at a speed in nm/us above capture."""
-
-    @abstractmethod
-    def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
-        """Say whether the tip stays at an approach speed in nm/us."""
 
     @abstractmethod
     def at_approach(self, approach_speed: ArrayLike) -> Speeds:
@@ -204,6 +195,15 @@ class Law(Impact):
         if self.delay is None:
             return HertzContact(none, none, none, length)
         return HertzContact(self.delay.hertz, self.delay.lead_nm, 0.5 * self.delay.offset_nm, length)
+
+    @property
+    def leaves(self) -> Bool[Array, "..."]:
+        """Whether any tip leaves, as fast ones do: if not, every impact is a capture."""
+        return jnp.ones_like(self.lowest, bool)
+
+    def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
+        """Say whether the tip stays at an approach speed in nm/us."""
+        return self.rebound_speed(approach_speed) == 0.0
 
     def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return u_out in nm/us for u_in in nm/us; 0 where the tip is captured."""
@@ -266,10 +266,6 @@ class ImpactLaw(Law):
         check_parameter("epsilon", self.epsilon, "not negative")
         check_parameter("viscous_loss", self.viscous_loss, "not negative")
         check_kind("delay", self.delay, CollisionDelay | None)
-
-    def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
-        """Say whether the tip stays at an approach speed in nm/us: the root's argument is not positive."""
-        return squared_rebound_speed(approach_speed, self.r, self.epsilon, self.viscous_loss) <= 0.0
 
     @property
     def adheres(self) -> Bool[Array, "..."]:
@@ -344,8 +340,6 @@ class ImpactLaw(Law):
 MOST_KNOTS = 24
 """Knots of a table's splines: tables of more rows are smoothed by least squares, of fewer go through every row."""
 _LEAST_ROWS = 4
-_NEWTON_STEPS = 30
-_SETTLED = 1e-15
 
 
 class TabulatedLaw(Law):
@@ -411,7 +405,9 @@ class TabulatedLaw(Law):
         most_knots: int = MOST_KNOTS,
     ):
         """Make a law of columns: see the class."""
-        u, w, late, _, held = _free_rows(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
+        u, w, late, captured = _columns_of_law(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
+        held = float(u[captured - 1]) if captured else 0.0
+        u, w, late = u[captured:], w[captured:], None if late is None else late[captured:]
         check_parameter("mass_ng", mass_ng, "positive", optional=True)
         check_kind("delay", delay, CollisionDelay | None)
         if delay is not None and late is None:
@@ -436,13 +432,11 @@ class TabulatedLaw(Law):
         knots = place[np.round(np.linspace(0, place.shape[0] - 1, count)).astype(int)]
         if late is not None and delay is None:
             delay = closest_delay(u, w, late, numpy)
-        beside = _Beside(knots, scale, r, viscous_loss, delay)
-        loss, late_spline = _splines(u, w, late, capture, beside, numpy)
         self.capture, self.r, self.viscous_loss = map(jnp.asarray, (capture, r, viscous_loss))
         self.scale_nm_per_us, self.knots = jnp.asarray(scale), jnp.asarray(knots)
-        self.loss_spline, self.delay_spline = jnp.asarray(loss), jnp.asarray(late_spline)
-        self.slowest_nm_per_us, self.fastest_nm_per_us = jnp.asarray(u[0]), jnp.asarray(u[-1])
         self.delay = delay  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.loss_spline, self.delay_spline = map(jnp.asarray, _splines(u, w, late, capture, self, numpy))
+        self.slowest_nm_per_us, self.fastest_nm_per_us = jnp.asarray(u[0]), jnp.asarray(u[-1])
         self.mass_ng = None if mass_ng is None else as_parameter(mass_ng)
         self.origin = Origin(origin)
         self.deviations = None
@@ -476,7 +470,8 @@ class TabulatedLaw(Law):
             ValueError: as of a law, or if shapes do not fit.
         """
         law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
-        u, w, late, captured, _ = _free_rows(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
+        u, w, late, captured = _columns_of_law(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
+        u, w, late = u[captured:], w[captured:], None if late is None else late[captured:]
         numpy = _numpy_of(u, w, late, rebound_changes, delay_changes, capture_changes, law.capture, law.delay)
         by_rebound = numpy.asarray(rebound_changes, float)
         if by_rebound.ndim != 2 or by_rebound.shape[1] != captured + len(u):
@@ -485,10 +480,6 @@ class TabulatedLaw(Law):
         by_delay = nothing if delay_changes is None else numpy.asarray(delay_changes, float)[:, captured:]
         by_capture = nothing[:, 0] if capture_changes is None else numpy.asarray(capture_changes, float)
         extrapolated = options.get("capture_speed_nm_per_us") is None
-        # the formula beside the table and the splines' knots stay as they are
-        numbers = law.knots, law.scale_nm_per_us, law.r, law.viscous_loss
-        knots, scale, r, viscous_loss = map(numpy.asarray, numbers)
-        beside = _Beside(knots, scale, r, viscous_loss, law.delay)
         capture = numpy.asarray(law.capture)
 
         def along(by_rebound: Any, by_delay: Any, by_capture: Any) -> dict[str, Any]:
@@ -500,7 +491,8 @@ class TabulatedLaw(Law):
                 if extrapolated:
                     held = _capture_speed(u, rebound, 0.0, numpy)
                 delayed = None if late is None else late + side * by_delay
-                ends.append((held, *_splines(u, rebound, delayed, held, beside, numpy)))
+                # the formula beside the table and the splines' knots stay as they are
+                ends.append((held, *_splines(u, rebound, delayed, held, law, numpy)))
             names = ("capture", "loss_spline", *(("delay_spline",) if late is not None else ()))
             return {name: (end - start) / (2.0 * small) for name, start, end in zip(names, *ends, strict=False)}
 
@@ -521,9 +513,10 @@ class TabulatedLaw(Law):
             return self
         steps = jnp.asarray(unknowns)
         changes = {name: jnp.tensordot(steps, change, axes=1) for name, change in self.deviations.items()}
-        made = _with_numbers(self, {name: getattr(self, name) + change for name, change in changes.items()})
+        moved = {name: getattr(self, name) + change for name, change in changes.items()}
         # a loss so small that it is not sure to be one
-        return _replaced(made, capture=jnp.maximum(made.capture, 0.0), deviations=None)
+        moved["capture"] = jnp.maximum(moved["capture"], 0.0)
+        return _replaced(self, **moved, deviations=None)
 
     def sample(self, key: Array, n: int) -> "TabulatedLaw":
         """Return laws drawn from the errors of this one: one law whose every number has a first axis of length n.
@@ -565,8 +558,10 @@ class TabulatedLaw(Law):
             told["mass_ng"] = float(self.mass_ng)
         if self.origin.text:
             told["origin"] = self.origin.text
-        numbers = {name: np.asarray(number).tolist() for name, number in _numbers_of(self).items()}
-        told["numbers"] = numbers | {"scale_nm_per_us": float(self.scale_nm_per_us)}
+        numbers = {name: getattr(self, name) for name in _NUMBERS}
+        if self.delay is not None:
+            numbers |= {name: getattr(self.delay, name) for name in _OF_DELAY}
+        told["numbers"] = {name: np.asarray(number).tolist() for name, number in numbers.items()}
         if self.deviations is not None:
             told["deviations"] = {name: np.asarray(change).tolist() for name, change in self.deviations.items()}
         return told
@@ -594,11 +589,6 @@ class TabulatedLaw(Law):
     def adheres(self) -> Bool[Array, "..."]:
         """Whether there is a capture speed: what takes a tip's last energy holds it."""
         return self.capture > 0.0
-
-    @property
-    def leaves(self) -> Bool[Array, "..."]:
-        """True: fast tips leave."""
-        return jnp.ones_like(self.capture, bool)
 
     @property
     def slow_restitution(self) -> Float[Array, "..."]:
@@ -632,17 +622,11 @@ class TabulatedLaw(Law):
     def beyond_capture(self, u: Float[Array, "..."], v: Float[Array, "..."]) -> Speeds:
         """Return speeds and delay where u and v = sqrt(u^2 - u_c^2), in nm/us, are both known."""
         place = _place(v, self.scale_nm_per_us)
-        cubes = _cubes(self.knots, place)
         rebound = v * jnp.sqrt(_formula(u, self.capture, self.r, self.viscous_loss))
-        rebound = rebound * jnp.exp(0.5 * _spline_of(self.loss_spline, self.knots, place, cubes))
+        rebound = rebound * jnp.exp(0.5 * _spline(self.loss_spline, self.knots, place))
         if self.delay is None:
             return Speeds(u, rebound, jnp.zeros_like(rebound))
-        late = _spline_of(self.delay_spline, self.knots, place, cubes)
-        return Speeds(u, rebound, self.delay(u, rebound) + late)
-
-    def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
-        """Say whether an approach speed in nm/us is not above the capture speed."""
-        return as_argument(approach_speed) <= self.capture
+        return Speeds(u, rebound, self.delay(u, rebound) + _spline(self.delay_spline, self.knots, place))
 
     def at_approach(self, approach_speed: ArrayLike) -> Speeds:
         """Return the speeds in nm/us and the delay in us at an approach speed; 0 where the tip is captured."""
@@ -653,9 +637,15 @@ class TabulatedLaw(Law):
         return Speeds(u, jnp.where(free, speeds.rebound, 0.0), jnp.where(free, speeds.delay, 0.0))
 
     def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return the u_in in nm/us that leaves at u_out in nm/us, by Newton's method; differentiable."""
+        """Return the u_in in nm/us that leaves at u_out in nm/us; differentiable."""
         w = as_argument(rebound_speed)
-        return _read_backwards(w, self)
+        leaves = w > 0.0
+        safe = jnp.where(leaves, w, 1.0)
+        v, _ = lax.stop_gradient(read_backwards(self, safe))
+        beyond = jnp.where(leaves, implicit_root(_rebound_misfit, v, (self, safe)), 0.0)
+        square = beyond**2 + self.capture**2
+        positive = square > 0.0
+        return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
 @jax.jit
@@ -666,89 +656,65 @@ def _at_knots(law: TabulatedLaw) -> Speeds:
 
 _SMALL = 1e-3
 """Part of an error over which a derivative is taken."""
-_NUMBERS = ("capture", "r", "viscous_loss", "knots", "loss_spline", "delay_spline")
+_NUMBERS = ("capture", "r", "viscous_loss", "scale_nm_per_us", "knots", "loss_spline", "delay_spline")
 _SPLINES = ("knots", "loss_spline", "delay_spline")
-
-
-def _numbers_of(law: TabulatedLaw) -> dict[str, Array]:
-    """Return what a table's law is made of and what may be uncertain, by name."""
-    numbers = {name: getattr(law, name) for name in _NUMBERS}
-    return numbers if law.delay is None else numbers | {name: getattr(law.delay, name) for name in _OF_DELAY}
 
 
 _OF_DELAY = ("hertz", "lead_nm", "offset_nm")
 
 
-def _with_numbers(law: TabulatedLaw, numbers: dict[str, Array]) -> TabulatedLaw:
-    """Return a law with other numbers, of `_numbers_of`."""
-
-    def places(law: TabulatedLaw) -> list[Any]:
-        return [getattr(law, name) if name in _NUMBERS else getattr(law.delay, name) for name in numbers]
-
-    return eqx.tree_at(places, law, list(numbers.values()))
-
-
-def _replaced(law: TabulatedLaw, **parts: Any) -> TabulatedLaw:
-    """Return a law with other fields, without the checks of a table."""
+def _replaced(law: TabulatedLaw | None, **parts: Any) -> TabulatedLaw:
+    """Return a law with other fields, or of all its fields, without the checks of a table."""
     made = object.__new__(TabulatedLaw)
     for field in dataclasses.fields(TabulatedLaw):
-        object.__setattr__(made, field.name, parts.get(field.name, getattr(law, field.name)))
+        value = parts[field.name] if field.name in parts else getattr(law, field.name)
+        object.__setattr__(made, field.name, value)
     return made
 
 
 def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
-    """Return the law that `TabulatedLaw.to_dict` tells, number for number.
+    """Return the law that `TabulatedLaw.to_dict` tells, number for number, or of a table with columns of these names.
 
     Raises:
         ValueError: if columns are missing or are no table of a law.
+        LookupError: if one of its numbers is missing.
     """
     names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
     missing = [name for name in names[:2] if not isinstance(told.get(name), list | np.ndarray)]
     if missing:
         raise ValueError(f"the law lacks {' and '.join(missing)}")
-    numbers = told.get("numbers")
-    delay = None
     u, w, late = (_as_numbers(name, told.get(name, ())) for name in names)
-    if isinstance(numbers, Mapping):
-        known = [*_NUMBERS, "scale_nm_per_us", *([name for name in _OF_DELAY if "hertz" in numbers])]
-        lacking = [name for name in known if name not in numbers]
-        if lacking:
-            raise ValueError(f"the numbers of the law lack {' and '.join(lacking)}")
-        if "hertz" not in numbers:
-            # how a fit tells instantaneous impacts: delays of 0
-            late = np.zeros(0)
-        else:
-            values = (numbers[name] for name in _OF_DELAY)
-            delay = CollisionDelay(*values, corrections=bool(told.get("corrections", True)))
-    law = TabulatedLaw(
-        u,
-        w,
-        late if late.size else None,
-        capture_speed_nm_per_us=told.get("capture_speed_nm_per_us"),
-        delay=delay,
-        mass_ng=told.get("mass_ng"),
-        origin=str(told.get("origin", "")),
-        most_knots=len(numbers["knots"]) if isinstance(numbers, Mapping) else MOST_KNOTS,
-    )
+    columns, numbers = (u, w, late if late.size else None), told.get("numbers")
+    mass, origin = told.get("mass_ng"), str(told.get("origin", ""))
     if not isinstance(numbers, Mapping):
-        return law
-    own = _numbers_of(law)
-    made = _with_numbers(law, {name: _told(name, numbers[name], own[name].shape) for name in own})
-    scale = _told("scale_nm_per_us", numbers["scale_nm_per_us"], ())
-    ends = _told("speed_range_nm_per_us", told.get("speed_range_nm_per_us"), (2,))
-    made = eqx.tree_at(
-        lambda law: (law.scale_nm_per_us, law.slowest_nm_per_us, law.fastest_nm_per_us),
-        made,
-        (scale, *ends),
+        capture = told.get("capture_speed_nm_per_us")
+        return TabulatedLaw(*columns, capture_speed_nm_per_us=capture, mass_ng=mass, origin=origin)
+    _columns_of_law(*columns)
+    check_parameter("mass_ng", mass, "positive", optional=True)
+    knots = (np.size(numbers["knots"]),)
+    spline = (knots[0] + 2,)
+    shapes = {"knots": knots, "loss_spline": spline, "delay_spline": spline}
+    deviations = told.get("deviations")
+    if deviations is not None:
+        count = len(deviations["capture"])
+        deviations = {
+            name: _told(f"deviations.{name}", deviations[name], (count, *shapes.get(name, ()))) for name in deviations
+        }
+    slowest, fastest = _told("speed_range_nm_per_us", told.get("speed_range_nm_per_us"), (2,))
+    delay = None
+    if "hertz" in numbers:
+        values = (numbers[name] for name in _OF_DELAY)
+        delay = CollisionDelay(*values, corrections=bool(told.get("corrections", True)))
+    return _replaced(
+        None,
+        **{name: _told(name, numbers[name], shapes.get(name, ())) for name in _NUMBERS},
+        slowest_nm_per_us=slowest,
+        fastest_nm_per_us=fastest,
+        origin=Origin(origin),
+        mass_ng=None if mass is None else as_parameter(mass),
+        delay=delay,
+        deviations=deviations,
     )
-    if told.get("deviations") is None:
-        return made
-    count = len(told["deviations"]["capture"])
-    deviations = {
-        name: _told(f"deviations.{name}", change, (count, *own[name].shape))
-        for name, change in told["deviations"].items()
-    }
-    return _replaced(made, deviations=deviations)
 
 
 def _told(name: str, number: Any, shape: tuple[int, ...]) -> Array:
@@ -784,34 +750,42 @@ def axes_of_one(scene: Scene) -> Scene:
     return eqx.tree_at(lambda scene: scene.interaction.deviations, axes, own)
 
 
+_SECANTS = 6
+"""Evaluations of a law to read it backwards."""
+
+
+def read_backwards(
+    law: Law, rebound: Float[Array, "..."], lasting: Callable[[Speeds, Array], Speeds] = lambda free, _: free
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return v = (Y - q^2/Y)/2 of the coordinate Y, and the delay, of the impact that leaves with a rebound speed.
+
+    Secants in ln v, with which the logarithm of the rebound grows nearly in proportion.
+
+    Args:
+        law: its `lowest` coordinate is q.
+        rebound: in nm/us, positive.
+        lasting: takes speeds and delay of a free tip and the delay of the last round, returns those of the impact.
+    """
+
+    def improve(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        place, before, missed, delay = state
+        v = jnp.exp(place)
+        speeds = lasting(law.speeds(v + jnp.sqrt(v * v + law.lowest**2)), delay)
+        miss = jnp.log(speeds.rebound / rebound)
+        apart = place - before
+        slope = jnp.clip((miss - missed) / jnp.where(apart == 0.0, 1.0, apart), 0.5, 2.0)
+        return place - miss / jnp.where(apart == 0.0, 1.0, slope), place, miss, speeds.delay
+
+    begin = jnp.log(rebound)
+    nothing = jnp.zeros_like(begin)
+    place, _, _, delay = lax.fori_loop(0, _SECANTS, improve, (begin, begin, nothing, nothing))
+    return jnp.exp(place), delay
+
+
 def _rebound_misfit(beyond: Array, law_and_rebound: tuple[TabulatedLaw, Array]) -> Array:
     """Return by how much the rebound at v misses the wanted one, in nm/us."""
     law, rebound = law_and_rebound
-    return law.beyond_capture(jnp.sqrt(beyond**2 + law.capture_speed_nm_per_us**2), beyond).rebound - rebound
-
-
-def _read_backwards(rebound: Float[Array, "..."], law: TabulatedLaw) -> Float[Array, "..."]:
-    wanted, fixed = lax.stop_gradient((rebound, law))
-    free = wanted > 0.0
-    safe = jnp.where(free, wanted, 1.0)
-
-    def unsettled(state):
-        step, v, move = state
-        return (step < _NEWTON_STEPS) & jnp.any(jnp.abs(move) > _SETTLED * v)
-
-    def improve(state):
-        step, v, _ = state
-        misfit, slope = jax.jvp(lambda v: _rebound_misfit(v, (fixed, safe)), (v,), (jnp.ones_like(v),))
-        move = jnp.clip(-misfit / jnp.where(slope > 0.0, slope, 1.0), -0.5 * v, v)
-        # the last step is rounding
-        return step + 1, v + move, jnp.where(jnp.abs(move) > 1e-9 * v, move, 0.0)
-
-    _, v, _ = lax.while_loop(unsettled, improve, (0, safe, safe))
-    at = implicit_root(_rebound_misfit, v, (law, jnp.where(free, rebound, 1.0)))
-    beyond = jnp.where(free, at, 0.0)
-    square = beyond**2 + law.capture_speed_nm_per_us**2
-    positive = square > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+    return law.beyond_capture(jnp.sqrt(beyond**2 + law.capture**2), beyond).rebound - rebound
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -827,20 +801,10 @@ class Origin:
         return hash(Origin)
 
 
-class _FreeRows(NamedTuple):
-    """The rows of a table whose tips leave: approach and rebound speed in nm/us, delay in us; and those before them."""
+def _columns_of_law(approach: Any, rebound: Any, delay: Any) -> tuple[Any, Any, Any, int]:
+    """Return a table's columns, checked as far as their numbers are known, and how many rows are captured.
 
-    u: Array
-    w: Array
-    delay: Array | None
-    captured: int
-    """How many slower rows are captured."""
-    held: float
-    """The fastest approach speed that is captured, 0 if none is."""
-
-
-def _free_rows(approach: Any, rebound: Any, delay: Any) -> _FreeRows:
-    """Return the rows of a table whose tips leave, its columns checked as far as their numbers are known.
+    The columns are approach and rebound speed in nm/us and the delay in us; the captured rows are the slowest.
 
     Raises:
         ValueError: as `TabulatedLaw`.
@@ -851,28 +815,20 @@ def _free_rows(approach: Any, rebound: Any, delay: Any) -> _FreeRows:
     if len(u) < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds, but has {len(u)}")
     if is_traced(u):
-        return _FreeRows(u, w, late, 0, 0.0)
-    speeds = np.asarray(u)
-    fall = np.flatnonzero(np.diff(speeds) <= 0.0)
+        return u, w, late, 0
+    fall = np.flatnonzero(np.diff(u) <= 0.0)
     if fall.size:
-        first, second = speeds[fall[0]], speeds[fall[0] + 1]
+        first, second = u[fall[0]], u[fall[0] + 1]
         raise ValueError(
             f"`approach_speed_nm_per_us` must increase from row to row, but {second:g} follows {first:g} in row "
             f"{fall[0] + 2}"
         )
-    if speeds[0] <= 0.0:
-        raise ValueError(f"`approach_speed_nm_per_us` must be positive, but is {speeds[0]:g} in row 1")
-    captured = 0 if is_traced(w) else _captured_rows(speeds, np.asarray(w))
+    if u[0] <= 0.0:
+        raise ValueError(f"`approach_speed_nm_per_us` must be positive, but is {u[0]:g} in row 1")
+    captured = 0 if is_traced(w) else _captured_rows(u, w)
     if len(u) - captured < _LEAST_ROWS:
         raise ValueError(f"a table of a law needs at least four speeds that leave, but has {len(u) - captured}")
-    late = None if late is None else late[captured:]
-    held = float(speeds[captured - 1]) if captured else 0.0
-    return _FreeRows(_known(u[captured:]), _known(w[captured:]), _known(late), captured, held)
-
-
-def _known(column: Any) -> Any:
-    """Return a column as NumPy's where its numbers are known."""
-    return column if column is None or is_traced(column) else np.asarray(column)
+    return u, w, late, captured
 
 
 def _numpy_of(*values: Any) -> Any:
@@ -881,19 +837,19 @@ def _numpy_of(*values: Any) -> Any:
 
 
 def _column(name: str, values: Any, rows: int | None = None) -> Any:
-    """Return a column of a table as an array, checked: finite numbers, and as many as there are speeds.
+    """Return a column of a table, NumPy's where its numbers are known: finite ones, as many as there are speeds.
 
     Raises:
         ValueError: if they are something else.
     """
-    column = as_parameter(jnp.asarray(values) if isinstance(values, list | tuple) else values)
+    column = as_parameter(values)
     if not is_traced(column):
-        numbers = as_real(name, column)
-        if numbers.ndim != 1:
-            raise ValueError(f"`{name}` must be a column of numbers, but has shape {numbers.shape}")
-        bad = np.flatnonzero(~np.isfinite(numbers))
+        column = as_real(name, column)
+        if column.ndim != 1:
+            raise ValueError(f"`{name}` must be a column of numbers, but has shape {column.shape}")
+        bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:
-            raise ValueError(f"`{name}` must be finite numbers, but is {numbers[bad[0]]} in row {bad[0] + 1}")
+            raise ValueError(f"`{name}` must be finite numbers, but is {column[bad[0]]} in row {bad[0] + 1}")
     if rows is not None and column.shape != (rows,):
         raise ValueError(f"`{name}` must have a number for each of the {rows} speeds, but has {column.shape[0]}")
     return column
@@ -977,15 +933,10 @@ def _cubes(knots: Any, place: Any, numpy: Any = jnp) -> Any:
     return numpy.maximum(place[..., None] - knots, 0.0) ** 3
 
 
-def _spline_of(
-    spline: Float[Array, "... numbers"], knots: Float[Array, "... knots"], place: Array, cubes: Array
-) -> Float[Array, "..."]:
-    return spline[..., 0] + spline[..., 1] * (place - knots[..., 0]) + jnp.sum(spline[..., 2:] * cubes, axis=-1)
-
-
 def _spline(spline: Float[Array, "... numbers"], knots: Float[Array, "... knots"], place: Array) -> Float[Array, "..."]:
     """Return a natural cubic spline: value and slope at the first knot, and the factors of (x - knot)_+^3."""
-    return _spline_of(spline, knots, place, _cubes(knots, place))
+    bends = jnp.sum(spline[..., 2:] * _cubes(knots, place), axis=-1)
+    return spline[..., 0] + spline[..., 1] * (place - knots[..., 0]) + bends
 
 
 def _natural(knots: Any, numpy: Any) -> Any:
@@ -1002,17 +953,7 @@ def _natural(knots: Any, numpy: Any) -> Any:
     return numpy.concatenate([one[:1], first[None], numpy.diff(third, axis=0) / 6.0])
 
 
-class _Beside(NamedTuple):
-    """What a table's splines are written beside: knots, scale of the speed, the closest formula and its delay."""
-
-    knots: Any
-    scale: Any
-    r: Any
-    viscous_loss: Any
-    delay: CollisionDelay | None
-
-
-def _splines(u: Any, w: Any, late: Any, capture: Any, beside: _Beside, numpy: Any) -> tuple[Any, Any]:
+def _splines(u: Any, w: Any, late: Any, capture: Any, law: TabulatedLaw, numpy: Any) -> tuple[Any, Any]:
     """Return the natural splines of loss and delay through a table's rows, or of more rows than knots the closest ones.
 
     Args:
@@ -1020,10 +961,11 @@ def _splines(u: Any, w: Any, late: Any, capture: Any, beside: _Beside, numpy: An
         w: rebound speeds.
         late: delays in us; None: instantaneous impacts.
         capture: the capture speed.
-        beside: what the splines are written beside.
+        law: what the splines are written beside: its knots, scale of the speed, formula and delay.
         numpy: NumPy or JAX's.
     """
-    knots, scale, r, viscous_loss, delay = beside
+    numbers = law.knots, law.scale_nm_per_us, law.r, law.viscous_loss
+    (knots, scale, r, viscous_loss), delay = map(numpy.asarray, numbers), law.delay
     square = (u - capture) * (u + capture)
     loss = numpy.log(w * w / (square * _formula(u, capture, r, viscous_loss, numpy)))
     left = numpy.zeros_like(loss)

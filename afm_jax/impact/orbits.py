@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Complex, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -30,7 +30,6 @@ from afm_jax.impact.closure import (
     find_roots,
     map_gaps,
     speeds_at_place,
-    turn_of_map,
 )
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
@@ -38,7 +37,7 @@ from afm_jax.impact.lasting_impact import crawls, depth_of_impact, middle_of_con
 from afm_jax.impact.law import Impact, ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
-from afm_jax.solve.derivatives import absent, implicit_root, implicit_step, implicit_system
+from afm_jax.solve.derivatives import absent, implicit_root, implicit_system
 from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.units import within_turn
 
@@ -131,7 +130,9 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     """
     require_float64(scene)
     impact_law_of(scene)
-    _check_order(order)
+    number = np.ones(()) if is_traced(order) else np.asarray(order)
+    if number.ndim or not number >= 1.0 or number % 1.0:
+        raise ValueError(f"`order` must be a positive integer, but is {order}")
     frame = free_frame(scene)
     if not is_traced(frame.periodic) and not np.all(frame.periodic):
         raise ValueError("there are no periodic orbits: the drive has several frequencies")
@@ -139,14 +140,6 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     if not is_traced(rate) and np.any(np.asarray(rate) != 0.0):
         raise ValueError(f"`offset_rate_nm_per_us` must be 0 for a periodic orbit, but is {np.asarray(rate).flat[0]:g}")
     return _single_impact_orbits(scene, frame, jnp.asarray(order, scene.platform.frequency_khz.dtype))
-
-
-def _check_order(order: ArrayLike) -> None:
-    if is_traced(order):
-        return
-    number = np.asarray(order)
-    if number.ndim or not np.isfinite(number) or number != np.round(number) or number < 1:
-        raise ValueError(f"`order` must be a positive integer, but is {order}")
 
 
 @compiled_quickly()
@@ -241,14 +234,13 @@ class OrbitState(NamedTuple):
 class SteadyOrbits(NamedTuple):
     """The roots of a problem, which of them are steady (admissible and stable), and their readings.
 
-    A reading is peak and lock-in amplitude in nm and the phase in degrees; ``slopes`` are those of `FollowedRoot`.
+    A reading is peak and lock-in amplitude in nm and the phase in degrees.
     """
 
     place: OrbitPlace
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
     amplitude_nm: Float[Array, "slots 3"]
-    slopes: Float[Array, "slots 5 2"] | None = None
 
 
 def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[str, Float[Array, ""]]:
@@ -258,34 +250,33 @@ def _lab_readings(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) ->
     if frame.response is None:
         return {"peak_amplitude_nm": peak, "lockin_amplitude_nm": amplitude, "lockin_phase_deg": angle}
 
-    drive_amplitude, drive_angle = _lockin(state, problem, at_drive=True)
+    free, at_drive = _phasor(amplitude, angle), _phasor(*_lockin(state, problem, at_drive=True))
 
-    def along_and_across(size: Float[Array, ""], degrees: Float[Array, ""], wave: Wave | None) -> tuple[Array, Array]:
-        """Return x and y of Re((x + i y) exp(i nu t)) of the free motion, with a wave of the drive's added to it."""
-        along, across = size * jnp.cos(jnp.deg2rad(degrees)), size * jnp.sin(jnp.deg2rad(degrees))
-        return (along, across) if wave is None else (along + wave.cosine, across - wave.sine)
-
-    def read(motion: Wave) -> tuple[Float[Array, ""], ...]:
-        """Return peak, readings at omega/N and at omega, and the lag, of the free motion with another one added."""
-        with_motion, free = (along_and_across(amplitude, angle, wave) for wave in (motion, None))
+    def read(motion: Wave, peak: str, of: str = "") -> dict[str, Float[Array, ""]]:
+        """Return the readings of the free motion with another one added, at omega/N and at omega, and the lag."""
+        wave = lax.complex(motion.cosine, -motion.sine)
         # the drive's frequency is the response's for N = 1 alone; the scene's own clock is ahead by the frame's phase
-        along, across = (jnp.where(order == 1.0, *parts) for parts in zip(with_motion, free, strict=True))
-        size, behind = size_and_lag(along, across, frame.phase_rad, order)
-        at_drive = along_and_across(drive_amplitude, drive_angle, motion)
-        drive_size, drive_behind = size_and_lag(*at_drive, frame.phase_rad)
-        _, lag = size_and_lag(*at_drive, frame.drive_phase_rad)
-        phases = within_turn(-behind, 360.0 / order), within_turn(-drive_behind, 360.0)
-        peak = highest_of_sum(cantilever, state.flight, _alone(motion))
-        return peak, size, phases[0], drive_size, phases[1], lag
+        at_response, driven = jnp.where(order == 1.0, free + wave, free), at_drive + wave
+        size, behind = size_and_lag(at_response.real, at_response.imag, frame.phase_rad, order)
+        drive_size, drive_behind = size_and_lag(driven.real, driven.imag, frame.phase_rad)
+        return {
+            peak: highest_of_flight(cantilever, state.flight, _alone(motion)),
+            f"{of}lockin_amplitude_nm": size,
+            f"{of}lockin_phase_deg": within_turn(-behind, 360.0 / order),
+            f"{of}drive_lockin_amplitude_nm": drive_size,
+            f"{of}drive_lockin_phase_deg": within_turn(-drive_behind, 360.0),
+            "phase_lag_deg": size_and_lag(driven.real, driven.imag, frame.drive_phase_rad)[1],
+        }
 
-    names = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
-    peak, *readings, lag = read(frame.response)
-    readings_of_height = {"peak_amplitude_nm": peak, "phase_lag_deg": lag} | dict(zip(names, readings, strict=True))
-    if frame.base is None:
-        return readings_of_height
-    peak, *readings, lag = read(frame.response + -frame.base)
-    of_deflection = {f"deflection_{name}": value for name, value in zip(names, readings, strict=True)}
-    return readings_of_height | {"peak_deflection_nm": peak, "phase_lag_deg": lag} | of_deflection
+    readings = read(frame.response, "peak_amplitude_nm")
+    if frame.base is not None:
+        readings |= read(frame.response + -frame.base, "peak_deflection_nm", "deflection_")
+    return readings
+
+
+def _phasor(size: Float[Array, ""], degrees: Float[Array, ""]) -> Complex[Array, ""]:
+    """Return x + i y of the motion Re((x + i y) exp(i nu t))."""
+    return lax.complex(size * jnp.cos(jnp.deg2rad(degrees)), size * jnp.sin(jnp.deg2rad(degrees)))
 
 
 def _alone(wave: Wave) -> Surface:
@@ -294,23 +285,12 @@ def _alone(wave: Wave) -> Surface:
 
 
 @jax.jit
-def orbit_state(place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "5 2"] | None = None) -> OrbitState:
-    """Return the motion at a root, with the root's derivatives (implicit function theorem).
-
-    Args:
-        place: the root.
-        problem: what it is an orbit of.
-        slopes: of `FollowedRoot`, for first derivatives alone; None: computed.
-    """
+def orbit_state(place: OrbitPlace, problem: OrbitProblem) -> OrbitState:
+    """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
     cantilever, platform, impact, order = problem
     if impact.lasts:
-        root = jnp.stack(place)
-        if slopes is None:
-            place = OrbitPlace(*implicit_system(map_gaps, root, problem))
-            speeds = speeds_at_place(place, problem)
-        else:
-            root, of_impact = implicit_step(turn_of_map, root, problem, slopes)
-            place, speeds = OrbitPlace(*root), Speeds(*of_impact)
+        place = OrbitPlace(*implicit_system(map_gaps, jnp.stack(place), problem))
+        speeds = speeds_at_place(place, problem)
         phase = place.phase + platform.angular_frequency * speeds.delay
     else:
         speeds, system = closure(implicit_root(closing_residual, place.coordinate, problem), problem)
@@ -352,47 +332,13 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     problem = lax.stop_gradient(problem)
     roots = find_roots(problem, COARSE)
 
-    def judged(place: OrbitPlace, found: Bool[Array, ""], slopes: Float[Array, "5 2"] | None) -> Any:
+    def judged(place: OrbitPlace, found: Bool[Array, ""]) -> Any:
         state = orbit_state(place, problem)
-        steady = is_admissible(found, state, problem) & is_stable(place, slopes, state, problem)
-        return steady, _readings(state, problem)
+        of_map = trace_and_determinant(problem.impact, problem.cantilever, problem.platform, state.flight)
+        return is_admissible(found, state, problem) & contracts(*of_map), _readings(state, problem)
 
-    steady, readings = jax.vmap(judged)(roots.place, roots.found, roots.slopes)
-    return SteadyOrbits(roots.place, steady, roots.near_fold, readings, roots.slopes)
-
-
-def is_stable(
-    place: OrbitPlace, slopes: Float[Array, "5 2"] | None, state: OrbitState, problem: OrbitProblem
-) -> Bool[Array, ""]:
-    """Say whether an orbit is stable, from the slopes that its search has found where the impact lasts.
-
-    With the gaps g and h of one turn in position and velocity relative to the surface, and the relative acceleration a,
-    the next impact is late by g/u and as fast as u - h - a g/u; T = 2 + t and D = 1 + t + d, t and d the trace and the
-    determinant of the changes of both.
-
-    Args:
-        place: the root.
-        slopes: of `FollowedRoot`.
-        state: the motion there.
-        problem: what it is an orbit of.
-    """
-    cantilever, platform, impact, _ = problem
-    flight = state.flight
-    if slopes is None:
-        return contracts(*trace_and_determinant(impact, cantilever, platform, flight))
-    omega, approach = platform.angular_frequency, state.speeds.approach
-    gaps, per_coordinate = slopes[:2], slopes[2, 0]
-    by_speed, by_time = gaps[:, 0] / per_coordinate, gaps[:, 1] * omega
-    pull = cantilever.acceleration(flight.end_position, flight.end_velocity)
-    pull = pull - platform.acceleration(place.phase / omega)
-
-    def changes(gap, missing):
-        late = platform.amplitude_nm * gap / approach
-        return late, -platform.top_speed_nm_per_us * missing - pull * late
-
-    (later, slower), (late, slow) = changes(*by_time), changes(*by_speed)
-    trace, determinant = later + slow, later * slow - slower * late
-    return contracts(2.0 + trace, 1.0 + trace + determinant)
+    steady, readings = jax.vmap(judged)(roots.place, roots.found)
+    return SteadyOrbits(roots.place, steady, roots.near_fold, readings)
 
 
 def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
@@ -406,14 +352,9 @@ def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array,
     return jax.tree.map(lambda leaf: leaf[fastest], states), jnp.any(orbits.steady)
 
 
-def amplitudes(
-    place: OrbitPlace, problem: OrbitProblem, slopes: Float[Array, "5 2"] | None = None
-) -> Float[Array, " 3"]:
-    """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable.
-
-    Arguments as of `orbit_state`.
-    """
-    return _readings(orbit_state(place, problem, slopes), problem)
+def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
+    """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
+    return _readings(orbit_state(place, problem), problem)
 
 
 @jax.jit
@@ -434,8 +375,8 @@ def _lockin(
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
         nu = platform.angular_frequency / (1.0 if at_drive else order)
         depth = depth_of_impact(impact, approach, middle, cantilever, nu)
-    flight, how = state.flight, {"delayed": impact.delayed, "at_drive": at_drive}
-    return lockin(cantilever, platform, flight, order, indentation=depth, **how)
+    settings: Any = {"delayed": impact.delayed, "indentation": depth, "at_drive": at_drive}
+    return lockin(cantilever, platform, state.flight, order, **settings)
 
 
 def trace_and_determinant(
@@ -497,25 +438,18 @@ def peak_amplitude(cantilever: Cantilever, flight: FlightEnds) -> Float[Array, "
 
 
 def highest_of_flight(
-    cantilever: Cantilever, flight: FlightEnds, response: Surface | None, samples: int = SAMPLES
+    cantilever: Cantilever, flight: FlightEnds, motion: Surface | None, samples: int = SAMPLES
 ) -> Float[Array, ""]:
-    """Return the largest height in nm in the lab during a flight, given the steady response that is added to it."""
-    if response is None:
-        return peak_amplitude(cantilever, flight)
-    return highest_of_sum(cantilever, flight, response, samples)
-
-
-def highest_of_sum(
-    cantilever: Cantilever, flight: FlightEnds, motion: Surface, samples: int = SAMPLES
-) -> Float[Array, ""]:
-    """Return the largest sum of a flight's height and another motion during the flight, in nm.
+    """Return the largest height in nm during a flight, or the largest sum of the height and another motion.
 
     Args:
         cantilever: of the free flight.
         flight: from impact to impact.
-        motion: added to it: a steady response, less a base's motion where the deflection is meant.
+        motion: added to it: a steady response, less a base's motion where the deflection is meant; None: nothing.
         samples: heights looked at; the highest of them is improved by Newton's method.
     """
+    if motion is None:
+        return peak_amplitude(cantilever, flight)
 
     def at(after):
         position, velocity = cantilever.propagator(after)(flight.start_position, flight.start_velocity)

@@ -6,13 +6,13 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from afm_jax.checks import check_parameter
+from afm_jax.checks import check_parameter, is_traced
 from afm_jax.contact.contact import FORCES, Contact, check_effects
 from afm_jax.contact.forces.force import Force
 from afm_jax.contact.forces.liquid import Liquid
 from afm_jax.contact.forces.solid import CoreRepulsion
 from afm_jax.contact.junction import explain_missing_junction, find_junction
-from afm_jax.contact.parameters import CONTACT_RANGES, EFFECTS
+from afm_jax.contact.parameters import CONTACT_RANGES
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 
@@ -33,7 +33,7 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     for name, value in parameters.items():
         check_parameter(name, value, CONTACT_RANGES[name])
     contact = Contact.of(tuple(effects), **parameters)
-    if not bool(junction_of(contact).exists):
+    if not any(map(is_traced, parameters.values())) and not bool(junction_of(contact).exists):
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
     return contact
 
@@ -47,14 +47,7 @@ def contact_parameters(contact: Contact) -> dict[str, Any]:
         ValueError: if it holds something that a scene file has no key for: another force, the same one twice, or
             different radii or liquids in its forces.
     """
-    effects = contact.effects
-    try:
-        check_effects(effects)
-    except ValueError as error:
-        raise ValueError(
-            f"a scene file holds each of {', '.join(EFFECTS)} once, or a dry contact, but the contact has "
-            f"{', '.join(effects)}: {error}"
-        ) from error
+    check_effects(contact.effects)
     values: dict[str, Any] = dict(vars(contact.junction))
     if contact.dry and contact.spans:
         values["range_nm"] = contact.bridge_forms_nm

@@ -12,18 +12,18 @@ is captured leaves at 0, or has a blank cell where a column `captured` says true
 
 import csv
 import json
-import math
 import os
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import numpy as np
 
-from afm_jax.checks import checked
-from afm_jax.impact.law import CollisionDelay, TabulatedLaw, law_of_dict
+from afm_jax.checks import check_parameter, checked
+from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.saved import FIT_FORMAT, why_no_fit
 from afm_jax.scenefile.tables import SceneError, read_text
 from afm_jax.strict_json import strict_json
@@ -35,12 +35,12 @@ FORMAT, FORMAT_VERSION = "afm-jax law", 1
 _SPEED_UNITS = {"nm_per_us": 1.0, "um_per_s": 1e-3, "mm_per_s": 1.0, "m_per_s": 1e3}
 _TIME_UNITS = {"us": 1.0, "ns": 1e-3, "ms": 1e3, "s": 1e6}
 _COLUMNS = ("approach_speed", "rebound_speed", "rebound_speed_error", "collision_delay", "collision_delay_error")
-_COLUMN = re.compile(r"(approach_speed|rebound_speed(?:_error)?|collision_delay(?:_error)?)(?:_(.*))?")
+_COLUMN = re.compile(rf"({'|'.join(_COLUMNS)})(?:_((?!error).*))?")
 """A column's kind and its unit."""
-_BANDS = ("rebound_low", "rebound_high", "delay_low", "delay_high")
-"""Further columns of a fit's law.csv: its band, which cannot be drawn from a table alone."""
-_COLLIDED = ("captured", "outcome", "time_in_", "deepest_gap_", "bridge_", "junction_", "viscous_loss_", "end_energy_")
-"""How columns begin that `collide --out` writes besides."""
+_BESIDES = ("rebound_low", "rebound_high", "delay_low", "delay_high", "captured", "outcome", "time_in_", "deepest_gap_")
+_BESIDES += ("bridge_", "junction_", "viscous_loss_", "end_energy_")
+"""How other columns begin: the band of a fit's law, which cannot be drawn from a table alone, and what collisions
+are written with."""
 _WRITTEN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "rebound_low_nm_per_us", "rebound_high_nm_per_us")
 _WRITTEN += ("collision_delay_us", "delay_low_us", "delay_high_us")
 _NUMBERS = ("mass_ng", "spring_constant_n_per_m", "frequency_khz", "capture_speed_nm_per_us")
@@ -152,8 +152,7 @@ def _of_csv(text: str) -> TabulatedLaw:
         stays = "captured" in names and row[names.index("captured")].lower() == "true"
         for kind, (place, unit) in columns.items():
             empty = stays and kind != "approach_speed" and not row[place]
-            value = 0.0 if empty else _number(row[place], f"line {number}: `{names[place]}`")
-            values[kind].append(value * _units_of(kind)[unit])
+            values[kind].append(0.0 if empty else unit * _number(row[place], f"line {number}: `{names[place]}`"))
     return _law_of_columns({kind: np.array(column) for kind, column in values.items()}, settings)
 
 
@@ -161,8 +160,7 @@ def _law_of_columns(values: Mapping[str, np.ndarray], settings: Mapping[str, str
     """Return the law of columns and of what the comments say of it."""
     numbers = {key: _number(settings[key], f"`# {key}`") for key in _NUMBERS if key in settings}
     for key, value in numbers.items():
-        if not (math.isfinite(value) and value >= 0.0):
-            raise ValueError(f"`# {key}` must be finite and not negative, but is {settings[key]}")
+        check_parameter(f"# {key}", value, "not negative")
     corrections = settings.get("corrections", "true")
     if corrections not in ("true", "false"):
         raise ValueError(f"`# corrections` must be true or false, but is {corrections!r}")
@@ -177,65 +175,46 @@ def _law_of_columns(values: Mapping[str, np.ndarray], settings: Mapping[str, str
     # how a fit of instantaneous impacts writes its law
     delay = None if delay is not None and not delay.any() else delay
     columns = values["approach_speed"], values["rebound_speed"], delay
-    options = {
-        "mass_ng": mass,
-        "origin": settings.get("origin", ""),
-        "capture_speed_nm_per_us": numbers.get("capture_speed_nm_per_us"),
-    }
-    errors = [values.get(f"{kind}_error") for kind in ("rebound_speed", "collision_delay")]
-    for column in errors:
-        if column is not None and not (np.isfinite(column).all() and (column >= 0.0).all()):
-            raise ValueError("errors must be finite and not negative")
-    if all(column is None for column in errors):
-        law = TabulatedLaw(*columns, **options)
+    options = {"mass_ng": mass, "origin": settings.get("origin", "")}
+    options["capture_speed_nm_per_us"] = numbers.get("capture_speed_nm_per_us")
+    kinds, nothing = ("rebound_speed_error", "collision_delay_error"), np.zeros(len(columns[0]))
+    errors = {kind: values[kind] for kind in kinds if kind in values}
+    for kind, column in errors.items():
+        check_parameter(kind, column, "not negative")
+    if errors:
+        # every reading has its own
+        changes, rows = np.diag(np.concatenate([errors.get(kind, nothing) for kind in kinds])), len(nothing)
+        options |= {"rebound_changes": changes[:, :rows], "delay_changes": None if delay is None else changes[:, rows:]}
+        law = TabulatedLaw.with_errors(*columns, **options)
     else:
-        rows = len(columns[0])
-        of_rebound, of_delay = (np.zeros(rows) if column is None else column for column in errors)
-        # every reading has its own error
-        none = np.zeros((rows, rows))
-        law = TabulatedLaw.with_errors(
-            *columns,
-            rebound_changes=np.concatenate([np.diag(of_rebound), none]),
-            delay_changes=None if columns[2] is None else np.concatenate([none, np.diag(of_delay)]),
-            **options,
-        )
+        law = TabulatedLaw(*columns, **options)
     if law.delay is None or corrections == "true":
         return law
-    delay = CollisionDelay(law.delay.hertz, law.delay.lead_nm, law.delay.offset_nm, corrections=False)
-    return eqx.tree_at(lambda law: law.delay, law, delay)
+    return eqx.tree_at(lambda law: law.delay, law, replace(law.delay, corrections=False))
 
 
-def _columns_of(names: list[str]) -> dict[str, tuple[int, str]]:
-    """Return place and unit of the columns that a law's table has, by their kinds."""
-    columns: dict[str, tuple[int, str]] = {}
+def _columns_of(names: list[str]) -> dict[str, tuple[int, float]]:
+    """Return place and unit, in nm/us or us, of the columns that a law's table has, by their kinds."""
+    columns: dict[str, tuple[int, float]] = {}
     for place, name in enumerate(names):
         matched = _COLUMN.fullmatch(name)
-        if matched is None and name.startswith((*_BANDS, *_COLLIDED)):
-            continue
         if matched is None:
+            if name.startswith(_BESIDES):
+                continue
             known = ", ".join(_COLUMNS)
             raise ValueError(f"column {printable(name)} is none of a law's; it has {known}, each with its unit")
         kind, unit = matched.groups()
-        units = _units_of(kind)
-        if unit is None:
-            raise ValueError(f"column {name}: the unit is missing; use {name}_{next(iter(units))}")
+        units = _SPEED_UNITS if "speed" in kind else _TIME_UNITS
         if unit not in units:
-            raise ValueError(f"column {printable(name)}: the unit is not known; use one of {', '.join(units)}")
+            wrong = "missing" if unit is None else "not known"
+            raise ValueError(f"column {printable(name)}: the unit is {wrong}; use one of {', '.join(units)}")
         if kind in columns:
             raise ValueError(f"has two columns of {kind}: {names[columns[kind][0]]} and {name}")
-        columns[kind] = place, unit
+        columns[kind] = place, units[unit]
     missing = [kind for kind in ("approach_speed", "rebound_speed") if kind not in columns]
     if missing:
         raise ValueError(f"has no column {missing[0]}_nm_per_us; it has {', '.join(names)}")
-    speeds = {kind: unit for kind, (_, unit) in columns.items() if "speed" in kind}
-    if len(set(speeds.values())) > 1:
-        mixed = " and ".join(f"{kind} in {unit}" for kind, unit in speeds.items())
-        raise ValueError(f"has speeds in mixed units, {mixed}: write all in one")
     return columns
-
-
-def _units_of(kind: str) -> Mapping[str, float]:
-    return _SPEED_UNITS if "speed" in kind else _TIME_UNITS
 
 
 def _number(text: str, what: str) -> float:

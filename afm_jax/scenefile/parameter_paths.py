@@ -8,9 +8,11 @@ or force make of the free tip, `force.free_amplitude_nm`, sets their amplitude, 
 import difflib
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -124,7 +126,7 @@ def check_ranges(scene: Scene, *ranges: ParameterRange) -> None:
         raise ValueError(f"the ranges {' and '.join(map(str, ranges))} change the same parameter: give two different")
     for given in ranges:
         for end in (given.low, given.high):
-            scene_of_tables(_tables_with(scene, given.path, end), str(given))
+            with_numbers(scene, {given.path: end}, str(given))
 
 
 def _check_paths(scene: Scene, paths: Sequence[str]) -> None:
@@ -139,17 +141,6 @@ def _check_paths(scene: Scene, paths: Sequence[str]) -> None:
 def _leaf_path(path: str) -> str:
     path = path.replace("reduced_frequency", "frequency_khz")
     return path.replace("free_amplitude_nm", "amplitude_nn" if path.startswith("force") else "amplitude_nm")
-
-
-def _tables_with(scene: Scene, path: str, value: float) -> dict[str, Any]:
-    tables = scene_tables(scene)
-    table, _, key = path.rpartition(".")
-    inner: dict[str, Any] = tables
-    for name in table.split("."):
-        inner = inner[name]
-    inner.pop(_leaf_path(path).rpartition(".")[2], None)
-    inner[key] = value
-    return tables
 
 
 @checked
@@ -196,56 +187,43 @@ def scene_batch(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
     return jax.vmap(scene_family(scene, *values))(*columns)
 
 
-def with_numbers(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
-    """Return a scene with some of its numbers replaced, by their paths; the new ones may be traced."""
+def with_numbers(scene: Scene, values: Mapping[str, ArrayLike], source: str = "the scene") -> Scene:
+    """Return a scene with some of its numbers replaced, by their paths: that of its tables with other numbers in them.
+
+    Args:
+        scene: one scene; its numbers may be traced.
+        values: by path; the new numbers may be traced.
+        source: what an error calls their origin.
+
+    Raises:
+        SceneError: if a number that is known is impossible.
+    """
+    interaction = scene.interaction
     unknowns = [path for path in values if path.startswith(UNKNOWN)]
     if unknowns:
-        steps = jnp.zeros(scene.interaction.unknowns)
+        steps = jnp.zeros(interaction.unknowns)
         for path in unknowns:
             steps = steps.at[int(path.removeprefix(UNKNOWN)) - 1].set(values[path])
-        scene = eqx.tree_at(lambda parts: parts.interaction, scene, scene.interaction.moved(steps))
-    of_contact = [path for path in values if path.startswith("interaction.") and hasattr(scene.interaction, "forces")]
-    if of_contact:
-        # only here, so that scenes with a law do without the contact's modules
-        from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
-
-        contact = scene.interaction
-        numbers = contact_parameters(contact) | {path.partition(".")[2]: values[path] for path in of_contact}
-        made = type(contact).of(contact.effects, **numbers)
-        scene = eqx.tree_at(lambda parts: parts.interaction, scene, made)
-    # the cantilever first: reduced frequencies are in its unit; free amplitudes last, which hang on both
-    values = {path: value for path, value in values.items() if path not in (*unknowns, *of_contact)}
-    for path in sorted(
-        values, key=lambda path: (path.endswith("free_amplitude_nm"), not path.startswith("cantilever"))
-    ):
-        scene = _with_number(scene, path, values[path])
-    return scene
+        interaction = interaction.moved(steps)
+    own = [path for path in values if path.startswith("interaction.") and path not in unknowns]
+    tables: Any = scene_tables(scene if own else replace(scene, interaction=None))
+    if _rests(scene) and not any(_leaf_path(path) in _PLATFORM_MOVES for path in values):
+        # its phase counts in the drive that moves
+        del tables["platform"]["frequency_khz"]
+    for path in (path for path in values if path not in unknowns):
+        *parts, key = path.split(".")
+        table = reduce(getitem, parts, tables)
+        table.pop(_leaf_path(path).rpartition(".")[2], None)
+        table[key] = values[path]
+    made = scene_of_tables(tables, source)
+    return made if own else replace(made, interaction=interaction)
 
 
-def _with_number(scene: Scene, path: str, value: ArrayLike) -> Scene:
-    *parts, key = path.split(".")
-    number = jnp.asarray(value, scene.platform.frequency_khz.dtype)
-    if key == "reduced_frequency":
-        key, number = "frequency_khz", 2.0 * number * scene.cantilever.frequency_khz
-    if key == "free_amplitude_nm":
-        drive = getattr(scene, parts[0])
-        number = number * drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive))
-        key = _leaf_path(path).rpartition(".")[2]
-    if parts[-1] == "second" and key.startswith("amplitude"):
-        key = "amplitude"
-    follows = parts[0] in ("base", "force") and parts[-1] != "second" and key == "frequency_khz" and _rests(scene)
-
-    def places(tree: Scene) -> list[object]:
-        part = tree
-        for name in parts:
-            part = getattr(part, name)
-        # the phase over a resting platform counts in the drive that moves
-        return [getattr(part, key), *([tree.platform.frequency_khz] if follows else [])]
-
-    return eqx.tree_at(places, scene, [number] * (2 if follows else 1))
+_PLATFORM_MOVES = ("platform.amplitude_nm", "platform.frequency_khz")
 
 
 def _rests(scene: Scene) -> bool:
-    """Say whether the platform is known to rest."""
+    """Say whether the platform is known to rest while something else moves."""
     amplitude = scene.platform.amplitude_nm
-    return scene.platform.second is None and not is_traced(amplitude) and not np.any(np.asarray(amplitude))
+    alone = (scene.base or scene.force) is None or scene.platform.second is not None
+    return not alone and not is_traced(amplitude) and not np.any(np.asarray(amplitude))

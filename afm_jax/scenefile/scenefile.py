@@ -47,7 +47,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -59,7 +59,7 @@ from afm_jax.apparatus.drives import SAME_FREQUENCY, BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, check_mass, drive_of
 from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
-from afm_jax.checks import check_parameter, checked
+from afm_jax.checks import check_parameter, checked, is_traced
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law, TabulatedLaw, law_of_dict
 from afm_jax.motion.record import State
 from afm_jax.scenefile.law_files import load_law
@@ -78,9 +78,6 @@ from afm_jax.scenefile.tables import (
 )
 from afm_jax.whole_files import write_whole
 from afm_jax.words import printable
-
-Excited = TypeVar("Excited", BaseDrive, ForceDrive)
-Driven = TypeVar("Driven", Platform, BaseDrive, ForceDrive)
 
 MASS_ASSUMED = (
     "1 ng assumed: the file does not give the tip's mass, and all energies and speeds of a contact depend on it; give "
@@ -162,6 +159,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
             start is impossible in it.
     """
     tables = scene_tables(scene)
+    scene_of_tables(tables, "the scene")
     if start is not None:
         check_start(start, scene)
         tables["start"] = {key: float(value) for key, value in start._asdict().items()}
@@ -169,17 +167,13 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
 
 
 def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
-    """Return a scene as the tables of its file, dicts of numbers; what is absent is left out.
+    """Return a scene as the tables of its file, dicts of numbers, traced ones too; what is absent is left out.
 
     Raises:
         TypeError: if the interaction is neither an impact law nor a contact nor None.
-        ValueError: if the scene is a batch of scenes, its contact is none that a file can hold, a second frequency is
-            equal to the first, or an undamped cantilever is driven at its free frequency.
+        ValueError: if the scene is a batch of scenes, or its contact is none that a file can hold.
     """
     drives = {"platform": scene.platform, "base": scene.base, "force": scene.force}
-    for name, drive in drives.items():
-        if isinstance(drive, BaseDrive | ForceDrive):
-            check_steady_response(scene.cantilever, drive.tones, name)
     return {
         "cantilever": _numbers_of(scene.cantilever, "cantilever"),
         **{name: _drive_table(name, drive) for name, drive in drives.items() if drive is not None},
@@ -243,85 +237,69 @@ def _model_of(table: SceneTable) -> str:
 def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     table = tables["cantilever"]
     cantilever = table.build(Cantilever, **table.numbers("frequency_khz"))
-    base = _excitation_of(tables, "base", BaseDrive, cantilever)
-    force = _excitation_of(tables, "force", ForceDrive, cantilever)
-    platform = _platform_of(tables, cantilever, base or force)
+    base, force = (_drive_of(tables, name, cantilever) for name in ("base", "force"))
+    platform = _drive_of(tables, "platform", cantilever, may_rest=(base or force) is not None)
     interaction = _interaction_of(tables)
     tables["interaction"].build(check_mass, interaction, cantilever)
     return tables["platform"].build(Scene, cantilever, platform, interaction, base, force)
 
 
-def _platform_of(
-    tables: Mapping[str, SceneTable], cantilever: Cantilever, excitation: BaseDrive | ForceDrive | None
-) -> Platform:
-    """Return the platform, which under another drive may rest without a frequency of its own."""
-    table = tables["platform"]
-    may_rest = excitation is not None and "platform.second" not in tables
-    numbers = table.numbers(*(() if may_rest else ("amplitude_nm",)))
-    if may_rest and not numbers.get("amplitude_nm") and not {"frequency_khz", "reduced_frequency"} & set(numbers):
-        return table.build(Platform, **numbers)
-    platform = table.build(Platform, **_with_frequency(table, {"amplitude_nm": 0.0} | numbers, cantilever))
-    return _with_second(tables, "platform", platform, cantilever)
+_KINDS: dict[str, Any] = {"platform": Platform, "base": BaseDrive, "force": ForceDrive}
 
 
-def _excitation_of(
-    tables: Mapping[str, SceneTable], name: str, kind: type[Excited], cantilever: Cantilever
-) -> Excited | None:
-    """Return base or force; its amplitude may be given as that of the free tip's height, `free_amplitude_nm`."""
-    table = tables.get(name)
+def _drive_of(tables: Mapping[str, SceneTable], name: str, cantilever: Cantilever, *, may_rest: bool = False) -> Any:
+    """Return platform, base or force, with its second frequency if it has one; None if the file does not have it.
+
+    Args:
+        tables: of the file.
+        name: of the drive's table.
+        cantilever: reduced frequencies are in its unit, free amplitudes those of its tip.
+        may_rest: whether it may be without amplitude and frequency, as a platform under another drive.
+    """
+    table, of_second = tables.get(name), tables.get(f"{name}.second")
     if table is None:
         return None
-    drive = _with_second(tables, name, table.build(kind, **_tone(table, name, cantilever)), cantilever)
-    table.build(check_steady_response, cantilever, drive.tones, name)
+    numbers = _tone(table, name, cantilever, may_rest=may_rest and of_second is None)
+    if of_second is not None:
+        own = _tone(of_second, name, cantilever)
+        second = numbers["second"] = of_second.build(Tone, own.pop(_amplitude(name)), **own)
+        both = numbers["frequency_khz"], second.frequency_khz
+        if not any(map(is_traced, both)) and np.all(np.isclose(*both, rtol=SAME_FREQUENCY, atol=0.0)):
+            of_second.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
+    drive = table.build(_KINDS[name], **numbers)
+    if name != "platform":
+        table.build(check_steady_response, cantilever, drive.tones, name)
     return drive
 
 
-def _tone(table: SceneTable, name: str, cantilever: Cantilever) -> dict[str, float]:
-    """Return the numbers of a tone of a drive, with its own amplitude in place of the free tip's height."""
+def _tone(table: SceneTable, name: str, cantilever: Cantilever, *, may_rest: bool = False) -> dict[str, Any]:
+    """Return the numbers of a drive's cosine, with its own amplitude and frequency, whichever way the table gives them.
+
+    The amplitude may be given as that of the free tip's height, `free_amplitude_nm`, the frequency as a reduced one.
+    """
     amplitude, free = _amplitude(name), "free_amplitude_nm"
     if amplitude in table.values and free in table.values:
         table.fail(f"has both {amplitude} and {free}; give one of them")
     given = free if free in table.values else amplitude
-    numbers = table.numbers(given)
-    table.build(check_parameter, given, numbers[given], "not negative")
-    numbers = _with_frequency(table, numbers, cantilever)
-    if given == free:
-        # the tone's amplitude only says that it moves
-        tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
-        table.build(check_steady_response, cantilever, (tone,), name)
-        kind = ForceDrive if name == "force" else BaseDrive
-        numbers[amplitude] = numbers.pop(free) * float(
-            drive_per_free_height(cantilever, numbers["frequency_khz"], kind)
-        )
-    return numbers
-
-
-def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, cantilever: Cantilever) -> Driven:
-    """Return a drive with the second frequency that its file gives it, if any."""
-    table = tables.get(f"{name}.second")
-    if table is None:
-        return drive
-    numbers = _tone(table, name, cantilever)
-    second = table.build(Tone, numbers.pop(_amplitude(name)), **numbers)
-    if _same_frequency(drive, second):
-        table.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
-    return eqx.tree_at(lambda drive: drive.second, drive, second, is_leaf=lambda leaf: leaf is None)
-
-
-def _with_frequency(table: SceneTable, numbers: dict[str, float], cantilever: Cantilever) -> dict[str, float]:
-    """Return a drive's numbers with `frequency_khz`, whichever way the table gives it."""
+    numbers = table.numbers(*(() if may_rest else (given,)))
     reduced = numbers.pop("reduced_frequency", None)
-    if (reduced is None) == ("frequency_khz" not in numbers):
-        both = reduced is not None
-        table.fail(
-            "has both frequency_khz and reduced_frequency; give one of them"
-            if both
-            else "the drive frequency is missing; add frequency_khz or reduced_frequency"
-        )
+    if reduced is not None and "frequency_khz" in numbers:
+        table.fail("has both frequency_khz and reduced_frequency; give one of them")
     if reduced is not None:
         table.build(check_parameter, "reduced_frequency", reduced, "positive")
         # omega / 2 Omega
-        numbers["frequency_khz"] = 2.0 * reduced * float(cantilever.frequency_khz)
+        numbers["frequency_khz"] = 2.0 * reduced * cantilever.frequency_khz
+    if "frequency_khz" not in numbers and not (may_rest and not numbers.get(amplitude)):
+        table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
+    if given == free:
+        table.build(check_parameter, free, numbers[free], "not negative")
+        # the tone's amplitude only says that it moves
+        tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
+        table.build(check_steady_response, cantilever, (tone,), name)
+        per_height = drive_per_free_height(cantilever, numbers["frequency_khz"], _KINDS[name])
+        numbers[amplitude] = numbers.pop(free) * per_height
+    elif amplitude in numbers:
+        table.build(check_parameter, amplitude, numbers[amplitude], "not negative")
     return numbers
 
 
@@ -334,17 +312,20 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
         from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
         from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
 
-        effects = table.texts("effects")
+        effects = table.value("effects", _are_texts, 'a list of texts alone, ["..."]')
         return table.build(make_contact, EFFECTS if effects is None else effects, table.numbers())
     if "file" in table.values or "table" in table.values:
         return _tabulated(table)
     numbers, delay = table.numbers("r"), tables.get("interaction.delay")
     if delay is None:
         return table.build(ImpactLaw, **numbers)
-    parameters = delay.numbers("hertz", "lead_nm", "offset_nm") | {
-        "corrections": delay.truth("corrections", usual=True)
-    }
+    corrections = delay.value("corrections", lambda value: isinstance(value, bool), "true or false")
+    parameters = delay.numbers("hertz", "lead_nm", "offset_nm") | {"corrections": corrections is not False}
     return table.build(ImpactLaw, **numbers, delay=delay.build(CollisionDelay, **parameters))
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, str) for entry in value)
 
 
 def _tabulated(table: SceneTable) -> TabulatedLaw:
@@ -353,13 +334,10 @@ def _tabulated(table: SceneTable) -> TabulatedLaw:
     others = [key for key in table.values if key not in ("model", source)]
     if others:
         table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
-    given = table.values[source]
     if source == "file":
-        if not isinstance(given, str):
-            table.fail(f"must be the path of a law's file, as text, but is {in_words(given)}", "file")
-        return table.build(load_law, Path(table.source).parent / given)
-    if not isinstance(given, dict):
-        table.fail(f"must be a table, [interaction.table], but is {in_words(given)}", "table")
+        path = table.value("file", lambda value: isinstance(value, str), "the path of a law's file, as text")
+        return table.build(load_law, Path(table.source).parent / path)
+    given = table.value("table", lambda value: isinstance(value, dict), "a table, [interaction.table]")
     try:
         return table.build(law_of_dict, given)
     except (KeyError, TypeError) as error:
@@ -371,14 +349,8 @@ def _drive_table(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[st
     second = drive.second
     if second is None:
         return table
-    if _same_frequency(drive, second):
-        raise ValueError(f"the second frequency of `{name}` is that of the first: add the two up to one cosine")
     amplitude = {_amplitude(name): _number_of(second.amplitude, _amplitude(name))}
     return {**table, "second": {**amplitude, **_numbers_of(second, f"{name}.second")}}
-
-
-def _same_frequency(drive: Platform | BaseDrive | ForceDrive, second: Tone) -> bool:
-    return bool(np.all(np.isclose(drive.frequency_khz, second.frequency_khz, rtol=SAME_FREQUENCY, atol=0.0)))
 
 
 def _amplitude(name: str) -> str:
@@ -389,10 +361,8 @@ def _interaction_table(interaction: Any) -> dict[str, Any]:
     if interaction is None:
         return {"model": "none"}
     if isinstance(interaction, TabulatedLaw):
-        if interaction.capture.ndim:
-            raise ValueError(
-                f"the law has shape {interaction.capture.shape}, but a scene file holds one scene: save them one by one"
-            )
+        # a batch is refused
+        _number_of(interaction.capture, "interaction")
         return {"model": "law", "table": interaction.to_dict()}
     if isinstance(interaction, ImpactLaw):
         table: dict[str, Any] = {"model": "law", **_numbers_of(interaction, "interaction")}
@@ -427,12 +397,14 @@ def _numbers_of(part: eqx.Module, table: str) -> dict[str, Any]:
     }
 
 
-def _number_of(value: ArrayLike, key: str) -> float:
-    """Return a parameter as a number.
+def _number_of(value: ArrayLike, key: str) -> Any:
+    """Return a parameter as a number; a traced one as it is.
 
     Raises:
         ValueError: if it is an array of numbers.
     """
+    if is_traced(value):
+        return value
     number = np.asarray(value)
     if number.ndim:
         raise ValueError(f"`{key}` has shape {number.shape}, but a scene file holds one scene: save them one by one")
@@ -458,37 +430,28 @@ def check_start(start: Start, scene: Scene) -> None:
         check_parameter(name, value, "finite")
     if scene.interaction is None:
         return
-    if isinstance(scene.interaction, Law):
-        check_parameter("height_above_platform_nm", height, "not negative")
-        if height == 0.0:
-            _check_leaves(start, scene.platform)
+    law = isinstance(scene.interaction, Law)
+    if abs(height) <= _TOUCHING_NM and (law or not scene.interaction.spans):
+        # a tip at rest on the platform rides until the platform lets go
+        moving = float(scene.platform.velocity(start.phase_deg / 360.0 * float(scene.platform.period_us)))
+        if start.velocity_nm_per_us < moving:
+            raise ValueError(
+                f"`velocity_nm_per_us` must not be below the platform's {moving:.6g} where the tip starts on it, but "
+                f"is {start.velocity_nm_per_us:.6g}: start faster or higher"
+            )
+        return
+    # else the tip would start inside the sample
+    check_parameter("height_above_platform_nm", height, "not negative" if law else "above 0")
+    if law:
         return
     # only here, so that scenes with a law do without the contact's modules
     from afm_jax.scenefile.contact import junction_of  # noqa: PLC0415
 
-    if not scene.interaction.spans and abs(height) <= _TOUCHING_NM:
-        _check_leaves(start, scene.platform)
-        return
-    if height <= 0.0:
-        raise ValueError(
-            f"`height_above_platform_nm` must be positive, but is {height:g}: the tip would start inside the sample"
-        )
     junction = junction_of(scene.interaction)
     forms = float(junction.forms_gap_nm)
     if bool(junction.exists) and height <= forms:
         raise ValueError(
             f"`height_above_platform_nm` must be above {forms:.6g}, where the solid junction forms, but is {height:g}"
-        )
-
-
-def _check_leaves(start: Start, platform: Platform) -> None:
-    """Check that a tip on the platform does not move into it; one at rest on it rides until the platform lets go."""
-    time_us = start.phase_deg / 360.0 * float(platform.period_us)
-    moving = float(platform.velocity(time_us))
-    if start.velocity_nm_per_us < moving:
-        raise ValueError(
-            f"`velocity_nm_per_us` must not be below the platform's {moving:.6g} where the tip starts on it, but is "
-            f"{start.velocity_nm_per_us:.6g}: start faster or higher"
         )
 
 

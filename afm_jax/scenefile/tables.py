@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
+from afm_jax.checks import is_array
 from afm_jax.whole_files import read_whole
 from afm_jax.words import printable
 
@@ -66,7 +67,7 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     >>> advise_key("force", "amplitude_nm")
     'unknown key; use amplitude_nn'
     >>> advise_key("interaction", "viscosity_pa_s", "law")
-    'unknown key of a law; it belongs to model = "contact"'
+    'unknown key of model = "law"; it belongs to model = "contact"'
 
     Args:
         table: a name of `KEYS`.
@@ -76,8 +77,7 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     keys, plain = keys_of(table, model), key.casefold()
     others = [other for other in MODELS if other != model and plain in keys_of("interaction", other)]
     if table == "interaction" and others:
-        whose = "a free cantilever" if model == "none" else f"a {model}"
-        return f'unknown key of {whose}; it belongs to model = "{others[0]}"'
+        return f'unknown key of model = "{model}"; it belongs to model = "{others[0]}"'
     without_unit = [name for name in keys if name.startswith(f"{plain}_")]
     nearest = without_unit or difflib.get_close_matches(plain, keys, cutoff=0.7)
     if nearest:
@@ -175,7 +175,7 @@ class SceneTable(NamedTuple):
             if key not in keys_of(self.name, self.model):
                 self.fail(advise_key(self.name, key, self.model), key)
 
-    def numbers(self, *required: str) -> dict[str, float]:
+    def numbers(self, *required: str) -> dict[str, Any]:
         """Return all numbers that the table has, by their keys.
 
         Args:
@@ -187,34 +187,22 @@ class SceneTable(NamedTuple):
         for key in required:
             if key not in self.values:
                 self.fail("missing; add it", key)
-        optional = (key for key in keys_of(self.name, self.model) if key not in (*required, *_NO_NUMBERS))
-        return {key: self._number(key) for key in (*required, *optional) if key in self.values}
+        return {key: self._number(key) for key in self.values if key not in _NO_NUMBERS}
 
-    def texts(self, key: str) -> list[str] | None:
-        """Return the list of texts that the table has under a key; None if the key is left out.
+    def value(self, key: str, good: Callable[[Any], bool], must: str) -> Any:
+        """Return what the table has under a key, if that is good; None if the key is left out.
+
+        Args:
+            key: of the table.
+            good: says whether a value may stand there.
+            must: what it must be, in words.
 
         Raises:
             SceneError: if there is something else.
         """
         value = self.values.get(key)
-        if value is None:
-            return None
-        if not isinstance(value, list):
-            self.fail(f'must be a list of texts, ["..."], but is {in_words(value)}', key)
-        for entry in value:
-            if not isinstance(entry, str):
-                self.fail(f"must be a list of texts, but one entry is {in_words(entry)}", key)
-        return value
-
-    def truth(self, key: str, *, usual: bool) -> bool:
-        """Return whether the table has true under a key; the usual answer if the key is left out.
-
-        Raises:
-            SceneError: if there is something else than true or false.
-        """
-        value = self.values.get(key, usual)
-        if not isinstance(value, bool):
-            self.fail(f"must be true or false, but is {in_words(value)}", key)
+        if value is not None and not good(value):
+            self.fail(f"must be {must}, but is {in_words(value)}", key)
         return value
 
     def build(self, kind: Callable[..., Built], *arguments: Any, **parameters: Any) -> Built:
@@ -228,8 +216,11 @@ class SceneTable(NamedTuple):
         except ValueError as error:
             self.fail(str(error))
 
-    def _number(self, key: str) -> float:
+    def _number(self, key: str) -> Any:
         value = self.values[key]
+        if is_array(value):
+            # of a scene whose numbers are replaced, maybe by traced ones
+            return value
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             self.fail(f"must be a number, but is {in_words(value)}", key)
         try:

@@ -413,7 +413,11 @@ def _solved(
 def _trace_and_determinant(
     faster, gaps, state, row: Row
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
-    """Return both of the map's Jacobian (eq. 8), from the gaps' slopes: as `afm_jax.impact.orbits.is_stable`.
+    """Return both of the map's Jacobian (eq. 8), from the gaps' slopes.
+
+    With the gaps g and h of one turn in position and velocity relative to the surface, and the relative acceleration a,
+    the next impact is late by g/u and as fast as u - h - a g/u; T = 2 + t and D = 1 + t + d, t and d the trace and the
+    determinant of the changes of both.
 
     ``faster``: derivative of the approach speed by the coordinate.
     """
