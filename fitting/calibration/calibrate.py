@@ -12,8 +12,8 @@ from scipy.special import digamma
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.columns import printed_table
-from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.solve.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
