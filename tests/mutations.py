@@ -307,7 +307,7 @@ MUTATIONS = {
         f"{SOLVE}test_open_lanes_are_computed_again_whether_numbers_are_known_or_not",
     ),
     "lanes in need worked on once too often": Mutation(
-        "jnp.any(carried[2]) & (carried[0] {< => <=} self.passes)",
+        "jnp.any(state[2]) & (state[0] {< => <=} self.passes)",
         "tests/test_contact_legs.py::test_the_few_get_what_each_would_alone[3]",
     ),
     "a lane's own tangent taken off": Mutation(
