@@ -220,7 +220,7 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
         error = error * averages**-0.5
     elif sweep.amplitude_error is not None:
         error, origin = sweep.amplitude_error / largest, "file"
-    (place, best, _), model, reverse = minimum(sweep, error)
+    (place, best, *_), model, reverse = minimum(sweep, error)
     freedom = len(best.residual) - len(place)
     # a scan without noise keeps rounding for an error
     scale = max(best.value / freedom, 1e-12) if origin == "estimated" else 1.0
