@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.contact.driven import ContactState, Driven, Leg
 from afm_jax.contact.settings import QuickSetting, Setting
 from afm_jax.solve.derivatives import halved, implicit_root
-from afm_jax.solve.quadrature import nodes_along
+from afm_jax.solve.quadrature import gauss_nodes, nodes_along
 
 _NEAREST = 1e-14
 """Lower bound of b: at 0 speed and square root would vanish together."""
@@ -254,9 +254,14 @@ def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
         # of a push that does not change on the way
         start_nm = way.course.at(jnp.zeros_like(way.total_aj))[0]
         guess = guess - way.tip.mass_ng * drive.push.position(way.begin_us) * (at.gap_nm - start_nm)
-    count = 0 if way.quiet else iterations
+    state, count = (guess, guess, guess), 0 if way.quiet else iterations
     # few are written out in the program, more are a loop
-    spent, before, spending = lax.fori_loop(0, count, again, (guess, guess, guess), unroll=count <= 3)
+    if count > 3:
+        state = lax.fori_loop(0, count, again, state)
+    else:
+        for number in range(count):
+            state = again(number, state)
+    spent, before, spending = state
     kinetic = at.available_aj - spent
     speed, time_slope = way.speed_and_time_slope(at.path_nm, kinetic)
     lost = at.drag * speed
@@ -272,6 +277,19 @@ def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
         change_aj=jnp.abs(spent - before),
         end_change_aj=jnp.abs(ends[0] - ends[2]),
     )
+
+
+def _pass_conserving(way: Way, nodes: int) -> Passage:
+    """Return the passage where nothing is spent: one quadrature of the time, its nodes in a loop of one small body."""
+    points, weights, _ = gauss_nodes(nodes)
+
+    def add(total, node):
+        at = way.along(node[0])
+        return total + node[1] * way.speed_and_time_slope(at.path_nm, at.available_aj)[1], None
+
+    nothing = jnp.zeros_like(way.total_aj)
+    pairs = jnp.asarray(np.stack([points, weights], axis=1), nothing.dtype)
+    return way.end(nothing, lax.scan(add, nothing, pairs)[0])
 
 
 def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
@@ -344,8 +362,7 @@ def _pass_bridge(way: Way, setting: Setting) -> Passage:
         return way.end(nothing, nothing)
     size = setting.inward if way.inward else setting.outward
     if way.quiet:
-        # one quadrature of the time
-        return collocate(way, max(size, setting.junction_nodes), 0).passage
+        return _pass_conserving(way, max(size, setting.junction_nodes))
     if setting.rule == "collocation":
         return collocate(way, size, setting.iterations).passage
     return pass_in_steps(way, size, setting.solver)
