@@ -7,6 +7,7 @@ orbit, the derivatives of amplitudes are NaN and a sentence says why.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -17,7 +18,6 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.checks import checked, in_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import Result, public_result
-from afm_jax.solve.lanes import compiled_quickly
 from fitting.infer.fit import model_of
 from fitting.infer.search import orbits_at
 from fitting.models import task_of
@@ -131,7 +131,7 @@ _TOUCHING = 1e-3
 """Smallest gap on the way, in terms of the drive's amplitude, below which a flight counts as grazing."""
 
 
-@compiled_quickly(static_argnames="drive")
+@partial(jax.jit, static_argnames="drive")
 def _touches(
     x: Float[Array, "rows 3"], approach: Float[Array, " rows"], local: Float[Array, "rows local"], row: Row, drive: str
 ) -> Bool[Array, " rows"]:

@@ -141,7 +141,7 @@ MUTATIONS = {
         "tests/test_lasting_fit.py::test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient",
     ),
     "damped steps uphill": Mutation(
-        "step[moves] = {- => }np.linalg.solve(normal",
+        "step[moving] = {- => }np.linalg.solve(normal",
         "tests/test_least_squares.py::test_a_search_alone_ends_where_scipys_does",
     ),
     "drag without its width": Mutation(
@@ -180,7 +180,9 @@ MUTATIONS = {
         "root * root * (0.4 * root**3 {- => +} self.attraction)",
         "tests/test_dry_contact.py::test_collisions_are_those_of_an_independent_integration[changed0-False]",
     ),
-    "delay counted from where the bridge forms, both ways": Mutation("approach_speed + gaps_nm[{1 => 0}]", COLLISIONS),
+    "delay counted from where the bridge forms, both ways": Mutation(
+        "/ speed + {end.gap_nm => contact.bridge_forms_nm} / jnp.where(leaves", COLLISIONS
+    ),
     "bridge that breaks where it formed": Mutation(
         "jnp.maximum(self.{breaks_nm => forms_nm}, self.junction", COLLISIONS
     ),

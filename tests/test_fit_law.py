@@ -144,4 +144,6 @@ def test_command_tells_what_the_functions_find(tmp_path):
     worst = np.abs(np.array(fitted) - 1.0).max()
     np.testing.assert_allclose(worst, law.worst_relative_error, rtol=1e-9, atol=0.0)
     delays = table(tmp_path / "law_delay.csv")
-    assert float(delays[0]["lag_us"]) == payload["delay"]["lag_us"][0]
+    delay = fit_delay(PAPER)
+    assert [float(row["lag_us"]) for row in delays] == delay.lag_us.tolist()
+    assert payload["delay"]["lead_nm"] == float(delay.delay.lead_nm)

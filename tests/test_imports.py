@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 ROWS = {
     "afm_jax": (
         ("units", "version", "lazy_names", "strict_json", "whole_files", "words", "columns", "outcomes"),
-        ("least_squares", "compilation_cache"),
+        ("compilation_cache",),
         ("checks", "saved", "results"),
         ("solve", "apparatus"),
         ("impact",),

@@ -34,7 +34,7 @@ def test_the_fit_ends_at_one_minimum_from_eight_starts(law, model):
     chi2 = Chi2(model, plain_weights(model.data, 0.0, np.zeros(len(model.data.read), bool)))
     for r, epsilon, quality in STARTS:
         best = chi2.minimised(np.array([1.0 - r**2, epsilon, 100.0 * np.log(quality / 40.0)])).place
-        end = chi2.descended(best).place[0]
+        end = chi2.descended(best).place
         assert np.abs(errors_from(law, [np.sqrt(1.0 - end[0]), end[1], 40.0 * np.exp(0.01 * end[2])])).max() < 1e-3
     assert law.convergence.optimiser.startswith("optax.lbfgs")
     assert law.convergence.iterations > 0

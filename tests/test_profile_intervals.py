@@ -120,11 +120,13 @@ def test_a_loss_that_vanishes_at_the_minimum_grows_again_where_it_has_to(model, 
     best = free_minimum[0] + fisher[0, 1] / fisher[0, 0] * free_minimum[1]
     chi2 = linear(model, np.linalg.cholesky(fisher).T, free_minimum)
     end = chi2.descended(np.array([0.3, 5.0, 1.0]))
-    np.testing.assert_allclose(end.place[0], [best, 0.0, 0.0], atol=1e-9)
-    assert end.chi2[0] == pytest.approx(least(best), rel=1e-9)
+    np.testing.assert_allclose(end.place, [best, 0.0, 0.0], atol=1e-9)
+    assert end.sum.value == pytest.approx(least(best), rel=1e-9)
 
     def rise(lost):
-        return float(chi2.descended(np.array([lost, 0.0, 0.0]), np.array([True, False, False])).chi2[0] - end.chi2[0])
+        return float(
+            chi2.descended(np.array([lost, 0.0, 0.0]), np.array([True, False, False])).sum.value - end.sum.value
+        )
 
     law = model.law
     unknown = Unknown(best, 0.01, lambda r: float(law.unknown_of("r", r)), lambda y: float(law.value_of("r", y)))

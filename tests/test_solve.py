@@ -248,8 +248,9 @@ def test_the_largest_value_has_the_slope_of_one_of_them():
     np.testing.assert_array_equal(jax.grad(largest)(values), [0.0, 1.0, 0.0, 0.0])
 
 
-def waves(shared, lanes, *, power):
-    return {"wave": jnp.sin(shared * lanes) ** power, "sign": jnp.sign(lanes).astype(jnp.int32)}
+def waves(shared, lanes, power):
+    found = {"wave": jnp.sin(shared * lanes) ** power, "sign": jnp.sign(lanes).astype(jnp.int32)}
+    return found, jnp.ones(lanes.shape, bool)
 
 
 @pytest.mark.parametrize("small", [True, False])
@@ -257,7 +258,7 @@ def test_derivatives_of_a_batch_are_found_forward_and_transposed(small: bool):  
     shared, lanes = jnp.asarray(0.3), jnp.asarray([0.5, 2.0, -1.0])
 
     def wave(shared, lanes):
-        return by_tangents(waves, shared, lanes, small=small, power=2)["wave"]
+        return by_tangents(waves, shared, lanes, small=small, settings=(2,))["wave"]
 
     slope = 2.0 * np.sin(0.3 * lanes) * np.cos(0.3 * lanes)
     along = jax.jvp(wave, (shared, lanes), (jnp.asarray(1.0), jnp.asarray([1.0, 0.0, 2.0])))[1]

@@ -101,7 +101,7 @@ for tips in (1, 2, 3, 4, 8):
     for accuracy in {accuracies}:
         found = collide.collide(Contact.paper(viscosity_pa_s=1e-3), speeds, accuracy=accuracy, method={method!r})
         assert jnp.isfinite(found.rebound_speed_nm_per_us).all()
-print(collide._quick._cache_size(), collide._careful.outside._cache_size())
+print(collide._quick._cache_size(), collide._careful.outside()._cache_size())
 """
 
 

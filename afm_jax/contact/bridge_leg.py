@@ -17,6 +17,7 @@ over Gauss nodes (`collocate`), or Diffrax's steps (`pass_in_steps`). `go_in` an
 tips, `turn_in_bridge` is the impact of a tip that never reaches the junction.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -25,11 +26,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import ContactState, Driven, Leg, free_tip
-from afm_jax.contact.junction import Junction
+from afm_jax.contact.driven import ContactState, Driven, Leg
 from afm_jax.contact.settings import QuickSetting, Setting
-from afm_jax.solve.derivatives import halved
+from afm_jax.solve.derivatives import halved, implicit_root
 from afm_jax.solve.quadrature import gauss_nodes, nodes_along
 
 _NEAREST = 1e-14
@@ -40,15 +39,10 @@ GRADING = 1.6
 """Steps towards the inner end shrink on the way in, where the core repulsion rises as the 8th power."""
 _SLOWEST = 0.01
 """Fraction of K at the start below which no iteration lets it fall: a slower driven tip is followed in time."""
-_WRITTEN_OUT = 3
-"""Iterations up to which they are written out in the program; more are a loop."""
 _REMEMBERED = 20
 """Steps up to which reverse mode keeps what it needs of each; of more it computes them again."""
-_TRIAL_MARGIN = 1e-3
-"""Margin of a first pass of the retraction, which tells how fast the tip is at its end."""
-_TURN_NODES, _TURN_ITERATIONS = 48, 12
-_TURN_ROUNDS = 2
 _SCAN = 256
+"""Gaps at which a turning point is looked for."""
 
 
 class Exit(NamedTuple):
@@ -164,7 +158,7 @@ class Way(NamedTuple):
         drive, lost = self.tip.drive, at.drag * speed
         if drive is None:
             return lost
-        friction, push = 2.0 * drive.cantilever.decay_rate, drive.push(self.begin_us + lasted_us)
+        friction, push = 2.0 * drive.cantilever.decay_rate, drive.push.position(self.begin_us + lasted_us)
         return lost + self.tip.mass_ng * at.path_nm * (friction * speed + self.sense * push)
 
     def end(
@@ -259,9 +253,10 @@ def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
     if drive is not None:
         # of a push that does not change on the way
         start_nm = way.course.at(jnp.zeros_like(way.total_aj))[0]
-        guess = guess - way.tip.mass_ng * drive.push(way.begin_us) * (at.gap_nm - start_nm)
+        guess = guess - way.tip.mass_ng * drive.push.position(way.begin_us) * (at.gap_nm - start_nm)
     state, count = (guess, guess, guess), 0 if way.quiet else iterations
-    if count > _WRITTEN_OUT:
+    # few are written out in the program, more are a loop
+    if count > 3:
         state = lax.fori_loop(0, count, again, state)
     else:
         for number in range(count):
@@ -350,7 +345,7 @@ def retract_through_bridge(tip: Driven, energy_aj: Float[Array, "..."], setting:
         return way_through(tip, gaps, energy_aj, margin, inward=False)
 
     # twice: roughly, for the energy at its end and so for its margin, then as the setting says
-    trial = out(jnp.full_like(energy_aj, _TRIAL_MARGIN))
+    trial = out(jnp.full_like(energy_aj, 1e-3))
     end = trial.total_aj - trial.end_potential_aj if trial.quiet else collocate(trial, 6, 1).passage.energy_aj
     return _pass_bridge(out(margin_of(end, pull_at(tip, tip.ends_nm))), setting)
 
@@ -403,7 +398,7 @@ def _cross(
     if not inward:
         at_outer = start + driven.potential(inner) - driven.potential(outer)
         if driven.drive is not None:
-            at_outer = at_outer + driven.mass_ng * driven.drive.push(state.time_us) * (outer - inner)
+            at_outer = at_outer + driven.mass_ng * driven.drive.push.position(state.time_us) * (outer - inner)
     margin = lax.stop_gradient(margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30)))
     way = way_through(driven, gaps, start, margin, inward=inward, begin_us=state.time_us)
     collocation = collocate(way._replace(slowest_aj=slowest), nodes, setting.iterations)
@@ -440,28 +435,20 @@ class Turn(NamedTuple):
     """Whether the iterations for the dissipated energy settled."""
 
 
-def turn_in_bridge(
-    contact: Contact,
-    junction: Junction,
-    approach_speed: Float[Array, "..."],
-    mass: Float[Array, "..."],
-    spent: Float[Array, "..."],
-) -> Turn:
+@jax.jit
+def turn_in_bridge(tip: Driven, approach_speed: Float[Array, "..."], spent: Float[Array, "..."]) -> Turn:
     """Return the impact of a free tip that turns in the bridge.
 
     Args:
-        contact: the contact.
-        junction: where the tip would form it.
+        tip: the tip.
         approach_speed: in nm/us.
-        mass: in ng.
         spent: energy dissipated on the way in, estimated, in aJ.
     """
-    tip = free_tip(contact, junction, mass)
-    total = 0.5 * mass * approach_speed**2 + tip.potential(tip.forms_nm)
+    total = 0.5 * tip.mass_ng * approach_speed**2 + tip.potential(tip.forms_nm)
 
     def half(start: Array, end: Array, level: Array) -> tuple[Passage, Array]:
         way = Way(tip, 1.0, jnp.zeros_like(level), level, tip.potential(end), Turning(start, end))
-        found = collocate(way, _TURN_NODES, _TURN_ITERATIONS)
+        found = collocate(way, 48, 12)
         scale = jnp.abs(level) + jnp.abs(found.passage.dissipated_aj)
         return found.passage, found.end_change_aj <= 1e-9 * scale + 1e-12
 
@@ -472,7 +459,7 @@ def turn_in_bridge(
 
     nothing = jnp.zeros_like(total)
     guess = nothing, nothing > 0.0, Passage(nothing, nothing, spent + nothing), nothing > 0.0
-    gap, turns, inward, settles_in = lax.fori_loop(0, _TURN_ROUNDS + 1, inwards, guess)
+    gap, turns, inward, settles_in = lax.fori_loop(0, 3, inwards, guess)
     outward, settles_out = half(gap, tip.breaks_nm, tip.potential(gap))
     return Turn(
         turns=turns,
@@ -486,27 +473,19 @@ def turn_in_bridge(
 
 def _turning_gap(tip: Driven, level: Float[Array, "..."]) -> tuple[Float[Array, "..."], Bool[Array, "..."]]:
     """Return the largest gap in nm at which the potential rises to a level in aJ, and whether there is one."""
-
-    def excess(log_gap, tip, level):
-        return tip.potential(jnp.exp(log_gap)) - level
-
     outer, inner = tip.forms_nm, tip.junction.forms_gap_nm
     log_gaps = jnp.log(outer) + jnp.log(inner / outer) * jnp.linspace(0.0, 1.0, _SCAN, dtype=level.dtype)
-    log_gaps, fixed_tip, fixed_level = lax.stop_gradient((log_gaps, tip, level))
-    above = excess(log_gaps, fixed_tip, fixed_level)
+    log_gaps, *fixed = lax.stop_gradient((log_gaps, tip, level))
+    above = _potential_excess(log_gaps, fixed)
     # only repulsion stops a tip, so that it turns closer to the sample than where the potential is least
     stopped = (jnp.arange(_SCAN) > jnp.argmin(above)) & (above >= 0.0)
     first = jnp.maximum(jnp.argmax(stopped), 1)
+    ends = log_gaps[first - 1], log_gaps[first]
+    turning = halved(lambda log_gap: _potential_excess(log_gap, fixed) < 0.0, *ends, rounds=60)[1]
+    return jnp.exp(implicit_root(_potential_excess, turning, (tip, level))), stopped.any()
 
-    def passes(log_gap):
-        return excess(log_gap, fixed_tip, fixed_level) < 0.0
 
-    def improve(log_gap, _):
-        value, slope = jax.jvp(lambda at: excess(at, tip, level), (log_gap,), (jnp.ones_like(log_gap),))
-        # where nothing stops the tip a step would lead anywhere
-        steep = stopped.any() & (slope != 0.0)
-        return log_gap - jnp.where(steep, value / jnp.where(steep, slope, 1.0), 0.0), None
-
-    _, turning = halved(passes, log_gaps[first - 1], log_gaps[first], rounds=60)
-    # two steps of Newton's method carry first and second derivatives
-    return jnp.exp(lax.scan(improve, turning, length=2)[0]), stopped.any()
+def _potential_excess(log_gap: Float[Array, "..."], of: Sequence[Any]) -> Float[Array, "..."]:
+    """Return by how much in aJ the potential at a gap is above a level."""
+    tip, level = of
+    return tip.potential(jnp.exp(log_gap)) - level

@@ -1,14 +1,12 @@
 """Collisions of free tips with a sample at rest: rebound speed, delay and losses for an approach speed (section IV).
 
-One collision is `three_parts`: the approach through the bridge, the junction, and the retraction, each from the kinetic
-energy that the one before leaves; `collision` says how it ends. `collide` takes batches of speeds and contacts, in few
-steps and again in many for the few tips that need it; `capture_speed` is the root of the energy at the end;
-`collisions` makes a table of them.
+One `collision` is the approach through the bridge, the junction, and the retraction. `collide` takes batches of speeds
+and contacts, in few steps and again in many for the few tips that need it; `capture_speed` is the root of the energy at
+the end; `collisions` makes a table of them.
 """
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,10 +25,9 @@ from afm_jax.checks import (
     refuse_float32,
     require_float64,
 )
-from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.columns import Cell, columns_of, printed_table, rows_of
 from afm_jax.contact.bridge_leg import (
     Passage,
-    Turn,
     approach_through_bridge,
     pull_at,
     retract_through_bridge,
@@ -44,10 +41,10 @@ from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.derivatives import by_tangents, implicit_root
-from afm_jax.solve.lanes import LANES, compiled_quickly, filled, for_each_lane, rows_in_blocks
+from afm_jax.solve.lanes import LANES, compiled_quickly, filled, for_each_lane, map_in_blocks
 
 _CAPTURE_POINTS = 64
-_CAPTURE_ROUNDS = 9
+"""Speeds of each search inside an interval for the capture speed."""
 _MOST_SPENT = {"steps": 0.2, "collocation": 0.05}
 """Fraction of the energy that dissipation may take where few steps, or few iterations, are enough."""
 _NEAR_CAPTURE = (-0.02, 0.2)
@@ -145,7 +142,7 @@ def collide(
     # one axis of tips inside, the speeds' own shape outside
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
     tips = contact, mass, speeds.ravel()
-    result = by_tangents(_quick, *tips, small=speeds.size <= LANES, many_steps=_in_many_steps, setting=setting)
+    result = by_tangents(_collided, *tips, small=speeds.size <= LANES, settings=(setting, CAREFUL))
     if not any(leaf.ndim for leaf in jax.tree.leaves(contact)):
         require_junction(contact, result.outcome != CollisionOutcome.NO_JUNCTION)
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
@@ -160,8 +157,9 @@ def collision(
 ) -> tuple[Collision, Bool[Array, "..."]]:
     """Return the collision of a free tip, and whether the setting resolves it.
 
-    The tip approaches through the bridge, passes the junction, and retracts through the bridge (`three_parts`). A
-    careful setting also follows tips that the bridge turns round before the junction forms.
+    The tip approaches through the bridge, passes the junction, and retracts through the bridge, each from the kinetic
+    energy that the part before leaves. A careful setting also follows tips that the bridge turns round before the
+    junction forms.
 
     Args:
         contact: the contact.
@@ -172,71 +170,102 @@ def collision(
     """
     valid = (approach_speed > 0.0) & jnp.isfinite(approach_speed)
     speed = jnp.where(valid, approach_speed, 1.0)
-    parts = three_parts(contact, junction, speed, mass, setting)
-    result = _collision_of_parts(contact, junction, speed, mass, parts)
-    finite = jnp.ones_like(valid)
+    tip, start_aj = free_tip(contact, junction, mass), 0.5 * mass * speed * speed
+    approach = approach_through_bridge(tip, start_aj, setting)
+    solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
+    retract = retract_through_bridge(tip, solid.energy_aj, setting)
+    lacking = jnp.minimum(retract.energy_aj, jnp.minimum(solid.energy_aj, approach.energy_aj))
+    sticks = (approach.energy_aj > 0.0) & ~(solid.energy_aj > 0.0)
+    end = _End(
+        energy_aj=jnp.where(lacking > 0.0, retract.energy_aj, lacking),
+        time_us=approach.time_us + solid.time_us + retract.time_us,
+        gap_nm=tip.ends_nm,
+        dissipated_aj=approach.dissipated_aj + retract.dissipated_aj,
+        deepest_gap_nm=solid.deepest_gap_nm,
+        time_in_junction_us=solid.time_us,
+        junction_hysteresis_aj=junction.junction_hysteresis_aj,
+        leaves_as=CollisionOutcome.REBOUND,
+        stays_as=jnp.where(sticks, CollisionOutcome.CAPTURED_BY_JUNCTION, CollisionOutcome.CAPTURED_BY_BRIDGE),
+    )
+    settled = jnp.ones_like(valid)
     if setting.careful and contact.spans:
-        turn = for_each_lane(turn_in_bridge, contact, junction, speed, mass, parts.approach.dissipated_aj)
-        turns = turn.turns & (parts.approach.energy_aj <= 0.0)
-        turned = _collision_of_turn(contact, junction, speed, mass, turn)
-        result = jax.tree.map(lambda a, b: jnp.where(turns, a, b), turned, result)
-        finite = turn.settled | ~turns
+        turn = for_each_lane(turn_in_bridge, tip, speed, approach.dissipated_aj)
+        turns, none = turn.turns & (approach.energy_aj <= 0.0), jnp.zeros_like(turn.time_us)
+        how = CollisionOutcome.TURNED_IN_BRIDGE, CollisionOutcome.CAPTURED_BY_BRIDGE
+        turned = turn.energy_aj, turn.time_us, contact.bridge_breaks_nm, turn.dissipated_aj, turn.gap_nm, none, none
+        end = jax.tree.map(lambda a, b: jnp.where(turns, a, b), _End(*turned, *how), end)
+        settled = turn.settled | ~turns
     if setting.careful:
-        finite = finite & jnp.isfinite(result.end_energy_aj) & jnp.isfinite(result.viscous_loss_aj)
-    outcome = jnp.where(finite, result.outcome, CollisionOutcome.UNRESOLVED)
+        settled = settled & jnp.isfinite(end.energy_aj) & jnp.isfinite(end.dissipated_aj)
+    leaves = end.energy_aj > 0.0
+    outcome = jnp.where(leaves, end.leaves_as, end.stays_as)
+    outcome = jnp.where(settled, outcome, CollisionOutcome.UNRESOLVED)
     outcome = jnp.where(junction.exists, outcome, CollisionOutcome.NO_JUNCTION)
     outcome = jnp.where(valid, outcome, CollisionOutcome.INVALID_START).astype(jnp.int32)
+    rebound = jnp.where(leaves, jnp.sqrt(2.0 * jnp.where(leaves, end.energy_aj, 1.0) / mass), 0.0)
+    straight_us = contact.bridge_forms_nm / speed + end.gap_nm / jnp.where(leaves, rebound, 1.0)
+    result = Collision(
+        approach_speed_nm_per_us=speed,
+        rebound_speed_nm_per_us=rebound,
+        collision_delay_us=jnp.where(leaves, end.time_us - straight_us, 0.0),
+        captured=~leaves,
+        outcome=outcome,
+        time_in_contact_us=jnp.where(leaves, end.time_us, 0.0),
+        time_in_junction_us=jnp.where(leaves, end.time_in_junction_us, 0.0),
+        deepest_gap_nm=end.deepest_gap_nm,
+        bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
+        junction_hysteresis_aj=end.junction_hysteresis_aj,
+        viscous_loss_aj=end.dissipated_aj,
+        end_energy_aj=end.energy_aj,
+    )
     # what has no result holds zeros
     ends = outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
     result = jax.tree.map(lambda part: jnp.where(ends, part, jnp.zeros_like(part)), result)
-    resolved = parts.resolved | ~valid | ~junction.exists
+    resolved = _resolved(tip, start_aj, approach, solid, retract, setting) | ~valid | ~junction.exists
     return result._replace(approach_speed_nm_per_us=approach_speed, outcome=outcome), resolved
 
 
-class ThreeParts(NamedTuple):
-    """The three parts of a collision that forms the junction."""
+class _End(NamedTuple):
+    """How a collision ends."""
 
-    approach: Passage
-    junction: JunctionWay
-    retract: Passage
-    resolved: Bool[Array, "..."]
-    """Whether the setting's few steps are enough."""
+    energy_aj: Float[Array, "..."]
+    """Kinetic energy, signed: positive where the tip leaves."""
+    time_us: Float[Array, "..."]
+    """From the beginning of the contact to its end."""
+    gap_nm: Float[Array, "..."]
+    """Where contact ends."""
+    dissipated_aj: Float[Array, "..."]
+    deepest_gap_nm: Float[Array, "..."]
+    time_in_junction_us: Float[Array, "..."]
+    junction_hysteresis_aj: Float[Array, "..."]
+    leaves_as: Int[ArrayLike, "..."]
+    """Outcome of a tip that leaves, and of one that stays."""
+    stays_as: Int[ArrayLike, "..."]
 
 
-def three_parts(
-    contact: Contact,
-    junction: Junction,
-    approach_speed: Float[Array, "..."],
-    mass: Float[Array, "..."],
+def _resolved(
+    tip: Driven,
+    start_aj: Float[Array, "..."],
+    approach: Passage,
+    solid: JunctionWay,
+    retract: Passage,
     setting: Setting,
-) -> ThreeParts:
-    """Return approach, junction and retraction of one tip, each from the kinetic energy that the one before leaves.
+) -> Bool[Array, "..."]:
+    """Say whether few steps resolve a collision from a kinetic energy at the start.
 
-    Args:
-        contact: the contact.
-        junction: of the contact.
-        approach_speed: in nm/us, positive.
-        mass: in ng.
-        setting: how finely.
+    They do where dissipation is small against the energies along the way, no repulsion almost stops the tip inside the
+    bridge, and it is not close to capture.
     """
-    tip = free_tip(contact, junction, mass)
-    start = 0.5 * mass * approach_speed * approach_speed
-    approach = approach_through_bridge(tip, start, setting)
-    solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
-    retract = retract_through_bridge(tip, solid.energy_aj, setting)
-
-    # Few steps resolve a collision where dissipation is small against the energies along the way, no repulsion almost
-    # stops the tip inside the bridge, and it is not close to capture.
     pull_in, calm_in = _pull_and_calm(tip, tip.forms_nm)
     _, calm_out = _pull_and_calm(tip, tip.ends_nm)
-    least = jnp.minimum(start + jnp.maximum(pull_in, 0.0), approach.energy_aj)
+    least = jnp.minimum(start_aj + jnp.maximum(pull_in, 0.0), approach.energy_aj)
     spent = _MOST_SPENT[setting.rule]
-    easy_in = (approach.dissipated_aj < spent * least) & (approach.energy_aj > 0.1 * start) & calm_in
+    easy_in = (approach.dissipated_aj < spent * least) & (approach.energy_aj > 0.1 * start_aj) & calm_in
     easy_out = (retract.dissipated_aj < spent * solid.energy_aj) & calm_out
     # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
     energy_left = jnp.where(solid.energy_aj > 0.0, retract.energy_aj, solid.energy_aj)
-    clear = (energy_left > _NEAR_CAPTURE[1] * start) | (energy_left < _NEAR_CAPTURE[0] * start)
-    return ThreeParts(approach, solid, retract, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
+    clear = (energy_left > _NEAR_CAPTURE[1] * start_aj) | (energy_left < _NEAR_CAPTURE[0] * start_aj)
+    return easy_in & clear & (easy_out | (solid.energy_aj <= 0.0))
 
 
 def _pull_and_calm(tip: Driven, outer_nm: Float[Array, "..."]) -> tuple[Float[Array, "..."], Bool[Array, "..."]]:
@@ -247,90 +276,6 @@ def _pull_and_calm(tip: Driven, outer_nm: Float[Array, "..."]) -> tuple[Float[Ar
     pull = pull_at(tip, outer_nm)
     drag = tip.bridge.damping(outer_nm) * outer_nm * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / tip.mass_ng)
     return pull, (pull <= 0.0) | (drag <= 0.1 * pull)
-
-
-def _collision_of_parts(
-    contact: Contact,
-    junction: Junction,
-    approach_speed: Float[Array, "..."],
-    mass: Float[Array, "..."],
-    parts: ThreeParts,
-) -> Collision:
-    """Return the collision that three parts make, for a tip that forms the junction."""
-    approach, solid, retract, _ = parts
-    reached, broke = approach.energy_aj > 0.0, solid.energy_aj > 0.0
-    leaves = reached & broke & (retract.energy_aj > 0.0)
-    lacking = jnp.minimum(retract.energy_aj, jnp.minimum(solid.energy_aj, approach.energy_aj))
-    captured = jnp.where(reached & ~broke, CollisionOutcome.CAPTURED_BY_JUNCTION, CollisionOutcome.CAPTURED_BY_BRIDGE)
-    return _collision(
-        approach_speed,
-        mass,
-        leaves,
-        energy_aj=jnp.where(leaves, retract.energy_aj, lacking),
-        time_us=approach.time_us + solid.time_us + retract.time_us,
-        gaps_nm=(contact.bridge_forms_nm, jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)),
-        outcome=jnp.where(leaves, CollisionOutcome.REBOUND, captured),
-        time_in_junction_us=jnp.where(leaves, solid.time_us, 0.0),
-        deepest_gap_nm=solid.deepest_gap_nm,
-        bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
-        junction_hysteresis_aj=junction.junction_hysteresis_aj,
-        viscous_loss_aj=approach.dissipated_aj + retract.dissipated_aj,
-    )
-
-
-def _collision_of_turn(
-    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], turn: Turn
-) -> Collision:
-    """Return the collision of a tip that turns in the bridge."""
-    leaves = turn.energy_aj > 0.0
-    return _collision(
-        approach_speed,
-        mass,
-        leaves,
-        energy_aj=turn.energy_aj,
-        time_us=turn.time_us,
-        gaps_nm=(contact.bridge_forms_nm, contact.bridge_breaks_nm),
-        outcome=jnp.where(leaves, CollisionOutcome.TURNED_IN_BRIDGE, CollisionOutcome.CAPTURED_BY_BRIDGE),
-        time_in_junction_us=jnp.zeros_like(turn.time_us),
-        deepest_gap_nm=turn.gap_nm,
-        bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
-        junction_hysteresis_aj=jnp.zeros_like(junction.junction_hysteresis_aj),
-        viscous_loss_aj=turn.dissipated_aj,
-    )
-
-
-def _collision(
-    approach_speed: Array,
-    mass: Array,
-    leaves: Array,
-    *,
-    energy_aj: Array,
-    time_us: Array,
-    gaps_nm: tuple[Array, Array],
-    **others: Any,
-) -> Collision:
-    """Return a collision with rebound speed and delay, from its energy at the end and its duration.
-
-    Args:
-        approach_speed: in nm/us.
-        mass: in ng.
-        leaves: whether the tip leaves.
-        energy_aj: kinetic energy at the end.
-        time_us: from the beginning of the contact to its end.
-        gaps_nm: where it begins and where it ends.
-        others: the other fields.
-    """
-    rebound = jnp.where(leaves, jnp.sqrt(2.0 * jnp.where(leaves, energy_aj, 1.0) / mass), 0.0)
-    straight = gaps_nm[0] / approach_speed + gaps_nm[1] / jnp.where(leaves, rebound, 1.0)
-    return Collision(
-        approach_speed_nm_per_us=approach_speed,
-        rebound_speed_nm_per_us=rebound,
-        collision_delay_us=jnp.where(leaves, time_us - straight, 0.0),
-        captured=~leaves,
-        time_in_contact_us=jnp.where(leaves, time_us, 0.0),
-        end_energy_aj=energy_aj,
-        **others,
-    )
 
 
 @checked
@@ -374,12 +319,14 @@ def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Arr
     def narrow(ends, _):
         # one small program for all rounds: the first looks far and wide, each further one inside an interval
         points = ends[0] + (ends[1] - ends[0]) * jnp.linspace(0.0, 1.0, _CAPTURE_POINTS, dtype=scale.dtype)
-        captured = jax.vmap(lambda point: _end_energy(jnp.exp(point), fixed))(points) <= 0.0
+        contact, junction, mass = fixed
+        found, _ = collision(contact, junction, jnp.exp(points), mass, CAREFUL)
+        captured = found.captured | (found.outcome == CollisionOutcome.UNRESOLVED)
         last = _CAPTURE_POINTS - 1 - jnp.argmax(captured[::-1])
         inside = jnp.stack([points[last], points[jnp.minimum(last + 1, _CAPTURE_POINTS - 1)]])
         return inside, (captured.any(), captured[-1])
 
-    ends, (any_captured, fastest_captured) = lax.scan(narrow, scale + width, None, length=_CAPTURE_ROUNDS)
+    ends, (any_captured, fastest_captured) = lax.scan(narrow, scale + width, None, length=9)
     found = jnp.exp(ends[0])
     root = implicit_root(_end_energy, found, (contact, junction, mass))
     speed = jnp.where(fastest_captured[0], jnp.inf, root)
@@ -389,32 +336,23 @@ def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Arr
 def _end_energy(
     approach_speed: Float[Array, ""], model: tuple[Contact, Junction, Float[Array, ""]]
 ) -> Float[Array, ""]:
-    """Return the kinetic energy left where the tip has least on its way out, in aJ; negative by what is missing."""
     contact, junction, mass = model
-    parts = three_parts(contact, junction, approach_speed, mass, CAREFUL)
-    through = jnp.minimum(parts.junction.energy_aj, parts.retract.energy_aj)
-    if not contact.spans:
-        return through
-    turn = turn_in_bridge(contact, junction, approach_speed, mass, parts.approach.dissipated_aj)
-    return jnp.where(turn.turns & (parts.approach.energy_aj <= 0.0), turn.energy_aj, through)
+    return collision(contact, junction, approach_speed, mass, CAREFUL)[0].end_energy_aj
 
 
 def collide_in_blocks(
-    contact: Contact,
-    speeds: Float[np.ndarray, " n"],
-    mass_ng: float = 1.0,
-    *,
-    accuracy: float = 1e-9,
-    method: str = "diffrax",
-) -> dict[str, np.ndarray]:
-    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all.
+    contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float = 1.0, **options: Any
+) -> Collision:
+    """Return the collisions of many speeds as NumPy arrays, filled up to whole blocks so that one program serves all.
 
-    Raises:
-        ValueError: as `collide`.
+    Args:
+        contact: the contact, of numbers.
+        speeds: approach speeds in nm/us.
+        mass_ng: the tip's mass in ng.
+        options: of `collide`.
     """
-    whole = filled(speeds, LANES * -(-len(speeds) // LANES))
-    result = collide(contact, whole, mass_ng, accuracy=accuracy, method=method)
-    return {name: np.asarray(part)[: len(speeds)] for name, part in result._asdict().items()}
+    result = collide(contact, filled(speeds, LANES * -(-len(speeds) // LANES)), mass_ng, **options)
+    return jax.tree.map(lambda part: np.asarray(part)[: len(speeds)], result)
 
 
 def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"], setting: Setting) -> Collision:
@@ -422,43 +360,26 @@ def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"]
     return _quick(contact, jnp.asarray(mass_ng, speeds.dtype), speeds, setting)[0]
 
 
-@partial(jax.jit, static_argnames="setting")
-def _quick(
-    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting
-) -> tuple[Collision, Bool[Array, " tips"]]:
-    """Return the collisions of a batch in few steps, and which of them these resolve."""
-    return _in_blocks(contact, mass, speeds, setting)
-
-
-@compiled_quickly()
-def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"]) -> Collision:
-    """Return the collisions of a batch in many steps, turning points in the bridge included."""
-    return _in_blocks(contact, mass, speeds, CAREFUL)[0]
-
-
-def _in_many_steps(contact: Contact, mass: Array, speeds: Array, setting: Setting) -> Collision:
-    # one program, whatever the setting that did not suffice
-    del setting
-    return _careful(contact, mass, speeds)
-
-
 def _in_blocks(
     contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting
 ) -> tuple[Collision, Bool[Array, " tips"]]:
-    if any(leaf.ndim for leaf in jax.tree.leaves(contact)):
-        junction = rows_in_blocks(lambda some, _: for_each_lane(find_junction, some), contact, speeds)
-    else:
-        junction = find_junction(contact)
+    """Return the collisions of a batch, and which of them the setting resolves; a careful one takes all as resolved."""
+    varied, shared = eqx.partition((contact, mass), lambda leaf: leaf.ndim > 0)
 
-    def block(parameters, speed):
-        (contact, junction), mass = parameters
-        return collision(contact, junction, speed, mass, setting)
+    def block(lanes):
+        contact, mass = eqx.combine(lanes[0], shared)
+        return collision(contact, for_each_lane(find_junction, contact), lanes[1], mass, setting)
 
-    return rows_in_blocks(block, ((contact, junction), mass), speeds)
+    return map_in_blocks(block, (varied, speeds), block=LANES, recompute=True)
 
 
-_POINTS = 20
-_TOP_SPEED = 200.0
+_quick = jax.jit(_in_blocks, static_argnames="setting")
+_careful = compiled_quickly(static_argnames="setting")(_in_blocks)
+
+
+def _collided(contact: Contact, mass: Array, speeds: Array, setting: Setting) -> tuple[Collision, Bool[Array, " tips"]]:
+    # few tips need many steps, many few: those are compiled for long runs
+    return (_careful if setting.careful else _quick)(contact, mass, speeds, setting=setting)
 
 
 class Collisions(NamedTuple):
@@ -495,7 +416,7 @@ class Collisions(NamedTuple):
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax collide`."""
         return {
-            **columns_of(self.rows, _COLUMNS),
+            **columns_of(self.rows, Collision._fields),
             "capture_speed_nm_per_us": self.capture_speed_nm_per_us,
             "capture_speed_reason": self.capture_speed_reason,
             "junction": self.junction,
@@ -534,15 +455,9 @@ class Collisions(NamedTuple):
 
     def tables(self) -> dict[str, dict[str, list[Any]]]:
         """Return the columns of collide.csv, a row a tip."""
-        return {"collide.csv": columns_of(self.rows, _COLUMNS)}
+        return {"collide.csv": columns_of(self.rows, Collision._fields)}
 
 
-_COLUMNS = (
-    *("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "captured", "outcome"),
-    *("time_in_contact_us", "time_in_junction_us", "deepest_gap_nm"),
-    *("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj", "end_energy_aj"),
-)
-"""Columns of a tip."""
 _MOST_PRINTED = 40
 """Tips in the printed table at most."""
 
@@ -571,7 +486,7 @@ def collisions(
     require_float64(contact)
     capture = float(capture_speed(contact, mass_ng))
     chosen = default_speeds(capture) if speeds is None else np.asarray(speeds, dtype=float)
-    junction = _junction(contact)
+    junction = find_junction(contact)
     rows = _rows(collide_in_blocks(contact, chosen, mass_ng, accuracy=accuracy, method=method))
     numbers = {name: float(getattr(junction, name)) for name in (*junction._fields, "hysteresis_aj")}
     return Collisions(
@@ -585,23 +500,15 @@ def default_speeds(capture_speed_nm_per_us: float) -> Float[np.ndarray, " n"]:
     """Return twenty speeds in nm/us, denser near the capture speed, with four digits each."""
     known = 0.0 < capture_speed_nm_per_us < math.inf
     low = 1.1 * capture_speed_nm_per_us if known else 10.0
-    speeds = np.geomspace(low, max(_TOP_SPEED, 10.0 * low), _POINTS)
+    speeds = np.geomspace(low, max(200.0, 10.0 * low), 20)
     return np.array([float(f"{speed:.4g}") for speed in speeds])
 
 
-_junction = eqx.filter_jit(find_junction)
-
-
-def _rows(found: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    columns = {name: part.tolist() for name, part in found.items()}
-    rows = []
-    for values in zip(*columns.values(), strict=True):
-        row = dict(zip(columns, values, strict=True))
+def _rows(found: Collision) -> list[dict[str, Any]]:
+    lost = found.outcome > CollisionOutcome.CAPTURED_BY_JUNCTION
+    gaps = found._unknown() | {"captured": lost}  # noqa: SLF001
+    rows = rows_of({name: np.where(gaps.get(name, False), None, part) for name, part in found._asdict().items()})
+    for row in rows:
         outcome = CollisionOutcome(row["outcome"])
         row |= {"outcome": outcome.sentence, "outcome_name": outcome.name.lower().replace("_", " ")}
-        if outcome > CollisionOutcome.CAPTURED_BY_JUNCTION:
-            row |= {name: None for name in columns if name not in ("approach_speed_nm_per_us", "outcome")}
-        elif row["captured"]:
-            row |= dict.fromkeys(ONLY_FREE)
-        rows.append(row)
     return rows

@@ -160,22 +160,8 @@ class Contact(eqx.Module):
         Raises:
             ValueError: if an effect is unknown or a required one missing, or a value outside its range.
         """
-        check_effects(effects)
-        liquid = Liquid(relative_humidity, temperature_k, surface_tension_n_per_m, molar_volume_cm3_per_mol)
-        makers = {
-            "capillary": lambda: Capillary(tip_radius_nm, liquid),
-            "structural": lambda: Structural(
-                structural_amplitude_n_per_m, structural_decay_nm, structural_offset_nm, tip_radius_nm, liquid
-            ),
-            "core": lambda: CoreRepulsion(core_constant_j_m6 * AJ_NM6_PER_J_M6, tip_radius_nm),
-            "viscous": lambda: Viscous(viscosity_pa_s, tip_radius_nm),
-        }
-        return cls(
-            forces=[make() for name, make in makers.items() if name in effects],
-            junction=Jkr(adhesion_energy_j_per_m2, modulus_gpa, tip_radius_nm),
-            bridge_forms_nm=bridge_forms_nm,
-            bridge_breaks_nm=bridge_breaks_nm,
-        )
+        given = locals()
+        return cls.of(effects, **{name: given[name] for name in PAPER})
 
     @classmethod
     def of(cls, effects: Sequence[str], **parameters: ArrayLike) -> "Contact":
@@ -193,18 +179,32 @@ class Contact(eqx.Module):
         1.0
         """
         check_effects(effects)
-        if not {"dmt", "hertz"} & set(effects):
-            return cls.paper(effects=effects, **{name: parameters[name] for name in PAPER if name in parameters})
         value = DEFAULTS | parameters
         radius, solid = value["tip_radius_nm"], (value["modulus_gpa"], value["tip_radius_nm"])
+
+        def liquid() -> Liquid:
+            return Liquid(*(value[name] for name in _OF_LIQUID))
+
+        makers: dict[str, Callable[[], Force]] = {
+            "capillary": lambda: Capillary(radius, liquid()),
+            "structural": lambda: Structural(
+                value["structural_amplitude_n_per_m"],
+                value["structural_decay_nm"],
+                value["structural_offset_nm"],
+                radius,
+                liquid(),
+            ),
+            "core": lambda: CoreRepulsion(value["core_constant_j_m6"] * AJ_NM6_PER_J_M6, radius),
+            "van_der_waals": lambda: VanDerWaals(value["hamaker_constant_aj"], radius),
+            "viscous": lambda: Viscous(value["viscosity_pa_s"], radius),
+        }
+        forces = [make() for name, make in makers.items() if name in effects]
         if "hertz" in effects:
             return cls((), Hertz(*solid))
-        forces: list[Force] = []
-        if "van_der_waals" in effects:
-            forces.append(VanDerWaals(value["hamaker_constant_aj"], radius))
-        if "viscous" in effects:
-            forces.append(Viscous(value["viscosity_pa_s"], radius))
-        return cls(forces, Dmt(*solid, value["contact_distance_nm"]), range_nm=value["range_nm"])
+        if "dmt" in effects:
+            return cls(forces, Dmt(*solid, value["contact_distance_nm"]), range_nm=value["range_nm"])
+        adhesive = Jkr(value["adhesion_energy_j_per_m2"], *solid)
+        return cls(forces, adhesive, value["bridge_forms_nm"], value["bridge_breaks_nm"])
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -228,6 +228,8 @@ class Contact(eqx.Module):
             return self.junction.curve
         return dry_curve(self.junction, -bridge_of(self).force(self.junction.begins_nm))
 
+
+_OF_LIQUID = ("relative_humidity", "temperature_k", "surface_tension_n_per_m", "molar_volume_cm3_per_mol")
 
 FORCES = {
     "capillary": Capillary,

@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface, Wave
-from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.contact.junction import Junction, Phase, find_junction
@@ -50,19 +49,8 @@ class Drive(NamedTuple):
 
     cantilever: Cantilever
     surface: Platform | Surface
-    mean_push: tuple[Float[Array, "..."], Float[Array, "..."]]
-    """q(t) of the offset and its ramp, and its rate."""
-    waves: tuple[Wave, ...]
-    """q(t) of the surface's cosines, in nm/us^2."""
-
-    def push(self, time_us: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return q(t) in nm/us^2: what the surface's motion does to the gap."""
-        level, rate = self.mean_push
-        push = level + rate * time_us
-        for wave in self.waves:
-            sine, cosine = sine_cosine(wave.angular_frequency * time_us)
-            push = push + wave.cosine * cosine + wave.sine * sine
-        return push
+    push: Surface
+    """q(t) in nm/us^2, what the surface's motion does to the gap, as another motion: offset, ramp and waves."""
 
 
 class Driven(NamedTuple):
@@ -111,7 +99,11 @@ class Driven(NamedTuple):
         """Return D'' in nm/us^2 under a contact force in nN."""
         if self.drive is None:
             return force * self.inverse_mass
-        return force * self.inverse_mass + self.drive.cantilever.acceleration(gap, rate) + self.drive.push(time_us)
+        return (
+            force * self.inverse_mass
+            + self.drive.cantilever.acceleration(gap, rate)
+            + self.drive.push.position(time_us)
+        )
 
     def potential(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the potential energy in aJ at a gap in nm in the bridge, that of the spring included."""
@@ -167,9 +159,9 @@ def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surf
         for wave in surface.waves
     )
     ramp = surface.offset_rate_nm_per_us
-    mean_push = (-square * surface.offset_nm - friction * ramp, -square * ramp)
+    push = Surface(-square * surface.offset_nm - friction * ramp, -square * ramp, waves)
     free = free_tip(contact, find_junction(contact), cantilever.mass_ng)
-    return free._replace(drive=Drive(cantilever, surface, mean_push, waves))
+    return free._replace(drive=Drive(cantilever, surface, push))
 
 
 def free_tip(contact: Contact, junction: Junction, mass_ng: Float[Array, "..."]) -> Driven:

@@ -28,7 +28,6 @@ from afm_jax.contact.forces.dry import Hertz
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import implicit_root
-from afm_jax.solve.lanes import compiled_quickly
 
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""
@@ -68,7 +67,7 @@ class Junction(ResultTuple):
 
 
 @checked
-@compiled_quickly()
+@jax.jit
 def find_junction(contact: Contact) -> Junction:
     """Return the gaps at which a contact's solid junction forms and breaks, and the energies that its hysteresis takes.
 

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from rich.table import Table
 
 from afm_jax.checks import checked, require_float64
-from afm_jax.columns import Cell, columns_of, printed_table
+from afm_jax.columns import Cell, printed_table
 from afm_jax.contact.bridge_leg import collocate, margin_of, pull_at, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Contact
@@ -36,11 +36,11 @@ from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
-from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, HertzContact, ImpactLaw, TabulatedLaw
-from afm_jax.least_squares import Box, Searches, descended, distance
+from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, HertzContact, ImpactLaw, TabulatedLaw, closest_delay
 from afm_jax.results import Result, public_result
 from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import compiled_quickly
+from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
@@ -50,15 +50,9 @@ LAW_SPEEDS = 1.5, 250.0
 DELAY_SPEEDS = 1.37, 700.0
 """The range of `fit_delay` if none is given, likewise: for the paper's contact 15 to 700 nm/us."""
 _NAMES = ("r", "epsilon", "viscous_loss")
-_STEPS, _TOLERANCE, _SETTLED = 100, 1e-28, 1e-18
+_TOLERANCE, _SETTLED = 1e-28, 1e-18
 """Distances of the sum of squares to its minimum, over the squared rebound speeds, to stop at and to have settled."""
 
-_GUESSES = 12
-"""Collisions of `law_of_contact`."""
-_GUESS_SPEEDS = 1.4, 500.0
-"""Their range, likewise."""
-_SLOWEST_GUESS = 5.0
-"""Their lowest speed in nm/us where no tip is captured."""
 _NEAREST, _FASTEST = 0.2, 700.0
 """Where the table of `make_law` begins, as sqrt(u^2 - u_c^2) over the capture speed, and ends, in nm/us."""
 
@@ -153,11 +147,6 @@ class ContactLaw(Result):
         return float(np.abs(self.error_nm_per_us).max())
 
     @property
-    def worst_share_of_top_speed(self) -> float:
-        """Largest error as a share of the highest approach speed."""
-        return self.worst_error_nm_per_us / self.speed_range[1]
-
-    @property
     def rms_relative_error(self) -> float:
         """Root of the mean square of the relative errors."""
         return float(np.sqrt(np.mean(self.relative_error**2)))
@@ -207,10 +196,9 @@ def fit_law(
     if points < len(FREE[model]):
         raise ValueError(f"`points` must be at least the number of parameters, {len(FREE[model])}, but is {points}")
     capture = float(capture_speed(contact, mass_ng))
-    low, high = range_above_capture(speed_range, capture, *LAW_SPEEDS)
-    approach = np.linspace(low, high, points)
-    rebound = rebounds(contact, approach, mass_ng)["rebound_speed_nm_per_us"]
-    law, converged = closest_law(approach, rebound, model, residuals)
+    approach = np.linspace(*_range_above_capture(speed_range, capture, *LAW_SPEEDS), points)
+    rebound = _rebounds(contact, approach, mass_ng).rebound_speed_nm_per_us
+    law, converged = _closest_law(approach, rebound, model, residuals)
     return ContactLaw(
         model=model,
         residuals=residuals,
@@ -243,20 +231,20 @@ def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS
         raise ValueError("the contact captures tips of every speed that was tried: there is no law to make")
     # a contact that captures no tip still needs a positive speed
     beyond = np.geomspace(max(_NEAREST * capture, 1e-3 * _FASTEST), _FASTEST, points)
-    leaving = rebounds(contact, np.hypot(beyond, capture), mass_ng)
-    approach, rebound = leaving["approach_speed_nm_per_us"], leaving["rebound_speed_nm_per_us"]
+    leaving = _rebounds(contact, np.hypot(beyond, capture), mass_ng)
+    approach = leaving.approach_speed_nm_per_us
     return TabulatedLaw(
         approach,
         # without any loss rounding may add to the speed
-        np.minimum(rebound, approach),
-        leaving["collision_delay_us"],
+        np.minimum(leaving.rebound_speed_nm_per_us, approach),
+        leaving.collision_delay_us,
         capture_speed_nm_per_us=capture,
         mass_ng=mass_ng,
         origin=f"contact: {', '.join(contact.effects)}",
     )
 
 
-def closest_law(
+def _closest_law(
     approach: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], model: str, residuals: str
 ) -> tuple[ImpactLaw, bool]:
     """Return the law with the least sum of squared residuals, and whether the search converged.
@@ -273,36 +261,33 @@ def closest_law(
     losses = np.stack([approach**2, np.ones_like(approach), approach], axis=1)[:, free] * scales
     weights = 1.0 / rebound if residuals == "relative" else np.ones_like(rebound)
 
-    def evaluate(place: Float[np.ndarray, "1 p"], _: object) -> Searches:
+    def evaluate(place: Float[np.ndarray, " p"]) -> Sum:
         # a law that captures a tip of the range has the smallest speed instead: far from any minimum
-        fitted = np.sqrt(np.maximum(approach**2 - place @ losses.T, 1e-12))
+        fitted = np.sqrt(np.maximum(approach**2 - losses @ place, 1e-12))
         residual = (fitted - rebound) * weights
-        slopes = (-0.5 * weights / fitted)[:, :, None] * losses
-        return Searches(place, residual, slopes, np.sum(residual**2, axis=1))
+        return Sum(float(residual @ residual), residual, (-0.5 * weights / fitted)[:, None] * losses)
 
     # to first order the residual is that of the squares over 2 u_out
     linear = weights / (2.0 * rebound)
-    guess = np.linalg.lstsq(losses * linear[:, None], (approach**2 - rebound**2) * linear, rcond=None)[0]
-    guess = np.maximum(guess, 0.0)
+    guess = np.linalg.lstsq(losses * linear[:, None], (approach**2 - rebound**2) * linear, rcond=None)[0].clip(0.0)
     guess /= max(1.0, 1.01 * float(np.max(losses @ guess / approach**2)))
     size = float(np.sum((weights * rebound) ** 2))
-    box = Box(np.zeros(len(scales)), np.full(len(scales), np.inf), np.zeros((1, len(scales)), bool))
-    minimum = descended(evaluate, evaluate(guess[None], None), box, settled=_TOLERANCE * size, most=_STEPS)
+    minimum = levenberg_marquardt(evaluate, guess, settled=_TOLERANCE * size, most=100, lowest=0.0)
     values = np.zeros(3)
-    values[free] = minimum.place[0] * scales
+    values[free] = minimum.place * scales
     loss, epsilon, viscous_loss = values.tolist()
     law = ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss)
-    return law, bool(distance(minimum, box)[0] < _SETTLED * size)
+    return law, minimum.distance < _SETTLED * size
 
 
-def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> dict[str, np.ndarray]:
-    """Return the fields of `Collision` for tips that all leave.
+def _rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> Any:
+    """Return the `Collision`, in NumPy arrays, of tips that all leave.
 
     Raises:
         ValueError: if one is captured, or not resolved.
     """
     tips = collide_in_blocks(contact, speeds, mass_ng)
-    stays = np.flatnonzero(~(tips["rebound_speed_nm_per_us"] > 0.0))
+    stays = np.flatnonzero(~(tips.rebound_speed_nm_per_us > 0.0))
     if stays.size:
         raise ValueError(
             f"`speed_range` must hold rebounding tips only, but the one of {speeds[stays[-1]]:.6g} nm/us does not leave"
@@ -310,7 +295,7 @@ def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) 
     return tips
 
 
-def range_above_capture(
+def _range_above_capture(
     speed_range: tuple[float, float] | None, capture: float, lowest: float, top: float
 ) -> tuple[float, float]:
     """Return a range of approach speeds in nm/us, checked.
@@ -400,20 +385,12 @@ def fit_delay(
     require_float64(contact)
     if points < 3:
         raise ValueError(f"`points` must be at least the number of parameters, 3, but is {points}")
-    low, high = range_above_capture(speed_range, float(capture_speed(contact, mass_ng)), *DELAY_SPEEDS)
-    tips = rebounds(contact, np.geomspace(low, high, points), mass_ng)
-    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us")
-    approach, rebound, delay, lag = (tips[name] for name in names)
-    law, fitted = closest_delay(approach, rebound, delay)
-    return ContactDelay(
-        delay=law,
-        approach_speed_nm_per_us=approach,
-        rebound_speed_nm_per_us=rebound,
-        delay_us=delay,
-        lag_us=lag,
-        lead_us=lag - delay,
-        fitted_us=fitted,
-    )
+    ends = _range_above_capture(speed_range, float(capture_speed(contact, mass_ng)), *DELAY_SPEEDS)
+    tips = _rebounds(contact, np.geomspace(*ends, points), mass_ng)
+    approach, rebound = tips.approach_speed_nm_per_us, tips.rebound_speed_nm_per_us
+    delay, lag = tips.collision_delay_us, tips.time_in_junction_us
+    law = closest_delay(approach, rebound, delay, np)
+    return ContactDelay(law, approach, rebound, delay, lag, lag - delay, np.asarray(law(approach, rebound)))
 
 
 class ContactLaws(NamedTuple):
@@ -431,11 +408,6 @@ class ContactLaws(NamedTuple):
         lost = [law.model for law in self.formulas if not law.converged]
         return f"the fit of {', '.join(lost)} did not converge; try another speed range" if lost else None
 
-    def _delay_rows(self) -> list[dict[str, float]]:
-        """Return the delay at a few speeds, first and last among them."""
-        places = np.round(np.linspace(0, len(self.delay.delay_us) - 1, _SHOWN_DELAYS)).astype(int)
-        return [{name: float(getattr(self.delay, name)[place]) for name in _DELAY_COLUMNS} for place in places]
-
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object."""
         first, delay = self.formulas[0], self.delay
@@ -450,13 +422,12 @@ class ContactLaws(NamedTuple):
                 "rms_us": delay.rms_us,
                 "worst_us": delay.worst_us,
                 "speed_range_nm_per_us": delay.speed_range,
-                **columns_of(self._delay_rows()),
             },
             "law": self.law.to_dict(),
         }
 
     def printed(self) -> list[str | Table]:
-        """Return a table of the formulas and one of the delay, each with what it is."""
+        """Return a table of the formulas, and the formula of the delay."""
         first, delay = self.formulas[0], self.delay
         formulas: dict[str, Cell] = {
             "law": "model",
@@ -466,14 +437,7 @@ class ContactLaws(NamedTuple):
             "worst error\n%": lambda law: f"{100.0 * law.worst_relative_error:.3g}",
             "rms error\n%": lambda law: f"{100.0 * law.rms_relative_error:.3g}",
             "worst error\nnm/us": "worst_error_nm_per_us:.3g",
-            "of top speed\n%": lambda law: f"{100.0 * law.worst_share_of_top_speed:.2g}",
             "capture speed\nnm/us": "capture_speed_nm_per_us:.5g",
-        }
-        delays: dict[str, Cell] = {
-            "approach\nnm/us": "approach_speed_nm_per_us:.5g",
-            "rebound\nnm/us": "rebound_speed_nm_per_us:.5g",
-            **{f"{name}\nus": f"{name}_us:.4f" for name in ("delay", "lag", "lead")},
-            "delay law\nus": "fitted_us:.4f",
         }
         (low, high), (slow, fast) = first.speed_range, delay.speed_range
         formula = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us"
@@ -483,10 +447,8 @@ class ContactLaws(NamedTuple):
             printed_table(f"{formula}, {first.residuals} residuals", formulas, self.formulas),
             f"Capture speed of the contact: {first.contact_capture_speed_nm_per_us:.6g} nm/us.",
             "law: the paper's eq. 6; viscous: r = 1 and a loss c linear in speed; full: all three.",
-            "",
-            printed_table("Collision delay = lag - lead", delays, self._delay_rows()),
-            "lag: time in the solid junction; lead: what straight paths to gap 0 would take longer outside it.",
-            f"Delay law: {numbers}; {errors}, from {slow:.4g} to {fast:.4g} nm/us.",
+            "Delay law in us: hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
+            f"with {numbers}; {errors}, from {slow:.4g} to {fast:.4g} nm/us.",
         ]
 
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -498,22 +460,16 @@ class ContactLaws(NamedTuple):
             **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in self.formulas},
             **{f"{law.model}_relative_error": law.relative_error for law in self.formulas},
         }
-        delays = {name: getattr(self.delay, name) for name in _DELAY_COLUMNS}
+        delays = {name: value for name, value in vars(self.delay).items() if name != "delay"}
         return {"law_models.csv": models, "law_delay.csv": delays}
 
 
 _MODEL_KEYS = (
     *("model", "r", "epsilon", "viscous_loss", "worst_relative_error", "rms_relative_error"),
-    *("worst_error_nm_per_us", "rms_error_nm_per_us", "worst_share_of_top_speed"),
-    *("capture_speed_nm_per_us", "converged"),
+    *("worst_error_nm_per_us", "rms_error_nm_per_us", "capture_speed_nm_per_us", "converged"),
 )
 """Columns of a formula: attributes of `ContactLaw`."""
-_DELAY_TIMES = ("delay_us", "lag_us", "lead_us", "fitted_us")
-_DELAY_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", *_DELAY_TIMES)
-"""Columns of the delay at a speed: attributes of `ContactDelay`."""
 _DELAY_NUMBERS = ("hertz", "lead_nm", "offset_nm")
-_SHOWN_DELAYS = 9
-"""Speeds at which JSON and text give the delay."""
 
 
 def contact_laws(
@@ -544,26 +500,6 @@ def contact_laws(
     return ContactLaws(formulas, delay, make_law(contact, mass_ng=mass_ng))
 
 
-def closest_delay(
-    approach: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], delay: Float[np.ndarray, " n"]
-) -> tuple[CollisionDelay, Float[np.ndarray, " n"]]:
-    """Return the delay law with the least sum of squared residuals, and its delays at the same speeds.
-
-    Args:
-        approach: u_in in nm/us.
-        rebound: u_out in nm/us, positive.
-        delay: in us.
-    """
-    terms = np.stack(_delay_terms(approach, rebound), axis=1)
-    values, *_ = np.linalg.lstsq(terms, delay, rcond=None)
-    return CollisionDelay(*values.tolist()), terms @ values
-
-
-def _delay_terms(u: Any, w: Any) -> tuple[Any, Any, Any]:
-    """Return what Hertz time, lead and offset of the delay law are multiplied with."""
-    return u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u
-
-
 def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     """Return the law u_out^2 = u_in^2 - c u_in - epsilon, with delay, of a contact; None if every tip is captured.
 
@@ -579,20 +515,17 @@ def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     slowest = float(capture_speed(contact, mass_ng))
     if not np.isfinite(slowest):
         return None
-    low = max(_GUESS_SPEEDS[0] * slowest, _SLOWEST_GUESS)
-    u = np.geomspace(low, max(_GUESS_SPEEDS[1], 4.0 * low), _GUESSES)
+    low = max(1.4 * slowest, 5.0)
     # a guess needs no more digits
-    result = collide(contact, jnp.asarray(u), mass_ng, accuracy=1e-6)
-    w, delay = np.asarray(result.rebound_speed_nm_per_us), np.asarray(result.collision_delay_us)
-    free = ~np.asarray(result.captured) & (w > 0.0)
-    if np.count_nonzero(free) <= 3:
+    result = collide(contact, np.geomspace(low, max(500.0, 4.0 * low), 12), mass_ng, accuracy=1e-6)
+    u, w, delay = np.stack(result[:3])[:, np.asarray(result.rebound_speed_nm_per_us) > 0.0]
+    if len(u) <= 3:
         return None
-    u, w, delay = u[free], w[free], delay[free]
     epsilon = 2.0 * float(find_junction(contact).hysteresis_aj) / mass_ng
     # relative residuals of u_out^2, so that fast tips do not count alone
     lost = (u * u - w * w - epsilon) / u
     viscous = max(float(np.mean(lost)), 0.0)
-    return ImpactLaw(1.0, max(epsilon, 0.0), viscous, closest_delay(u, w, delay)[0])
+    return ImpactLaw(1.0, max(epsilon, 0.0), viscous, closest_delay(u, w, delay, np))
 
 
 @compiled_quickly()
@@ -689,7 +622,7 @@ def _lead_and_height(table: TabulatedImpact) -> tuple[Float[Array, ""], Float[Ar
     And half of d at the last of them, for the table's own a.
     """
     u, w, delay = jax.vmap(table.speeds)(table.lowest * jnp.asarray(_LEAD_SPEEDS))
-    terms = jnp.stack(_delay_terms(u, w), axis=1)
+    terms = jnp.stack([u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u], axis=1)
     scale = jnp.sqrt(jnp.sum(terms**2, axis=0))
     terms = terms / scale
     lead = jnp.linalg.solve(terms.T @ terms, terms.T @ delay)[1] / scale[1]

@@ -40,12 +40,6 @@ _NEAR_FOLD = 1e-5
 """That of a fold at s = 0, relative to where the step began: s bends little there."""
 _SHORTEST = 1e-3
 """Bounds of a repeated trial's length over that of the failed one: this, and 1 less a tenth of it."""
-_CORE_FRACTION = 0.4
-"""Of the gap where the junction forms: there the core's force varies over the gap less this."""
-_FROM_REST = 0.5
-"""Weight of the acceleration in the time scale, without which a tip at rest would take no notice of the forces."""
-_CUBIC_STEPS = 4
-"""Steps of Newton's method to where a cubic vanishes."""
 
 
 class TipInContact(NamedTuple):
@@ -281,8 +275,10 @@ def inverse_bridge_step(driven: Driven, state: ContactState, acceleration: Float
     nearest = driven.junction.forms_gap_nm
     gap = jnp.maximum(state.x, 0.3 * nearest)
     stiffness = jnp.abs(driven.bridge.stiffness(gap)) * driven.inverse_mass
-    distance = jnp.maximum(gap - _CORE_FRACTION * nearest, 0.3 * nearest)
-    moving = (state.gap_rate / distance) ** 2 + _FROM_REST * jnp.abs(acceleration) / distance
+    # the core's force varies over the gap less 0.4 of that where the junction forms
+    distance = jnp.maximum(gap - 0.4 * nearest, 0.3 * nearest)
+    # without the acceleration a tip at rest would take no notice of the forces
+    moving = (state.gap_rate / distance) ** 2 + 0.5 * jnp.abs(acceleration) / distance
     return jnp.sqrt(stiffness + moving + _drive_frequency(driven) ** 2)
 
 
@@ -378,7 +374,7 @@ class _Cubic(NamedTuple):
             return jnp.clip(fraction - correction, 0.0, 1.0)
 
         secant = self.start / jnp.where(self.start == self.end, 1.0, self.start - self.end)
-        return lax.fori_loop(0, _CUBIC_STEPS, improve, secant)
+        return lax.fori_loop(0, 4, improve, secant)
 
     def turning_point(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return fraction and value of the extremum, where the slopes at the ends have different signs."""

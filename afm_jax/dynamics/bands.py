@@ -24,7 +24,7 @@ from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.impact_loop import LoopFamily, closing_gaps, highest_point
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
-from afm_jax.solve.lanes import compiled_quickly, in_blocks
+from afm_jax.solve.lanes import in_blocks
 
 _BETWEEN = (0.025, 0.975)
 """Quantiles between which 95 % of the draws lie."""
@@ -109,14 +109,14 @@ def _slopes_of_special_point(
     return np.asarray(_slopes_by_uncertain(family, at))[-1] * width
 
 
-@compiled_quickly()
+@jax.jit
 def _slopes_by_uncertain(family: LoopFamily, point: Array) -> Float[Array, "n uncertain"]:
     slopes = jax.jacfwd(lambda unknowns: equations_at(unknowns, family))(point)
     solved = slopes.shape[0]
     return -jnp.linalg.solve(slopes[:, :solved], slopes[:, solved:])
 
 
-@compiled_quickly()
+@jax.jit
 def _amplitude_slopes(family: LoopFamily, points: Array) -> Float[Array, "points uncertain"]:
     """Return the derivatives of the peak amplitude of closed loops by the uncertain parameters."""
 

@@ -27,7 +27,7 @@ from afm_jax.motion.start import gap_of_departure, start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
-from afm_jax.solve.lanes import LANES, Report, compiled_quickly, in_blocks
+from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.units import within_turn
 
 _STRETCHES = LANES
@@ -379,7 +379,7 @@ def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.n
     return np.where(inside, height, np.nan).reshape(len(period), -1)
 
 
-@compiled_quickly()
+@jax.jit
 def _flight_height(
     scenes: Scene,
     gap_nm: Float[Array, " values"],

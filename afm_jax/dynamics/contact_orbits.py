@@ -572,7 +572,7 @@ class ContactLoops(LoopFamily):
         return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, speeds)
 
 
-@compiled_quickly()
+@jax.jit
 def _lowest_gap(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array) -> tuple[Array, Array]:
     """Return the lowest point of flights between two contacts above the gap at which the bridge forms, in nm.
 

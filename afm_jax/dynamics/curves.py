@@ -35,7 +35,7 @@ from afm_jax.dynamics.impact_loop import (
 )
 from afm_jax.scenefile.parameter_paths import with_numbers
 from afm_jax.solve.arclength import EquationsAt, PointInPlane, point_in_plane
-from afm_jax.solve.derivatives import bracketed_root, largest
+from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import compiled_quickly, in_blocks
 from afm_jax.solve.newton import Newton
 
@@ -141,7 +141,7 @@ def _linearised(family: LoopFamily, point: Array) -> tuple[Array, Array]:
     return value, slopes
 
 
-@compiled_quickly()
+@jax.jit
 def _tests_and_delay(family: LoopFamily, point: Array) -> tuple[Array, Array]:
     unknowns, fractions = split_point(point, family)
     loop = loop_at(fractions, family)
@@ -388,8 +388,10 @@ def root_on(leg: CurveLeg, test: Callable[[CurvePoint], float], family: LoopFami
         point = leg.at(fraction, family)
         return np.nan if point is None else test(point)
 
+    from scipy.optimize import brentq  # noqa: PLC0415  # half a second, seldom needed
+
     try:
-        fraction = bracketed_root(tested_at, 0.0, 1.0, tolerance=1e-15)
+        fraction = float(np.asarray(brentq(tested_at, 0.0, 1.0, xtol=1e-15)))
     except ValueError:
         # the guesses on the way led elsewhere
         return None

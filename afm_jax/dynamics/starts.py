@@ -115,7 +115,7 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
     return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
 
 
-@compiled_quickly()
+@jax.jit
 def landed_tips(scenes: Scene, start: State) -> Tips:
     """Return tips just after the first impact of a flight from anywhere above the platform, or of a rest on it.
 
@@ -136,7 +136,7 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
     return after_impacts(scenes, tips, jax.vmap(first_impact_of)(scenes, starts))[0]
 
 
-@compiled_quickly()
+@jax.jit
 def leaving_tips(scenes: Scene) -> Tips:
     """Return tips that leave the platform upward at its highest speed, at that speed again or twice the capture speed.
 

@@ -21,7 +21,6 @@ from afm_jax.impact.lasting_impact import speeds_of_impact
 from afm_jax.impact.law import Impact, Law, impact_law_of
 from afm_jax.impact.map import next_impact
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.lanes import compiled_quickly
 
 
 class PaperFlight(NamedTuple):
@@ -230,7 +229,7 @@ def map_jacobian(scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike
     return _map_jacobian(seen, response, as_argument(time_us), as_argument(velocity_nm_per_us), impact)
 
 
-@compiled_quickly()
+@jax.jit
 def _map_jacobian(seen: Scene, response: Surface | None, time, velocity, impact) -> Float[Array, "2 2"]:
     leaves = impact.outcome == Outcome.IMPACT
     arrival = jnp.where(leaves, impact.arrival_time_us, time)

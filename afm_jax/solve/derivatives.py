@@ -96,37 +96,6 @@ def implicit_step(
     return root + step, value[count:] + jnp.sum(slopes[count:] * step, axis=-1)
 
 
-class _Mapped(NamedTuple):
-    """A residual for a batch: row by row the same function; ``axes``: 0 or None for each leaf of the parameters."""
-
-    residual: Callable[[Any, Any], Any]
-    structure: Any
-    axes: tuple[int | None, ...]
-
-    def __call__(self, x: Array, parameters: Any) -> Array:
-        def one(value, *leaves):
-            return self.residual(value, jax.tree.unflatten(self.structure, leaves))
-
-        return jax.vmap(one, in_axes=(0, *self.axes))(x, *jax.tree.leaves(parameters))
-
-
-@_implicit_root.def_impl
-def _evaluate(root, *leaves, residual, structure, system):
-    del leaves, residual, structure, system
-    return root
-
-
-@_implicit_root.def_abstract_eval
-def _shape(root, *leaves, residual, structure, system):
-    del leaves, residual, structure, system
-    return root
-
-
-def _lower(context, root, *leaves, residual, structure, system):
-    del context, leaves, residual, structure, system
-    return [root]
-
-
 def _differentiate(primals, tangents, *, residual, structure, system):
     """Differentiate: dx = -(df/dp dp) / (df/dx) at the root, summed over the parameters that move."""
     root, *leaves = primals
@@ -153,14 +122,9 @@ def _differentiate(primals, tangents, *, residual, structure, system):
 
 
 def solved_columns(columns: list[Float[Array, "... n"]], right: Float[Array, "... n"]) -> Float[Array, "... n"]:
-    """Return the solution of n linear equations, given the matrix's columns; of two equations as `solved_pair`."""
-    if len(columns) == 2:
-        return solved_pair(columns, right)
-    return jnp.linalg.solve(jnp.stack(columns, axis=-1), right[..., None])[..., 0]
-
-
-def solved_pair(columns: list[Float[Array, "... 2"]], right: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-    """Return the solution of two linear equations, given the matrix's columns; 0 where the matrix is singular."""
+    """Return the solution of n linear equations, given the matrix's columns; 0 where that of two is singular."""
+    if len(columns) != 2:
+        return jnp.linalg.solve(jnp.stack(columns, axis=-1), right[..., None])[..., 0]
     (a, c), (b, d), (first, second) = (jnp.moveaxis(part, -1, 0) for part in (*columns, right))
     determinant = a * d - b * c
     regular = determinant != 0.0
@@ -176,11 +140,20 @@ def _map_over_batch(arguments, axes, *, residual, structure, system):
     )
     if axes[0] is None:
         root = jnp.broadcast_to(root, (size, *root.shape))
-    mapped = _Mapped(residual, structure, tuple(None if axis is None else 0 for axis in axes[1:]))
+
+    def mapped(x, parameters):
+        def of_row(value, *leaves):
+            return residual(value, jax.tree.unflatten(structure, leaves))
+
+        in_axes = 0, *(None if axis is None else 0 for axis in axes[1:])
+        return jax.vmap(of_row, in_axes=in_axes)(x, *jax.tree.leaves(parameters))
+
     return _implicit_root.bind(root, *leaves, residual=mapped, structure=structure, system=system), 0
 
 
-mlir.register_lowering(_implicit_root, _lower)
+_implicit_root.def_impl(lambda root, *_, **__: root)
+_implicit_root.def_abstract_eval(lambda root, *_, **__: root)
+mlir.register_lowering(_implicit_root, lambda _, root, *__, **___: [root])
 ad.primitive_jvps[_implicit_root] = _differentiate
 batching.primitive_batchers[_implicit_root] = _map_over_batch
 
@@ -203,23 +176,6 @@ def halved(
         return jnp.where(held, middle, ends[0]), jnp.where(held, ends[1], middle)
 
     return lax.fori_loop(0, rounds, halve, (low, high))
-
-
-def bracketed_root(function: Callable[[float], float], low: float, high: float, *, tolerance: float) -> float:
-    """Return where a continuous function is 0 between two numbers, in either order.
-
-    Args:
-        function: from a number to a number.
-        low: one end of the bracket.
-        high: the other end; the function has the other sign there.
-        tolerance: absolute, of the root.
-
-    Raises:
-        ValueError: if the function has one sign at both ends, or is NaN on the way.
-    """
-    from scipy.optimize import brentq  # noqa: PLC0415 (half a second, seldom needed)
-
-    return float(np.asarray(brentq(function, low, high, xtol=tolerance)))
 
 
 def largest(values: Float[Array, " n"]) -> Float[Array, ""]:
@@ -259,67 +215,66 @@ _FORWARD_BY = 4
 
 
 def by_tangents(
-    function: Callable[..., Any],
-    *arguments: Any,
-    small: bool,
-    many_steps: Callable[..., Any] | None = None,
-    **settings: Hashable,
+    function: Callable[..., tuple[Any, Array]], *arguments: Any, small: bool, settings: tuple[Hashable, ...]
 ) -> Any:
-    """Return `function(*arguments, **settings)`, with derivatives that are computed forward.
+    """Return the results of a function of tips, with derivatives that are computed forward.
 
     Args:
-        function: a plain function of module level that returns a pytree of arrays, a value a tip, differentiable as it
-            stands.
+        function: a plain function of module level that takes the arguments and a setting, and returns a pytree of
+            arrays, a value a tip, differentiable as it stands, and for which tips these hold.
         arguments: pytrees of arrays: numbers for all tips, or one value for each tip, which only its own results use.
             At least one has an axis of tips.
         small: whether the batch is so small that forward passes along all numbers are quick; else reverse mode goes
             back through the function itself where more than a few numbers move.
-        many_steps: the function for hard tips; `function` then returns with its results for which tips they hold, and
-            the others are computed again.
-        settings: what is no array.
+        settings: tips whose results with one of them do not hold are computed again with the next.
     """
     leaves, structure = jax.tree.flatten(arguments)
-    return _differentiable(_Work(function, many_steps, structure, tuple(settings.items())), leaves, small=small)
+    return _differentiable(_Work(function, structure, settings), leaves, small=small)
 
 
 class _Work(NamedTuple):
-    """A function of flat arguments, which can be compared: equal work shares compiled programs."""
+    """A function of flat arguments and its derivatives, which can be compared: equal work shares compiled programs."""
 
-    function: Callable[..., Any]
-    many_steps: Callable[..., Any] | None
+    function: Callable[..., tuple[Any, Array]]
     structure: Any
-    settings: tuple[tuple[str, Hashable], ...]
+    settings: tuple[Hashable, ...]
+    moving: tuple[tuple[int, ...], ...] = ()
+    """For each derivative, one of the other, the leaves that it is by."""
 
     def of(self, *leaves: Array) -> Any:
-        found = self.function(*jax.tree.unflatten(self.structure, leaves), **dict(self.settings))
-        if self.many_steps is None:
-            return found
-        return again_for_the_open(self.hard.of, found[1], leaves, found[0])
+        """Return the results, with the derivatives beside them, if any, along an axis behind the tips'."""
+        results, holds = _with_slopes(leaves, self) if self.moving else self.once(*leaves)
+        if len(self.settings) == 1:
+            return results
+        return again_for_the_open(self._replace(settings=self.settings[1:]).of, holds, leaves, results)
 
-    @property
-    def hard(self) -> "_Work":
-        """The work for hard tips."""
-        return self._replace(function=self.many_steps, many_steps=None)
+    def once(self, *leaves: Array) -> tuple[Any, Array]:
+        """Return the results by the first setting, and for which tips they hold."""
+        if not self.moving:
+            return self.function(*jax.tree.unflatten(self.structure, leaves), self.settings[0])
+        moving, inner = self.moving[-1], self._replace(moving=self.moving[:-1])
+
+        def shifted(shifts):
+            moved = list(leaves)
+            for place, i in enumerate(moving):
+                moved[i] = leaves[i] + shifts[place]
+            results, holds = inner.once(*moved)
+            real = jax.tree.map(lambda part: part if _is_real(part) else jnp.zeros(part.shape), results)
+            return real, (results, holds)
+
+        # by shifts, at 0, that all tips' numbers have in common
+        at = jnp.zeros(len(moving), jnp.result_type(*leaves))
+        slopes, (results, holds) = jax.jacfwd(shifted, has_aux=True)(at)
+        return (results, jax.tree.map(lambda part: jnp.moveaxis(part, -1, 1), slopes)), holds
 
 
-class _Slopes(NamedTuple):
-    """Work that gives results and their derivatives by the leaves that move, along an axis behind the tips'."""
-
-    work: "_Work | _Slopes"
-    moving: tuple[int, ...]
-
-    def of(self, *leaves: Array) -> Any:
-        work = self.work
-        if isinstance(work, _Slopes) or work.many_steps is None or any(map(is_traced, leaves)):
-            return _with_slopes(leaves, self)
-        # by themselves: the second program is made only where a tip needs it
-        (results, enough), (slopes, _) = _with_slopes(leaves, self._replace(work=work._replace(many_steps=None)))
-        hard = self._replace(work=work.hard)
-        return again_for_the_open(lambda *some: _with_slopes(some, hard), enough, leaves, (results, slopes))
+@compiled_quickly(static_argnames="work")
+def _with_slopes(leaves: tuple[Array, ...], work: _Work) -> tuple[Any, Array]:
+    return work.once(*leaves)
 
 
-def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bool) -> Any:
-    """Return the results of work, whose derivative is the product of `_Slopes` with the tangents."""
+def _differentiable(work: _Work, leaves: Sequence[Array], *, small: bool) -> Any:
+    """Return the results of work, whose derivative is the product of one derivative more with the tangents."""
     ruled = jax.custom_jvp(partial(_side_by_side, work))
 
     def derivative(values, tangents):
@@ -327,7 +282,8 @@ def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bo
         if not small and len(moving) > _FORWARD_BY:
             given = [tangents[i] if i in moving else jnp.zeros_like(value) for i, value in enumerate(values)]
             return jax.jvp(work.of, values, tuple(given))
-        results, slopes = _differentiable(_Slopes(work, moving), values, small=small)
+        more = work._replace(moving=(*work.moving, moving))
+        results, slopes = _differentiable(more, values, small=small)
         return results, jax.tree.map(partial(_along, tangents=[tangents[i] for i in moving]), results, slopes)
 
     ruled.defjvp(derivative, symbolic_zeros=True)
@@ -345,25 +301,9 @@ def _along(result: Array, slopes: Array, tangents: Sequence[Array]) -> Any:
     return total
 
 
-@compiled_quickly(static_argnames="asked")
-def _with_slopes(leaves: tuple[Array, ...], asked: _Slopes) -> tuple[Any, Any]:
-    """Return results and derivatives: the derivatives by shifts, at 0, that all tips' numbers have in common."""
-
-    def shifted(shifts):
-        moved = list(leaves)
-        for place, i in enumerate(asked.moving):
-            moved[i] = leaves[i] + shifts[place]
-        results = asked.work.of(*moved)
-        return jax.tree.map(lambda part: part if _is_real(part) else jnp.zeros(part.shape), results), results
-
-    at = jnp.zeros(len(asked.moving), jnp.result_type(*leaves))
-    slopes, results = jax.jacfwd(shifted, has_aux=True)(at)
-    return results, jax.tree.map(lambda part: jnp.moveaxis(part, -1, 1), slopes)
-
-
-def _side_by_side(work: _Work | _Slopes, *leaves: Array) -> Any:
+def _side_by_side(work: _Work, *leaves: Array) -> Any:
     """Return what work comes to, on all tips of all examples at once under `vmap`."""
-    if not any(is_traced(leaf) for leaf in leaves):
+    if not any(map(is_traced, leaves)):
         return work.of(*leaves)
 
     def all_examples(size, batched, *leaves):

@@ -9,10 +9,9 @@ need more are gathered into small blocks of their own, where no others wait for 
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property, partial, update_wrapper
+from functools import cache, partial, wraps
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,46 +87,33 @@ def in_blocks(
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
 
 
-class QuicklyCompiled:
-    """A function that is compiled with `quick_options`: for programs that take longer to compile than to run.
-
-    Inside of another program it is compiled as that one is.
-    """
-
-    def __init__(self, function: Callable[..., Any], static_argnames: str | Sequence[str], level: int):
-        """Take the function's name and docstring."""
-        update_wrapper(self, function)
-        self.level = level
-        self.jitted = partial(jax.jit, function, static_argnames=static_argnames)
-        self.inside = self.jitted()
-
-    @property
-    def options(self) -> dict[str, Any] | None:
-        """The compiler's options, known once JAX has started."""
-        return quick_options(self.level)
-
-    @cached_property
-    def outside(self) -> Any:
-        """The function by itself."""
-        return self.jitted(compiler_options=self.options)
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        """Return the function's result."""
-        # inside a program everything is traced, also what is made of known numbers
-        traced = is_traced(jnp.asarray(0.0)) or any(map(is_traced, jax.tree.leaves((arguments, named))))
-        return (self.inside if traced else self.outside)(*arguments, **named)
-
-
 def compiled_quickly(
     *, static_argnames: str | Sequence[str] = (), level: int = 1
-) -> Callable[[Callable[..., Any]], QuicklyCompiled]:
-    """Return a decorator like `jax.jit` for the beginning of a program that is not run for long.
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator like `jax.jit` for the beginning of a program that takes longer to compile than to run.
+
+    Inside of another program the function is compiled as that one is.
 
     Args:
         static_argnames: as of `jax.jit`.
         level: of `quick_options`: 0 for what runs once or twice.
     """
-    return lambda function: QuicklyCompiled(function, static_argnames, level)
+
+    def decorated(function: Callable[..., Any]) -> Callable[..., Any]:
+        jitted = partial(jax.jit, function, static_argnames=static_argnames)
+        # the compiler's options are known once JAX has started
+        inside, outside = jitted(), cache(lambda: jitted(compiler_options=quick_options(level)))
+
+        @wraps(function)
+        def called(*arguments: Any, **named: Any) -> Any:
+            # inside a program everything is traced, also what is made of known numbers
+            traced = is_traced(jnp.asarray(0.0)) or any(map(is_traced, jax.tree.leaves((arguments, named))))
+            return (inside if traced else outside())(*arguments, **named)
+
+        vars(called)["outside"] = outside
+        return called
+
+    return decorated
 
 
 def map_in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int, recompute: bool = False) -> Any:
@@ -150,20 +136,6 @@ def map_in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int, recompu
 
     results = lax.map(jax.checkpoint(work) if recompute else work, jax.tree.map(parted, lanes))
     return jax.tree.map(lambda part: part.reshape(blocks * width, *part.shape[2:])[:size], results)
-
-
-def rows_in_blocks(work: Callable[[Any, Any], Any], parameters: Any, rows: Any) -> Any:
-    """Return the results of work on rows inside a compiled program, so that memory does not grow with their number.
-
-    Args:
-        work: takes parameters and rows of a block, gives a tree of arrays with the rows' axis.
-        parameters: a tree of numbers for all rows, and of arrays with one value a row.
-        rows: an array of one value a row.
-    """
-    varied, shared = eqx.partition(parameters, lambda leaf: leaf.ndim > 0)
-    return map_in_blocks(
-        lambda lanes: work(eqx.combine(lanes[0], shared), lanes[1]), (varied, rows), block=LANES, recompute=True
-    )
 
 
 def for_each_lane(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -223,7 +195,9 @@ def again_for_the_open(
         # recomputed in reverse mode: what long work leaves behind would not fit into memory
         again = jax.checkpoint(lambda: work(*arguments))
         slow = lax.cond(jnp.all(settled), lambda: results, again)
-        return jax.tree.map(lambda old, new: jnp.where(settled, old, new), results, slow)
+        return jax.tree.map(
+            lambda old, new: jnp.where(settled.reshape(-1, *(1,) * (old.ndim - 1)), old, new), results, slow
+        )
     open_lanes = np.flatnonzero(~np.asarray(settled))
     count = open_lanes.size
     if not count:
@@ -315,10 +289,8 @@ class _Repeated(NamedTuple):
             values, given = leaves[:count], leaves[count:]
 
             def of_varied(*parts):
-                now = [*values]
-                for index, part in zip(varied, parts, strict=True):
-                    now[index] = part
-                return self.work(*now)
+                now = dict(zip(varied, parts, strict=True))
+                return self.work(*(now.get(index, value) for index, value in enumerate(values)))
 
             # a batch may have a value for each lane and one tangent for all, or the other way round
             pairs = [jnp.broadcast_arrays(values[i], tangent) for i, tangent in zip(varied, given, strict=True)]
@@ -353,8 +325,8 @@ class _Repeated(NamedTuple):
             results = self.of_one(*leaves)
             return results, (False,) * len(results)
         if max(leaf.ndim + (not flag) for flag, leaf in zip(flags, leaves, strict=True)) > 1:
-            # a batch of batches: one after the other
-            results = self._one_by_one(size, flags, leaves)
+            # a batch of batches: all wait for the slowest
+            results = jax.vmap(self.of_one, in_axes=[0 if flag else None for flag in flags])(*leaves)
         else:
             results = self._in_need(size, flags, leaves)
         # values that do not differ stay one, whatever the tangents: several derivatives at one point
@@ -363,16 +335,8 @@ class _Repeated(NamedTuple):
         return results, (False,) * same + (True,) * (len(results) - same)
 
     def _with(self, leaves: Sequence[Array], values: Sequence[Array]) -> list[Array]:
-        now = [*leaves]
-        for index, value in zip(self.changed, values, strict=True):
-            now[index] = value
-        return now
-
-    def _one_by_one(self, size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
-        def one(index):
-            return self.of_one(*(leaf[index] if flag else leaf for flag, leaf in zip(flags, leaves, strict=True)))
-
-        return lax.map(one, jnp.arange(size))
+        now = dict(zip(self.changed, values, strict=True))
+        return [now.get(index, leaf) for index, leaf in enumerate(leaves)]
 
     def _in_need(self, size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
         """Return the changed arguments of a batch: the lanes in need, gathered anew pass after pass."""

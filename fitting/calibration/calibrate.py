@@ -12,8 +12,8 @@ from scipy.special import digamma
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.columns import printed_table
-from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.solve.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
@@ -220,7 +220,7 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
         error = error * averages**-0.5
     elif sweep.amplitude_error is not None:
         error, origin = sweep.amplitude_error / largest, "file"
-    (place, best, _), model, reverse = minimum(sweep, error)
+    (place, best, *_), model, reverse = minimum(sweep, error)
     freedom = len(best.residual) - len(place)
     # a scan without noise keeps rounding for an error
     scale = max(best.value / freedom, 1e-12) if origin == "estimated" else 1.0

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.checks import check_parameter, checked
-from afm_jax.least_squares import covariance_of
+from afm_jax.solve.least_squares import covariance_of
 from fitting.experiments.prior import Prior
 from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained

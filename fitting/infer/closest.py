@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import covariance_of
+from afm_jax.solve.least_squares import covariance_of
 from fitting.infer.explain import Explained
 from fitting.infer.law import DELAY_TERMS, bounded, closest_loss, delay_by_formula, rebound_by_formula, root_of
 from fitting.parameters import LAW, PARAMETERS

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import covariance_of
+from afm_jax.solve.least_squares import covariance_of
 from fitting.infer.law import LawWithErrors, root_of
 from fitting.infer.rows import Weights, few_left, remainders_of, weights_of
 from fitting.infer.search import (

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import Box, Searches, descended
-from afm_jax.solve.least_squares import Sum
+from afm_jax.solve.least_squares import Lowest, Sum, levenberg_marquardt
 from fitting.infer.explain import MOST_OUTLIERS, OUTLIER, ROBUST, Explained
 from fitting.infer.optimiser import Minimised, minimised
 from fitting.infer.rows import Weights, plain_weights
@@ -81,27 +80,25 @@ class Chi2(NamedTuple):
 
     def descended(
         self, theta: Float[np.ndarray, " k"], fixed: Bool[np.ndarray, " k"] | None = None, settled: float = _FINE
-    ) -> Searches:
+    ) -> Lowest:
         """Return where damped steps go: no loss is negative, and some unknowns may be held."""
         lowest, highest = np.full(theta.size, -np.inf), np.full(theta.size, np.inf)
         lowest[: len(self.model.law.own)] = 0.0
         if "r" in self.model.law.own:
             highest[self.model.law.own.index("r")] = 1.0 - 1e-4
 
-        def evaluate(places: Float[np.ndarray, "1 k"], _: object) -> Searches:
-            _, residual, jacobian = self.at(places[0])
+        def evaluate(place: Float[np.ndarray, " k"]) -> Sum:
+            _, residual, jacobian = self.at(place)
             chi2 = float(residual @ residual) if np.isfinite(residual).all() else np.inf
-            return Searches(places, np.nan_to_num(residual)[None], np.nan_to_num(jacobian)[None], np.array([chi2]))
+            return Sum(chi2, np.nan_to_num(residual), np.nan_to_num(jacobian))
 
-        held = np.zeros((1, theta.size), bool) if fixed is None else fixed[None]
-        start = evaluate(np.clip(theta, lowest, highest)[None], None)
-        return descended(evaluate, start, Box(lowest, highest, held), settled=settled, most=_STEPS)
+        how = {"fixed": fixed, "lowest": lowest, "highest": highest}
+        return levenberg_marquardt(evaluate, np.clip(theta, lowest, highest), settled=settled, most=_STEPS, **how)
 
-    def explained(self, end: Searches) -> Explained:
+    def explained(self, end: Lowest) -> Explained:
         """Return the rows as the law at an end explains them."""
-        theta = end.place[0]
-        found, residual, jacobian = self.at(theta)
-        descent = Descent(theta, found.orbits, float(end.chi2[0]), residual, jacobian)
+        found, residual, jacobian = self.at(end.place)
+        descent = Descent(end.place, found.orbits, end.sum.value, residual, jacobian)
         return Explained(self.model, descent, self.weights, found, 0.0, settled=True)
 
 
@@ -110,7 +107,7 @@ def profile(explained: Explained, place: int, value: float) -> float:
     fixed = np.zeros(explained.end.theta.size, bool)
     fixed[place] = True
     chi2 = Chi2(explained.model, explained.weights)
-    return float(chi2.descended(explained.beside(place, value), fixed, _NEAR).chi2[0])
+    return chi2.descended(explained.beside(place, value), fixed, _NEAR).sum.value
 
 
 def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained, Minimised, Explained | None]:
@@ -128,7 +125,7 @@ def fit_instantaneous(model: Model, *, robust: bool = False) -> tuple[Explained,
     order = np.argsort(np.nan_to_num(cost, nan=np.inf), kind="stable")[:_POLISHED]
     ends = [chi2.minimised(points[i]) for i in order[:_BY_OPTAX]]
     others = [chi2.descended(points[i], settled=_NEAR) for i in order[_BY_OPTAX:]]
-    elsewhere = [(float(end.chi2[0]), end.place[0]) for end in others]
+    elsewhere = [(end.sum.value, end.place) for end in others]
     least, place = min(elsewhere, key=lambda end: end[0], default=(np.inf, points[0]))
     best = min(ends, key=lambda end: end.value)
     if least < best.value - _SAME:

@@ -11,12 +11,11 @@ import numpy as np
 import optax
 from jaxtyping import Float
 
-from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.solve.least_squares import Sum
 
 OPTIMISER = f"optax.lbfgs {optax.__version__}"
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
-_init, _update = (compiled_quickly(level=0)(part) for part in (_LBFGS.init, _LBFGS.update))
+_init, _update = jax.jit(_LBFGS.init), jax.jit(_LBFGS.update)
 _LONGEST = 30.0
 """Longest step in standard errors."""
 _ARMIJO, _SHORTEST = 1e-4, 1e-9

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -16,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.impact.law import CollisionDelay, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
-from afm_jax.solve.lanes import compiled_quickly
 from afm_jax.strict_json import plain
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
 from fitting.infer.law import LAW_POINTS, AtSpeeds, points_of_law, rebound_by_formula
@@ -329,7 +329,7 @@ class FitResult(Result):
         )
 
 
-@compiled_quickly(level=0)
+@jax.jit
 def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, Array]:
     return law.rebound_speed(speeds), law.collision_delay(speeds)
 

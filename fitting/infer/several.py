@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.least_squares import chi2_tail, covariance_of
+from afm_jax.solve.least_squares import chi2_tail, covariance_of
 
 _LEAST_SHARE = 1e-9
 """Variance that a table takes from a direction of the law, over the variance there, below which it says nothing."""

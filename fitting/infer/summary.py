@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.impact.law import CollisionDelay
-from afm_jax.least_squares import chi2_tail, covariance_of
+from afm_jax.solve.least_squares import chi2_tail, covariance_of
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.infer.closest import Closest, closest_parameters, covariance_of_unknowns, held_at_bound

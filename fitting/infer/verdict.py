@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN
 from afm_jax.outcomes import Rule, Rules, judge
+from afm_jax.solve.least_squares import IMPROBABLE, LARGEST_SCALE, PULLED, TORN
 from fitting.infer.explain import LARGEST_SHARE, MOST_OUTLIERS, OUTLIER
 from fitting.infer.intervals import UNSETTLED
 from fitting.infer.result import NO_MASS, Convergence, FittedParameter, FittedRows

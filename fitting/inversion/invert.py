@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 
 from afm_jax.checks import checked, in_float64
 from afm_jax.columns import printed_table, rows_of
-from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.solve.least_squares import IMPROBABLE, chi2_tail
 from afm_jax.words import bullets, with_error
 from fitting.infer.unknowns import NEUTRAL, UNDAMPED
 from fitting.inversion.flight import invert_rows

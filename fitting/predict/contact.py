@@ -124,7 +124,7 @@ class ContactLawModel(LawModel):
         return np.isfinite(approach) & ~((speed <= SPEED_ERROR) & (delay <= DELAY_ERROR_US))
 
 
-_errors = compiled_quickly()(TabulatedImpact.errors)
+_errors = jax.jit(TabulatedImpact.errors)
 
 
 @compiled_quickly(static_argnames="names", level=0)

@@ -331,7 +331,7 @@ def _in_blocks(program, table: AnyLaw, drive: str, *trees):
     parts = []
     for first in range(0, count, block):
         some = np.minimum(np.arange(first, first + block), count - 1)
-        part = program.outside(*jax.tree.map(lambda column, some=some: np.asarray(column)[some], trees), table, drive)
+        part = program.outside()(*jax.tree.map(lambda column, some=some: np.asarray(column)[some], trees), table, drive)
         parts.append([np.asarray(array)[: count - first] for array in part])
     return [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
 

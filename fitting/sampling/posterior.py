@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 
 from afm_jax.checks import check_count, checked, in_float64
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.solve.lanes import compiled_quickly
 from fitting.infer.closest import closest_parameters, covariance_of_unknowns
 from fitting.infer.explain import Explained
 from fitting.infer.fit import explained_of
@@ -229,7 +228,7 @@ def _nuts(density: LogDensity, samples: int, seed: int) -> PosteriorChains:
 
     # blackjax mixes integers of 32 and 64 bits, which strict promotion would refuse
     with jax.numpy_dtype_promotion("standard"):
-        drawn, diverging = compiled_quickly()(jax.vmap(chain))(jax.random.split(jax.random.key(seed), CHAINS))
+        drawn, diverging = jax.jit(jax.vmap(chain))(jax.random.split(jax.random.key(seed), CHAINS))
         values = np.asarray(drawn)
         halves = jnp.asarray(values[:, : samples // 2 * 2].reshape(2 * CHAINS, samples // 2, -1))
         # of one parameter they have no axis

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from afm_jax.least_squares import chi2_tail
+from afm_jax.solve.least_squares import chi2_tail
 from fitting.tables.table import (
     MEASURED,
     AmplitudeTable,

@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import isotonic_regression
 from scipy.special import ndtr, ndtri
 
-from afm_jax.least_squares import IMPROBABLE, Box, Searches, chi2_tail, covariance_of, descended, distance
+from afm_jax.solve.least_squares import IMPROBABLE, Sum, chi2_tail, covariance_of, levenberg_marquardt
 from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS
@@ -201,19 +201,17 @@ Function = Callable[[np.ndarray], np.ndarray]
 def _minimum(residual: Function, jacobian: Function, start: np.ndarray, *, until: float = _SETTLED) -> Solution:
     """Return the minimum of a sum of squares to some distance of chi2, and whether the search settled there."""
 
-    def evaluate(places: np.ndarray, _: np.ndarray) -> Searches:
-        left, slopes = residual(places[0]), jacobian(places[0])
-        return Searches(places, left[None], slopes[None], np.array([left @ left]))
+    def evaluate(place: np.ndarray) -> Sum:
+        left = residual(place)
+        return Sum(float(left @ left), left, jacobian(place))
 
-    count = len(start)
-    box = Box(np.full(count, -np.inf), np.full(count, np.inf), np.zeros((1, count), bool))
     # what is far out of range is refused by its chi2
     with np.errstate(over="ignore", invalid="ignore"):
-        end = descended(evaluate, evaluate(start[None], np.arange(1)), box, settled=until, most=_ROUNDS, rise=_RISE)
-        settled = bool(distance(end, box)[0] <= 1e-2)
-    covariance = covariance_of(end.jacobian[0].T @ end.jacobian[0])
-    settled &= bool(np.isfinite(covariance).all())
-    return Solution(end.place[0], covariance, float(end.chi2[0]), len(end.residual[0]) - count, settled)
+        end = levenberg_marquardt(evaluate, start, settled=until, most=_ROUNDS, rise=_RISE)
+    chi2, left, slopes = end.sum
+    covariance = covariance_of(slopes.T @ slopes)
+    settled = end.distance <= 1e-2 and bool(np.isfinite(covariance).all())
+    return Solution(end.place, covariance, chi2, len(left) - len(start), settled)
 
 
 def _slopes(function: Function, x: np.ndarray, count: int) -> np.ndarray:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.checks import checked, in_float64
-from afm_jax.least_squares import IMPROBABLE
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.solve.least_squares import IMPROBABLE
 from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TableLike, as_table

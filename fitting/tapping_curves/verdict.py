@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.least_squares import IMPROBABLE, LARGEST_SCALE, TORN
 from afm_jax.outcomes import Rule, Rules
+from afm_jax.solve.least_squares import IMPROBABLE, LARGEST_SCALE, TORN
 from afm_jax.words import interval
 from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS, USUAL_ERRORS
