@@ -1,6 +1,6 @@
 """Law scenes in time: the impact map over whatever surface the tip sees, and rests on it, to the end of a duration.
 
-The tip is followed from flight to flight (`follow_tip`); each impact, with the rest after it, is written into one row.
+A round of the loop (`follow_rounds`) is a flight, the impact that ends it and the rest after it, written into one row.
 All shapes are fixed; a batch goes on until its last tip has ended. The tip rests on the surface for as long as the
 surface pushes it.
 
@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -26,7 +26,8 @@ from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.junction import Phase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, time_above
 from afm_jax.impact.law import Law, impact_law_of
-from afm_jax.impact.map import Departure, FollowedTip, NextImpact, Search, follow_tip
+from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
+from afm_jax.motion.course import Course, follow_rounds, where
 from afm_jax.motion.record import (
     ContactKind,
     Contacts,
@@ -63,18 +64,6 @@ class LawRow(NamedTuple):
     approach: Float[Array, "..."]
     departure_us: Float[Array, "..."]
     rebound: Float[Array, "..."]
-
-
-class LawRecord(NamedTuple):
-    """What is written down of one tip on the way."""
-
-    used: Int[Array, ""]
-    """Rows that are filled."""
-    rows: Float[Array, "rows columns"]
-    outcome: Int[Array, ""]
-    """A `MotionOutcome`."""
-    flights: Int[Array, ""]
-    """Flights that were followed."""
 
 
 @compiled_quickly(static_argnames=("max_contacts", "reverse"))
@@ -114,57 +103,38 @@ def follow_law(
     gap, rate = to_gap(surface, response, start)
     touches = (gap < 0.0) & (gap > -_ON_SURFACE_NM)
     gap = gap + lax.stop_gradient(jnp.where(touches, -gap, 0.0))
-    none = jnp.zeros((), jnp.int32)
-    rows = jnp.zeros((max_contacts, len(LawRow._fields)), gap.dtype)
-    tip = FollowedTip(
-        Departure(start.time_us, gap, rate + surface.velocity(start.time_us)),
-        jnp.ones((), bool),
-        LawRecord(none, rows, none + jnp.int32(MotionOutcome.FINISHED), none),
-    )
-    tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, until.dtype)
-    search = Search(_FLIGHT_STEPS, tolerance, until, from_above=True)
-    through = partial(_written_down, seen, until)
-    tip, _ = follow_tip(seen, tip, through, search, impacts=max_contacts + 1, until_ended=True, reverse=reverse)
-    record = tip.record
-    held = record.outcome == MotionOutcome.HELD
+    departure = Departure(start.time_us, gap, rate + surface.velocity(start.time_us))
+    no_row, begun = LawRow(*[jnp.zeros_like(gap)] * len(LawRow._fields)), jnp.int32(MotionOutcome.FINISHED)
+    course = Course.begun(departure, no_row, begun, rows=max_contacts)
+    # one more, which finds no room
+    course = follow_rounds(partial(_one_flight, seen, until), course, rounds=max_contacts + 1, reverse=reverse)
+    held = course.outcome == MotionOutcome.HELD
     return Simulation(
         start=start,
-        contacts=_contacts(scene, surface, response, LawRow(*jnp.moveaxis(record.rows, -1, 0))),
-        count=record.used,
-        final=_final(seen, response, tip.departure, record.outcome, until),
+        contacts=_contacts(scene, surface, response, LawRow(*course.rows.T)),
+        count=course.contacts,
+        final=_final(seen, response, course.tip, course.outcome, until),
         phase=jnp.where(held, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
-        held=held,
-        outcome=record.outcome,
+        outcome=course.outcome,
     )
 
 
-def _written_down(seen: Scene, until: Array, tip: FollowedTip, impact: NextImpact) -> tuple[FollowedTip, None]:
-    """Return a tip after an impact and the rest that follows it, with its row; as it was where there is none."""
-    departure, flies, (used, rows, outcome_before, flights) = tip
-    rested = or_rest(seen, departure, impact)
-    impact = jax.tree.map(lambda at_start, later: jnp.where(flights == 0, at_start, later), rested, impact)
+def _one_flight(seen: Scene, until: Array, course: Course) -> Course:
+    """Return a tip after a flight, its impact and the rest that follows, with its row; as it was where it has ended."""
+    departure, flies = course.tip, ~course.done
+    impact = impact_after(seen, departure, Search(_FLIGHT_STEPS, until_us=until, from_above=True), flies=flies)
+    impact = where(course.contacts == 0, or_rest(seen, departure, impact), impact)
     ended = impact.outcome
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)
     arrived = flies & landed & (impact.arrival_time_us < until)
     failed = flies & ~landed & (ended != Outcome.NO_FURTHER_IMPACT)
     row, beyond, lost = through_impact(seen, impact, arrived, until)
-    room = used < rows.shape[0]
-    held, full = arrived & (row.kind == ContactKind.HELD), arrived & ~room
+    held = arrived & (row.kind == ContactKind.HELD)
     outcome = jnp.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED)
-    outcome = jnp.where(failed, _failure(ended, flights), outcome)
+    outcome = jnp.where(failed, _failure(ended, course.contacts), outcome)
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
-    outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, outcome)
-    goes_on = arrived & ~held & ~full & ~lost
-    written = arrived & room & ~lost
-    place = jnp.where(written, used, rows.shape[0])
-    record = LawRecord(
-        used=jnp.where(written, used + 1, used),
-        rows=rows.at[place].set(jnp.stack(row), mode="drop"),
-        outcome=jnp.where(flies, outcome, outcome_before).astype(jnp.int32),
-        flights=flights + 1,
-    )
-    departure = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), beyond, departure)
-    return FollowedTip(departure, flies & goes_on, record), None
+    goes_on = arrived & ~held & ~lost
+    return course.after(where(goes_on, beyond, departure), row, arrived & ~lost, outcome, ~goes_on)
 
 
 def or_rest(seen: Scene, departure: Departure, impact: NextImpact) -> NextImpact:
@@ -175,7 +145,7 @@ def or_rest(seen: Scene, departure: Departure, impact: NextImpact) -> NextImpact
     slow = jnp.abs(velocity - speed) <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
     rests = (gap == 0.0) & slow
     captured = NextImpact(time, time, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests)
-    return jax.tree.map(lambda resting, flying: jnp.where(rests, resting, flying), captured, impact)
+    return where(rests, captured, impact)
 
 
 def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, Departure, Array]:
@@ -213,15 +183,15 @@ def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array
         kind=jnp.where(leaves, kind, float(ContactKind.HELD)),
         arrival_us=arrival,
         approach=approach,
-        departure_us=jnp.where(leaves, jnp.where(rests, release.time_us, leaving), jnp.inf),
+        departure_us=jnp.where(rests, release.time_us, leaving),
         rebound=jnp.where(leaves & ~rests, rebound, 0.0),
     )
-    return row, jax.tree.map(lambda new, old: jnp.where(rests, new, old), away, next_flight), arrived & release.lost
+    return row, where(rests, away, next_flight), arrived & release.lost
 
 
-def _failure(ended: Array, flights: Array) -> Array:
-    """Return the outcome of a simulation whose flight failed."""
-    start = jnp.where(flights == 0, MotionOutcome.INVALID_START, MotionOutcome.UNRESOLVED)
+def _failure(ended: Array, contacts: Array) -> Array:
+    """Return the outcome of a simulation whose flight failed after so many contacts."""
+    start = jnp.where(contacts == 0, MotionOutcome.INVALID_START, MotionOutcome.UNRESOLVED)
     other = jnp.where(ended == Outcome.STEP_LIMIT, MotionOutcome.STEP_LIMIT, MotionOutcome.UNRESOLVED)
     return jnp.where(ended == Outcome.INVALID_START, start, other)
 

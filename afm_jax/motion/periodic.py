@@ -14,7 +14,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase, explain_missing_junction, find_junction
 from afm_jax.motion.follow import Run, follow_in_pieces, why_over
 from afm_jax.motion.record import MotionOutcome, Simulation, State
-from afm_jax.motion.trajectory import flights_of, state_at
+from afm_jax.motion.trajectory import DensePath, flights_of
 from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 
 _ORBIT_PIECE = 50.0
@@ -90,14 +90,14 @@ def _orbit_near(scene: Scene, motion: Simulation, run: Run) -> Orbit | None:
     if not flights.begin_us.size:
         return None
     last = np.arange(flights.begin_us.size) >= flights.begin_us.size - _LAST_FLIGHTS
-    state = state_at(scene, motion, flights.middle_of_longest(last))
+    state = DensePath(scene, motion).flying_at(flights.middle_of_longest(last))
     if state is None:
         return None
     period = drive_of(scene).period_us
-    ahead = run(state, (_LONGEST_RESPONSE + 0.5) * period)
+    ahead = DensePath(scene, run(state, (_LONGEST_RESPONSE + 0.5) * period))
     omega = float(scene.cantilever.angular_frequency)
     for periods in range(1, _LONGEST_RESPONSE + 1):
-        after = state_at(scene, ahead, float(state.time_us) + periods * period)
+        after = ahead.flying_at(float(state.time_us) + periods * period)
         if after is not None and _apart(_column(state), _column(after), omega)[0] <= _NEAR:
             orbit = _orbit_of(scene, state, periods, run)
             if orbit is not None:

@@ -122,10 +122,19 @@ class Simulation(Result, eqx.Module):
     final: State
     phase: Int[Array, "..."]
     """What is between tip and sample at the end, a `Phase` (laws: JUNCTION where the platform holds the tip)."""
-    held: Bool[Array, "..."]
-    """Whether the tip is held at the end."""
     outcome: Int[Array, "..."]
     """How the simulation ended, the number of a `MotionOutcome`."""
+
+    @property
+    def held(self) -> Bool[Array, "..."]:
+        """Whether the tip is held at the end."""
+        return self.outcome == MotionOutcome.HELD
+
+    @property
+    def broke_off(self) -> str | None:
+        """Why one simulation was not followed to its end; None where it was."""
+        outcome = MotionOutcome(int(self.outcome))
+        return None if outcome in (MotionOutcome.FINISHED, MotionOutcome.HELD) else outcome.sentence
 
     def _known_rows(self) -> np.ndarray:
         """Return which rows are contacts."""
@@ -134,22 +143,22 @@ class Simulation(Result, eqx.Module):
     def _unknown(self) -> dict[str, np.ndarray]:
         """Return by column which contacts have no value there: one that holds the tip to the end has no departure."""
         held = np.asarray(self.contacts.kind) == ContactKind.HELD
-        names = (
-            "departure_time_us",
-            "departure_position_nm",
-            "departure_velocity_nm_per_us",
-            "rebound_speed_nm_per_us",
-        )
-        unknown = {f"contacts_{name}": held for name in names}
+        unknown = {f"contacts_{name}": held for name in Contacts._fields if name.startswith(("departure_", "rebound_"))}
         if self.contacts.detail is not None:
             dry = np.asarray(self.contacts.detail.junctions) == 0
             unknown |= {f"contacts_detail_junction_{name}_us": dry for name in ("forms", "breaks")}
         return unknown
 
 
-def contacts_left(simulation: Simulation) -> Bool[np.ndarray, " rows"]:
-    """Return which rows of a simulation's contacts are contacts that the tip left."""
-    return np.isin(np.asarray(simulation.contacts.kind), (ContactKind.IMPACT, ContactKind.CHATTER))
+def contacts_of(simulation: Simulation) -> Contacts:
+    """Return the contacts of one simulation, without unused rows, as arrays of NumPy's."""
+    return jax.tree.map(lambda column: np.asarray(column)[: int(simulation.count)], simulation.contacts)
+
+
+def contacts_left(simulation: Simulation) -> Contacts:
+    """Return the contacts of one simulation that the tip left, as arrays of NumPy's."""
+    rows = contacts_of(simulation)
+    return jax.tree.map(lambda column: column[rows.kind != ContactKind.HELD], rows)
 
 
 def with_response(response: Surface | None, state: State, sign: float = 1.0) -> State:
@@ -196,7 +205,7 @@ def contacts_in_lab(
         response: the steady response to drives of base and tip, or None.
         kind: numbers of `ContactKind`.
         arrival: time, gap and gap rate at the beginnings.
-        departure: time, gap and gap rate at the ends; time infinite and zeros where the tip is held.
+        departure: time, gap and gap rate at the ends; anything where the tip is held.
         energy_lost_aj: what each dissipated.
         detail: of resolved contacts.
     """
@@ -212,10 +221,10 @@ def contacts_in_lab(
         arrival_position_nm=jnp.where(used, came.position_nm, 0.0),
         arrival_velocity_nm_per_us=jnp.where(used, came.velocity_nm_per_us, 0.0),
         approach_speed_nm_per_us=jnp.where(used, approach, 0.0),
-        departure_time_us=departure.time_us,
+        departure_time_us=jnp.where(kind == ContactKind.HELD, jnp.inf, departure.time_us),
         departure_position_nm=jnp.where(has_left, went.position_nm, 0.0),
         departure_velocity_nm_per_us=jnp.where(has_left, went.velocity_nm_per_us, 0.0),
-        rebound_speed_nm_per_us=departure.velocity_nm_per_us,
+        rebound_speed_nm_per_us=jnp.where(has_left, departure.velocity_nm_per_us, 0.0),
         energy_lost_aj=energy_lost_aj,
         detail=detail,
     )
