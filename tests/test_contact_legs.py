@@ -12,7 +12,7 @@ from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip
 from afm_jax.contact.junction import Phase, find_junction
-from afm_jax.contact.settings import DRIVEN_SETTINGS, QuickSetting, driven_setting_of
+from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting, driven_setting_of
 from afm_jax.contact.step import TipInContact, advance
 from afm_jax.motion.contact_motion import legs_through
 from afm_jax.scenefile.presets import contact_scene
@@ -37,7 +37,9 @@ SCENE = contact_scene(5.277, 4.0, 0.0)
 def through_contact(driven: Driven, state: ContactState, quick: QuickSetting) -> TipInContact:
     """Return tips after the three legs of their contact; DRY those whose legs all hold."""
     arrives = jnp.ones(state.x.shape, bool)
-    return legs_through(quick, 5.5, driven, TipInContact.arriving(driven, state, arrives), arrives, arrives, jnp.inf)
+    return legs_through(
+        DrivenSetting(quick, 5.5, 1), driven, TipInContact.arriving(driven, state, arrives), arrives, arrives, jnp.inf
+    )
 
 
 def at_threshold(gap_nm, gap_rate, time) -> ContactState:

@@ -15,7 +15,7 @@ All shapes are fixed.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ from afm_jax.contact.bridge_leg import go_in, go_out
 from afm_jax.contact.driven import ContactState, Driven, Leg, driven_by
 from afm_jax.contact.junction import Phase
 from afm_jax.contact.junction_leg import go_through_junction
-from afm_jax.contact.settings import DrivenSetting, QuickSetting
+from afm_jax.contact.settings import DrivenSetting
 from afm_jax.contact.step import TipInContact, advance, inverse_junction_step
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.motion.course import Course, as_vector, follow_rounds, where
@@ -122,17 +122,15 @@ def follow_contacts(  # noqa: PLR0913
         max_rounds: most rounds; None: more than any motion takes, in reverse mode four for every contact.
         reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
     """
+    rounds = max(_HELD_ROUNDS_PER_CONTACT * max_contacts, _LEAST_HELD_ROUNDS)
     if reverse:
         # legs tell by NaN that they do not hold, which reverse derivatives would spread
         setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS, agreement=None)
-    if max_rounds is None and reverse:
-        max_rounds = _ROUNDS_PER_CONTACT * max_contacts + _SPARE_ROUNDS
-    elif max_rounds is None:
-        max_rounds = max(_HELD_ROUNDS_PER_CONTACT * max_contacts, _LEAST_HELD_ROUNDS)
+        rounds = _ROUNDS_PER_CONTACT * max_contacts + _SPARE_ROUNDS
     driven = driven_by(scene.interaction, scene.cantilever, surface)
     course = _at_start(driven, start.time_us, *to_gap(surface, response, start), rows=max_contacts)
     one_round = partial(_round, driven, until, setting, reverse)
-    course = follow_rounds(one_round, course, rounds=max_rounds, reverse=reverse)
+    course = follow_rounds(one_round, course, rounds=max_rounds or rounds, reverse=reverse)
     tip, arrival, _ = course.tip
     row = jax.vmap(as_vector(ContactRow(course.contacts, arrival, tip))[1])(course.rows)
     return Simulation(
@@ -259,7 +257,7 @@ def _through_legs(
     if setting.quick is None:
         return tip
     one_pass = repeat_for(
-        partial(legs_through, setting.quick, setting.fineness),
+        partial(legs_through, setting),
         lambda driven, tip, arrives, active, _: arrives | (active & at_junction(driven, tip)),
         changed=1,
         passes=1,
@@ -269,25 +267,19 @@ def _through_legs(
 
 
 def legs_through(
-    quick: QuickSetting,
-    fineness: float,
-    driven: Driven,
-    tip: TipInContact,
-    arrives: Array,
-    active: Array,
-    until_us: ArrayLike,
+    setting: DrivenSetting, driven: Driven, tip: TipInContact, arrives: Array, active: Array, until_us: ArrayLike
 ) -> TipInContact:
     """Return a tip as far on its way through the contact as legs hold that end before a time.
 
     Args:
-        quick: how finely.
-        fineness: of the steps in time that a tip takes where a leg does not hold.
+        setting: how finely; with a `quick` one.
         driven: the equation of motion.
         tip: the tip.
         arrives: whether it has just begun the contact.
         active: whether it moves.
         until_us: the time.
     """
+    quick: Any = setting.quick
 
     def takes(leg, wanted):
         return wanted & leg.holds & (leg.state.time_us < until_us)
@@ -306,7 +298,7 @@ def legs_through(
     breaks = takes(solid, waits & goes_out)
     # one for which the leg does not hold is told how far to go in time, and waits no longer
     at_forming = lax.stop_gradient(tip.state._replace(x=driven.junction.forms_root))
-    first_step = lax.stop_gradient(1.0 / (fineness * inverse_junction_step(driven, at_forming)))
+    first_step = lax.stop_gradient(1.0 / (setting.fineness * inverse_junction_step(driven, at_forming)))
     tip = tip._replace(trial_length=jnp.where(waits & ~breaks, first_step, tip.trial_length))
     in_junction = tip.time_in_junction_us + solid.state.time_us - tip.state.time_us
     tip = _at_end_of(solid, tip, breaks, Phase.BRIDGE)

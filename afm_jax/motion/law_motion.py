@@ -30,7 +30,6 @@ from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.motion.course import Course, follow_rounds, where
 from afm_jax.motion.record import (
     ContactKind,
-    Contacts,
     MotionOutcome,
     Simulation,
     State,
@@ -108,13 +107,15 @@ def follow_law(
     course = Course.begun(departure, no_row, begun, rows=max_contacts)
     # one more, which finds no room
     course = follow_rounds(partial(_one_flight, seen, until), course, rounds=max_contacts + 1, reverse=reverse)
-    held = course.outcome == MotionOutcome.HELD
+    row, no_gap = LawRow(*course.rows.T), jnp.zeros(max_contacts)
+    arrival, departure = State(row.arrival_us, no_gap, -row.approach), State(row.departure_us, no_gap, row.rebound)
+    lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
     return Simulation(
         start=start,
-        contacts=_contacts(scene, surface, response, LawRow(*course.rows.T)),
+        contacts=contacts_in_lab(surface, response, row.kind, arrival, departure, lost),
         count=course.contacts,
         final=_final(seen, response, course.tip, course.outcome, until),
-        phase=jnp.where(held, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
+        phase=jnp.where(course.outcome == MotionOutcome.HELD, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
         outcome=course.outcome,
     )
 
@@ -131,7 +132,9 @@ def _one_flight(seen: Scene, until: Array, course: Course) -> Course:
     row, beyond, lost = through_impact(seen, impact, arrived, until)
     held = arrived & (row.kind == ContactKind.HELD)
     outcome = jnp.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED)
-    outcome = jnp.where(failed, _failure(ended, course.contacts), outcome)
+    known = [ended == Outcome.STEP_LIMIT, (ended == Outcome.INVALID_START) & (course.contacts == 0)]
+    failure = jnp.select(known, [MotionOutcome.STEP_LIMIT, MotionOutcome.INVALID_START], MotionOutcome.UNRESOLVED)
+    outcome = jnp.where(failed, failure, outcome)
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
     goes_on = arrived & ~held & ~lost
     return course.after(where(goes_on, beyond, departure), row, arrived & ~lost, outcome, ~goes_on)
@@ -139,11 +142,9 @@ def _one_flight(seen: Scene, until: Array, course: Course) -> Course:
 
 def or_rest(seen: Scene, departure: Departure, impact: NextImpact) -> NextImpact:
     """Return the capture that a tip at rest on the surface at its start has had, or the impact that was found."""
-    surface = seen.platform
     time, gap, velocity = departure
-    speed = surface.velocity(time)
-    slow = jnp.abs(velocity - speed) <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
-    rests = (gap == 0.0) & slow
+    speed, fastest = seen.platform.velocity(time), Bed(seen.cantilever, seen.platform).fastest
+    rests = (gap == 0.0) & (jnp.abs(velocity - speed) <= _ON_SURFACE_NM * fastest)
     captured = NextImpact(time, time, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests)
     return where(rests, captured, impact)
 
@@ -164,36 +165,26 @@ def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array
     before = jnp.where(arrived, impact.velocity_before_nm_per_us, 0.0)
     approach = jnp.where(arrived, bed.surface.velocity(arrival) - before, 1.0)
     captured = arrived & (impact.outcome == Outcome.CAPTURED)
-    rebound = law.rebound_speed(approach)
-    if law.lasts:
-        departs = arrived & ~captured
-        time, after = (jnp.where(departs, part, 0.0) for part in (impact.time_us, impact.velocity_after_nm_per_us))
-        rebound = jnp.where(departs, after - bed.surface.velocity(time), 0.0)
+    leaving = jnp.where(arrived, impact.time_us, until)
+    after = jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0)
+    rebound = jnp.where(arrived & ~captured, after - bed.surface.velocity(leaving), 0.0)
     chatters, lasts = chatter(bed, law, arrival, rebound)
     chatters = chatters & arrived & ~captured
     rests = captured | chatters
     resting = jnp.minimum(arrival + jnp.where(chatters, lasts, 0.0), until)
-    release = first_release(bed, jnp.where(rests & ~law.adheres, resting, until), until)
-    away = Departure(*take_off(bed, release.time_us, until))
-    leaving = jnp.where(arrived, impact.time_us, until)
-    next_flight = Departure(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))
-    leaves = jnp.where(rests, release.happens, leaving < until)
+    is_let_go, release_us, lost = first_release(bed, jnp.where(rests & ~law.adheres, resting, until), until)
+    away = Departure(*take_off(bed, release_us, until))
+    next_flight = Departure(leaving, jnp.zeros_like(leaving), after)
+    leaves = jnp.where(rests, is_let_go, leaving < until)
     kind = jnp.where(chatters, float(ContactKind.CHATTER), float(ContactKind.IMPACT))
     row = LawRow(
         kind=jnp.where(leaves, kind, float(ContactKind.HELD)),
         arrival_us=arrival,
         approach=approach,
-        departure_us=jnp.where(rests, release.time_us, leaving),
-        rebound=jnp.where(leaves & ~rests, rebound, 0.0),
+        departure_us=jnp.where(rests, release_us, leaving),
+        rebound=jnp.where(rests, 0.0, rebound),
     )
-    return row, where(rests, away, next_flight), arrived & release.lost
-
-
-def _failure(ended: Array, contacts: Array) -> Array:
-    """Return the outcome of a simulation whose flight failed after so many contacts."""
-    start = jnp.where(contacts == 0, MotionOutcome.INVALID_START, MotionOutcome.UNRESOLVED)
-    other = jnp.where(ended == Outcome.STEP_LIMIT, MotionOutcome.STEP_LIMIT, MotionOutcome.UNRESOLVED)
-    return jnp.where(ended == Outcome.INVALID_START, start, other)
+    return row, where(rests, away, next_flight), arrived & lost
 
 
 def _final(seen: Scene, response: Surface | None, departure: Departure, outcome: Array, until: Array) -> State:
@@ -205,15 +196,6 @@ def _final(seen: Scene, response: Surface | None, departure: Departure, outcome:
     position, velocity = seen.cantilever.propagator(time - departure.time_us)(height, departure.velocity_nm_per_us)
     gap, rate = to_gap(surface, None, State(time, position, velocity))
     return to_lab(surface, response, time, jnp.where(held, 0.0, gap), jnp.where(held, 0.0, rate))
-
-
-def _contacts(scene: Scene, surface: Platform | Surface, response: Surface | None, row: LawRow) -> Contacts:
-    """Return the rows as contacts in the lab."""
-    zero = jnp.zeros_like(row.approach)
-    arrival = State(row.arrival_us, zero, -row.approach)
-    departure = State(row.departure_us, zero, row.rebound)
-    lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
-    return contacts_in_lab(surface, response, row.kind, arrival, departure, lost)
 
 
 class Bed(NamedTuple):
@@ -245,30 +227,19 @@ class Bed(NamedTuple):
         return jax.jvp(self.push, (time_us,), (jnp.ones_like(time_us),))
 
     def time_pressed(self, time_us: Float[Array, ""]) -> Float[Array, ""]:
-        """Return for how long after a time in us the push stays positive, whatever the phase of the waves."""
+        """Return infinity where the push stays positive after a time in us, whatever the phase of the waves, else 0."""
         surface, decay, square = self.surface, self.cantilever.decay_rate, self.cantilever.angular_frequency**2
         rate, reach = surface.offset_rate_nm_per_us, surface.reach_nm
         waves = surface.largest_acceleration_nm_per_us2 + (
             2.0 * decay * surface.fastest_angular_frequency * reach + square * reach
         )
         least = square * (surface.offset_nm + rate * time_us) + 2.0 * decay * rate - waves
-        sinks = rate < 0.0
-        lasts = jnp.where(sinks, least / jnp.where(sinks, -square * rate, 1.0), jnp.inf)
-        return jnp.where(least >= 0.0, lasts, 0.0)
+        return jnp.where((least >= 0.0) & (rate >= 0.0), jnp.inf, 0.0)
 
 
-class Release(NamedTuple):
-    """When the surface lets a resting tip go."""
-
-    happens: Bool[Array, ""]
-    """Whether it does before the end of the search."""
-    time_us: Float[Array, ""]
-    """When; the end of the search where it does not."""
-    lost: Bool[Array, ""]
-    """The search gave up."""
-
-
-def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""]) -> Release:
+def first_release(
+    bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""]
+) -> tuple[Bool[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Return when a tip that rests from a time on is let go: the first time at which the push turns negative.
 
     The search cannot miss it: with the push n >= 0, its slope n' and |n''| <= M, the push stays positive for
@@ -280,7 +251,8 @@ def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""
         until_us: end of the search.
 
     Returns:
-        The release, its time with implicit derivatives. A tip that is lifted from the beginning is let go at once.
+        Whether the surface lets the tip go before the end of the search; when, with implicit derivatives, else that
+        end; whether the search gave up. A tip that is lifted from the beginning is let go at once.
     """
     still, begin, until = lax.stop_gradient((bed, from_us, until_us))
     resolution = 4.0 * jnp.finfo(begin.dtype).eps
@@ -303,9 +275,9 @@ def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""
     time, lifted, steps = lax.while_loop(searching, advance, (begin, none, jnp.zeros_like(begin, dtype=jnp.int32)))
     happens = lifted & (time < until)
     at_once = still.push(begin) < -bend * shortest**2
-    root = implicit_root(_push_at, jnp.where(happens, time, until), bed)
+    root = implicit_root(lambda time, bed: bed.push(time), jnp.where(happens, time, until), bed)
     when = jnp.where(happens, jnp.where(at_once, from_us, root), until_us)
-    return Release(happens, when, ~lifted & (time < until) & (steps >= _MAX_STEPS))
+    return happens, when, ~lifted & (time < until) & (steps >= _MAX_STEPS)
 
 
 def take_off(
@@ -352,11 +324,5 @@ def chatter(
     converges = (push > 0.0) & (loss > 0.0) & ~law.adheres
     lasts = 2.0 * rebound / jnp.where(converges, push * loss, 1.0)
     change = lasts * jnp.maximum(bed.fastest * push, jnp.abs(rate))
-    short = converges & (change < CONSTANT_PUSH * push)
-    if law.delay is not None:
-        short = jnp.zeros_like(short)
+    short = converges & (change < CONSTANT_PUSH * push) & (law.delay is None)
     return short, jnp.where(short, lasts, 0.0)
-
-
-def _push_at(time_us: Float[Array, ""], bed: Bed) -> Float[Array, ""]:
-    return bed.push(time_us)

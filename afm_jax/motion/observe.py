@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
@@ -32,7 +32,6 @@ from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import FlightEnds, highest_of_flight
 from afm_jax.motion.record import (
     ContactKind,
-    Contacts,
     Simulation,
     State,
     contacts_left,
@@ -85,9 +84,8 @@ class Observable(NamedTuple):
         return value if value is None or self.of_a_part or motion.responses else math.nan
 
 
-def _row(meaning: str, read: Callable[["MotionWindow"], float | None], absent: str = "", **options: bool) -> Any:
-    """Return a row of the table: an `Observable` in the place of its number."""
-    return Observable(meaning, read, absent, **options)
+_row: Any = Observable
+"""Makes a row of the table: an `Observable` in the place of its number."""
 
 
 def _of_deflection(meaning: str, read: Callable[["Signal"], float], **options: bool) -> Any:
@@ -219,7 +217,13 @@ def observe(
     window = window_of(scene, simulation, verdict)
     dense = DensePath(scene, simulation) if dense is None else dense
     motion = MotionWindow(dense, window.from_us, window.to_us, window.periods, window.responses)
-    motion.check_covered()
+    covered = float(np.sum(motion.nodes[1]))
+    # integrals over part of the window would be wrong in silence
+    if not abs(covered - motion.span_us) <= _COVERED * motion.span_us:
+        raise RuntimeError(
+            f"the dense trajectory covers {covered:.6g} of the {motion.span_us:.6g} us of the window: integrated "
+            "once more, a contact ended otherwise than in the simulation, which is not to be trusted there"
+        )
     frequency = drive_of(scene).angular_frequency / RAD_PER_US_PER_KHZ
     height, deflection = motion.height, motion.deflection
     values: dict[str, Any] = {name: observable.of(motion) for name, observable in OBSERVABLES.items()}
@@ -293,28 +297,10 @@ class MotionWindow:
         """Return the integral over time, in us, of a quantity given at the nodes."""
         return float(np.sum(self.nodes[1] * rates))
 
-    def check_covered(self) -> None:
-        """Check that the nodes cover the window: integrals over part of it would be wrong in silence.
-
-        Raises:
-            RuntimeError: if they do not.
-        """
-        covered = float(np.sum(self.nodes[1]))
-        if not abs(covered - self.span_us) <= _COVERED * self.span_us:
-            raise RuntimeError(
-                f"the dense trajectory covers {covered:.6g} of the {self.span_us:.6g} us of the window: integrated "
-                "once more, a contact ended otherwise than in the simulation, which is not to be trusted there"
-            )
-
-    @cached_property
-    def rows(self) -> Contacts:
-        """All contacts of the simulation, as arrays of NumPy's."""
-        return contacts_of(self.dense.simulation)
-
     @cached_property
     def begun(self) -> Bool[np.ndarray, " rows"]:
         """Which contacts begin in the window."""
-        arrival = np.asarray(self.rows.arrival_time_us)
+        arrival = np.asarray(self.dense.contacts.arrival_time_us)
         return (arrival >= self.from_us) & (arrival < self.to_us)
 
     @property
@@ -325,9 +311,9 @@ class MotionWindow:
     @property
     def in_contact_us(self) -> float:
         """Time in contact; impacts of a law take none, but for rests on the sample."""
-        lasting = self.rows.kind > (ContactKind.NONE if self._resolved else ContactKind.IMPACT)
-        begin = np.maximum(self.rows.arrival_time_us, self.from_us)
-        end = np.minimum(self.rows.departure_time_us, self.to_us)
+        lasting = self.dense.contacts.kind > (ContactKind.NONE if self._resolved else ContactKind.IMPACT)
+        begin = np.maximum(self.dense.contacts.arrival_time_us, self.from_us)
+        end = np.minimum(self.dense.contacts.departure_time_us, self.to_us)
         return float(np.sum(np.maximum(end - begin, 0.0)[lasting]))
 
     @property
@@ -352,19 +338,33 @@ class MotionWindow:
             return None
         return within_turn(float(drive.phase_deg) - (self.deflection or self.height).at_drive.phase_deg, 360.0)
 
+    def largest(self, quantity: Callable[[Trajectory], np.ndarray]) -> float:
+        """Return the largest value of a quantity of trajectories in the window.
+
+        It is evaluated at the nodes, then on ever finer grids around its highest local maxima: at the nodes one may be
+        the highest that is not.
+        """
+        times, largest = np.unique([*self.nodes[0], self.from_us, self.to_us]), -np.inf
+        for _ in range(_REFINEMENTS + 1):
+            values = quantity(self.dense.at(times))
+            largest = max(largest, float(values.max()))
+            framed = np.concatenate([[-np.inf], values, [-np.inf]])
+            tops = np.flatnonzero((values >= framed[:-2]) & (values >= framed[2:]))
+            tops = tops[np.argsort(values[tops])[-_TOPS:]]
+            around = times[np.maximum(tops - 1, 0)], times[np.minimum(tops + 1, len(times) - 1)]
+            times = np.unique(np.linspace(*around, _REFINED))
+        return largest
+
     def largest_force_nn(self, sign: float) -> float | None:
         """Return the largest repulsive force in nN, with a sign of -1 the most attractive; None without resolution."""
-        if not self._resolved:
-            return None
-        ends = self.from_us, self.to_us
-        return sign * max(largest_along(self.dense, lambda path: sign * path.force_nn, self.nodes[0], ends), 0.0)
+        return sign * max(self.largest(lambda path: sign * path.force_nn), 0.0) if self._resolved else None
 
     @property
     def virial_aj(self) -> float:
         """1/T int F z dt in aJ; an impact of a law counts m (V' - V) z, z halfway where it has a delay."""
         if self.scene.interaction is None or self._resolved:
             return self.integral(self.path.force_nn * self.path.position_nm) / self.span_us
-        rows, impacts = self.rows, self.begun & (self.rows.kind == ContactKind.IMPACT)
+        rows, impacts = self.dense.contacts, self.begun & (self.dense.contacts.kind == ContactKind.IMPACT)
         kick = (rows.departure_velocity_nm_per_us - rows.arrival_velocity_nm_per_us)[impacts]
         height = 0.5 * (rows.departure_position_nm + rows.arrival_position_nm)[impacts]
         return float(self.scene.cantilever.mass_ng) * float(np.sum(kick * height)) / self.span_us
@@ -385,11 +385,11 @@ class MotionWindow:
         air = 2.0 * float(cantilever.decay_rate) * mass * self.integral(v * v)
         energy = 0.5 * mass * ends.velocity_nm_per_us**2 + 0.5 * stiffness * ends.position_nm**2
         stored = float(energy[1] - energy[0])
-        contact = float(np.sum(self.rows.energy_lost_aj[self.begun]))
+        contact = float(np.sum(self.dense.contacts.energy_lost_aj[self.begun]))
         if isinstance(scene.interaction, Law):
             return EnergyBalance(air + contact + stored, air, contact, stored, None)
         # a contact that the window cuts has lost what its ledger does not tell yet
-        if np.any(self.rows.kind[self.begun] == ContactKind.HELD) or np.any(ends.phase):
+        if np.any(self.dense.contacts.kind[self.begun] == ContactKind.HELD) or np.any(ends.phase):
             contact = -self.integral(path.force_nn * path.gap_rate_nm_per_us)
         # D' = z' - z_p', whatever else drives the tip
         given = self.integral(path.force_nn * (v - path.gap_rate_nm_per_us))
@@ -423,8 +423,7 @@ class Signal:
     @property
     def largest(self) -> float:
         """Largest value in nm."""
-        motion = self.motion
-        return largest_along(motion.dense, self.along, motion.nodes[0], (motion.from_us, motion.to_us))
+        return self.motion.largest(self.along)
 
     @property
     def mean(self) -> float:
@@ -489,66 +488,26 @@ def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> comp
         motion: of any scene; only a law with a delay has something to add.
         angular_frequency: nu in rad/us.
     """
-    law, rows = motion.scene.interaction, motion.rows
+    law, rows = motion.scene.interaction, motion.dense.contacts
     if not isinstance(law, Law) or law.delay is None:
         return 0j
     arrival, departure = rows.arrival_time_us, rows.departure_time_us
     middle = 0.5 * (arrival + departure)
     inside = (rows.kind == ContactKind.IMPACT) & (middle >= motion.from_us) & (middle < motion.to_us)
     impacts = np.flatnonzero(inside)
-    depth = 0.0
+    cantilever, (surface, response), depth = motion.scene.cantilever, surface_of(motion.scene), 0.0
     if law.lasts:
-        cantilever, (surface, _) = motion.scene.cantilever, surface_of(motion.scene)
         at_middle = middle_of_contact(cantilever, surface, jnp.asarray(middle[impacts]))
         approach = jnp.asarray(rows.approach_speed_nm_per_us)[impacts]
         depth = np.asarray(depth_of_impact(law, approach, at_middle, cantilever, angular_frequency))
     total = -np.sum(depth * np.exp(-1j * angular_frequency * middle[impacts]))
-    early = impacts[departure[impacts] < arrival[impacts]]
-    return complex(total) + (_integral_of_overlaps(motion, early, angular_frequency) if early.size else 0j)
-
-
-def _integral_of_overlaps(
-    motion: MotionWindow, early: Int[np.ndarray, " impacts"], angular_frequency: float
-) -> complex:
-    """Return int gap exp(-i nu t) dt of flights from their beginning to the end of the flight before, in nm us."""
-    rows, (surface, response) = motion.rows, surface_of(motion.scene)
-    columns = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
-    departure = State(*(jnp.asarray(column)[early] for column in columns))
-    half = 0.5 * (rows.arrival_time_us[early] - rows.departure_time_us[early])[:, None]
-    times = rows.departure_time_us[early][:, None] + half * (_NODES + 1.0)
-    origin, start = departure.time_us[:, None], (part[:, None] for part in to_gap(surface, response, departure))
-    gaps, _ = fly(motion.scene.cantilever, surface, *start, origin, jnp.asarray(times))
-    return complex(np.sum(half * _WEIGHTS * gaps * np.exp(-1j * angular_frequency * times)))
-
-
-def largest_along(
-    dense: DensePath,
-    quantity: Callable[[Trajectory], np.ndarray],
-    times_us: Float[np.ndarray, " times"],
-    ends_us: tuple[float, float],
-) -> float:
-    """Return the largest value of a quantity of trajectories between two times.
-
-    The quantity is evaluated at the given times, then on ever finer grids around its highest local maxima: at those
-    times one may be the highest that is not.
-
-    Args:
-        dense: the tip between the two times.
-        quantity: of a trajectory, an array of its times' shape.
-        times_us: times to begin with.
-        ends_us: the two times.
-    """
-    times = np.unique(np.concatenate([times_us, ends_us]))
-    largest = -np.inf
-    for _ in range(_REFINEMENTS + 1):
-        values = quantity(dense.at(times))
-        largest = max(largest, float(values.max()))
-        framed = np.concatenate([[-np.inf], values, [-np.inf]])
-        tops = np.flatnonzero((values >= framed[:-2]) & (values >= framed[2:]))
-        tops = tops[np.argsort(values[tops])[-_TOPS:]]
-        around = times[np.maximum(tops - 1, 0)], times[np.minimum(tops + 1, len(times) - 1)]
-        times = np.unique(np.linspace(*around, _REFINED))
-    return largest
+    # flights from their beginning to the end of the flight before
+    early = impacts[departure[impacts] < arrival[impacts], None]
+    start = State(departure[early], rows.departure_position_nm[early], rows.departure_velocity_nm_per_us[early])
+    half = 0.5 * (arrival[early] - departure[early])
+    times = departure[early] + half * (_NODES + 1.0)
+    gaps, _ = fly(cantilever, surface, *to_gap(surface, response, start), start.time_us, times)
+    return complex(total + np.sum(half * _WEIGHTS * gaps * np.exp(-1j * angular_frequency * times)))
 
 
 def peaks_of_flights(scene: Scene, start: State, end_us: ArrayLike) -> Float[np.ndarray, " flights"]:
@@ -581,8 +540,8 @@ def peaks_between_contacts(scene: Scene, simulation: Simulation) -> Float[np.nda
     return peaks_of_flights(scene, State(*(column[:-1] for column in starts)), rows.arrival_time_us[1:])
 
 
-def poincare_section(scene: Scene, simulation: Simulation) -> tuple[Float[np.ndarray, " contacts"], Contacts]:
-    """Return the paper's Poincare section: the drive's phase in degrees at every departure, and the contacts before.
+def poincare_section(scene: Scene, simulation: Simulation) -> tuple[Float[np.ndarray, " contacts"], Any]:
+    """Return the paper's Poincare section: the drive's phase in degrees at every departure, and the `Contacts` before.
 
     Args:
         scene: the scene that was simulated.

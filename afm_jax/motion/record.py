@@ -5,7 +5,7 @@ surface that the free tip sees (`surface_of`), `contacts_in_lab` does so for con
 """
 
 import enum
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -150,13 +150,13 @@ class Simulation(Result, eqx.Module):
         return unknown
 
 
-def contacts_of(simulation: Simulation) -> Contacts:
-    """Return the contacts of one simulation, without unused rows, as arrays of NumPy's."""
+def contacts_of(simulation: Simulation) -> Any:
+    """Return the `Contacts` of one simulation without unused rows, as arrays of NumPy's."""
     return jax.tree.map(lambda column: np.asarray(column)[: int(simulation.count)], simulation.contacts)
 
 
-def contacts_left(simulation: Simulation) -> Contacts:
-    """Return the contacts of one simulation that the tip left, as arrays of NumPy's."""
+def contacts_left(simulation: Simulation) -> Any:
+    """Return the `Contacts` of one simulation that the tip left, as arrays of NumPy's."""
     rows = contacts_of(simulation)
     return jax.tree.map(lambda column: column[rows.kind != ContactKind.HELD], rows)
 

@@ -226,7 +226,8 @@ def window_of(scene: Scene, simulation: Simulation, verdict: Settled) -> Window:
     periods = verdict.periods or _likely_order(simulation, drive.period_us, stuck=verdict.stuck)
     response = periods * drive.period_us
     if verdict.settled and not verdict.stuck and last - first >= response:
-        end = last if verdict.contacts == 0 else _middle_of_a_flight(scene, simulation, response)
+        flights = flights_of(scene, simulation)
+        end = last if verdict.contacts == 0 else flights.where(flights.end_us > last - response).middle_of_longest()
         return Window(max(end - response, first), end, periods, 1)
     return last_fifth(first, last, drive, periods)
 
@@ -255,9 +256,3 @@ def _likely_order(simulation: Simulation, period_us: float, *, stuck: bool) -> i
     if stuck or len(some) < 2:
         return 1
     return max(1, round(float(some[-1] - some[0]) / (len(some) - 1) / period_us))
-
-
-def _middle_of_a_flight(scene: Scene, simulation: Simulation, response_us: float) -> float:
-    """Return the middle of the longest flight that ends in the last response period."""
-    flights = flights_of(scene, simulation)
-    return flights.middle_of_longest(flights.end_us > float(simulation.final.time_us) - response_us)

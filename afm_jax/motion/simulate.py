@@ -125,7 +125,7 @@ def _follow_free(cantilever: Cantilever, response: Surface | None, start: State,
     none, count = jnp.zeros((0,), until.dtype), jnp.zeros((), jnp.int32)
     sane = jnp.isfinite(final.position_nm) & jnp.isfinite(final.velocity_nm_per_us)
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START).astype(jnp.int32)
-    contacts = Contacts(none.astype(jnp.int32), *[none] * 9)
+    contacts = Contacts(none.astype(jnp.int32), *[none] * 9, detail=None)
     return Simulation(start, contacts, count, final, jnp.full_like(count, Phase.DRY), outcome)
 
 

@@ -74,8 +74,8 @@ class Pieces(NamedTuple):
     rate: np.ndarray
     """Gap rate in nm/us; of a whole contact the velocity in the lab."""
 
-    def where(self, mask: np.ndarray) -> "Pieces":
-        """Return some of the pieces, chosen by a mask or by their places."""
+    def where(self, mask: Any) -> "Pieces":
+        """Return some of the pieces, chosen by a mask, by their places or as a slice."""
         return Pieces(*(column[mask] for column in self))
 
     def joined_by(self, others: "Pieces") -> "Pieces":
@@ -83,9 +83,9 @@ class Pieces(NamedTuple):
         whole = Pieces(*map(np.concatenate, zip(self, others, strict=True)))
         return whole.where(np.argsort(whole.begin_us, kind="stable"))
 
-    def middle_of_longest(self, among: np.ndarray) -> float:
-        """Return the middle in us of the longest flight among some; there must be one."""
-        longest = int(np.argmax(np.where(among, self.end_us - self.begin_us, -np.inf)))
+    def middle_of_longest(self) -> float:
+        """Return the middle in us of the longest piece; there must be one."""
+        longest = int(np.argmax(self.end_us - self.begin_us))
         return 0.5 * float(self.begin_us[longest] + self.end_us[longest])
 
 
@@ -106,6 +106,7 @@ class DensePath:
         # the equation of motion of a resolved contact
         self.driven: Any = None
         kind, rows = REST, contacts_of(simulation)
+        self.contacts = rows
         if isinstance(scene.interaction, Contact):
             self.driven, kind = driven_by(scene.interaction, scene.cantilever, self.surface), CONTACT
         begin, end = rows.arrival_time_us, np.minimum(rows.departure_time_us, self.end_us)
@@ -159,7 +160,7 @@ class DensePath:
         touching = piece.kind >= 0
         if touching.any():
             inside = Pieces(*(_filled_up(column[touching]) for column in piece))
-            start = ContactState(inside.x, inside.rate, inside.origin_us, np.zeros_like(inside.x))
+            start = ContactState(*map(jnp.asarray, (inside.x, inside.rate, inside.origin_us, 0.0 * inside.x)))
             states = _states_at(self.driven, start, inside.kind, _filled_up(times[touching]))
             gap[touching], rate[touching] = (np.asarray(part)[: int(touching.sum())] for part in states)
         phase = np.select([piece.kind == kind for kind in _PHASES], list(_PHASES.values()), piece.kind)
@@ -282,7 +283,7 @@ def _states_at(
         return eighth_order_step(lambda place: driven.rates(place, solid), start, length)
 
     # in the junction the variable is fictitious time: its value at a time is a root
-    rate = driven.rates(start, solid).time_us
+    rates = driven.rates(start, solid)
 
     def newton(_, length):
         end = stepped(length)
@@ -291,13 +292,10 @@ def _states_at(
         return length + (time_us - end.time_us) / jnp.where(passing == 0.0, 1.0, passing)
 
     elapsed = time_us - start.time_us
-    first = elapsed / jnp.where(solid, jnp.maximum(rate, 1e-3), 1.0)
-    if driven.solid.reversible:
-        # time stands still where a dry contact begins, and grows with the square of the variable
-        s_rate = driven.rates(start, solid).x
-        _, growth = jax.jvp(driven.solid.depth_slope, (start.x,), (s_rate,))
-        root = jnp.sqrt(jnp.maximum(rate * rate + 2.0 * growth * elapsed, 0.0))
-        first = jnp.where(solid, 2.0 * elapsed / jnp.maximum(rate + root, 1e-9), first)
+    # time stands still where a dry contact begins, and grows with the square of the variable
+    _, growth = jax.jvp(driven.solid.depth_slope, (start.x,), (rates.x,))
+    root = jnp.sqrt(jnp.maximum(rates.time_us**2 + 2.0 * growth * elapsed, 0.0))
+    first = jnp.where(solid, 2.0 * elapsed / jnp.maximum(rates.time_us + root, 1e-9), elapsed)
     length = lax.fori_loop(0, _NEWTON_STEPS, newton, first)
     end = stepped(length)
     return driven.gap(end.x, phase), end.gap_rate

@@ -12,7 +12,7 @@ from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.motion.observe import peaks_between_contacts, poincare_section
-from afm_jax.motion.record import Contacts, Simulation, contacts_of
+from afm_jax.motion.record import Simulation, contacts_of
 from afm_jax.motion.settle import Settled, is_stuck, settled, slower_period_us, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory
 from afm_jax.plots.picture_style import (
@@ -83,9 +83,9 @@ def draw_motion(
     """
     look = look_at(scene, simulation, verdict=verdict, dense=dense)
     figures = {"time_course": course_figure, "spectrum": spectrum_figure}
-    if np.isfinite(look.contacts.departure_time_us).any():
+    if np.isfinite(look.dense.contacts.departure_time_us).any():
         figures |= {"poincare": section_figure}
-    if look.contacts.kind.size and isinstance(scene.interaction, Contact):
+    if look.dense.contacts.kind.size and isinstance(scene.interaction, Contact):
         figures |= {"force_gap": force_gap_figure}
     files = []
     for name, figure in figures.items():
@@ -127,8 +127,6 @@ class Look(NamedTuple):
 
     dense: DensePath
     """The tip at any time."""
-    contacts: Contacts
-    """All of the simulation."""
     drive: DrivePeriod
     responses: Responses
     """What the spectrum is made of."""
@@ -165,7 +163,7 @@ def look_at(
     begin, end = _course_shown(scene, simulation)
     verdict = settled(scene, simulation) if verdict is None else verdict
     dense = DensePath(scene, simulation) if dense is None else dense
-    rows, times = contacts_of(simulation), np.linspace(begin, end, _POINTS)
+    rows, times = dense.contacts, np.linspace(begin, end, _POINTS)
     if rows.kind.size:
         # where the phase of contact changes the force jumps, and the velocity of a law
         jumps = [rows.arrival_time_us, rows.departure_time_us]
@@ -175,7 +173,7 @@ def look_at(
         edges = edges[(edges > begin + _BESIDE_US) & (edges < end - _BESIDE_US)]
         times = np.unique([*times, *dense.nodes(begin, end)[0], *edges - _BESIDE_US, *edges, *edges + _BESIDE_US])
     responses = _responses_shown(scene, simulation, verdict, end)
-    return Look(dense, rows, drive_of(scene), responses, begin, end, dense.at(times))
+    return Look(dense, drive_of(scene), responses, begin, end, dense.at(times))
 
 
 def _course_shown(scene: Scene, simulation: Simulation) -> tuple[float, float]:
@@ -207,7 +205,7 @@ def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
 
 def course_figure(look: Look) -> Figure:
     """Return the time course, of many contacts with the peaks of the whole motion below."""
-    overview = len(look.contacts.kind) >= _MANY
+    overview = len(look.dense.contacts.kind) >= _MANY
     picture = new_figure(9.0, 7.0 if overview else 4.6)
     axes = picture.subplots(1 + overview, 1, squeeze=False)[:, 0]
     _course(axes[0], look)
@@ -229,7 +227,7 @@ def _course(axes: Axes, look: Look) -> None:
     with_zero_line(axes)
     axes.set_xlim(look.from_us, look.to_us)
     _with_legend_above(axes, x="time (µs)", y="height (nm)")
-    count = len(look.contacts.kind)
+    count = len(look.dense.contacts.kind)
     what = f"The last contacts of {count}" if count else "Last periods"
     if is_stuck(look.scene, look.dense.simulation):
         what += ", the sample holds the tip"
@@ -247,7 +245,7 @@ def _with_legend_above(axes: Axes, *, x: str, y: str) -> None:
 def _peaks(axes: Axes, look: Look) -> None:
     """Draw the peak after each contact over the whole motion, and mark the stretch above."""
     peaks = peaks_between_contacts(look.scene, look.dense.simulation)
-    axes.plot(look.contacts.arrival_time_us[:-1], peaks, ".", color=BLUE, markersize=4.0)
+    axes.plot(look.dense.contacts.arrival_time_us[:-1], peaks, ".", color=BLUE, markersize=4.0)
     axes.axvspan(look.from_us, look.to_us, color=GRID, alpha=0.4, linewidth=0, label="shown above")
     with_zero_line(axes)
     what = "contact" if isinstance(look.scene.interaction, Contact) else "impact"
@@ -256,8 +254,8 @@ def _peaks(axes: Axes, look: Look) -> None:
 
 def _around(look: Look, row: int) -> tuple[float, float]:
     """Return the times between which a contact is shown: from and to a gap of a few nm."""
-    arrival, departure = look.contacts.arrival_time_us[row], look.contacts.departure_time_us[row]
-    approach = max(float(look.contacts.approach_speed_nm_per_us[row]), 1.0)
+    arrival, departure = look.dense.contacts.arrival_time_us[row], look.dense.contacts.departure_time_us[row]
+    approach = max(float(look.dense.contacts.approach_speed_nm_per_us[row]), 1.0)
     lead = 0.4 * min(_GAP_SHOWN_NM / approach, 0.25 * look.drive.period_us)
     end = departure if np.isfinite(departure) else arrival + look.drive.period_us
     return min(arrival, end) - lead, max(arrival, end) + lead
@@ -267,11 +265,11 @@ def force_gap_figure(look: Look) -> Figure:
     """Return the force against the gap through the last contacts: all of it, and the attractive part."""
     picture = new_figure(12.0, 5.0)
     whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
-    rows = np.arange(len(look.contacts.kind))[-_CURVES:]
+    rows = np.arange(len(look.dense.contacts.kind))[-_CURVES:]
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
         path_of_row = look.between(*_around(look, int(row)))
-        lost, over = look.contacts.energy_lost_aj[row], np.isfinite(look.contacts.departure_time_us[row])
+        lost, over = look.dense.contacts.energy_lost_aj[row], np.isfinite(look.dense.contacts.departure_time_us[row])
         label = f"contact {row + 1}: " + (f"{lost:.1f} aJ lost" if over else "not over")
         least = min(least, float(path_of_row.force_nn.min()))
         for axes in (whole, part):

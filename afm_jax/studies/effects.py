@@ -454,7 +454,7 @@ def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], ang
     """Return a reading of a simulation over a window."""
     motion = MotionWindow(DensePath(scene, simulation), *window)
     value = motion.height.lockin(angular_frequency)
-    lost = motion.rows.energy_lost_aj[motion.begun]
+    lost = motion.dense.contacts.energy_lost_aj[motion.begun]
     return Reading(
         peak_amplitude_nm=motion.height.largest,
         lockin_amplitude_nm=float(abs(value)),
