@@ -28,7 +28,7 @@ from afm_jax.motion.record import Simulation, State, contacts_of, to_gap, to_lab
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import compiled_quickly, filled, power_of_two
 
-_BLOCK, _FEWEST = 128, 16
+_BLOCK, _FEWEST = 128, 8
 """Trials computed in one call, and contacts at least."""
 _FINENESS = 4.5
 _NEWTON_STEPS = 6
