@@ -507,7 +507,7 @@ def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> comp
     half = 0.5 * (arrival[early] - departure[early])
     times = departure[early] + half * (_NODES + 1.0)
     gaps, _ = fly(cantilever, surface, *to_gap(surface, response, start), start.time_us, times)
-    return complex(total + np.sum(half * _WEIGHTS * gaps * np.exp(-1j * angular_frequency * times)))
+    return complex(total + np.sum(half * _WEIGHTS * np.asarray(gaps) * np.exp(-1j * angular_frequency * times)))
 
 
 def peaks_of_flights(scene: Scene, start: State, end_us: ArrayLike) -> Float[np.ndarray, " flights"]:
