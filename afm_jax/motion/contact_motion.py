@@ -32,17 +32,20 @@ from afm_jax.contact.junction_leg import go_through_junction
 from afm_jax.contact.settings import DrivenSetting
 from afm_jax.contact.step import TipInContact, advance, inverse_junction_step
 from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.motion.course import Course, as_vector, follow_rounds, where
 from afm_jax.motion.record import (
     ContactDetail,
     ContactKind,
     Contacts,
+    FollowedTip,
     MotionOutcome,
     Simulation,
     State,
+    as_vector,
     contacts_in_lab,
+    follow_rounds,
     to_gap,
     to_lab,
+    where,
 )
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import compiled_quickly, repeat_for
@@ -177,7 +180,7 @@ def slowest_departure(surface: Platform | Surface, time_us: ArrayLike) -> Float[
     return _ROUNDINGS * jnp.finfo(speeds.dtype).eps * speeds
 
 
-def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, rows: int) -> Course:
+def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, rows: int) -> FollowedTip:
     """Return a tip at its start: free above the gap where the bridge forms or if it has just left, else in the bridge.
 
     One that has just left starts exactly where contact ends, on its way up, with the derivatives of what was given.
@@ -195,10 +198,10 @@ def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, row
     state = ContactState(gap_nm, rate, time_us, zero)
     tip = TipInContact.at_start(state, phase)
     start, no_row = ContactTip(tip, state, Repeats(none, zero, zero)), ContactRow(none, state, tip)
-    return Course.begun(start, no_row, outcome.astype(jnp.int32), rows=rows)
+    return FollowedTip.begun(start, no_row, outcome.astype(jnp.int32), rows=rows)
 
 
-def _round(driven: Driven, until_us: Array, setting: DrivenSetting, reverse: bool, course: Course) -> Course:  # noqa: FBT001
+def _round(driven: Driven, until_us: Array, setting: DrivenSetting, reverse: bool, course: FollowedTip) -> FollowedTip:  # noqa: FBT001
     """Return a tip after one round: flight, legs through the contact, steps in time where those do not hold."""
     (tip, arrival, repeats), active = course.tip, ~course.done
     free = (tip.phase == Phase.DRY) & active

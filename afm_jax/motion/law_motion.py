@@ -27,15 +27,17 @@ from afm_jax.contact.junction import Phase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, time_above
 from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
-from afm_jax.motion.course import Course, follow_rounds, where
 from afm_jax.motion.record import (
     ContactKind,
+    FollowedTip,
     MotionOutcome,
     Simulation,
     State,
     contacts_in_lab,
+    follow_rounds,
     to_gap,
     to_lab,
+    where,
 )
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.derivatives import implicit_root
@@ -104,7 +106,7 @@ def follow_law(
     gap = gap + lax.stop_gradient(jnp.where(touches, -gap, 0.0))
     departure = Departure(start.time_us, gap, rate + surface.velocity(start.time_us))
     no_row, begun = LawRow(*[jnp.zeros_like(gap)] * len(LawRow._fields)), jnp.int32(MotionOutcome.FINISHED)
-    course = Course.begun(departure, no_row, begun, rows=max_contacts)
+    course = FollowedTip.begun(departure, no_row, begun, rows=max_contacts)
     # one more, which finds no room
     course = follow_rounds(partial(_one_flight, seen, until), course, rounds=max_contacts + 1, reverse=reverse)
     row, no_gap = LawRow(*course.rows.T), jnp.zeros(max_contacts)
@@ -120,7 +122,7 @@ def follow_law(
     )
 
 
-def _one_flight(seen: Scene, until: Array, course: Course) -> Course:
+def _one_flight(seen: Scene, until: Array, course: FollowedTip) -> FollowedTip:
     """Return a tip after a flight, its impact and the rest that follows, with its row; as it was where it has ended."""
     departure, flies = course.tip, ~course.done
     impact = impact_after(seen, departure, Search(_FLIGHT_STEPS, until_us=until, from_above=True), flies=flies)

@@ -23,8 +23,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, driven_by
 from afm_jax.contact.junction import Phase, force_in_phase
 from afm_jax.contact.step import TipInContact, advance, eighth_order_step
-from afm_jax.motion.course import where
-from afm_jax.motion.record import Simulation, State, contacts_of, to_gap, to_lab
+from afm_jax.motion.record import Simulation, State, contacts_of, to_gap, to_lab, where
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import compiled_quickly, filled, power_of_two
 
