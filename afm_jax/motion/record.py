@@ -1,7 +1,7 @@
 """What a simulation hands out: its contacts in order, its last state, and how it ended.
 
-A tip on its way, of a law or through resolved contacts, is a `FollowedTip`: its contacts are written down there, round by
-round of one loop (`follow_rounds`).
+A tip on its way, of a law or through resolved contacts, is a `FollowedTip`: its contacts are written down there, round
+by round of one loop (`follow_rounds`).
 
 States of the tip are heights and velocities in the lab; `to_gap` and `to_lab` go between these and the gap over the
 surface that the free tip sees (`surface_of`), `contacts_in_lab` does so for contacts.
@@ -256,11 +256,9 @@ class FollowedTip(NamedTuple):
     @classmethod
     def begun(cls, tip: Any, row: Any, outcome: Array, *, rows: int) -> "FollowedTip":
         """Return a tip at its start, with room for so many rows like a given one; a start with a fault is an end."""
-        columns = as_vector(row)[0]
-        none = jnp.zeros((), jnp.int32)
-        return cls(
-            tip, jnp.zeros((rows, *columns.shape), columns.dtype), none, outcome, outcome != MotionOutcome.FINISHED
-        )
+        columns, none = as_vector(row)[0], jnp.zeros((), jnp.int32)
+        empty = jnp.zeros((rows, *columns.shape), columns.dtype)
+        return cls(tip, empty, none, outcome, outcome != MotionOutcome.FINISHED)
 
     def after(self, tip: Any, row: Any, ends: Array, outcome: Array, over: Array) -> "FollowedTip":
         """Return the course a round later; it ends as it was before a contact that has no room.
@@ -285,9 +283,7 @@ class FollowedTip(NamedTuple):
         )
 
 
-def follow_rounds(
-    one_round: Callable[[FollowedTip], FollowedTip], course: FollowedTip, *, rounds: int, reverse: bool
-) -> FollowedTip:
+def follow_rounds(one_round: Callable[..., Any], course: FollowedTip, *, rounds: int, reverse: bool) -> FollowedTip:
     """Return a course after so many rounds, or as soon as it is done; in a batch all courses.
 
     Args:
