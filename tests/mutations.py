@@ -82,7 +82,7 @@ MUTATIONS = {
         "overlap = jnp.maximum({- => }delay, 0.0)", f"{MAP}test_every_end_of_a_flight_is_said"
     ),
     "rows after a capture look alive": Mutation(
-        "{jnp.where(tip.flies, impact.outcome, Outcome.NOT_REACHED) => impact.outcome}",
+        "{jnp.where(flies, impact.outcome, Outcome.NOT_REACHED) => impact.outcome}",
         f"{MAP}test_after_a_capture_the_rows_say_so",
     ),
     "flight's Jacobian without the start's shift": Mutation(

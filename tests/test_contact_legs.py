@@ -10,11 +10,11 @@ import pytest
 from afm_jax.contact.bridge_leg import go_in
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import ContactState, driven_by, free_tip
+from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip
 from afm_jax.contact.junction import Phase, find_junction
-from afm_jax.contact.settings import DRIVEN_SETTINGS, QuickSetting, driven_setting_of
+from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting, driven_setting_of
 from afm_jax.contact.step import TipInContact, advance
-from afm_jax.motion.contact_motion import cross
+from afm_jax.motion.contact_motion import legs_through
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.solve.lanes import repeat_for
 from tests.reference_driven_contact import DrivenContact, follow
@@ -31,7 +31,15 @@ def contacts():
 
 
 SCENE = contact_scene(5.277, 4.0, 0.0)
-through_contact = jax.jit(cross, static_argnums=2)
+
+
+@partial(jax.jit, static_argnums=2)
+def through_contact(driven: Driven, state: ContactState, quick: QuickSetting) -> TipInContact:
+    """Return tips after the three legs of their contact; DRY those whose legs all hold."""
+    arrives = jnp.ones(state.x.shape, bool)
+    return legs_through(
+        DrivenSetting(quick, 5.5, 1), driven, TipInContact.arriving(driven, state, arrives), arrives, arrives, jnp.inf
+    )
 
 
 def at_threshold(gap_nm, gap_rate, time) -> ContactState:
@@ -55,7 +63,7 @@ def driven():
 def test_straight_contacts_are_those_of_an_independent_integration(contacts, driven, accuracy):
     arrivals = column(contacts, "arrival_time_us"), -column(contacts, "approach_speed_nm_per_us")
     leg = through_contact(driven, at_threshold(driven.forms_nm, arrivals[1], arrivals[0]), quick_of(accuracy))
-    holds = np.asarray(leg.holds)
+    holds = np.asarray(leg.phase) == Phase.DRY
     assert holds.sum() >= 8
     # what holds formed the junction once
     assert (column(contacts, "junctions")[holds] == 1).all()
@@ -96,7 +104,7 @@ def assert_leaves(state: ContactState, expected):
 def test_the_legs_of_driven_contacts_take_a_free_tip_where_collide_does(free):
     tip, state, expected = free
     leg = through_contact(tip, state, QuickSetting(24, 18, 30, 24, 1e-9, 12, 2, 1e-2))
-    assert np.asarray(leg.holds).all()
+    assert (np.asarray(leg.phase) == Phase.DRY).all()
     assert_leaves(leg.state, expected)
     np.testing.assert_allclose(leg.deepest_gap_nm, expected.deepest_gap_nm, rtol=1e-12)
 

@@ -26,7 +26,7 @@ from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
-from afm_jax.motion.trajectory import state_at
+from afm_jax.motion.trajectory import DensePath
 from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 from afm_jax.studies.sweep import sweep
 
@@ -258,7 +258,7 @@ def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit():
     assert found == pytest.approx(place, rel=1e-8)
     assert swept.height_nm[0, -1] == pytest.approx(-5.0, abs=1e-12)
     period = 2.0 * np.pi / angular_frequency(scene)
-    seen = state_at(scene, simulate(scene, started(scene, orbits, slot), 3.0 * period), 2.0 * period)
+    seen = DensePath(scene, simulate(scene, started(scene, orbits, slot), 3.0 * period)).flying_at(2.0 * period)
     assert seen is not None
     heights = swept.strobe_height_nm[0]
     assert heights[np.isfinite(heights)][-1] == pytest.approx(float(seen.position_nm), abs=1e-6)

@@ -44,11 +44,11 @@ def test_the_stretch_shown_ends_with_whole_contacts(bouncing):
     scene, found = bouncing
     look = look_at(scene, found)
     rows = int(found.count)
-    assert look.arrival_us.size == rows
+    assert look.dense.contacts.arrival_time_us.size == rows
     # six contacts, each with bridge and junction resolved
-    shown = look.arrival_us[-6:]
+    shown = look.dense.contacts.arrival_time_us[-6:]
     assert look.from_us < shown[0] < look.to_us
-    for arrival, departure in zip(shown, look.departure_us[-6:], strict=True):
+    for arrival, departure in zip(shown, look.dense.contacts.departure_time_us[-6:], strict=True):
         part = look.between(arrival, departure)
         assert {Phase.BRIDGE, Phase.JUNCTION} <= set(part.phase.tolist())
         assert part.force_nn.min() < -50.0  # the pull-off force is over 100 nN

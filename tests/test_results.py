@@ -343,7 +343,7 @@ def test_rows_without_a_contact_are_in_no_table():
     kinds = jnp.array([ContactKind.IMPACT, ContactKind.HELD, ContactKind.NONE, ContactKind.NONE])
     columns: dict[str, Any] = dict.fromkeys(set(Contacts._fields) - {"detail"}, jnp.arange(4.0)) | {"kind": kinds}
     where, zero = State(*[jnp.zeros(())] * 3), jnp.array(0)
-    found = afm.Simulation(where, Contacts(**columns), jnp.array(2), where, zero, jnp.array(1, bool), zero)
+    found = afm.Simulation(where, Contacts(**columns), jnp.array(2), where, zero, zero)
     table = found.to_pandas()
     assert table["contacts_approach_speed_nm_per_us"].tolist() == [0.0, 1.0]
     assert table["contacts_rebound_speed_nm_per_us"].isna().tolist() == [False, True]

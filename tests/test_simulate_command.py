@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.apparatus.drives import ForceDrive
 from afm_jax.cli.main import main
-from afm_jax.motion.trajectory import pieces_between
+from afm_jax.motion.trajectory import DensePath
 from afm_jax.scenefile.scenefile import Start
 from fitting import lockin, read_trace
 from tests import answers
@@ -44,8 +44,8 @@ def nulls(answer: dict[str, object]) -> set[str]:
 
 
 def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    worked_out, own = [], "afm_jax.motion.trajectory.pieces_between"
-    monkeypatch.setattr(own, lambda *where: worked_out.append(where) or pieces_between(*where))
+    worked_out, own = [], DensePath.__init__
+    monkeypatch.setattr(DensePath, "__init__", lambda *where: worked_out.append(where) or own(*where))
     answer = answers.answer(tmp_path / "out", "simulate", law_file, "--harmonics", "1,3")
     # observables, files and pictures look at one path
     assert len(worked_out) == 1

@@ -13,7 +13,7 @@ from afm_jax.contact.junction import Phase
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.motion.record import MotionOutcome, State
 from afm_jax.motion.simulate import simulate
-from afm_jax.motion.trajectory import dense_path, trajectory
+from afm_jax.motion.trajectory import DensePath, trajectory
 from afm_jax.scenefile.presets import contact_scene
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow
@@ -117,7 +117,7 @@ def test_dense_output_agrees_with_an_independent_integration():
     # 1e-9 us times up to 100 nm/us, and times accelerations of 1e3 nm/us^2
     np.testing.assert_allclose(seen.position_nm, position, rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(seen.velocity_nm_per_us, velocity, rtol=0.0, atol=1e-4)
-    when, weights = dense_path(scene, simulation, start[0], start[0] + 25.0).nodes(start[0], start[0] + 25.0)
+    when, weights = DensePath(scene, simulation).nodes(start[0], start[0] + 25.0)
     assert weights.sum() == pytest.approx(25.0, abs=1e-8)
     dense = trajectory(scene, simulation, when)
     # work of the contact force on the gap is what the finished contacts dissipated

@@ -14,16 +14,15 @@ from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Course, Orders, Positive, Share
 from afm_jax.motion.follow import LongRun, follow_long
-from afm_jax.motion.motion_table import MotionTable, stretch_written
+from afm_jax.motion.motion_table import MotionTable
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome
-from afm_jax.motion.settle import Window, window_of
+from afm_jax.motion.settle import Window
 from afm_jax.motion.start import start_of
-from afm_jax.motion.trajectory import DensePath, dense_path
+from afm_jax.motion.trajectory import DensePath
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 draw_motion = later("afm_jax.plots.motion:draw_motion")
-stretch_drawn = later("afm_jax.plots.motion:stretch_drawn")
 
 _MOST_PERIODS = 2000
 """Drive periods followed at most where no duration is given."""
@@ -97,13 +96,13 @@ def simulation(  # noqa: PLR0913
     settings = {"accuracy": accuracy, "until_settled": until_settled}
     run = _follow(session, scene, longest, settings)
     with session.working("reading amplitudes"):
-        dense = _dense(scene.scene, run, to_files=session.out is not None)
+        dense = DensePath(scene.scene, run.simulation)
         seen = observe(scene.scene, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
-    told = MotionTable(scene.scene, run, seen, dense, settings | {"longest_us": longest, "pieces": run.pieces})
+    told = MotionTable(run, seen, dense, settings | {"longest_us": longest, "pieces": run.pieces})
 
     def report(folder: Path, _: Any) -> Any:
         if samples:
-            _write_trace(session, scene.scene, run, seen.window)
+            _write_trace(session, dense, seen.window)
         return draw_motion(scene.scene, run.simulation, folder, verdict=run.verdict, dense=dense)
 
     return Output(
@@ -149,34 +148,21 @@ def _follow(session: Session, scene: NamedScene, longest_us: float, settings: di
     return run
 
 
-def _dense(scene: Scene, run: LongRun, *, to_files: bool) -> DensePath:
-    """Return the tip over all that is read, written and drawn of it: its contacts are integrated once more, once."""
-    window = window_of(scene, run.simulation, run.verdict)
-    stretches = [(window.from_us, window.to_us)]
-    if to_files:
-        stretches.append(stretch_written(run.simulation, window))
-        stretches.append(stretch_drawn(scene, run.simulation, run.verdict))
-    begin, end = zip(*stretches, strict=True)
-    return dense_path(scene, run.simulation, min(begin), max(end))
-
-
-def _write_trace(session: Session, scene: Scene, run: LongRun, window: Window) -> None:
+def _write_trace(session: Session, dense: DensePath, window: Window) -> None:
     """Write trace.csv, the deflection over the last response periods at equal steps of time, into the `--out` folder.
 
     Args:
         session: whose folder.
-        scene: the scene.
-        run: its simulation.
+        dense: the tip.
         window: of the observables; how long a response period is, and the end of the trace.
     """
-    drive = drive_of(scene)
+    scene, drive = dense.scene, drive_of(dense.scene)
     response = window.periods * drive.period_us
-    responses = min((window.to_us - float(run.simulation.start.time_us)) / response, _TRACE_RESPONSES)
+    responses = min((window.to_us - float(dense.simulation.start.time_us)) / response, _TRACE_RESPONSES)
     begin = window.to_us - responses * response
     count = math.ceil(responses * window.periods * _SAMPLES_A_PERIOD)
-    path = dense_path(scene, run.simulation, begin, window.to_us)
     times = np.linspace(begin, window.to_us, count, endpoint=False)
-    deflection = path.at(times).position_nm
+    deflection = dense.at(times).position_nm
     columns = {"time_us": times, "deflection_nm": deflection}
     if scene.base is not None:
         columns["drive"] = np.asarray(scene.base.position_and_velocity(times)[0])

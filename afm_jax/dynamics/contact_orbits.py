@@ -33,7 +33,7 @@ from afm_jax.dynamics.starts import SampleDriven, evenly_spread, laws_of, leavin
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_flight, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
-from afm_jax.motion.record import ContactKind, Contacts
+from afm_jax.motion.record import ContactKind, Contacts, State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import default_start, gap_of_departure
 from afm_jax.scenefile.parameter_paths import scene_family
@@ -495,7 +495,7 @@ class ContactFlights:
         loop, contacts, count = flown.loop, flown.contacts, len(rebound)
         height, rate = (np.asarray(part) for part in there.platform.position_and_velocity(time))
         ends, forms = float(gap_of_departure(there)), float(there.interaction.bridge_forms_nm)
-        peaks = peaks_of_flights(there, time, height + ends, rebound + rate, contacts.arrival_time_us)
+        peaks = peaks_of_flights(there, State(time, height + ends, rebound + rate), contacts.arrival_time_us)
         # of the contact before each departure
         approach = np.roll(contacts.approach_speed_nm_per_us, 1)
         lasts = np.roll(contacts.departure_time_us - contacts.arrival_time_us, 1)

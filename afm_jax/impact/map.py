@@ -1,14 +1,12 @@
 """The impact map of a law: from the departure of the tip after one impact to that after the next (eqs. 2-4 and 6).
 
 `next_impact` is the map of one tip, `iterate_map` a sequence of impacts, `iterate_batch` such sequences of many tips.
-Below them, for any surface that the tip sees: `impact_after` ends one flight, and `follow_tip` follows flight after
-flight until a number of impacts is reached, or until the motion has ended. Simulations of law scenes, the search for
-orbits of many impacts and the sequences here are all followed by it.
+Below them, for any surface that the tip sees: `impact_after` ends one flight. Simulations of law scenes, the search for
+orbits of many impacts and the sequences here all go from flight to flight by it.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -93,20 +91,6 @@ class Search(NamedTuple):
     """Time at which the search ends with `Outcome.NO_FURTHER_IMPACT`; None: never."""
     from_above: bool = False
     """Whether a flight may begin above the surface on its way down; if not, the tip leaves the surface."""
-
-
-class FollowedTip(NamedTuple):
-    """A tip that is followed from flight to flight."""
-
-    departure: Departure
-    flies: Bool[Array, ""]
-    """Whether the flight takes place: False once the motion has ended."""
-    record: Any = None
-    """What the one who follows writes down on the way."""
-
-
-ThroughImpact = Callable[[FollowedTip, NextImpact], tuple[FollowedTip, Any]]
-"""Takes a tip at a departure and the impact that ends the flight, returns the tip at its next departure, and a row."""
 
 
 @checked
@@ -223,55 +207,6 @@ def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
     )
 
 
-_IMPACTS_EACH = 8
-"""Impacts after which the loop checks whether all tips of a batch have ended."""
-
-
-def follow_tip(
-    scene: Scene,
-    tip: FollowedTip,
-    through: ThroughImpact,
-    search: Search,
-    *,
-    impacts: int,
-    until_ended: bool = False,
-    reverse: bool = False,
-) -> tuple[FollowedTip, Any]:
-    """Return a tip followed from flight to flight, and the rows of its impacts.
-
-    Args:
-        scene: the interaction is a law, the platform the surface that the free tip sees.
-        tip: at its first departure.
-        through: what an impact, and a rest after it, makes of the tip.
-        search: for the impact of each flight.
-        impacts: how many flights are followed at most.
-        until_ended: stop as soon as the tip no longer flies, in a batch all tips; there are no rows then, what is to be
-            kept is in `FollowedTip.record`. False: follow all flights; those of a tip that has ended cost one step.
-        reverse: make the stop differentiable in reverse mode: all flights are followed, in blocks that are recomputed
-            backwards.
-    """
-
-    def one_flight(tip: FollowedTip, _: None) -> tuple[FollowedTip, Any]:
-        return through(tip, impact_after(scene, tip.departure, search, flies=tip.flies))
-
-    def some_flights(tip: FollowedTip) -> FollowedTip:
-        return lax.scan(lambda tip, _: (one_flight(tip, None)[0], None), tip, length=_IMPACTS_EACH)[0]
-
-    if not until_ended:
-        return lax.scan(one_flight, tip, length=impacts)
-    blocks = -(-impacts // _IMPACTS_EACH)
-    if reverse:
-        again = jax.checkpoint(lambda tip, _: (some_flights(tip), None))
-        return lax.scan(again, tip, length=blocks)[0], None
-
-    def under_way(state: tuple[Array, FollowedTip]) -> Array:
-        return state[1].flies & (state[0] < blocks)
-
-    return lax.while_loop(under_way, lambda state: (state[0] + 1, some_flights(state[1])), (jnp.zeros((), int), tip))[
-        1
-    ], None
-
-
 @partial(jax.jit, static_argnames=("max_steps",))
 def _next_impact(scene: Scene, departure: Departure, tolerance: Float[Array, ""], *, max_steps: int) -> NextImpact:
     return impact_after(scene, departure, Search(max_steps, tolerance))
@@ -366,18 +301,20 @@ def follow_impacts(
         impacts: how many are followed.
         max_steps: steps of the search for one impact before it gives up.
     """
+    search = Search(max_steps, tolerance)
 
-    def through(tip: FollowedTip, impact: NextImpact) -> tuple[FollowedTip, NextImpact]:
-        outcome = jnp.where(tip.flies, impact.outcome, Outcome.NOT_REACHED)
+    def one_flight(tip: tuple[Departure, Array], _: None) -> tuple[tuple[Departure, Array], NextImpact]:
+        start, flies = tip
+        impact = impact_after(scene, start, search, flies=flies)
+        outcome = jnp.where(flies, impact.outcome, Outcome.NOT_REACHED)
         goes_on = outcome == Outcome.IMPACT
-        time = jnp.where(goes_on, impact.time_us, tip.departure.time_us)
-        velocity = jnp.where(goes_on, impact.velocity_after_nm_per_us, tip.departure.velocity_nm_per_us)
+        time = jnp.where(goes_on, impact.time_us, start.time_us)
+        velocity = jnp.where(goes_on, impact.velocity_after_nm_per_us, start.velocity_nm_per_us)
         row = eqx.tree_at(lambda row: row.outcome, impact, outcome)
-        return FollowedTip(Departure(time, None, velocity), goes_on), row
+        return (Departure(time, None, velocity), goes_on), row
 
-    tip = FollowedTip(departure, jnp.array(True))  # noqa: FBT003
     # the row of a flight that does not take place has neither times nor velocities
-    return follow_tip(scene, tip, through, Search(max_steps, tolerance), impacts=impacts)[1]
+    return lax.scan(one_flight, (departure, jnp.array(True)), length=impacts)[1]  # noqa: FBT003
 
 
 DEFAULT_BLOCK = 1000

@@ -18,15 +18,14 @@ from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.scene import Scene, drive_of, require_one_frequency
 from afm_jax.apparatus.surface import drive_per_free_height, force_per_height, surface_of
 from afm_jax.checks import check_count, checked, require_float64
-from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase
 from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.observe import Observables, observe
-from afm_jax.motion.record import MotionOutcome, Simulation, State, to_gap
-from afm_jax.motion.settle import is_stuck, settled, window_of
+from afm_jax.motion.record import Simulation, State, to_gap
+from afm_jax.motion.settle import felt_nm, is_stuck, settled
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import state
-from afm_jax.motion.trajectory import DensePath, dense_path
+from afm_jax.motion.trajectory import DensePath
 from afm_jax.outcomes import OutcomeInWords
 from afm_jax.results import ResultTuple, public_result
 
@@ -160,14 +159,14 @@ def approach_curve(
         report(len(readings), len(course))
     columns: dict[str, Any] = dict(zip(HeightReading._fields, map(np.array, zip(*readings, strict=True)), strict=True))
     columns["reasons"] = tuple(columns.pop("reason").tolist())
-    step = np.diff(course)
     ratio = drive.frequency_khz / scene.cantilever.frequency_khz
     gamma = complex(*map(float, force_per_height(ratio, scene.cantilever.quality_factor)))
     # the free tip where its height is real: the drive is gamma times that, the deflection against a base the rest
     free = _free_height_nm(scene) * (1.0 if scene.base is None else 1.0 - gamma)
     return ApproachCurve(
         height_nm=course,
-        retract=np.concatenate([step[:1] < 0.0, step < 0.0]) if step.size else np.zeros(1, bool),
+        # the first height belongs to the way to the second
+        retract=np.diff(course, prepend=2.0 * course[0] - course[:2][-1]) < 0.0,
         scene=scene,
         drive="force" if scene.base is None else "base",
         drive_frequency_khz=float(drive.frequency_khz),
@@ -199,24 +198,17 @@ def _only_drive(scene: Scene) -> BaseDrive | ForceDrive:
 
 def _free_height_nm(scene: Scene) -> float:
     """Return the amplitude of the free tip's height."""
-    drive = scene.force or scene.base
-    assert drive is not None  # as `_only_drive` says  # noqa: S101
+    drive: Any = scene.force or scene.base
     return float(drive.tones[0].amplitude / drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive)))
 
 
 def _free_motion(scene: Scene, height_nm: float) -> Motion:
     """Return the free tip in its steady motion over a sample at a height, or as far up as does not touch it."""
-    _, response = surface_of(scene)
-    assert response is not None  # something drives the tip  # noqa: S101
+    response: Any = surface_of(scene)[1]
     times = np.linspace(0.0, drive_of(scene).period_us, _TIMES)
     top = times[np.argmax(np.asarray(response.position_and_velocity(times)[0]))]
     start = state(top, *map(float, response.position_and_velocity(top)))
-    return Motion(min(height_nm, -_free_height_nm(scene) - _felt_nm(scene) - _CLEARANCE_NM), start)
-
-
-def _felt_nm(scene: Scene) -> float:
-    """Return the gap below which a flying tip meets the sample."""
-    return float(scene.interaction.bridge_forms_nm) if isinstance(scene.interaction, Contact) else 0.0
+    return Motion(min(height_nm, -_free_height_nm(scene) - felt_nm(scene) - _CLEARANCE_NM), start)
 
 
 def _at_height(
@@ -233,7 +225,7 @@ def _at_height(
     """
     period_us = drive_of(scene).period_us
     start, here = begin.state, _with_sample(scene, height_nm, 0.0)
-    clear = float(to_gap(*surface_of(here), start)[0]) > _felt_nm(scene)
+    clear = float(to_gap(*surface_of(here), start)[0]) > felt_nm(scene)
     if begin.height_nm != height_nm and not (begin.lost and clear):
         periods = math.ceil(abs(height_nm - begin.height_nm) / (_MOVED * _free_height_nm(scene)))
         rate = (height_nm - begin.height_nm) / (periods * period_us)
@@ -242,7 +234,7 @@ def _at_height(
         reading = _why_over(on_the_way)
         if reading is None:
             end_us = float(on_the_way.simulation.final.time_us)
-            dense = dense_path(moving, on_the_way.simulation, end_us - period_us, end_us)
+            dense = DensePath(moving, on_the_way.simulation)
             start = _top_of_swing(dense, end_us - period_us, end_us, period_us)
             if start is None:
                 return HeightReading(CurveOutcome.CAPTURED, "the sample holds the tip on the way there"), None
@@ -260,28 +252,22 @@ def _at_height(
     reading = _why_over(run)
     if reading is not None:
         return reading, None
-    verdict = settled(here, run.simulation, tolerance=TOLERANCE)
-    window = window_of(here, run.simulation, verdict)
-    dense = dense_path(here, run.simulation, window.from_us, window.to_us)
+    verdict, dense = settled(here, run.simulation, tolerance=TOLERANCE), DensePath(here, run.simulation)
     seen = observe(here, run.simulation, verdict=verdict, dense=dense)
-    top = _top_of_swing(dense, window.from_us, window.to_us, period_us)
+    top = _top_of_swing(dense, seen.window.from_us, seen.window.to_us, period_us)
     return _reading_of(seen, deflection=scene.base is not None), top
 
 
 def _with_sample(scene: Scene, height_nm: float, rate: float) -> Scene:
     """Return a scene with its sample at a height at time 0 and a rate in nm/us."""
-    return eqx.tree_at(
-        lambda each: (each.platform.offset_nm, each.platform.offset_rate_nm_per_us),
-        scene,
-        (jnp.asarray(height_nm), jnp.asarray(rate)),
-    )
+    place = jnp.asarray(height_nm), jnp.asarray(rate)
+    return eqx.tree_at(lambda s: (s.platform.offset_nm, s.platform.offset_rate_nm_per_us), scene, place)
 
 
 def _why_over(run: LongRun) -> HeightReading | None:
     """Return what to say of a motion that does not go on; None where it does."""
-    ended = MotionOutcome(int(run.simulation.outcome))
-    if ended not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
-        return HeightReading(CurveOutcome.BROKE_OFF, ended.sentence)
+    if run.simulation.broke_off is not None:
+        return HeightReading(CurveOutcome.BROKE_OFF, run.simulation.broke_off)
     return HeightReading(CurveOutcome.CAPTURED, run.verdict.reason) if run.verdict.stuck else None
 
 

@@ -6,8 +6,9 @@ without a search, and the speed follows from the energy. A leg holds (is accurat
 in the bridge or becoming slow; every other tip takes steps in time (`contact/step.py`) from the end of the last leg
 that held.
 
-One round of the loop is a flight to the next contact, the legs that hold (`legs_through`), then some steps in time
-until a leg begins or the tip has left. Contacts that magnify errors are computed again in finer steps (`_repetition`).
+One round of the loop (`follow_rounds`) is a flight to the next contact, the legs that hold (`legs_through`), then some
+steps in time until a leg begins or the tip has left. Contacts that magnify errors are computed again in finer steps
+(`_repetition`).
 
 Every tip of a batch goes at its own rate, and a batch does not wait for the few contacts that turn inside the bridge.
 All shapes are fixed.
@@ -19,7 +20,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
@@ -29,25 +29,27 @@ from afm_jax.contact.bridge_leg import go_in, go_out
 from afm_jax.contact.driven import ContactState, Driven, Leg, driven_by
 from afm_jax.contact.junction import Phase
 from afm_jax.contact.junction_leg import go_through_junction
-from afm_jax.contact.settings import DrivenSetting, QuickSetting
+from afm_jax.contact.settings import DrivenSetting
 from afm_jax.contact.step import TipInContact, advance, inverse_junction_step
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.motion.record import (
     ContactDetail,
     ContactKind,
     Contacts,
+    FollowedTip,
     MotionOutcome,
     Simulation,
     State,
+    as_vector,
     contacts_in_lab,
+    follow_rounds,
     to_gap,
     to_lab,
+    where,
 )
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import compiled_quickly, repeat_for
 
-_ROUNDS = 8
-"""Rounds between two checks whether all tips have arrived at the end."""
 _FLIGHT_STEPS = 2000
 """Most steps of the search for the end of a flight."""
 _ROUNDS_PER_CONTACT, _SPARE_ROUNDS = 4, 64
@@ -88,18 +90,13 @@ class Repeats(NamedTuple):
 
 
 class ContactTip(NamedTuple):
-    """A tip on its way through a scene; scalars of one tip, but for the rows."""
+    """A tip on its way through a scene; scalars of one tip."""
 
     tip: TipInContact
     """State and phase, and a record of the present contact; x of a free tip is the gap."""
     arrival: ContactState
     """Where the present contact began."""
     repeats: Repeats
-    contacts: Int[Array, ""]
-    rows: Float[Array, "rows columns"]
-    outcome: Int[Array, ""]
-    done: Bool[Array, ""]
-    rounds: Int[Array, ""]
 
 
 @compiled_quickly(static_argnames=("max_contacts", "setting", "max_rounds", "reverse"))
@@ -128,26 +125,24 @@ def follow_contacts(  # noqa: PLR0913
         max_rounds: most rounds; None: more than any motion takes, in reverse mode four for every contact.
         reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
     """
+    rounds = max(_HELD_ROUNDS_PER_CONTACT * max_contacts, _LEAST_HELD_ROUNDS)
     if reverse:
         # legs tell by NaN that they do not hold, which reverse derivatives would spread
         setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS, agreement=None)
-    if max_rounds is None and reverse:
-        max_rounds = _ROUNDS_PER_CONTACT * max_contacts + _SPARE_ROUNDS
-    elif max_rounds is None:
-        max_rounds = max(_HELD_ROUNDS_PER_CONTACT * max_contacts, _LEAST_HELD_ROUNDS)
+        rounds = _ROUNDS_PER_CONTACT * max_contacts + _SPARE_ROUNDS
     driven = driven_by(scene.interaction, scene.cantilever, surface)
-    begun = _at_start(driven, start.time_us, *to_gap(surface, response, start), rows=max_contacts)
-    end = _at_end(driven, begun, until, setting, rounds=max_rounds, reverse=reverse)
-    state, phase = end.tip.state, end.tip.phase
-    row = jax.vmap(_as_vector(ContactRow(end.contacts, end.arrival, end.tip))[1])(end.rows)
+    course = _at_start(driven, start.time_us, *to_gap(surface, response, start), rows=max_contacts)
+    one_round = partial(_round, driven, until, setting, reverse)
+    course = follow_rounds(one_round, course, rounds=max_rounds or rounds, reverse=reverse)
+    tip, arrival, _ = course.tip
+    row = jax.vmap(as_vector(ContactRow(course.contacts, arrival, tip))[1])(course.rows)
     return Simulation(
         start=start,
         contacts=_contacts(row, scene, surface, response, driven),
-        count=jnp.minimum(end.contacts, max_contacts),
-        final=to_lab(surface, response, state.time_us, driven.gap(state.x, phase), state.gap_rate),
-        phase=phase,
-        held=end.outcome == MotionOutcome.HELD,
-        outcome=end.outcome,
+        count=course.contacts,
+        final=to_lab(surface, response, tip.state.time_us, driven.gap(tip.state.x, tip.phase), tip.state.gap_rate),
+        phase=tip.phase,
+        outcome=course.outcome,
     )
 
 
@@ -185,7 +180,7 @@ def slowest_departure(surface: Platform | Surface, time_us: ArrayLike) -> Float[
     return _ROUNDINGS * jnp.finfo(speeds.dtype).eps * speeds
 
 
-def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, rows: int) -> ContactTip:
+def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, rows: int) -> FollowedTip:
     """Return a tip at its start: free above the gap where the bridge forms or if it has just left, else in the bridge.
 
     One that has just left starts exactly where contact ends, on its way up, with the derivatives of what was given.
@@ -199,81 +194,33 @@ def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, row
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START)
     outcome = jnp.where(driven.junction.exists, outcome, MotionOutcome.NO_JUNCTION)
     phase = jnp.where(leaves | (gap_nm > driven.forms_nm), Phase.DRY, Phase.BRIDGE)
-    none, zero = jnp.zeros_like(phase), jnp.zeros_like(time_us)
-    start = ContactState(gap_nm, rate, time_us, zero)
-    tip = TipInContact.at_start(start, phase)
-    columns = _as_vector(ContactRow(none, start, tip))[0].size
-    return ContactTip(
-        tip=tip,
-        arrival=start,
-        repeats=Repeats(none.astype(jnp.int32), zero, zero),
-        contacts=none,
-        rows=jnp.zeros((rows, columns), time_us.dtype),
-        outcome=outcome.astype(jnp.int32),
-        done=outcome != MotionOutcome.FINISHED,
-        rounds=none,
-    )
+    none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(time_us)
+    state = ContactState(gap_nm, rate, time_us, zero)
+    tip = TipInContact.at_start(state, phase)
+    start, no_row = ContactTip(tip, state, Repeats(none, zero, zero)), ContactRow(none, state, tip)
+    return FollowedTip.begun(start, no_row, outcome.astype(jnp.int32), rows=rows)
 
 
-def _at_end(
-    driven: Driven, start: ContactTip, until_us: Array, setting: DrivenSetting, *, rounds: int, reverse: bool
-) -> ContactTip:
-    """Return a tip after so many rounds, or as soon as it is done."""
-    blocks = -(-rounds // _ROUNDS)
-    advance_round = partial(_round, driven, until_us=until_us, setting=setting, reverse=reverse)
-
-    def block(course, _):
-        return lax.scan(lambda state, _: (advance_round(state), None), course, None, length=_ROUNDS)
-
-    if reverse:
-        course, _ = lax.scan(jax.checkpoint(block), start, None, length=blocks)
-    else:
-        limit = blocks * _ROUNDS
-        course = lax.while_loop(
-            lambda course: ~course.done & (course.rounds < limit), lambda course: block(course, None)[0], start
-        )
-    outcome = jnp.where(course.done, course.outcome, MotionOutcome.STEP_LIMIT)
-    return course._replace(outcome=outcome.astype(jnp.int32))
-
-
-def _round(driven: Driven, course: ContactTip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> ContactTip:
+def _round(driven: Driven, until_us: Array, setting: DrivenSetting, reverse: bool, course: FollowedTip) -> FollowedTip:  # noqa: FBT001
     """Return a tip after one round: flight, legs through the contact, steps in time where those do not hold."""
-    active, free = ~course.done, (course.tip.phase == Phase.DRY) & ~course.done
-    flown, arrives, lost = _fly(driven, course.tip.state, free, until_us)
-    tip = TipInContact.arriving(driven, flown, arrives)
-    tip, arrival = _where(free, tip, course.tip), _where(arrives, flown, course.arrival)
-    tip = _through_legs(driven, tip, arrives, active & (course.repeats.times == 0), until_us, setting)
-    tip = _step_in_time(driven, tip, active, course.repeats.times, until_us, setting, reverse=reverse)
+    (tip, arrival, repeats), active = course.tip, ~course.done
+    free = (tip.phase == Phase.DRY) & active
+    flown, arrives, lost = _fly(driven, tip.state, free, until_us)
+    tip, arrival = where(free, TipInContact.arriving(driven, flown, arrives), tip), where(arrives, flown, arrival)
+    tip = _through_legs(driven, tip, arrives, active & (repeats.times == 0), until_us, setting)
+    tip = _step_in_time(driven, tip, active, repeats.times, until_us, setting, reverse=reverse)
 
     in_contact, leaves, over = active & (arrives | ~free), tip.phase == Phase.DRY, tip.state.time_us >= until_us
-    again, repeats = _repetition(tip, arrival, course.repeats, in_contact & leaves & ~over, setting)
-    ends = in_contact & (leaves | over) & ~again
-    room = course.rows.shape[0]
-    full, finite = ends & (course.contacts >= room), jnp.isfinite(tip.state.x)
-    outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, course.outcome)
-    outcome = jnp.where(ends & ~leaves, MotionOutcome.HELD, outcome)
+    again, repeats = _repetition(tip, arrival, repeats, in_contact & leaves & ~over, setting)
+    ends, finite = in_contact & (leaves | over) & ~again, jnp.isfinite(tip.state.x)
+    outcome = jnp.where(ends & ~leaves, MotionOutcome.HELD, MotionOutcome.FINISHED)
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
     outcome = jnp.where(finite, outcome, MotionOutcome.UNRESOLVED)
+    row = ContactRow(jnp.where(leaves, ContactKind.IMPACT, ContactKind.HELD), arrival, tip)
     if setting.agreement is not None:
-        tip = _where(again, TipInContact.arriving(driven, arrival, jnp.ones_like(again)), tip)
-    place = jnp.where(ends & ~full, course.contacts, room)
-    kind = jnp.where(leaves, ContactKind.IMPACT, ContactKind.HELD).astype(course.contacts.dtype)
-    row, _ = _as_vector(ContactRow(kind, arrival, tip))
-    return ContactTip(
-        tip=tip,
-        arrival=arrival,
-        repeats=repeats,
-        contacts=course.contacts + ends.astype(course.contacts.dtype),
-        rows=course.rows.at[place].set(row, mode="drop"),
-        outcome=jnp.where(course.done, course.outcome, outcome).astype(jnp.int32),
-        done=course.done | (free & ~arrives) | (in_contact & over) | full | lost | ~finite,
-        rounds=course.rounds + 1,
-    )
-
-
-def _where(condition: Array, new: Any, old: Any) -> Any:
-    """Return a tree with the leaves of one where a condition holds, else those of another."""
-    return jax.tree.map(partial(jnp.where, condition), new, old)
+        tip = where(again, TipInContact.arriving(driven, arrival, jnp.ones_like(again)), tip)
+    is_over = (free & ~arrives) | (in_contact & over) | lost | ~finite
+    return course.after(ContactTip(tip, arrival, repeats), row, ends, outcome, is_over)
 
 
 def _fly(
@@ -298,23 +245,7 @@ def _fly(
     height, speed = surface.position_and_velocity(time)
     gap = jnp.where(arrives, driven.forms_nm, position - height)
     end = ContactState(gap, velocity - speed, time, jnp.zeros_like(time))
-    return _where(free, end, start), arrives, lost
-
-
-def cross(driven: Driven, start: ContactState, setting: QuickSetting) -> Leg:
-    """Return a contact passed in three legs, from where the bridge forms to where it breaks, as one leg.
-
-    Approach through the bridge, junction, retract through the bridge; the result holds where all three do.
-
-    Args:
-        driven: the equation of motion.
-        start: where the bridge forms; the gap closes.
-        setting: how finely.
-    """
-    inward = go_in(driven, start, setting)
-    solid = go_through_junction(driven, inward.state, setting)
-    outward = go_out(driven, solid.state, setting)
-    return outward._replace(deepest_gap_nm=solid.deepest_gap_nm, holds=inward.holds & solid.holds & outward.holds)
+    return where(free, end, start), arrives, lost
 
 
 def at_junction(driven: Driven, tip: TipInContact) -> Bool[Array, "..."]:
@@ -328,17 +259,18 @@ def _through_legs(
     """Return `legs_through`, of a batch for the tips alone that begin a leg."""
     if setting.quick is None:
         return tip
-
-    def needed(driven, tip, arrives, active, until_us):
-        del until_us
-        return arrives | (active & at_junction(driven, tip))
-
-    one_pass = repeat_for(partial(legs_through, setting), needed, changed=1, passes=1, block=_LEGS_AT_ONCE)
+    one_pass = repeat_for(
+        partial(legs_through, setting),
+        lambda driven, tip, arrives, active, _: arrives | (active & at_junction(driven, tip)),
+        changed=1,
+        passes=1,
+        block=_LEGS_AT_ONCE,
+    )
     return one_pass(driven, tip, arrives, active, until_us)
 
 
 def legs_through(
-    setting: DrivenSetting, driven: Driven, tip: TipInContact, arrives: Array, active: Array, until_us: Array
+    setting: DrivenSetting, driven: Driven, tip: TipInContact, arrives: Array, active: Array, until_us: ArrayLike
 ) -> TipInContact:
     """Return a tip as far on its way through the contact as legs hold that end before a time.
 
@@ -350,9 +282,7 @@ def legs_through(
         active: whether it moves.
         until_us: the time.
     """
-    quick = setting.quick
-    if quick is None:
-        raise ValueError("`setting` has no legs")
+    quick: Any = setting.quick
 
     def takes(leg, wanted):
         return wanted & leg.holds & (leg.state.time_us < until_us)
@@ -386,7 +316,7 @@ def legs_through(
 def _at_end_of(leg: Leg, tip: TipInContact, takes: Array, phase: Phase) -> TipInContact:
     """Return a tip in a phase at the end of a leg where it takes the leg, else as it was."""
     return tip._replace(
-        state=_where(takes, leg.state, tip.state),
+        state=where(takes, leg.state, tip.state),
         phase=jnp.where(takes, phase, tip.phase).astype(tip.phase.dtype),
         trial_length=jnp.where(takes, 0.0, tip.trial_length),
         deepest_gap_nm=jnp.where(takes, jnp.minimum(tip.deepest_gap_nm, leg.deepest_gap_nm), tip.deepest_gap_nm),
@@ -405,46 +335,30 @@ def _step_in_time(
 ) -> TipInContact:
     """Return a tip in contact after some trial steps, or where legs may go on; a free one stays as it is."""
     fineness = setting.fineness * _FINER ** repeats.astype(until_us.dtype)
-    if reverse:
-
-        def once(tip, _):
-            return _advanced(driven, tip, _moves(tip, active, until_us), fineness, until_us), None
-
-        return lax.scan(once, tip, None, length=setting.trials)[0]
 
     def needs_steps(driven, tip, active, fineness, until_us):
-        # a tip that has just formed the junction waits for its leg, unless that did not hold or the contact is repeated
+        finite = jnp.isfinite(tip.state.x) & jnp.isfinite(tip.state.gap_rate)
+        moves = active & (tip.phase != Phase.DRY) & (tip.state.time_us < until_us) & finite
         if setting.quick is None:
-            return _moves(tip, active, until_us)
-        waits = at_junction(driven, tip) & (fineness == setting.fineness)
-        return _moves(tip, active, until_us) & ~waits
+            return moves
+        # a tip that has just formed the junction waits for its leg, unless that did not hold or the contact is repeated
+        return moves & ~(at_junction(driven, tip) & (fineness == setting.fineness))
 
-    def some_trials(driven, tip, active, fineness, until_us):
+    def one_trial(driven, tip, active, fineness, until_us):
+        moving = needs_steps(driven, tip, active, fineness, until_us)
+        return where(moving, advance(driven, tip, until_us, fineness), tip)
+
+    def some_trials(driven, tip, *others):
         def goes_on(state):
-            tip, count = state
-            return jnp.any(needs_steps(driven, tip, active, fineness, until_us)) & (count < _TRIALS)
+            return jnp.any(needs_steps(driven, state[0], *others)) & (state[1] < _TRIALS)
 
-        def one_trial(state):
-            tip, count = state
-            moving = needs_steps(driven, tip, active, fineness, until_us)
-            return _advanced(driven, tip, moving, fineness, until_us), count + 1
+        return lax.while_loop(goes_on, lambda state: (one_trial(driven, state[0], *others), state[1] + 1), (tip, 0))[0]
 
-        return lax.while_loop(goes_on, one_trial, (tip, 0))[0]
-
+    others = active, fineness, until_us
+    if reverse:
+        return lax.scan(lambda tip, _: (one_trial(driven, tip, *others), None), tip, length=setting.trials)[0]
     passes = -(-setting.trials // _TRIALS)
-    repeated = repeat_for(some_trials, needs_steps, changed=1, passes=passes, block=_TRIALS_AT_ONCE)
-    return repeated(driven, tip, active, fineness, until_us)
-
-
-def _moves(tip: TipInContact, active: Array, until_us: Array) -> Bool[Array, "..."]:
-    """Return whether a tip is in contact before the end, its state finite."""
-    finite = jnp.isfinite(tip.state.x) & jnp.isfinite(tip.state.gap_rate)
-    return active & (tip.phase != Phase.DRY) & (tip.state.time_us < until_us) & finite
-
-
-def _advanced(driven: Driven, tip: TipInContact, moving: Array, fineness: Array, until_us: Array) -> TipInContact:
-    """Return a tip after one trial where it moves."""
-    return _where(moving, advance(driven, tip, until_us, fineness), tip)
+    return repeat_for(some_trials, needs_steps, changed=1, passes=passes, block=_TRIALS_AT_ONCE)(driven, tip, *others)
 
 
 def _repetition(
@@ -471,12 +385,7 @@ def _repetition(
     magnified = slowed | lasts | (tip.junctions != 1) if setting.turned else slowed | lasts
     again = has_left & jnp.where(repeats.times == 0, magnified, differs & (repeats.times < _MOST_REPEATS))
     over = repeats._replace(times=jnp.where(has_left, 0, repeats.times))
-    return again, _where(again, Repeats(repeats.times + 1, departed.time_us, departed.gap_rate), over)
-
-
-def _as_vector(row: ContactRow) -> tuple[Array, Any]:
-    """Return a contact as one vector of floats, and the function that makes a contact of such a vector again."""
-    return ravel_pytree(jax.tree.map(lambda part: part.astype(row.arrival.x.dtype), row))
+    return again, where(again, Repeats(repeats.times + 1, departed.time_us, departed.gap_rate), over)
 
 
 def _contacts(
@@ -505,7 +414,5 @@ def _contacts(
     )
     arrival = State(row.arrival.time_us, row.arrival.x, row.arrival.gap_rate)
     departure = State(tip.state.time_us, tip.state.x, tip.state.gap_rate)
-    held = row.kind == ContactKind.HELD
-    departure = State(*(jnp.where(held, none, part) for part, none in zip(departure, (jnp.inf, 0.0, 0.0), strict=True)))
     lost = bridge + solid + tip.state.viscous_loss_aj
     return contacts_in_lab(surface, response, row.kind, arrival, departure, lost, detail)

@@ -5,6 +5,7 @@ A piece ends at a departure, and the next one continues from there, so that no c
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.junction import Phase
-from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
+from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, contacts_of
 from afm_jax.motion.settle import Settled, held_since, is_stuck, settled, slower_period_us
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
 
@@ -27,7 +28,6 @@ _LITTLE = 1.001
 _HELD_LONG_ENOUGH = 12.0
 """Drive periods (and free periods) for which a tip that is held is followed, where the end is left open: reading what
 it does takes longer than following it."""
-_GOES_ON = (MotionOutcome.FINISHED, MotionOutcome.HELD, MotionOutcome.CONTACT_LIMIT)
 
 Run = Callable[[State, float], Simulation]
 """Of a start and a duration in us: the motion of one scene."""
@@ -38,17 +38,12 @@ class Piece(NamedTuple):
 
     motion: Simulation
     length_us: float
-    row: int | None
-    """The contact after whose departure the motion goes on; None: it goes on from the end."""
-    goes_on: bool
-    """Whether it can go on from there: it is no part of a contact that began with the piece and still lasts."""
+    contacts: int
+    """Number of its contacts up to where the next piece begins."""
+    goes_on_from: State | None
+    """Where the next piece begins; None where the motion is over, or in a contact that began with the piece."""
     stuck: bool
     """Whether the sample holds the tip at the end (`is_stuck`)."""
-
-    @property
-    def contacts(self) -> int:
-        """Number of its contacts up to where the next piece begins."""
-        return int(self.motion.count) if self.row is None else self.row + 1
 
 
 class LongRun(NamedTuple):
@@ -79,63 +74,43 @@ def follow_in_pieces(
         to_end = until_us - float(state.time_us)
         length = stretch * piece_us if to_end > stretch * piece_us * _LITTLE else to_end
         motion = run(state, length)
-        outcome = MotionOutcome(int(motion.outcome))
-        stuck = outcome in _GOES_ON and is_stuck(scene, motion)
-        row, goes_on = where_to_go_on(motion)
-        goes_on = goes_on and outcome in _GOES_ON and not stuck
-        yield Piece(motion, length, row, goes_on, stuck)
-        full = outcome == MotionOutcome.CONTACT_LIMIT
-        if outcome not in _GOES_ON or (length == to_end and not (full and goes_on)):
+        full, stuck = bool(motion.outcome == MotionOutcome.CONTACT_LIMIT), is_stuck(scene, motion)
+        departures = np.flatnonzero(np.asarray(motion.contacts.kind) == ContactKind.IMPACT)
+        onward, contacts = None, int(motion.count)
+        if departures.size and not stuck and (full or motion.broke_off is None):
+            onward, contacts = state_after(motion, int(departures[-1])), int(departures[-1]) + 1
+        elif motion.outcome == MotionOutcome.FINISHED and motion.phase == Phase.DRY:
+            onward = motion.final
+        yield Piece(motion, length, contacts, onward, stuck)
+        if not (full or motion.broke_off is None) or (length == to_end and not (full and onward)):
             return
-        if goes_on:
-            state, stretch = state_after(motion, row), 1.0
+        if onward is not None:
+            state, stretch = onward, 1.0
         else:
             stretch = math.ceil(to_end / piece_us) if stuck else 2.0 * stretch
 
 
-def where_to_go_on(motion: Simulation) -> tuple[int | None, bool]:
-    """Return the last contact that the tip left, None: the end of a motion in flight; and whether there is either."""
-    departures = np.flatnonzero(np.asarray(motion.contacts.kind) == ContactKind.IMPACT)
-    if departures.size:
-        return int(departures[-1]), True
-    flying = int(motion.phase) == Phase.DRY and not bool(motion.held) and motion.outcome == MotionOutcome.FINISHED
-    return None, bool(flying)
-
-
-def state_after(motion: Simulation, row: int | None) -> State:
-    """Return the tip at its departure from a contact (its row), or at the end of the motion (None)."""
+def state_after(motion: Simulation, row: int) -> State:
+    """Return the tip at its departure from a contact, given its row."""
     rows = motion.contacts
-    if row is None:
-        return State(*motion.final)
     return State(rows.departure_time_us[row], rows.departure_position_nm[row], rows.departure_velocity_nm_per_us[row])
 
 
 def joined(pieces: Sequence[Piece]) -> Simulation:
     """Return pieces that follow each other as one simulation that ended as the last one did; arrays of NumPy's."""
-    counts = [*(piece.contacts for piece in pieces[:-1]), int(pieces[-1].motion.count)]
-    rows = [
-        jax.tree.map(lambda column, count=count: np.asarray(column)[:count], piece.motion.contacts)
-        for piece, count in zip(pieces, counts, strict=True)
-    ]
-    contacts = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
-    last = pieces[-1].motion
-    return Simulation(
-        start=pieces[0].motion.start,
-        contacts=contacts,
-        count=jnp.asarray(len(contacts.kind), jnp.int32),
-        final=last.final,
-        phase=last.phase,
-        held=last.held,
-        outcome=last.outcome,
-    )
+    *before, last = pieces
+    parts = [jax.tree.map(lambda column, n=part.contacts: column[:n], contacts_of(part.motion)) for part in before]
+    rows = jax.tree.map(lambda *columns: np.concatenate(columns), *parts, contacts_of(last.motion))
+    count = jnp.asarray(len(rows.kind), jnp.int32)
+    return replace(last.motion, start=pieces[0].motion.start, contacts=rows, count=count)
 
 
 def why_over(piece: Piece) -> str | None:
     """Return why a motion does not go on after a piece; None where it does, or could have."""
-    outcome = MotionOutcome(int(piece.motion.outcome))
-    if outcome not in _GOES_ON:
-        return outcome.sentence
-    return f"the sample captures the tip (at {held_since(piece.motion):.4g} us)" if piece.stuck else None
+    if piece.stuck:
+        return f"the sample captures the tip (at {held_since(piece.motion):.4g} us)"
+    full = piece.motion.outcome == MotionOutcome.CONTACT_LIMIT
+    return None if full else piece.motion.broke_off
 
 
 def follow_long(
@@ -175,7 +150,7 @@ def follow_long(
     for piece in follow_in_pieces(scene, start, float(start.time_us) + duration_us, run, piece_us=piece_us):
         if until_settled and piece.stuck:
             piece = _shortened(scene, piece, run)  # noqa: PLW2901
-        count, pieces = count + 1, [*(done for done in pieces if done.goes_on), piece]
+        count, pieces = count + 1, [*(done for done in pieces if done.goes_on_from), piece]
         whole = joined(pieces)
         if report is not None:
             report(float(whole.final.time_us), len(whole.contacts.kind))

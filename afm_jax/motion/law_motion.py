@@ -1,6 +1,6 @@
 """Law scenes in time: the impact map over whatever surface the tip sees, and rests on it, to the end of a duration.
 
-The tip is followed from flight to flight (`follow_tip`); each impact, with the rest after it, is written into one row.
+A round of the loop (`follow_rounds`) is a flight, the impact that ends it and the rest after it, written into one row.
 All shapes are fixed; a batch goes on until its last tip has ended. The tip rests on the surface for as long as the
 surface pushes it.
 
@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -26,16 +26,18 @@ from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.junction import Phase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, time_above
 from afm_jax.impact.law import Law, impact_law_of
-from afm_jax.impact.map import Departure, FollowedTip, NextImpact, Search, follow_tip
+from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.motion.record import (
     ContactKind,
-    Contacts,
+    FollowedTip,
     MotionOutcome,
     Simulation,
     State,
     contacts_in_lab,
+    follow_rounds,
     to_gap,
     to_lab,
+    where,
 )
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.derivatives import implicit_root
@@ -63,18 +65,6 @@ class LawRow(NamedTuple):
     approach: Float[Array, "..."]
     departure_us: Float[Array, "..."]
     rebound: Float[Array, "..."]
-
-
-class LawRecord(NamedTuple):
-    """What is written down of one tip on the way."""
-
-    used: Int[Array, ""]
-    """Rows that are filled."""
-    rows: Float[Array, "rows columns"]
-    outcome: Int[Array, ""]
-    """A `MotionOutcome`."""
-    flights: Int[Array, ""]
-    """Flights that were followed."""
 
 
 @compiled_quickly(static_argnames=("max_contacts", "reverse"))
@@ -114,68 +104,51 @@ def follow_law(
     gap, rate = to_gap(surface, response, start)
     touches = (gap < 0.0) & (gap > -_ON_SURFACE_NM)
     gap = gap + lax.stop_gradient(jnp.where(touches, -gap, 0.0))
-    none = jnp.zeros((), jnp.int32)
-    rows = jnp.zeros((max_contacts, len(LawRow._fields)), gap.dtype)
-    tip = FollowedTip(
-        Departure(start.time_us, gap, rate + surface.velocity(start.time_us)),
-        jnp.ones((), bool),
-        LawRecord(none, rows, none + jnp.int32(MotionOutcome.FINISHED), none),
-    )
-    tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, until.dtype)
-    search = Search(_FLIGHT_STEPS, tolerance, until, from_above=True)
-    through = partial(_written_down, seen, until)
-    tip, _ = follow_tip(seen, tip, through, search, impacts=max_contacts + 1, until_ended=True, reverse=reverse)
-    record = tip.record
-    held = record.outcome == MotionOutcome.HELD
+    departure = Departure(start.time_us, gap, rate + surface.velocity(start.time_us))
+    no_row, begun = LawRow(*[jnp.zeros_like(gap)] * len(LawRow._fields)), jnp.int32(MotionOutcome.FINISHED)
+    course = FollowedTip.begun(departure, no_row, begun, rows=max_contacts)
+    # one more, which finds no room
+    course = follow_rounds(partial(_one_flight, seen, until), course, rounds=max_contacts + 1, reverse=reverse)
+    row, no_gap = LawRow(*course.rows.T), jnp.zeros(max_contacts)
+    arrival, departure = State(row.arrival_us, no_gap, -row.approach), State(row.departure_us, no_gap, row.rebound)
+    lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
     return Simulation(
         start=start,
-        contacts=_contacts(scene, surface, response, LawRow(*jnp.moveaxis(record.rows, -1, 0))),
-        count=record.used,
-        final=_final(seen, response, tip.departure, record.outcome, until),
-        phase=jnp.where(held, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
-        held=held,
-        outcome=record.outcome,
+        contacts=contacts_in_lab(surface, response, row.kind, arrival, departure, lost),
+        count=course.contacts,
+        final=_final(seen, response, course.tip, course.outcome, until),
+        phase=jnp.where(course.outcome == MotionOutcome.HELD, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
+        outcome=course.outcome,
     )
 
 
-def _written_down(seen: Scene, until: Array, tip: FollowedTip, impact: NextImpact) -> tuple[FollowedTip, None]:
-    """Return a tip after an impact and the rest that follows it, with its row; as it was where there is none."""
-    departure, flies, (used, rows, outcome_before, flights) = tip
-    rested = or_rest(seen, departure, impact)
-    impact = jax.tree.map(lambda at_start, later: jnp.where(flights == 0, at_start, later), rested, impact)
+def _one_flight(seen: Scene, until: Array, course: FollowedTip) -> FollowedTip:
+    """Return a tip after a flight, its impact and the rest that follows, with its row; as it was where it has ended."""
+    departure, flies = course.tip, ~course.done
+    impact = impact_after(seen, departure, Search(_FLIGHT_STEPS, until_us=until, from_above=True), flies=flies)
+    impact = where(course.contacts == 0, or_rest(seen, departure, impact), impact)
     ended = impact.outcome
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)
     arrived = flies & landed & (impact.arrival_time_us < until)
     failed = flies & ~landed & (ended != Outcome.NO_FURTHER_IMPACT)
     row, beyond, lost = through_impact(seen, impact, arrived, until)
-    room = used < rows.shape[0]
-    held, full = arrived & (row.kind == ContactKind.HELD), arrived & ~room
+    held = arrived & (row.kind == ContactKind.HELD)
     outcome = jnp.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED)
-    outcome = jnp.where(failed, _failure(ended, flights), outcome)
+    known = [ended == Outcome.STEP_LIMIT, (ended == Outcome.INVALID_START) & (course.contacts == 0)]
+    failure = jnp.select(known, [MotionOutcome.STEP_LIMIT, MotionOutcome.INVALID_START], MotionOutcome.UNRESOLVED)
+    outcome = jnp.where(failed, failure, outcome)
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
-    outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, outcome)
-    goes_on = arrived & ~held & ~full & ~lost
-    written = arrived & room & ~lost
-    place = jnp.where(written, used, rows.shape[0])
-    record = LawRecord(
-        used=jnp.where(written, used + 1, used),
-        rows=rows.at[place].set(jnp.stack(row), mode="drop"),
-        outcome=jnp.where(flies, outcome, outcome_before).astype(jnp.int32),
-        flights=flights + 1,
-    )
-    departure = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), beyond, departure)
-    return FollowedTip(departure, flies & goes_on, record), None
+    goes_on = arrived & ~held & ~lost
+    return course.after(where(goes_on, beyond, departure), row, arrived & ~lost, outcome, ~goes_on)
 
 
 def or_rest(seen: Scene, departure: Departure, impact: NextImpact) -> NextImpact:
     """Return the capture that a tip at rest on the surface at its start has had, or the impact that was found."""
-    surface = seen.platform
     time, gap, velocity = departure
-    speed = surface.velocity(time)
-    slow = jnp.abs(velocity - speed) <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
-    rests = (gap == 0.0) & slow
+    speed, fastest = seen.platform.velocity(time), Bed(seen.cantilever, seen.platform).fastest
+    rests = (gap == 0.0) & (jnp.abs(velocity - speed) <= _ON_SURFACE_NM * fastest)
     captured = NextImpact(time, time, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests)
-    return jax.tree.map(lambda resting, flying: jnp.where(rests, resting, flying), captured, impact)
+    return where(rests, captured, impact)
 
 
 def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, Departure, Array]:
@@ -194,36 +167,26 @@ def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array
     before = jnp.where(arrived, impact.velocity_before_nm_per_us, 0.0)
     approach = jnp.where(arrived, bed.surface.velocity(arrival) - before, 1.0)
     captured = arrived & (impact.outcome == Outcome.CAPTURED)
-    rebound = law.rebound_speed(approach)
-    if law.lasts:
-        departs = arrived & ~captured
-        time, after = (jnp.where(departs, part, 0.0) for part in (impact.time_us, impact.velocity_after_nm_per_us))
-        rebound = jnp.where(departs, after - bed.surface.velocity(time), 0.0)
+    leaving = jnp.where(arrived, impact.time_us, until)
+    after = jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0)
+    rebound = jnp.where(arrived & ~captured, after - bed.surface.velocity(leaving), 0.0)
     chatters, lasts = chatter(bed, law, arrival, rebound)
     chatters = chatters & arrived & ~captured
     rests = captured | chatters
     resting = jnp.minimum(arrival + jnp.where(chatters, lasts, 0.0), until)
-    release = first_release(bed, jnp.where(rests & ~law.adheres, resting, until), until)
-    away = Departure(*take_off(bed, release.time_us, until))
-    leaving = jnp.where(arrived, impact.time_us, until)
-    next_flight = Departure(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))
-    leaves = jnp.where(rests, release.happens, leaving < until)
+    is_let_go, release_us, lost = first_release(bed, jnp.where(rests & ~law.adheres, resting, until), until)
+    away = Departure(*take_off(bed, release_us, until))
+    next_flight = Departure(leaving, jnp.zeros_like(leaving), after)
+    leaves = jnp.where(rests, is_let_go, leaving < until)
     kind = jnp.where(chatters, float(ContactKind.CHATTER), float(ContactKind.IMPACT))
     row = LawRow(
         kind=jnp.where(leaves, kind, float(ContactKind.HELD)),
         arrival_us=arrival,
         approach=approach,
-        departure_us=jnp.where(leaves, jnp.where(rests, release.time_us, leaving), jnp.inf),
-        rebound=jnp.where(leaves & ~rests, rebound, 0.0),
+        departure_us=jnp.where(rests, release_us, leaving),
+        rebound=jnp.where(rests, 0.0, rebound),
     )
-    return row, jax.tree.map(lambda new, old: jnp.where(rests, new, old), away, next_flight), arrived & release.lost
-
-
-def _failure(ended: Array, flights: Array) -> Array:
-    """Return the outcome of a simulation whose flight failed."""
-    start = jnp.where(flights == 0, MotionOutcome.INVALID_START, MotionOutcome.UNRESOLVED)
-    other = jnp.where(ended == Outcome.STEP_LIMIT, MotionOutcome.STEP_LIMIT, MotionOutcome.UNRESOLVED)
-    return jnp.where(ended == Outcome.INVALID_START, start, other)
+    return row, where(rests, away, next_flight), arrived & lost
 
 
 def _final(seen: Scene, response: Surface | None, departure: Departure, outcome: Array, until: Array) -> State:
@@ -235,15 +198,6 @@ def _final(seen: Scene, response: Surface | None, departure: Departure, outcome:
     position, velocity = seen.cantilever.propagator(time - departure.time_us)(height, departure.velocity_nm_per_us)
     gap, rate = to_gap(surface, None, State(time, position, velocity))
     return to_lab(surface, response, time, jnp.where(held, 0.0, gap), jnp.where(held, 0.0, rate))
-
-
-def _contacts(scene: Scene, surface: Platform | Surface, response: Surface | None, row: LawRow) -> Contacts:
-    """Return the rows as contacts in the lab."""
-    zero = jnp.zeros_like(row.approach)
-    arrival = State(row.arrival_us, zero, -row.approach)
-    departure = State(row.departure_us, zero, row.rebound)
-    lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
-    return contacts_in_lab(surface, response, row.kind, arrival, departure, lost)
 
 
 class Bed(NamedTuple):
@@ -275,30 +229,19 @@ class Bed(NamedTuple):
         return jax.jvp(self.push, (time_us,), (jnp.ones_like(time_us),))
 
     def time_pressed(self, time_us: Float[Array, ""]) -> Float[Array, ""]:
-        """Return for how long after a time in us the push stays positive, whatever the phase of the waves."""
+        """Return infinity where the push stays positive after a time in us, whatever the phase of the waves, else 0."""
         surface, decay, square = self.surface, self.cantilever.decay_rate, self.cantilever.angular_frequency**2
         rate, reach = surface.offset_rate_nm_per_us, surface.reach_nm
         waves = surface.largest_acceleration_nm_per_us2 + (
             2.0 * decay * surface.fastest_angular_frequency * reach + square * reach
         )
         least = square * (surface.offset_nm + rate * time_us) + 2.0 * decay * rate - waves
-        sinks = rate < 0.0
-        lasts = jnp.where(sinks, least / jnp.where(sinks, -square * rate, 1.0), jnp.inf)
-        return jnp.where(least >= 0.0, lasts, 0.0)
+        return jnp.where((least >= 0.0) & (rate >= 0.0), jnp.inf, 0.0)
 
 
-class Release(NamedTuple):
-    """When the surface lets a resting tip go."""
-
-    happens: Bool[Array, ""]
-    """Whether it does before the end of the search."""
-    time_us: Float[Array, ""]
-    """When; the end of the search where it does not."""
-    lost: Bool[Array, ""]
-    """The search gave up."""
-
-
-def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""]) -> Release:
+def first_release(
+    bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""]
+) -> tuple[Bool[Array, ""], Float[Array, ""], Bool[Array, ""]]:
     """Return when a tip that rests from a time on is let go: the first time at which the push turns negative.
 
     The search cannot miss it: with the push n >= 0, its slope n' and |n''| <= M, the push stays positive for
@@ -310,7 +253,8 @@ def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""
         until_us: end of the search.
 
     Returns:
-        The release, its time with implicit derivatives. A tip that is lifted from the beginning is let go at once.
+        Whether the surface lets the tip go before the end of the search; when, with implicit derivatives, else that
+        end; whether the search gave up. A tip that is lifted from the beginning is let go at once.
     """
     still, begin, until = lax.stop_gradient((bed, from_us, until_us))
     resolution = 4.0 * jnp.finfo(begin.dtype).eps
@@ -333,9 +277,9 @@ def first_release(bed: Bed, from_us: Float[Array, ""], until_us: Float[Array, ""
     time, lifted, steps = lax.while_loop(searching, advance, (begin, none, jnp.zeros_like(begin, dtype=jnp.int32)))
     happens = lifted & (time < until)
     at_once = still.push(begin) < -bend * shortest**2
-    root = implicit_root(_push_at, jnp.where(happens, time, until), bed)
+    root = implicit_root(lambda time, bed: bed.push(time), jnp.where(happens, time, until), bed)
     when = jnp.where(happens, jnp.where(at_once, from_us, root), until_us)
-    return Release(happens, when, ~lifted & (time < until) & (steps >= _MAX_STEPS))
+    return happens, when, ~lifted & (time < until) & (steps >= _MAX_STEPS)
 
 
 def take_off(
@@ -382,11 +326,5 @@ def chatter(
     converges = (push > 0.0) & (loss > 0.0) & ~law.adheres
     lasts = 2.0 * rebound / jnp.where(converges, push * loss, 1.0)
     change = lasts * jnp.maximum(bed.fastest * push, jnp.abs(rate))
-    short = converges & (change < CONSTANT_PUSH * push)
-    if law.delay is not None:
-        short = jnp.zeros_like(short)
+    short = converges & (change < CONSTANT_PUSH * push) & (law.delay is None)
     return short, jnp.where(short, lasts, 0.0)
-
-
-def _push_at(time_us: Float[Array, ""], bed: Bed) -> Float[Array, ""]:
-    return bed.push(time_us)

@@ -13,39 +13,44 @@ the last response period once a motion has settled, else the whole response peri
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Annotated, Any, NamedTuple, get_args
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import FlightEnds, highest_of_flight
-from afm_jax.motion.record import ContactKind, Contacts, Simulation, State, contacts_left, to_gap, with_response
+from afm_jax.motion.record import (
+    ContactKind,
+    Simulation,
+    State,
+    contacts_left,
+    contacts_of,
+    to_gap,
+    with_response,
+)
 from afm_jax.motion.settle import Settled, Window, settled, window_of
-from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
+from afm_jax.motion.trajectory import DensePath, Trajectory, fly
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-_LOADS = 4001
-"""Points on the junction's load curve at which its most attractive force is searched for."""
 _COVERED = 1e-6
 """Fraction of a window that may be missing from its nodes: rounding."""
 _REFINEMENTS = 4
-_REFINED = 33
-"""Times between two around the best one, of every refinement."""
+_TOPS, _REFINED = 4, 33
+"""Local maxima that are refined, and times around each in every refinement."""
 TOO_SHORT = "the window is shorter than a response period: follow the motion longer"
-_ONLY_RESOLVED = "only a resolved contact has a force"
+_RESOLVED = "only a resolved contact has a force"
 _BASE_RESTS = "the base rests: the deflection is the height"
 
 
@@ -62,8 +67,7 @@ class Harmonic(NamedTuple):
     of this harmonic by multiples of 360/N'."""
 
 
-@dataclass(frozen=True)
-class Observable:
+class Observable(NamedTuple):
     """How a quantity is read of a motion."""
 
     meaning: str
@@ -73,8 +77,6 @@ class Observable:
     """Why there may be none; empty where every motion has it."""
     of_a_part: bool = False
     """Whether a window shorter than a response period tells it; else the quantity is NaN there."""
-    name: str = ""
-    """With the unit: the attribute of `Observables`, the JSON key, the column of a sweep."""
 
     def of(self, motion: "MotionWindow") -> float | None:
         """Return the quantity of a window; None where the scene has none, NaN where the window is too short."""
@@ -82,9 +84,15 @@ class Observable:
         return value if value is None or self.of_a_part or motion.responses else math.nan
 
 
-def _of_deflection(meaning: str, read: Callable[["Signal"], float], *, of_a_part: bool = False) -> Observable:
-    """Return how a quantity of the deflection against a moving base is read."""
-    return Observable(meaning, lambda m: m.deflection and read(m.deflection), _BASE_RESTS, of_a_part)
+_row: Any = Observable
+"""Makes a row of the table: an `Observable` in the place of its number."""
+
+
+def _of_deflection(meaning: str, read: Callable[["Signal"], float], **options: bool) -> Any:
+    """Return the row of a quantity of the deflection against a moving base."""
+    return _row(
+        f"{meaning} against a moving base", lambda m: m.deflection and read(m.deflection), _BASE_RESTS, **options
+    )
 
 
 class Observables(NamedTuple):
@@ -102,119 +110,81 @@ class Observables(NamedTuple):
     deflection_harmonics: tuple[Harmonic, ...] | None
     """Of the deflection z - z_b, at the multiples asked for; None without a moving base."""
 
-    # the table: m is the motion in its window
-    peak_amplitude_nm: Annotated[
-        float, Observable("largest height above the rest position", lambda m: m.height.largest, of_a_part=True)
-    ]
-    lockin_amplitude_nm: Annotated[
-        float, Observable("amplitude at the response frequency omega/N", lambda m: m.height.at_response.amplitude_nm)
-    ]
-    lockin_phase_deg: Annotated[
-        float, Observable("phase at the response frequency, modulo 360/N", lambda m: m.height.at_response.phase_deg)
-    ]
-    drive_lockin_amplitude_nm: Annotated[
-        float, Observable("amplitude at the drive's frequency omega", lambda m: m.height.at_drive.amplitude_nm)
-    ]
-    drive_lockin_phase_deg: Annotated[
-        float, Observable("phase at the drive's frequency omega", lambda m: m.height.at_drive.phase_deg)
-    ]
-    mean_height_nm: Annotated[float, Observable("mean height", lambda m: m.height.mean)]
-    contact_share: Annotated[float, Observable("fraction of time in contact", lambda m: m.in_contact_us / m.span_us)]
-    time_in_contact_us: Annotated[
-        float,
-        Observable("time in contact of a response period", lambda m: m.in_contact_us / m.cycles * m.periods),
-    ]
-    peak_force_nn: Annotated[
-        float | None,
-        Observable(
-            "largest force on the tip, of a resolved contact", lambda m: m.forces_nn[1], _ONLY_RESOLVED, of_a_part=True
-        ),
-    ]
-    most_attractive_force_nn: Annotated[
-        float | None,
-        Observable(
-            "most attractive force on the tip, of a resolved contact",
-            lambda m: m.forces_nn[0],
-            _ONLY_RESOLVED,
-            of_a_part=True,
-        ),
-    ]
-    dissipated_in_contact_aj: Annotated[
-        float, Observable("energy lost to the sample per drive period", lambda m: m.energy.contact_aj / m.cycles)
-    ]
-    dissipated_per_contact_aj: Annotated[
-        float | None,
-        Observable(
-            "energy lost to the sample per contact",
-            lambda m: m.energy.contact_aj / m.contacts if m.contacts else None,
-            "no contact begins in the window",
-        ),
-    ]
-    dissipated_in_air_aj: Annotated[
-        float, Observable("energy lost to the air per drive period", lambda m: m.energy.air_aj / m.cycles)
-    ]
-    given_by_drives_aj: Annotated[
-        float, Observable("energy given by the drives per drive period", lambda m: m.energy.given_aj / m.cycles)
-    ]
-    stored_aj: Annotated[
-        float,
-        Observable(
-            "growth of the energy of tip and spring per drive period; 0 once settled",
-            lambda m: m.energy.stored_aj / m.cycles,
-        ),
-    ]
-    energy_imbalance: Annotated[
-        float | None,
-        Observable(
-            "what the four energies leave unexplained, of the largest; only of a resolved contact",
-            lambda m: m.energy.imbalance,
-            "with an impact law the energy given by the drives closes the balance",
-            of_a_part=True,
-        ),
-    ]
-    virial_aj: Annotated[float, Observable("mean of force times height", lambda m: m.virial_aj)]
-    peak_deflection_nm: Annotated[
-        float | None,
-        _of_deflection("largest deflection against a moving base", lambda s: s.largest, of_a_part=True),
-    ]
-    mean_deflection_nm: Annotated[
-        float | None, _of_deflection("mean deflection against a moving base", lambda s: s.mean)
-    ]
-    deflection_lockin_amplitude_nm: Annotated[
-        float | None,
-        _of_deflection("amplitude of the deflection at the response frequency", lambda s: s.at_response.amplitude_nm),
-    ]
-    deflection_lockin_phase_deg: Annotated[
-        float | None,
-        _of_deflection(
-            "phase of the deflection at the response frequency, modulo 360/N", lambda s: s.at_response.phase_deg
-        ),
-    ]
-    deflection_drive_lockin_amplitude_nm: Annotated[
-        float | None,
-        _of_deflection("amplitude of the deflection at the drive's frequency", lambda s: s.at_drive.amplitude_nm),
-    ]
-    deflection_drive_lockin_phase_deg: Annotated[
-        float | None,
-        _of_deflection("phase of the deflection at the drive's frequency", lambda s: s.at_drive.phase_deg),
-    ]
-    phase_lag_deg: Annotated[
-        float | None,
-        Observable(
-            "lag of deflection or height behind base or force at the drive's frequency",
-            lambda m: m.phase_lag_deg,
-            "no base and no force drives the tip",
-        ),
-    ]
+    # the table: the default of a quantity says how it is read; m is the motion in its window
+    peak_amplitude_nm: float = _row(
+        "largest height above the rest position", lambda m: m.height.largest, of_a_part=True
+    )
+    lockin_amplitude_nm: float = _row(
+        "amplitude at the response frequency omega/N", lambda m: m.height.at_response.amplitude_nm
+    )
+    lockin_phase_deg: float = _row(
+        "phase at the response frequency, modulo 360/N", lambda m: m.height.at_response.phase_deg
+    )
+    drive_lockin_amplitude_nm: float = _row(
+        "amplitude at the drive's frequency omega", lambda m: m.height.at_drive.amplitude_nm
+    )
+    drive_lockin_phase_deg: float = _row("phase at the drive's frequency omega", lambda m: m.height.at_drive.phase_deg)
+    mean_height_nm: float = _row("mean height", lambda m: m.height.mean)
+    contact_share: float = _row("fraction of time in contact", lambda m: m.in_contact_us / m.span_us)
+    time_in_contact_us: float = _row(
+        "time in contact of a response period", lambda m: m.in_contact_us / m.cycles * m.periods
+    )
+    peak_force_nn: float | None = _row(
+        "largest force on the tip, of a resolved contact", lambda m: m.largest_force_nn(1.0), _RESOLVED, of_a_part=True
+    )
+    most_attractive_force_nn: float | None = _row(
+        "most attractive force on the tip, of a resolved contact",
+        lambda m: m.largest_force_nn(-1.0),
+        _RESOLVED,
+        of_a_part=True,
+    )
+    dissipated_in_contact_aj: float = _row(
+        "energy lost to the sample per drive period", lambda m: m.energy.contact_aj / m.cycles
+    )
+    dissipated_per_contact_aj: float | None = _row(
+        "energy lost to the sample per contact",
+        lambda m: m.energy.contact_aj / m.contacts if m.contacts else None,
+        "no contact begins in the window",
+    )
+    dissipated_in_air_aj: float = _row("energy lost to the air per drive period", lambda m: m.energy.air_aj / m.cycles)
+    given_by_drives_aj: float = _row(
+        "energy given by the drives per drive period", lambda m: m.energy.given_aj / m.cycles
+    )
+    stored_aj: float = _row(
+        "growth of the energy of tip and spring per drive period; 0 once settled",
+        lambda m: m.energy.stored_aj / m.cycles,
+    )
+    energy_imbalance: float | None = _row(
+        "what the four energies leave unexplained, of the largest; only of a resolved contact",
+        lambda m: m.energy.imbalance,
+        "with an impact law the energy given by the drives closes the balance",
+        of_a_part=True,
+    )
+    virial_aj: float = _row("mean of force times height", lambda m: m.virial_aj)
+    peak_deflection_nm: float | None = _of_deflection("largest deflection", lambda s: s.largest, of_a_part=True)
+    mean_deflection_nm: float | None = _of_deflection("mean deflection", lambda s: s.mean)
+    deflection_lockin_amplitude_nm: float | None = _of_deflection(
+        "amplitude at the response frequency", lambda s: s.at_response.amplitude_nm
+    )
+    deflection_lockin_phase_deg: float | None = _of_deflection(
+        "phase at the response frequency, modulo 360/N,", lambda s: s.at_response.phase_deg
+    )
+    deflection_drive_lockin_amplitude_nm: float | None = _of_deflection(
+        "amplitude at the drive's frequency", lambda s: s.at_drive.amplitude_nm
+    )
+    deflection_drive_lockin_phase_deg: float | None = _of_deflection(
+        "phase at the drive's frequency", lambda s: s.at_drive.phase_deg
+    )
+    phase_lag_deg: float | None = _row(
+        "lag of deflection or height behind base or force at the drive's frequency",
+        lambda m: m.phase_lag_deg,
+        "no base and no force drives the tip",
+    )
 
 
-OBSERVABLES: tuple[Observable, ...] = tuple(
-    replace(row, name=name)
-    for name, hint in Observables.__annotations__.items()
-    for row in get_args(hint)
-    if isinstance(row, Observable)
-)
-"""The rows of the table, in the order of the output."""
+OBSERVABLES: dict[str, Observable] = Observables._field_defaults
+"""The rows of the table by their names, in the order of the output: the attributes of `Observables`, the JSON keys, the
+columns of a sweep."""
 
 
 def observe(
@@ -234,7 +204,7 @@ def observe(
         simulation: of one scene, not of a batch.
         harmonics: multiples k of the response frequency that are read besides 1 and N, positive integers.
         verdict: what `settled` said, if it is known already.
-        dense: the tip over the window and whatever else is looked at, if that is known already.
+        dense: the tip at any time, if that is at hand.
 
     Raises:
         ValueError: if a harmonic is not a positive integer, or there are none.
@@ -245,12 +215,18 @@ def observe(
         raise ValueError(f"`harmonics` must be positive integers, but are {tuple(harmonics)}")
     verdict = settled(scene, simulation) if verdict is None else verdict
     window = window_of(scene, simulation, verdict)
-    dense = dense_path(scene, simulation, window.from_us, window.to_us) if dense is None else dense
+    dense = DensePath(scene, simulation) if dense is None else dense
     motion = MotionWindow(dense, window.from_us, window.to_us, window.periods, window.responses)
-    motion.check_covered()
+    covered = float(np.sum(motion.nodes[1]))
+    # integrals over part of the window would be wrong in silence
+    if not abs(covered - motion.span_us) <= _COVERED * motion.span_us:
+        raise RuntimeError(
+            f"the dense trajectory covers {covered:.6g} of the {motion.span_us:.6g} us of the window: integrated "
+            "once more, a contact ended otherwise than in the simulation, which is not to be trusted there"
+        )
     frequency = drive_of(scene).angular_frequency / RAD_PER_US_PER_KHZ
     height, deflection = motion.height, motion.deflection
-    values: dict[str, Any] = {observable.name: observable.of(motion) for observable in OBSERVABLES}
+    values: dict[str, Any] = {name: observable.of(motion) for name, observable in OBSERVABLES.items()}
     return Observables(
         settled=verdict,
         window=window,
@@ -265,17 +241,12 @@ def observe(
 
 def why_absent(scene: Scene, seen: Observables) -> dict[str, str]:
     """Return why a quantity is None or NaN, by its name, for each that is."""
-    reasons = {}
-    for observable in OBSERVABLES:
-        value = getattr(seen, observable.name)
-        if value is None:
-            reasons[observable.name] = observable.absent
+    reasons = {} if scene.base is not None else {"deflection_harmonics": _BASE_RESTS}
+    for name, observable in OBSERVABLES.items():
+        if getattr(seen, name) is None:
+            reasons[name] = observable.absent
         elif not (seen.window.responses or observable.of_a_part):
-            reasons[observable.name] = TOO_SHORT
-    if scene.interaction is None:
-        reasons |= {name: "no contact" for name, reason in reasons.items() if reason == _ONLY_RESOLVED}
-    if scene.base is None:
-        reasons["deflection_harmonics"] = _BASE_RESTS
+            reasons[name] = TOO_SHORT
     return reasons
 
 
@@ -326,29 +297,11 @@ class MotionWindow:
         """Return the integral over time, in us, of a quantity given at the nodes."""
         return float(np.sum(self.nodes[1] * rates))
 
-    def check_covered(self) -> None:
-        """Check that the nodes cover the window: integrals over part of it would be wrong in silence.
-
-        Raises:
-            RuntimeError: if they do not.
-        """
-        covered = float(np.sum(self.nodes[1]))
-        if not abs(covered - self.span_us) <= _COVERED * self.span_us:
-            raise RuntimeError(
-                f"the dense trajectory covers {covered:.6g} of the {self.span_us:.6g} us of the window: integrated "
-                "once more, a contact ended otherwise than in the simulation, which is not to be trusted there"
-            )
-
-    @cached_property
-    def rows(self) -> Contacts:
-        """All contacts of the simulation, as arrays of NumPy's."""
-        return jax.tree.map(np.asarray, self.dense.simulation.contacts)
-
     @cached_property
     def begun(self) -> Bool[np.ndarray, " rows"]:
         """Which contacts begin in the window."""
-        kind, arrival = np.asarray(self.rows.kind), self.rows.arrival_time_us
-        return np.asarray((kind != ContactKind.NONE) & (arrival >= self.from_us) & (arrival < self.to_us))
+        arrival = np.asarray(self.dense.contacts.arrival_time_us)
+        return (arrival >= self.from_us) & (arrival < self.to_us)
 
     @property
     def contacts(self) -> int:
@@ -358,9 +311,9 @@ class MotionWindow:
     @property
     def in_contact_us(self) -> float:
         """Time in contact; impacts of a law take none, but for rests on the sample."""
-        lasting = self.rows.kind > (ContactKind.NONE if self._resolved else ContactKind.IMPACT)
-        begin = np.maximum(self.rows.arrival_time_us, self.from_us)
-        end = np.minimum(self.rows.departure_time_us, self.to_us)
+        lasting = self.dense.contacts.kind > (ContactKind.NONE if self._resolved else ContactKind.IMPACT)
+        begin = np.maximum(self.dense.contacts.arrival_time_us, self.from_us)
+        end = np.minimum(self.dense.contacts.departure_time_us, self.to_us)
         return float(np.sum(np.maximum(end - begin, 0.0)[lasting]))
 
     @property
@@ -385,39 +338,68 @@ class MotionWindow:
             return None
         return within_turn(float(drive.phase_deg) - (self.deflection or self.height).at_drive.phase_deg, 360.0)
 
-    @cached_property
-    def forces_nn(self) -> tuple[float | None, float | None]:
-        """The most attractive and the largest repulsive force in nN; None where the contact is not resolved.
+    def largest(self, quantity: Callable[[Trajectory], np.ndarray]) -> float:
+        """Return the largest value of a quantity of trajectories in the window.
 
-        A contact that lies in the window counts with its largest load and, if its junction formed, with all loads of
-        the junction's branch, which it went through until the junction broke.
+        It is evaluated at the nodes, then on ever finer grids around its highest local maxima: at the nodes one may be
+        the highest that is not.
         """
-        detail, force = self.rows.detail, self.path.force_nn
-        if not self._resolved or detail is None or not force.size:
-            return None, None
-        whole = (self.rows.kind != ContactKind.NONE) & (self.rows.arrival_time_us >= self.from_us)
-        whole &= self.rows.departure_time_us <= self.to_us
-        loads = [0.0, float(force.min()), float(force.max()), *np.asarray(detail.peak_force_nn)[whole].tolist()]
-        if np.any(np.asarray(detail.junctions)[whole] > 0):
-            solid = self.scene.interaction.solid
-            depths = np.linspace(float(solid.depth_scale_nm * solid.depth(solid.fold)), 0.0, _LOADS)
-            loads.append(float(_least_force(solid, depths)))
-        return min(loads), max(loads)
+        times, largest = np.unique([*self.nodes[0], self.from_us, self.to_us]), -np.inf
+        for _ in range(_REFINEMENTS + 1):
+            values = quantity(self.dense.at(times))
+            largest = max(largest, float(values.max()))
+            framed = np.concatenate([[-np.inf], values, [-np.inf]])
+            tops = np.flatnonzero((values >= framed[:-2]) & (values >= framed[2:]))
+            tops = tops[np.argsort(values[tops])[-_TOPS:]]
+            around = times[np.maximum(tops - 1, 0)], times[np.minimum(tops + 1, len(times) - 1)]
+            times = np.unique(np.linspace(*around, _REFINED))
+        return largest
+
+    def largest_force_nn(self, sign: float) -> float | None:
+        """Return the largest repulsive force in nN, with a sign of -1 the most attractive; None without resolution."""
+        return sign * max(self.largest(lambda path: sign * path.force_nn), 0.0) if self._resolved else None
 
     @property
     def virial_aj(self) -> float:
         """1/T int F z dt in aJ; an impact of a law counts m (V' - V) z, z halfway where it has a delay."""
         if self.scene.interaction is None or self._resolved:
             return self.integral(self.path.force_nn * self.path.position_nm) / self.span_us
-        rows, impacts = self.rows, self.begun & (self.rows.kind == ContactKind.IMPACT)
+        rows, impacts = self.dense.contacts, self.begun & (self.dense.contacts.kind == ContactKind.IMPACT)
         kick = (rows.departure_velocity_nm_per_us - rows.arrival_velocity_nm_per_us)[impacts]
         height = 0.5 * (rows.departure_position_nm + rows.arrival_position_nm)[impacts]
         return float(self.scene.cantilever.mass_ng) * float(np.sum(kick * height)) / self.span_us
 
     @cached_property
     def energy(self) -> "EnergyBalance":
-        """The energies of the window in aJ."""
-        return _energy_balance(self)
+        """The energies of the window in aJ, from the equation of motion multiplied by z'.
+
+        m z'' + (m Omega/Q) z' + k z = F + f + k z_b, with the contact force F, the drive force f and the base z_b. The
+        gap D and the platform z_p split the contact's power, F z' = F D' + F z_p'. Drives give F z_p' + f z' +
+        k z_b z', air dissipates (m Omega/Q) z'^2, and the contact receives -F D', and returns the part of conservative
+        forces.
+        """
+        scene, path = self.scene, self.path
+        cantilever = scene.cantilever
+        mass, stiffness = float(cantilever.mass_ng), float(cantilever.stiffness_n_per_m)
+        v, ends = path.velocity_nm_per_us, self.dense.at(np.array([self.from_us, self.to_us]))
+        air = 2.0 * float(cantilever.decay_rate) * mass * self.integral(v * v)
+        energy = 0.5 * mass * ends.velocity_nm_per_us**2 + 0.5 * stiffness * ends.position_nm**2
+        stored = float(energy[1] - energy[0])
+        contact = float(np.sum(self.dense.contacts.energy_lost_aj[self.begun]))
+        if isinstance(scene.interaction, Law):
+            return EnergyBalance(air + contact + stored, air, contact, stored, None)
+        # a contact that the window cuts has lost what its ledger does not tell yet
+        if np.any(self.dense.contacts.kind[self.begun] == ContactKind.HELD) or np.any(ends.phase):
+            contact = -self.integral(path.force_nn * path.gap_rate_nm_per_us)
+        # D' = z' - z_p', whatever else drives the tip
+        given = self.integral(path.force_nn * (v - path.gap_rate_nm_per_us))
+        if scene.force is not None:
+            given += self.integral(np.asarray(scene.force.force(path.time_us)) * v)
+        if scene.base is not None:
+            given += stiffness * self.integral(np.asarray(scene.base.position_and_velocity(path.time_us)[0]) * v)
+        largest = max(abs(given), abs(air), abs(contact), abs(stored))
+        imbalance = (given - air - contact - stored) / largest if largest else 0.0
+        return EnergyBalance(given, air, contact, stored, imbalance)
 
 
 @dataclass(frozen=True)
@@ -441,8 +423,7 @@ class Signal:
     @property
     def largest(self) -> float:
         """Largest value in nm."""
-        motion = self.motion
-        return largest_along(motion.dense, self.along, motion.nodes[0], (motion.from_us, motion.to_us))
+        return self.motion.largest(self.along)
 
     @property
     def mean(self) -> float:
@@ -494,37 +475,6 @@ class EnergyBalance(NamedTuple):
     """What is left, of the largest of them; None with a law."""
 
 
-def _energy_balance(motion: MotionWindow) -> EnergyBalance:
-    """Return the energies of a window in aJ, from the equation of motion multiplied by z'.
-
-    m z'' + (m Omega/Q) z' + k z = F + f + k z_b, with the contact force F, the drive force f and the base z_b. The gap
-    D and the platform z_p split the contact's power, F z' = F D' + F z_p'. Drives give F z_p' + f z' + k z_b z', air
-    dissipates (m Omega/Q) z'^2, and the contact receives -F D', and returns the part of conservative forces.
-    """
-    scene, path = motion.scene, motion.path
-    cantilever = scene.cantilever
-    mass, stiffness = float(cantilever.mass_ng), float(cantilever.stiffness_n_per_m)
-    v, ends = path.velocity_nm_per_us, motion.dense.at(np.array([motion.from_us, motion.to_us]))
-    air = 2.0 * float(cantilever.decay_rate) * mass * motion.integral(v * v)
-    energy = 0.5 * mass * ends.velocity_nm_per_us**2 + 0.5 * stiffness * ends.position_nm**2
-    stored = float(energy[1] - energy[0])
-    contact = float(np.sum(motion.rows.energy_lost_aj[motion.begun]))
-    if isinstance(scene.interaction, Law):
-        return EnergyBalance(air + contact + stored, air, contact, stored, None)
-    # a contact that the window cuts has lost what its ledger does not tell yet
-    if np.any(motion.rows.kind[motion.begun] == ContactKind.HELD) or np.any(ends.phase):
-        contact = -motion.integral(path.force_nn * path.gap_rate_nm_per_us)
-    # D' = z' - z_p', whatever else drives the tip
-    given = motion.integral(path.force_nn * (v - path.gap_rate_nm_per_us))
-    if scene.force is not None:
-        given += motion.integral(np.asarray(scene.force.force(path.time_us)) * v)
-    if scene.base is not None:
-        given += stiffness * motion.integral(np.asarray(scene.base.position_and_velocity(path.time_us)[0]) * v)
-    largest = max(abs(given), abs(air), abs(contact), abs(stored))
-    imbalance = (given - air - contact - stored) / largest if largest else 0.0
-    return EnergyBalance(given, air, contact, stored, imbalance)
-
-
 def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> complex:
     """Return what impacts of a law add to int z exp(-i nu t) dt of flights and rests, in nm us.
 
@@ -538,141 +488,64 @@ def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> comp
         motion: of any scene; only a law with a delay has something to add.
         angular_frequency: nu in rad/us.
     """
-    law, rows = motion.scene.interaction, motion.rows
+    law, rows = motion.scene.interaction, motion.dense.contacts
     if not isinstance(law, Law) or law.delay is None:
         return 0j
     arrival, departure = rows.arrival_time_us, rows.departure_time_us
     middle = 0.5 * (arrival + departure)
     inside = (rows.kind == ContactKind.IMPACT) & (middle >= motion.from_us) & (middle < motion.to_us)
     impacts = np.flatnonzero(inside)
-    depth = 0.0
+    cantilever, (surface, response), depth = motion.scene.cantilever, surface_of(motion.scene), 0.0
     if law.lasts:
-        cantilever, (surface, _) = motion.scene.cantilever, surface_of(motion.scene)
         at_middle = middle_of_contact(cantilever, surface, jnp.asarray(middle[impacts]))
         approach = jnp.asarray(rows.approach_speed_nm_per_us)[impacts]
         depth = np.asarray(depth_of_impact(law, approach, at_middle, cantilever, angular_frequency))
     total = -np.sum(depth * np.exp(-1j * angular_frequency * middle[impacts]))
-    early = impacts[departure[impacts] < arrival[impacts]]
-    return complex(total) + (_integral_of_overlaps(motion, early, angular_frequency) if early.size else 0j)
+    # flights from their beginning to the end of the flight before
+    early = impacts[departure[impacts] < arrival[impacts], None]
+    start = State(departure[early], rows.departure_position_nm[early], rows.departure_velocity_nm_per_us[early])
+    half = 0.5 * (arrival[early] - departure[early])
+    times = departure[early] + half * (_NODES + 1.0)
+    gaps, _ = fly(cantilever, surface, *to_gap(surface, response, start), start.time_us, times)
+    return complex(total + np.sum(half * _WEIGHTS * np.asarray(gaps) * np.exp(-1j * angular_frequency * times)))
 
 
-def _integral_of_overlaps(
-    motion: MotionWindow, early: Int[np.ndarray, " impacts"], angular_frequency: float
-) -> complex:
-    """Return int gap exp(-i nu t) dt of flights from their beginning to the end of the flight before, in nm us."""
-    rows, (surface, response) = motion.rows, surface_of(motion.scene)
-    columns = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
-    departure = State(*(jnp.asarray(column)[early] for column in columns))
-    half = 0.5 * (rows.arrival_time_us[early] - rows.departure_time_us[early])[:, None]
-    times = rows.departure_time_us[early][:, None] + half * (_NODES + 1.0)
-    gap, rate = to_gap(surface, response, departure)
-    height, speed = surface.position_and_velocity(departure.time_us)
-    flight = motion.scene.cantilever.propagator(jnp.asarray(times) - departure.time_us[:, None])
-    position, _ = flight((gap + height)[:, None], (rate + speed)[:, None])
-    gaps = np.asarray(position - surface.position(jnp.asarray(times)))
-    return complex(np.sum(half * _WEIGHTS * gaps * np.exp(-1j * angular_frequency * times)))
-
-
-def largest_along(
-    dense: DensePath,
-    quantity: Callable[[Trajectory], np.ndarray],
-    times_us: Float[np.ndarray, " times"],
-    ends_us: tuple[float, float],
-) -> float:
-    """Return the largest value of a quantity of trajectories between two times.
-
-    The quantity is evaluated at the given times, then on ever finer grids around its two highest local maxima. Two are
-    refined because a response period that begins just before its maximum ends on one that is nearly as high.
-
-    Args:
-        dense: the tip between the two times.
-        quantity: of a trajectory, an array of its times' shape.
-        times_us: times to begin with.
-        ends_us: the two times.
-    """
-    times = np.unique(np.concatenate([times_us, ends_us]))
-    largest = -np.inf
-    for _ in range(_REFINEMENTS + 1):
-        values = quantity(dense.at(times))
-        largest = max(largest, float(values.max()))
-        framed = np.concatenate([[-np.inf], values, [-np.inf]])
-        tops = np.flatnonzero((values >= framed[:-2]) & (values >= framed[2:]))
-        tops = tops[np.argsort(values[tops])[-2:]]
-        around = times[np.maximum(tops - 1, 0)], times[np.minimum(tops + 1, len(times) - 1)]
-        times = np.unique(np.linspace(*around, _REFINED))
-    return largest
-
-
-def peaks_of_flights(
-    scene: Scene, start_us: ArrayLike, position_nm: ArrayLike, velocity_nm_per_us: ArrayLike, end_us: ArrayLike
-) -> Float[np.ndarray, " flights"]:
+def peaks_of_flights(scene: Scene, start: State, end_us: ArrayLike) -> Float[np.ndarray, " flights"]:
     """Return the largest height of each of some flights (`highest_of_flight`).
 
     Args:
         scene: the scene.
-        start_us: where the flights start, shape (flights,).
-        position_nm: height in the lab there.
-        velocity_nm_per_us: velocity in the lab there.
+        start: where the flights start in the lab, arrays of shape (flights,).
         end_us: where they end.
     """
-    _, response = surface_of(scene)
-    columns = (jnp.asarray(column, float) for column in (start_us, position_nm, velocity_nm_per_us, end_us))
-    return np.asarray(_peaks(scene.cantilever, response, *columns))
-
-
-@jax.jit
-def _least_force(solid: ElasticCurve, depths_nm: Float[np.ndarray | Array, " loads"]) -> Float[Array, ""]:
-    return jnp.min(solid.force(depths_nm))
+    start, end = jax.tree.map(partial(jnp.asarray, dtype=float), (start, end_us))
+    return np.asarray(_peaks(scene.cantilever, surface_of(scene)[1], start, end))
 
 
 @jax.jit
 def _peaks(
-    cantilever: Cantilever,
-    response: Surface | None,
-    start_us: Float[Array, " flights"],
-    position_nm: Float[Array, " flights"],
-    velocity_nm_per_us: Float[Array, " flights"],
-    end_us: Float[Array, " flights"],
+    cantilever: Cantilever, response: Surface | None, start: State, end_us: Float[Array, " flights"]
 ) -> Float[Array, " flights"]:
-    """Return the largest heights in the lab of flights."""
-    duration = end_us - start_us
-    _, position, velocity = with_response(response, State(start_us, position_nm, velocity_nm_per_us), -1.0)
+    duration = end_us - start.time_us
+    _, position, velocity = with_response(response, start, -1.0)
     ends = cantilever.propagator(duration)(position, velocity)
-    flights = FlightEnds(start_us, duration, position, velocity, *ends)
+    flights = FlightEnds(start.time_us, duration, position, velocity, *ends)
     return jax.vmap(lambda flight: highest_of_flight(cantilever, flight, response))(flights)
 
 
 def peaks_between_contacts(scene: Scene, simulation: Simulation) -> Float[np.ndarray, " flights"]:
     """Return the largest heights of the flights from a contact to the next one, in order."""
-    rows = simulation.contacts
-    count = int(np.sum(np.asarray(rows.kind) != ContactKind.NONE))
-    departures = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
-    start, position, velocity = (np.asarray(column)[: max(count - 1, 0)] for column in departures)
-    return peaks_of_flights(scene, start, position, velocity, np.asarray(rows.arrival_time_us)[1 : max(count, 1)])
+    rows = contacts_of(simulation)
+    starts = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
+    return peaks_of_flights(scene, State(*(column[:-1] for column in starts)), rows.arrival_time_us[1:])
 
 
-class Section(NamedTuple):
-    """The paper's Poincare section: one point a contact that the tip left; arrays of shape (contacts,)."""
-
-    time_us: Float[np.ndarray, " contacts"]
-    drive_phase_deg: Float[np.ndarray, " contacts"]
-    """Of the departure, in [0, 360)."""
-    departure_velocity_nm_per_us: Float[np.ndarray, " contacts"]
-    approach_speed_nm_per_us: Float[np.ndarray, " contacts"]
-
-
-def poincare_section(scene: Scene, simulation: Simulation) -> Section:
-    """Return the drive's phase and the tip's velocity at every departure, and how fast the tip had come.
+def poincare_section(scene: Scene, simulation: Simulation) -> tuple[Float[np.ndarray, " contacts"], Any]:
+    """Return the paper's Poincare section: the drive's phase in degrees at every departure, and the `Contacts` before.
 
     Args:
         scene: the scene that was simulated.
         simulation: of one scene.
     """
-    rows, has_left = simulation.contacts, contacts_left(simulation)
-    time = np.asarray(rows.departure_time_us)[has_left]
-    return Section(
-        time_us=time,
-        drive_phase_deg=360.0 * within_turn(time / drive_of(scene).period_us, 1.0),
-        departure_velocity_nm_per_us=np.asarray(rows.departure_velocity_nm_per_us)[has_left],
-        approach_speed_nm_per_us=np.asarray(rows.approach_speed_nm_per_us)[has_left],
-    )
+    rows = contacts_left(simulation)
+    return 360.0 * within_turn(np.asarray(rows.departure_time_us) / drive_of(scene).period_us, 1.0), rows

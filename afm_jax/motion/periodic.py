@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase, explain_missing_junction, find_junction
+from afm_jax.contact.junction import Phase, find_junction, require_junction
 from afm_jax.motion.follow import Run, follow_in_pieces, why_over
 from afm_jax.motion.record import MotionOutcome, Simulation, State
-from afm_jax.motion.trajectory import flights_of, state_at
+from afm_jax.motion.trajectory import DensePath, flights_of
 from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 
 _ORBIT_PIECE = 50.0
@@ -52,10 +52,10 @@ def why_impossible(scene: Scene) -> str | None:
     """Return why a scene cannot be simulated at all; None if it can."""
     try:
         surface_of(scene)
+        if isinstance(scene.interaction, Contact):
+            require_junction(scene.interaction, find_junction(scene.interaction).exists)
     except ValueError as error:
         return str(error)
-    if isinstance(scene.interaction, Contact) and not bool(find_junction(scene.interaction).exists):
-        return f"no junction forms: {explain_missing_junction(scene.interaction)}"
     return None
 
 
@@ -89,42 +89,38 @@ def _orbit_near(scene: Scene, motion: Simulation, run: Run) -> Orbit | None:
     flights = flights_of(scene, motion)
     if not flights.begin_us.size:
         return None
-    last = np.arange(flights.begin_us.size) >= flights.begin_us.size - _LAST_FLIGHTS
-    state = state_at(scene, motion, flights.middle_of_longest(last))
+    state = DensePath(scene, motion).flying_at(flights.where(slice(-_LAST_FLIGHTS, None)).middle_of_longest())
     if state is None:
         return None
     period = drive_of(scene).period_us
-    ahead = run(state, (_LONGEST_RESPONSE + 0.5) * period)
-    omega = float(scene.cantilever.angular_frequency)
+    ahead = DensePath(scene, run(state, (_LONGEST_RESPONSE + 0.5) * period))
+    here, omega = np.array(state, float)[:, None], float(scene.cantilever.angular_frequency)
     for periods in range(1, _LONGEST_RESPONSE + 1):
-        after = state_at(scene, ahead, float(state.time_us) + periods * period)
-        if after is not None and _apart(_column(state), _column(after), omega)[0] <= _NEAR:
-            orbit = _orbit_of(scene, state, periods, run)
+        after = ahead.flying_at(float(state.time_us) + periods * period)
+        if after is not None and _apart(here, np.array(after, float)[:, None], omega)[0] <= _NEAR:
+            orbit = _orbit_of(scene, here, periods, run)
             if orbit is not None:
                 return orbit
     return None
 
 
-def _orbit_of(scene: Scene, near: State, periods: int, run: Run) -> Orbit | None:
+def _orbit_of(scene: Scene, near: np.ndarray, periods: int, run: Run) -> Orbit | None:
     """Return the attracting orbit of a number of drive periods near a state; None if there is none."""
     duration = periods * drive_of(scene).period_us
 
+    def at(start: np.ndarray) -> Simulation:
+        return run(State(*map(jnp.asarray, start)), duration)
+
     def ends(starts: np.ndarray, _: np.ndarray) -> np.ndarray:
-        motions = [run(State(near.time_us, *(jnp.asarray(part) for part in start[1:])), duration) for start in starts.T]
-        return np.stack([ends_in_flight(motion) for motion in motions], axis=1)
+        return np.stack([ends_in_flight(at(start)) for start in starts.T], axis=1)
 
     omega = float(scene.cantilever.angular_frequency)
-    periods_closed = close_periods(ends, _column(near), np.zeros(1, int), angular_frequency=omega, reach=_NEAR)
-    if not periods_closed.closed[0] or not periods_closed.contraction[0] < _ATTRACTS:
+    found = close_periods(ends, near, np.zeros(1, int), angular_frequency=omega, reach=_NEAR)
+    contraction = float(found.contraction[0])
+    if not found.closed[0] or not contraction < _ATTRACTS:
         return None
-    start = State(near.time_us, *(jnp.asarray(part) for part in periods_closed.starts[1:, 0]))
-    motion = run(start, duration)
-    contraction = float(periods_closed.contraction[0])
-    return Orbit(start, duration, periods, int(motion.count), contraction, motion)
-
-
-def _column(state: State) -> Float[np.ndarray, "3 1"]:
-    return np.array([[float(part)] for part in state])
+    motion = at(found.starts[:, 0])
+    return Orbit(motion.start, duration, periods, int(motion.count), contraction, motion)
 
 
 def ends_in_flight(motion: Simulation) -> np.ndarray:
@@ -142,8 +138,6 @@ class ClosedPeriods(NamedTuple):
     """Whether the motion comes back to its start."""
     contraction: Float[np.ndarray, " rows"]
     """Largest modulus of the multipliers of the linearised map; infinite where it is not known."""
-    slopes: Float[np.ndarray, "rows 2 2"]
-    """The linearised map: of the end's position and velocity by the start's."""
 
 
 def close_periods(
@@ -183,7 +177,7 @@ def close_periods(
     contraction[finite] = np.abs(np.linalg.eigvals(slopes[finite])).max(axis=1)
     ending = np.concatenate([starts[:1], roots.x.T])
     closed = roots.converged & (_apart(starts, ending, angular_frequency) <= reach)
-    return ClosedPeriods(ending, closed, contraction, slopes)
+    return ClosedPeriods(ending, closed, contraction)
 
 
 def _map_of(

@@ -1,16 +1,23 @@
 """What a simulation hands out: its contacts in order, its last state, and how it ended.
 
+A tip on its way, of a law or through resolved contacts, is a `FollowedTip`: its contacts are written down there, round
+by round of one loop (`follow_rounds`).
+
 States of the tip are heights and velocities in the lab; `to_gap` and `to_lab` go between these and the gap over the
 surface that the free tip sees (`surface_of`), `contacts_in_lab` does so for contacts.
 """
 
 import enum
-from typing import TYPE_CHECKING, NamedTuple, Self
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
@@ -122,10 +129,19 @@ class Simulation(Result, eqx.Module):
     final: State
     phase: Int[Array, "..."]
     """What is between tip and sample at the end, a `Phase` (laws: JUNCTION where the platform holds the tip)."""
-    held: Bool[Array, "..."]
-    """Whether the tip is held at the end."""
     outcome: Int[Array, "..."]
     """How the simulation ended, the number of a `MotionOutcome`."""
+
+    @property
+    def held(self) -> Bool[Array, "..."]:
+        """Whether the tip is held at the end."""
+        return self.outcome == MotionOutcome.HELD
+
+    @property
+    def broke_off(self) -> str | None:
+        """Why one simulation was not followed to its end; None where it was."""
+        outcome = MotionOutcome(int(self.outcome))
+        return None if outcome in (MotionOutcome.FINISHED, MotionOutcome.HELD) else outcome.sentence
 
     def _known_rows(self) -> np.ndarray:
         """Return which rows are contacts."""
@@ -134,22 +150,22 @@ class Simulation(Result, eqx.Module):
     def _unknown(self) -> dict[str, np.ndarray]:
         """Return by column which contacts have no value there: one that holds the tip to the end has no departure."""
         held = np.asarray(self.contacts.kind) == ContactKind.HELD
-        names = (
-            "departure_time_us",
-            "departure_position_nm",
-            "departure_velocity_nm_per_us",
-            "rebound_speed_nm_per_us",
-        )
-        unknown = {f"contacts_{name}": held for name in names}
+        unknown = {f"contacts_{name}": held for name in Contacts._fields if name.startswith(("departure_", "rebound_"))}
         if self.contacts.detail is not None:
             dry = np.asarray(self.contacts.detail.junctions) == 0
             unknown |= {f"contacts_detail_junction_{name}_us": dry for name in ("forms", "breaks")}
         return unknown
 
 
-def contacts_left(simulation: Simulation) -> Bool[np.ndarray, " rows"]:
-    """Return which rows of a simulation's contacts are contacts that the tip left."""
-    return np.isin(np.asarray(simulation.contacts.kind), (ContactKind.IMPACT, ContactKind.CHATTER))
+def contacts_of(simulation: Simulation) -> Any:
+    """Return the `Contacts` of one simulation without unused rows, as arrays of NumPy's."""
+    return jax.tree.map(lambda column: np.asarray(column)[: int(simulation.count)], simulation.contacts)
+
+
+def contacts_left(simulation: Simulation) -> Any:
+    """Return the `Contacts` of one simulation that the tip left, as arrays of NumPy's."""
+    rows = contacts_of(simulation)
+    return jax.tree.map(lambda column: column[rows.kind != ContactKind.HELD], rows)
 
 
 def with_response(response: Surface | None, state: State, sign: float = 1.0) -> State:
@@ -196,7 +212,7 @@ def contacts_in_lab(
         response: the steady response to drives of base and tip, or None.
         kind: numbers of `ContactKind`.
         arrival: time, gap and gap rate at the beginnings.
-        departure: time, gap and gap rate at the ends; time infinite and zeros where the tip is held.
+        departure: time, gap and gap rate at the ends; anything where the tip is held.
         energy_lost_aj: what each dissipated.
         detail: of resolved contacts.
     """
@@ -212,10 +228,92 @@ def contacts_in_lab(
         arrival_position_nm=jnp.where(used, came.position_nm, 0.0),
         arrival_velocity_nm_per_us=jnp.where(used, came.velocity_nm_per_us, 0.0),
         approach_speed_nm_per_us=jnp.where(used, approach, 0.0),
-        departure_time_us=departure.time_us,
+        departure_time_us=jnp.where(kind == ContactKind.HELD, jnp.inf, departure.time_us),
         departure_position_nm=jnp.where(has_left, went.position_nm, 0.0),
         departure_velocity_nm_per_us=jnp.where(has_left, went.velocity_nm_per_us, 0.0),
-        rebound_speed_nm_per_us=departure.velocity_nm_per_us,
+        rebound_speed_nm_per_us=jnp.where(has_left, departure.velocity_nm_per_us, 0.0),
         energy_lost_aj=energy_lost_aj,
         detail=detail,
     )
+
+
+_EACH = 8
+"""Rounds between two checks whether all tips of a batch have arrived at the end."""
+
+
+class FollowedTip(NamedTuple):
+    """A tip that is followed, and its contacts so far; scalars of one tip, but for the rows."""
+
+    tip: Any
+    """Where the next round begins: a tree of scalars."""
+    rows: Float[Array, "rows columns"]
+    contacts: Int[Array, ""]
+    """Rows that are filled."""
+    outcome: Int[Array, ""]
+    """A `MotionOutcome`."""
+    done: Bool[Array, ""]
+
+    @classmethod
+    def begun(cls, tip: Any, row: Any, outcome: Array, *, rows: int) -> "FollowedTip":
+        """Return a tip at its start, with room for so many rows like a given one; a start with a fault is an end."""
+        columns, none = as_vector(row)[0], jnp.zeros((), jnp.int32)
+        empty = jnp.zeros((rows, *columns.shape), columns.dtype)
+        return cls(tip, empty, none, outcome, outcome != MotionOutcome.FINISHED)
+
+    def after(self, tip: Any, row: Any, ends: Array, outcome: Array, over: Array) -> "FollowedTip":
+        """Return the course a round later; it ends as it was before a contact that has no room.
+
+        Args:
+            tip: where the next round begins.
+            row: of the contact that the round ends.
+            ends: whether it ends one.
+            outcome: of the motion, if it is over.
+            over: whether it is.
+        """
+        room = self.rows.shape[0]
+        full = ends & (self.contacts >= room)
+        outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, outcome)
+        place = jnp.where(ends, self.contacts, room)
+        return FollowedTip(
+            tip=where(full, self.tip, tip),
+            rows=self.rows.at[place].set(as_vector(row)[0], mode="drop"),
+            contacts=jnp.where(ends & ~full, self.contacts + 1, self.contacts),
+            outcome=jnp.where(self.done, self.outcome, outcome).astype(jnp.int32),
+            done=self.done | over | full,
+        )
+
+
+def follow_rounds(one_round: Callable[..., Any], course: FollowedTip, *, rounds: int, reverse: bool) -> FollowedTip:
+    """Return a course after so many rounds, or as soon as it is done; in a batch all courses.
+
+    Args:
+        one_round: what a round makes of a course; one that is done stays as it is.
+        course: at the start.
+        rounds: at most, filled up to blocks of eight.
+        reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
+    """
+    blocks = -(-rounds // _EACH)
+
+    def block(course, _=None):
+        return lax.scan(lambda state, _: (one_round(state), None), course, length=_EACH)
+
+    if reverse:
+        course, _ = lax.scan(jax.checkpoint(block), course, length=blocks)
+    else:
+        _, course = lax.while_loop(
+            lambda state: ~state[1].done & (state[0] < blocks),
+            lambda state: (state[0] + 1, block(state[1])[0]),
+            (0, course),
+        )
+    outcome = jnp.where(course.done, course.outcome, MotionOutcome.STEP_LIMIT)
+    return course._replace(outcome=outcome.astype(jnp.int32))
+
+
+def where(condition: Array, new: Any, old: Any) -> Any:
+    """Return a tree with the leaves of one where a condition holds, else those of another."""
+    return jax.tree.map(partial(jnp.where, condition), new, old)
+
+
+def as_vector(row: Any) -> tuple[Array, Any]:
+    """Return a row, a tree of scalars, as one vector of floats, and the function that makes a row of it again."""
+    return ravel_pytree(jax.tree.map(lambda part: part.astype(float), row))

@@ -12,8 +12,9 @@ from jaxtyping import Float, Int
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.motion.record import ContactKind, Simulation, contacts_left, to_gap
+from afm_jax.motion.record import ContactKind, Simulation, contacts_left, contacts_of, to_gap
 from afm_jax.motion.trajectory import flights_of
+from afm_jax.words import counted
 
 DEFAULT_TOLERANCE = 1e-4
 HELD_PERIODS = 3.0
@@ -107,17 +108,17 @@ def _distances(
 class Settled(NamedTuple):
     """Whether a motion has settled, and on what."""
 
-    settled: bool
-    contacts: int | None
-    """m of the (m, N) orbit: contacts in a response period, 0 where the tip no longer meets the sample."""
-    periods: int | None
-    """N: drive periods in a response period; None where nothing repeats, and for a tip that is held."""
-    stuck: bool
-    """Whether the sample holds the tip to the end, for more than three periods."""
-    remaining: float | None
-    """Estimated distance from the motion it tends to: largest of velocity over velocity scale and phase in rad."""
     reason: str
     """In words, what was found."""
+    stuck: bool = False
+    """Whether the sample holds the tip to the end, for more than three periods."""
+    settled: bool = True
+    contacts: int | None = None
+    """m of the (m, N) orbit: contacts in a response period, 0 where the tip no longer meets the sample."""
+    periods: int | None = None
+    """N: drive periods in a response period; None where nothing repeats, and for a tip that is held."""
+    remaining: float | None = None
+    """Estimated distance from the motion it tends to: largest of velocity over velocity scale and phase in rad."""
 
 
 def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_TOLERANCE) -> Settled:
@@ -140,36 +141,26 @@ def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_
         raise ValueError(f"`tolerance` must be positive, but is {tolerance!r}")
     drive = drive_of(scene)
     stuck = is_stuck(scene, simulation)
-    unsettled = Settled(settled=False, contacts=None, periods=None, stuck=stuck, remaining=None, reason="")
     if drive.aperiodic is not None:
-        held = "the sample holds the tip; " if stuck else ""
-        return unsettled._replace(reason=held + drive.aperiodic)
+        return Settled(("the sample holds the tip; " if stuck else "") + drive.aperiodic, stuck, settled=False)
     if stuck:
-        return unsettled._replace(settled=True, reason="the sample holds the tip to the end")
+        return Settled("the sample holds the tip to the end", stuck)
     transient = _transient_of_a_free_tip(scene, simulation, drive.period_us)
     if transient is not None:
         if not transient <= tolerance:
             why = f"the tip does not meet the sample, but its transient is still {transient:.1e} of the velocity scale"
-            return unsettled._replace(reason=why)
+            return Settled(why, settled=False)
         where = "the tip no longer meets the sample" if scene.interaction is not None else "the cantilever is free"
-        why = f"{where}, and its transient has decayed"
-        return Settled(settled=True, contacts=0, periods=1, stuck=False, remaining=transient, reason=why)
-    rows = simulation.contacts
-    departures = (rows.departure_time_us, rows.departure_velocity_nm_per_us)
-    times, velocities = (np.asarray(column)[contacts_left(simulation)] for column in departures)
-    turns = times[None] / drive.period_us
-    contacts, periods, remaining = (
-        column[0].item() for column in find_repetitions(turns, velocities[None], tolerance=tolerance)
-    )
+        return Settled(f"{where}, and its transient has decayed", contacts=0, periods=1, remaining=transient)
+    rows = contacts_left(simulation)
+    turns, velocities = rows.departure_time_us[None] / drive.period_us, rows.departure_velocity_nm_per_us[None]
+    found = find_repetitions(turns, velocities, tolerance=tolerance)
+    contacts, periods, remaining = (column[0].item() for column in found)
     if not contacts:
-        why = f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {len(times)} contacts)"
-        return unsettled._replace(reason=why)
-    why = f"the motion repeats: {_counted(contacts, 'contact')} in {_counted(periods, 'drive period')}"
-    return Settled(settled=True, contacts=contacts, periods=periods, stuck=False, remaining=remaining, reason=why)
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' if count > 1 else ''}"
+        why = f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {turns.size} contacts)"
+        return Settled(why, settled=False)
+    why = f"the motion repeats: {counted(contacts, 'contact')} in {counted(periods, 'drive period')}"
+    return Settled(why, contacts=contacts, periods=periods, remaining=remaining)
 
 
 def is_stuck(scene: Scene, simulation: Simulation) -> bool:
@@ -189,6 +180,11 @@ def slower_period_us(scene: Scene) -> float:
     return max(drive_of(scene).period_us, 2.0 * np.pi / float(scene.cantilever.angular_frequency))
 
 
+def felt_nm(scene: Scene) -> float:
+    """Return the gap below which a flying tip meets the sample."""
+    return float(scene.interaction.bridge_forms_nm) if isinstance(scene.interaction, Contact) else 0.0
+
+
 def _transient_of_a_free_tip(scene: Scene, simulation: Simulation, period_us: float) -> float | None:
     """Return the transient of a tip that cannot meet the sample any more, of the velocity scale; None where it can."""
     surface, response = surface_of(scene)
@@ -196,11 +192,9 @@ def _transient_of_a_free_tip(scene: Scene, simulation: Simulation, period_us: fl
     height, speed = (float(part) for part in surface.position_and_velocity(simulation.final.time_us))
     omega = float(scene.cantilever.angular_frequency)
     size = float(np.hypot(gap + height, (rate + speed) / omega))
-    if scene.interaction is not None:
-        level = float(scene.interaction.bridge_forms_nm) if isinstance(scene.interaction, Contact) else 0.0
-        highest = float(surface.offset_nm) + float(surface.reach_nm)
-        if bool(simulation.held) or -highest - size <= level:
-            return None
+    highest = float(surface.offset_nm) + float(surface.reach_nm)
+    if scene.interaction is not None and (bool(simulation.held) or -highest - size <= felt_nm(scene)):
+        return None
     steady = 0.0 if response is None else float(response.top_speed_nm_per_us)
     moved = max(steady, float(surface.top_speed_nm_per_us), 2.0 * np.pi / period_us * 1e-3)
     return omega * size / moved
@@ -232,7 +226,8 @@ def window_of(scene: Scene, simulation: Simulation, verdict: Settled) -> Window:
     periods = verdict.periods or _likely_order(simulation, drive.period_us, stuck=verdict.stuck)
     response = periods * drive.period_us
     if verdict.settled and not verdict.stuck and last - first >= response:
-        end = last if verdict.contacts == 0 else _middle_of_a_flight(scene, simulation, response)
+        flights = flights_of(scene, simulation)
+        end = last if verdict.contacts == 0 else flights.where(flights.end_us > last - response).middle_of_longest()
         return Window(max(end - response, first), end, periods, 1)
     return last_fifth(first, last, drive, periods)
 
@@ -255,15 +250,9 @@ def last_fifth(first_us: float, last_us: float, drive: DrivePeriod, periods: int
 
 def _likely_order(simulation: Simulation, period_us: float, *, stuck: bool) -> int:
     """Return the nearest integer to the mean number of drive periods between contacts, over the last fifth of them."""
-    rows = simulation.contacts
-    times = np.asarray(rows.departure_time_us)[np.asarray(rows.kind) == ContactKind.IMPACT]
+    rows = contacts_of(simulation)
+    times = rows.departure_time_us[rows.kind == ContactKind.IMPACT]
     some = times[-max(5, int(_LAST_FRACTION * len(times))) :]
     if stuck or len(some) < 2:
         return 1
     return max(1, round(float(some[-1] - some[0]) / (len(some) - 1) / period_us))
-
-
-def _middle_of_a_flight(scene: Scene, simulation: Simulation, response_us: float) -> float:
-    """Return the middle of the longest flight that ends in the last response period."""
-    flights = flights_of(scene, simulation)
-    return flights.middle_of_longest(flights.end_us > float(simulation.final.time_us) - response_us)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
@@ -27,7 +28,6 @@ from afm_jax.motion.record import (
     with_response,
 )
 from afm_jax.motion.start import default_start
-from afm_jax.solve.lanes import power_of_two
 
 DEFAULT_ACCURACY = 1e-9
 _CONTACTS_PER_PERIOD = 4.0
@@ -94,7 +94,7 @@ def simulate(  # noqa: PLR0913
     begin = State(*(jnp.asarray(value, dtype) for value in start))
     world = (scene, surface, response, begin, begin.time_us + jnp.asarray(duration_us, dtype))
     if scene.interaction is None:
-        return _follow_free(*world)
+        return _follow_free(scene.cantilever, response, begin, world[-1])
     if isinstance(scene.interaction, Law):
         follow = partial(follow_law, *world, reverse=reverse)
     elif isinstance(scene.interaction, Contact):
@@ -107,50 +107,36 @@ def simulate(  # noqa: PLR0913
         return follow(max_contacts=max_contacts)
     room = _room(scene, surface, duration_us)
     # in reverse mode every round is run, needed or not
-    return _with_room(follow, room if reverse else max(_LEAST_ROOM, power_of_two(room)))
+    return _with_room(follow, room if reverse else max(_LEAST_ROOM, room))
 
 
 @jax.jit
-def _follow_free(
-    scene: Scene, surface: Platform | Surface, response: Surface | None, start: State, until: Float[Array, ""]
-) -> Simulation:
+def _follow_free(cantilever: Cantilever, response: Surface | None, start: State, until: Float[Array, ""]) -> Simulation:
     """Return a free tip at the end of a simulation, in closed form; no contacts.
 
     Args:
-        scene: the scene.
-        surface: what its tip sees; not met.
+        cantilever: the tip and its spring.
         response: the steady response to drives of base and tip, or None.
         start: the tip at the start, in the lab.
         until: time of the end in us.
     """
-    del surface
     _, position, velocity = with_response(response, start, -1.0)
-    free = scene.cantilever.propagator(until - start.time_us)(position, velocity)
-    final = with_response(response, State(until, *free))
-    none = jnp.zeros((0,), until.dtype)
-    count = jnp.zeros((), jnp.int32)
+    final = with_response(response, State(until, *cantilever.propagator(until - start.time_us)(position, velocity)))
+    none, count = jnp.zeros((0,), until.dtype), jnp.zeros((), jnp.int32)
     sane = jnp.isfinite(final.position_nm) & jnp.isfinite(final.velocity_nm_per_us)
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START).astype(jnp.int32)
-    return Simulation(
-        start=start,
-        contacts=Contacts(none.astype(jnp.int32), *[none] * 9, detail=None),
-        count=count,
-        final=final,
-        phase=jnp.full_like(count, Phase.DRY),
-        held=jnp.zeros((), bool),
-        outcome=outcome,
-    )
+    contacts = Contacts(none.astype(jnp.int32), *[none] * 9, detail=None)
+    return Simulation(start, contacts, count, final, jnp.full_like(count, Phase.DRY), outcome)
 
 
 def _with_room(follow: Callable[..., Simulation], room: int) -> Simulation:
     """Return a motion with room for all its contacts: as long as there is too little, followed again with more."""
-    simulation = follow(max_contacts=room)
-    while room < _MOST_CONTACTS and not is_traced(simulation.outcome):
-        if not bool(jnp.any(simulation.outcome == MotionOutcome.CONTACT_LIMIT)):
-            break
-        room = min(_MORE_ROOM * room, _MOST_CONTACTS)
+    while True:
         simulation = follow(max_contacts=room)
-    return simulation
+        known = not is_traced(simulation.outcome) and room < _MOST_CONTACTS
+        if not (known and bool(jnp.any(simulation.outcome == MotionOutcome.CONTACT_LIMIT))):
+            return simulation
+        room = min(_MORE_ROOM * room, _MOST_CONTACTS)
 
 
 def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> int:

@@ -19,7 +19,7 @@ from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import State, with_response
 
 _HIGHEST_ORDER = 200
-_NEWTON_STEPS = 30
+_NEWTON_STEPS = 12
 _PUSH = 1e-3
 """Of the rebound speed, by which a start misses an unstable orbit: rounding may hold a tip there for ever."""
 
@@ -125,10 +125,7 @@ def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | No
         z, v = (float(part) for part in scene.cantilever.propagator(duration)(position, free))
         if not v > speed:
             return None
-        step = (gap - (z - height)) / (v - speed)
-        duration += step
-        if abs(step) < 1e-13:
-            break
+        duration += (gap - (z - height)) / (v - speed)
     end = time + duration
     v = float(with_response(response, state(end, 0.0, v)).velocity_nm_per_us)
     return state(end, float(scene.platform.position(end)) + gap, v)
@@ -139,10 +136,9 @@ def _leaving(scene: Scene) -> State:
     drive = drive_of(scene)
     time = 0.75 * drive.period_us
     height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
-    slowest = 0.0
     if isinstance(scene.interaction, Contact):
         slowest = float(capture_speed(scene.interaction, float(scene.cantilever.mass_ng)))
-    elif isinstance(scene.interaction, Law):
+    else:
         slowest = float(scene.interaction.capture_speed_nm_per_us)
     rebound = max(float(scene.platform.top_speed_nm_per_us), 2.0 * slowest if math.isfinite(slowest) else 0.0)
     return state(time, height + float(gap_of_departure(scene)), speed + (rebound or drive.angular_frequency))

@@ -1,12 +1,12 @@
 """Dense output: where the tip is at any time of a simulation, worked out on request.
 
-A simulation keeps its contacts alone. `dense_path` makes pieces of it in the order of time, each with a state from
-which the tip is followed: flights, in closed form; steps of contacts, which are integrated once more, a place inside a
-step being one step of order 8 from its beginning; rests on the surface of a law.
+A simulation keeps its contacts alone. A `DensePath` is made of pieces in the order of time, each with a state from
+which the tip is followed: flights, in closed form; resolved contacts, which are integrated once more when a time within
+them is asked for, a place inside a step being one step of order 8 from its beginning; rests on the surface of a law.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +23,12 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, driven_by
 from afm_jax.contact.junction import Phase, force_in_phase
 from afm_jax.contact.step import TipInContact, advance, eighth_order_step
-from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
+from afm_jax.motion.record import Simulation, State, contacts_of, to_gap, to_lab, where
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import compiled_quickly, filled, power_of_two
 
-_BLOCK = 128
-"""Trials computed in one call."""
+_BLOCK, _FEWEST = 128, 8
+"""Trials computed in one call, and contacts at least."""
 _FINENESS = 4.5
 _NEWTON_STEPS = 6
 _SHORTEST_US = 1e-13
@@ -36,7 +36,7 @@ _NODES_PER_STEP = 8
 _NODES_PER_PANEL = 16
 _PANEL_RAD = 1.5
 """Phase of the fastest motion that one panel of a flight spans."""
-FLIGHT, REST = -1, -2
+FLIGHT, REST, CONTACT = -1, -2, -3
 _PHASES = {FLIGHT: int(Phase.DRY), REST: int(Phase.JUNCTION)}
 
 
@@ -59,86 +59,131 @@ class Trajectory(ResultTuple):
     """Force of the sample on the tip; 0 with a law, whose impacts take no time."""
 
 
-class PreparedScene(NamedTuple):
-    """A scene with what its motion is made of: surface, steady response, and equation of motion in contact."""
-
-    scene: Scene
-    surface: Platform | Surface
-    response: Surface | None
-    driven: Driven | None = None
-    """None for a law, and without an interaction."""
-
-
 class Pieces(NamedTuple):
     """Pieces of a motion in the order of time; arrays of shape (pieces,)."""
 
     begin_us: np.ndarray
     end_us: np.ndarray
     kind: np.ndarray
-    """`FLIGHT`, `REST`, or the phase of a step of a contact."""
+    """`FLIGHT`, `REST`, a whole `CONTACT`, or the phase of a step of one."""
     origin_us: np.ndarray
     """Time at which the tip has the state that follows: of a flight the departure, or the start."""
     x: np.ndarray
-    """The gap in nm; s = sqrt(A) in the junction."""
+    """The gap in nm; s = sqrt(A) in the junction, the height in the lab of a whole contact."""
     rate: np.ndarray
-    """Gap rate in nm/us."""
+    """Gap rate in nm/us; of a whole contact the velocity in the lab."""
 
-    def where(self, mask: np.ndarray) -> "Pieces":
-        """Return some of the pieces, chosen by a mask or by their places."""
+    def where(self, mask: Any) -> "Pieces":
+        """Return some of the pieces, chosen by a mask, by their places or as a slice."""
         return Pieces(*(column[mask] for column in self))
 
-    def middle_of_longest(self, among: np.ndarray) -> float:
-        """Return the middle in us of the longest flight among some; there must be one."""
-        longest = int(np.argmax(np.where(among, self.end_us - self.begin_us, -np.inf)))
+    def joined_by(self, others: "Pieces") -> "Pieces":
+        """Return these and other pieces in the order of time."""
+        whole = Pieces(*map(np.concatenate, zip(self, others, strict=True)))
+        return whole.where(np.argsort(whole.begin_us, kind="stable"))
+
+    def middle_of_longest(self) -> float:
+        """Return the middle in us of the longest piece; there must be one."""
+        longest = int(np.argmax(self.end_us - self.begin_us))
         return 0.5 * float(self.begin_us[longest] + self.end_us[longest])
 
 
-class DensePath(NamedTuple):
-    """The tip over a stretch of time, its contacts worked out once for all times that are asked for."""
+class DensePath:
+    """The tip at any time of a simulation of one scene; each contact is worked out once, when it is first asked for."""
 
-    simulation: Simulation
-    prepared: PreparedScene
-    pieces: Pieces
+    def __init__(self, scene: Scene, simulation: Simulation) -> None:
+        """Take the scene that was simulated and its simulation.
 
-    @property
-    def scene(self) -> Scene:
-        """The scene that was simulated."""
-        return self.prepared.scene
+        Raises:
+            ValueError: if the simulation is a batch.
+        """
+        if np.ndim(simulation.count):
+            raise ValueError("a trajectory is of one simulation: pick one of the batch")
+        self.scene, self.simulation = scene, simulation
+        self.surface, self.response = surface_of(scene)
+        self.end_us = float(simulation.final.time_us)
+        # the equation of motion of a resolved contact
+        self.driven: Any = None
+        kind, rows = REST, contacts_of(simulation)
+        self.contacts = rows
+        if isinstance(scene.interaction, Contact):
+            self.driven, kind = driven_by(scene.interaction, scene.cantilever, self.surface), CONTACT
+        begin, end = rows.arrival_time_us, np.minimum(rows.departure_time_us, self.end_us)
+        arrival = (begin, rows.arrival_position_nm, rows.arrival_velocity_nm_per_us)
+        contacts = Pieces(begin, end, np.full(begin.shape, kind), *arrival).where(end > begin)
+        self._pieces = flights_of(scene, simulation).joined_by(contacts)
+
+    def pieces_between(self, low: float, high: float) -> Pieces:
+        """Return pieces in which there is no whole contact between two times in us: each is one of steps."""
+        touched = self._pieces.kind == CONTACT
+        touched &= (self._pieces.end_us >= low) & (self._pieces.begin_us <= high)
+        if touched.any():
+            steps = self._steps_of(self._pieces.where(touched))
+            self._pieces = self._pieces.where(~touched).joined_by(steps)
+        return self._pieces
+
+    def _steps_of(self, contacts: Pieces) -> Pieces:
+        """Return the steps of contacts to their ends, or to that of the simulation; each step is of one phase."""
+        # few shapes, so that few programs are compiled
+        lanes = power_of_two(len(contacts.x), _FEWEST)
+        arrival = State(*(jnp.asarray(filled(part, lanes)) for part in contacts[3:]))
+        gap, rate = to_gap(self.surface, self.response, arrival)
+        place = ContactState(gap, rate, arrival.time_us, jnp.zeros(lanes))
+        tip = TipInContact.arriving(self.driven, place, jnp.arange(lanes) < len(contacts.x))
+        until, taken = jnp.asarray(self.end_us), [Pieces(*np.zeros((6, 0)))]
+        while np.any((np.asarray(tip.phase) != Phase.DRY) & (np.asarray(tip.state.time_us) < self.end_us)):
+            tip, (steps, accepted) = _some_trials(self.driven, tip, until)
+            taken.append(Pieces(*(np.asarray(column)[np.asarray(accepted)] for column in steps)))
+        joined = Pieces(*map(np.concatenate, zip(*taken, strict=True)))
+        joined = joined._replace(kind=joined.kind.astype(int))
+        # a step within the rounding of its time could come to stand behind the flight after it
+        return joined.where(joined.end_us - joined.begin_us > _SHORTEST_US * (1.0 + np.abs(joined.begin_us)))
 
     def at(self, times_us: ArrayLike) -> Trajectory:
-        """Return the tip at given times in us within the stretch, of any shape.
+        """Return the tip at given times in us, of any shape.
 
         Raises:
             ValueError: if a time lies outside the simulation.
         """
         wanted = np.asarray(times_us, float)
-        _check(self.simulation, wanted)
-        if not wanted.size:
-            return Trajectory(wanted, *(np.zeros(wanted.shape, kind) for kind in (float,) * 4 + (int, float)))
-        times, prepared = _filled_up(wanted.reshape(-1)), self.prepared
-        piece = self.pieces.where(np.clip(np.searchsorted(self.pieces.begin_us, times, side="right") - 1, 0, None))
-        flown = _flight(self.scene.cantilever, prepared.surface, piece.x, piece.rate, piece.origin_us, times)
+        first, last = float(self.simulation.start.time_us), self.end_us
+        low, high = wanted.min(initial=last), wanted.max(initial=first)
+        rounding = 1e-9 * (1.0 + abs(last))
+        if low < first - rounding or not high <= last + rounding:
+            raise ValueError(f"`times_us` must lie within the simulation, {first:.9g} to {last:.9g} us")
+        # one more, so that there always is one
+        pieces, times = self.pieces_between(low, high), _filled_up(np.append(wanted, last))
+        piece = pieces.where(np.clip(np.searchsorted(pieces.begin_us, times, side="right") - 1, 0, None))
+        flown = fly(self.scene.cantilever, self.surface, piece.x, piece.rate, piece.origin_us, times)
         gap, rate = (np.where(piece.kind == FLIGHT, np.asarray(part), 0.0) for part in flown)
         touching = piece.kind >= 0
         if touching.any():
             inside = Pieces(*(_filled_up(column[touching]) for column in piece))
-            in_contact = _in_contact(prepared, inside, _filled_up(times[touching]))
-            gap[touching], rate[touching] = (part[: int(touching.sum())] for part in in_contact)
+            start = ContactState(*map(jnp.asarray, (inside.x, inside.rate, inside.origin_us, 0.0 * inside.x)))
+            states = _states_at(self.driven, start, inside.kind, _filled_up(times[touching]))
+            gap[touching], rate[touching] = (np.asarray(part)[: int(touching.sum())] for part in states)
         phase = np.select([piece.kind == kind for kind in _PHASES], list(_PHASES.values()), piece.kind)
-        lab = to_lab(prepared.surface, prepared.response, times, gap, rate)
+        lab = to_lab(self.surface, self.response, times, gap, rate)
         force = np.zeros(times.shape)
-        if prepared.driven is not None:
-            force = _force(self.scene.interaction, prepared.driven.junction, phase, gap, rate)
+        if self.driven is not None:
+            force = _force(self.scene.interaction, self.driven.junction, phase, gap, rate)
         parts = (lab.position_nm, lab.velocity_nm_per_us, gap, rate, phase, force)
         return Trajectory(wanted, *(np.asarray(part)[: wanted.size].reshape(wanted.shape) for part in parts))
+
+    def flying_at(self, time_us: float) -> State | None:
+        """Return the tip in flight at a time in us, or None where it is in contact or outside the simulation."""
+        if not self.simulation.start.time_us <= time_us <= self.simulation.final.time_us:
+            return None
+        tip = self.at(time_us)
+        return State(*map(jnp.asarray, tip[:3])) if tip.phase == Phase.DRY else None
 
     def nodes(self, from_us: float, to_us: float) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
         """Return times and weights in us whose weighted sums are integrals between two times of the stretch.
 
         Gauss-Legendre nodes in every flight and every step of a contact, so that no phase change is crossed.
         """
-        cantilever, surface, pieces = self.scene.cantilever, self.prepared.surface, self.pieces
-        fastest = max(float(cantilever.angular_frequency), float(surface.fastest_angular_frequency))
+        cantilever, pieces = self.scene.cantilever, self.pieces_between(from_us, to_us)
+        fastest = max(float(cantilever.angular_frequency), float(self.surface.fastest_angular_frequency))
         in_flight, in_contact = (np.polynomial.legendre.leggauss(n) for n in (_NODES_PER_PANEL, _NODES_PER_STEP))
         times, weights = [np.zeros(0)], [np.zeros(0)]
         for begin, end, kind in zip(pieces.begin_us, pieces.end_us, pieces.kind, strict=True):
@@ -166,74 +211,26 @@ def trajectory(scene: Scene, simulation: Simulation, times_us: ArrayLike) -> Tra
     Raises:
         ValueError: if a time lies outside the simulation, or the simulation is a batch.
     """
-    wanted = np.asarray(times_us, float)
-    # without times: a stretch of no length
-    ends = (wanted.min(), wanted.max()) if wanted.size else (simulation.start.time_us,) * 2
-    return dense_path(scene, simulation, *(float(end) for end in ends)).at(wanted)
-
-
-def dense_path(scene: Scene, simulation: Simulation, from_us: float, to_us: float) -> DensePath:
-    """Return the tip over a stretch of time, to be asked for times and nodes as often as wanted.
-
-    A tip that is held is integrated from the beginning of its contact: a second time would cost as much again.
-
-    Args:
-        scene: the scene that was simulated.
-        simulation: of one scene, not of a batch.
-        from_us: beginning of the stretch.
-        to_us: its end.
-
-    Raises:
-        ValueError: if a time lies outside the simulation, or the simulation is a batch.
-    """
-    _check(simulation, np.array([from_us, to_us]))
-    contact, prepared = scene.interaction, PreparedScene(scene, *surface_of(scene))
-    if isinstance(contact, Contact):
-        prepared = prepared._replace(driven=driven_by(contact, scene.cantilever, prepared.surface))
-    return DensePath(simulation, prepared, pieces_between(prepared, simulation, from_us, to_us))
+    return DensePath(scene, simulation).at(times_us)
 
 
 def flights_of(scene: Scene, simulation: Simulation) -> Pieces:
     """Return all flights of a simulation of one scene."""
-    rows = simulation.contacts
-    used = np.asarray(rows.kind) != ContactKind.NONE
-    arrival = np.asarray(rows.arrival_time_us)[used]
-    start = [np.asarray(part, float).reshape(1) for part in simulation.start]
+    rows, first = contacts_of(simulation), [np.asarray(part, float).reshape(1) for part in simulation.start]
     departures = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
-    origin, position, velocity = (
-        np.concatenate([first, np.asarray(column)[used]]) for first, column in zip(start, departures, strict=True)
-    )
+    origin, position, velocity = map(np.concatenate, zip(first, departures, strict=True))
     flies = np.isfinite(origin)
     state = State(*(jnp.asarray(column) for column in (np.where(flies, origin, 0.0), position, velocity)))
     gap, rate = (np.asarray(column) for column in to_gap(*surface_of(scene), state))
     # a negative delay lets a flight begin before the last one has ended: the earlier one is kept to its end
-    begin = np.maximum(origin, np.concatenate([start[0], arrival]))
-    end = np.append(arrival, float(simulation.final.time_us))
+    begin = np.maximum(origin, np.concatenate([first[0], rows.arrival_time_us]))
+    end = np.append(rows.arrival_time_us, float(simulation.final.time_us))
     columns = (begin, end, np.full(begin.shape, FLIGHT), origin, gap, rate)
     return Pieces(*columns).where(flies & (end > begin))
 
 
-def fly(scene: Scene, flights: Pieces, times_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return heights in nm and velocities in nm/us in the lab along flights, at times of shape (times, flights)."""
-    surface, response = surface_of(scene)
-    origin, times = jnp.asarray(flights.origin_us), jnp.asarray(times_us)
-    gap, rate = _flight(scene.cantilever, surface, jnp.asarray(flights.x), jnp.asarray(flights.rate), origin, times)
-    lab = to_lab(surface, response, times, gap, rate)
-    return np.asarray(lab.position_nm), np.asarray(lab.velocity_nm_per_us)
-
-
-def state_at(scene: Scene, simulation: Simulation, time_us: float) -> State | None:
-    """Return the tip in flight at a time, or None where it is in contact or outside the simulation."""
-    flights = flights_of(scene, simulation)
-    here = np.flatnonzero((flights.begin_us <= time_us) & (time_us <= flights.end_us))
-    if not here.size:
-        return None
-    position, velocity = fly(scene, flights.where(here[:1]), np.array([[time_us]]))
-    return State(*(jnp.asarray(part) for part in (time_us, position[0, 0], velocity[0, 0])))
-
-
 @jax.jit
-def _flight(
+def fly(
     cantilever: Cantilever,
     surface: Platform | Surface,
     gap: Float[Array, "..."],
@@ -251,47 +248,6 @@ def _flight(
 _force = jax.jit(force_in_phase)
 
 
-def pieces_between(prepared: PreparedScene, simulation: Simulation, low: float, high: float) -> Pieces:
-    """Return the pieces that cover the times from `low` to `high`."""
-    rows, last = simulation.contacts, float(simulation.final.time_us)
-    flights = flights_of(prepared.scene, simulation)
-    flights = flights.where((flights.end_us >= low) & (flights.begin_us <= high))
-    arrival = np.asarray(rows.arrival_time_us)
-    stops = np.minimum(np.asarray(rows.departure_time_us), last)
-    touched = (np.asarray(rows.kind) != ContactKind.NONE) & (stops >= low) & (arrival <= high) & (stops > arrival)
-    touched = np.flatnonzero(touched)
-    if prepared.driven is not None and touched.size:
-        # to the end of the last step that a wanted time may lie in
-        contacts = _integrated_contacts(prepared, simulation, touched, min(high, last))
-    else:
-        begin, still = arrival[touched], np.zeros(touched.shape)
-        contacts = Pieces(begin, stops[touched], np.full(begin.shape, REST), begin, still, still)
-    both = Pieces(*(np.concatenate(columns) for columns in zip(flights, contacts, strict=True)))
-    return both.where(np.argsort(both.begin_us, kind="stable"))
-
-
-def _integrated_contacts(prepared: PreparedScene, simulation: Simulation, rows: np.ndarray, until_us: float) -> Pieces:
-    """Return the steps of contacts from their beginnings to their ends, or to a time; each step is of one phase."""
-    driven, contacts = prepared.driven, simulation.contacts
-    assert driven is not None  # its contacts are to be integrated  # noqa: S101
-    columns = (contacts.arrival_time_us, contacts.arrival_position_nm, contacts.arrival_velocity_nm_per_us)
-    arrival = State(*(jnp.asarray(np.asarray(column)[rows]) for column in columns))
-    gap, rate = to_gap(prepared.surface, prepared.response, arrival)
-    # filled up with tips in no contact to a power of two: few shapes, so that few programs are compiled
-    spare = jnp.ones((1 << max(len(rows) - 1, 0).bit_length()) - len(rows))
-    parts = (gap, rate, arrival.time_us, jnp.zeros(rows.shape))
-    place = ContactState(*(jnp.concatenate([part, spare]) for part in parts))
-    tip = TipInContact.arriving(driven, place, jnp.arange(len(place.x)) < len(rows))
-    until, taken = jnp.asarray(until_us, tip.state.x.dtype), [Pieces(*np.zeros((6, 0)))]
-    while np.any((np.asarray(tip.phase) != Phase.DRY) & (np.asarray(tip.state.time_us) < until_us)):
-        tip, (steps, accepted) = _some_trials(driven, tip, until)
-        taken.append(Pieces(*(np.asarray(column)[np.asarray(accepted)] for column in steps)))
-    joined = Pieces(*(np.concatenate(columns) for columns in zip(*taken, strict=True)))
-    joined = joined._replace(kind=joined.kind.astype(int))
-    # a step within the rounding of its time could come to stand behind the flight after it
-    return joined.where(joined.end_us - joined.begin_us > _SHORTEST_US * (1.0 + np.abs(joined.begin_us)))
-
-
 @compiled_quickly()
 def _some_trials(
     driven: Driven, tip: TipInContact, until: Float[Array, ""]
@@ -303,19 +259,9 @@ def _some_trials(
         after = advance(driven, tip, until, _FINENESS)
         place, begin = tip.state, tip.state.time_us
         step = (begin, after.state.time_us, tip.phase, begin, place.x, place.gap_rate)
-        moved = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, tip)
-        return moved, (step, going & (after.trial_length == 0.0))
+        return where(going, after, tip), (step, going & (after.trial_length == 0.0))
 
     return lax.scan(once, tip, None, length=_BLOCK)
-
-
-def _in_contact(prepared: PreparedScene, piece: Pieces, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gap and gap rate at times within steps of contacts, each with the step that it lies in."""
-    start = ContactState(*(jnp.asarray(part) for part in (piece.x, piece.rate, piece.origin_us, 0.0 * piece.x)))
-    phase = jnp.asarray(piece.kind, jnp.int32)
-    assert prepared.driven is not None  # steps of contacts are of resolved contacts  # noqa: S101
-    gap, rate = _states_at(prepared.driven, start, phase, jnp.asarray(times))
-    return np.asarray(gap), np.asarray(rate)
 
 
 @jax.jit
@@ -336,7 +282,7 @@ def _states_at(
         return eighth_order_step(lambda place: driven.rates(place, solid), start, length)
 
     # in the junction the variable is fictitious time: its value at a time is a root
-    rate = driven.rates(start, solid).time_us
+    rates = driven.rates(start, solid)
 
     def newton(_, length):
         end = stepped(length)
@@ -345,13 +291,10 @@ def _states_at(
         return length + (time_us - end.time_us) / jnp.where(passing == 0.0, 1.0, passing)
 
     elapsed = time_us - start.time_us
-    first = elapsed / jnp.where(solid, jnp.maximum(rate, 1e-3), 1.0)
-    if driven.solid.reversible:
-        # time stands still where a dry contact begins, and grows with the square of the variable
-        s_rate = driven.rates(start, solid).x
-        _, growth = jax.jvp(driven.solid.depth_slope, (start.x,), (s_rate,))
-        root = jnp.sqrt(jnp.maximum(rate * rate + 2.0 * growth * elapsed, 0.0))
-        first = jnp.where(solid, 2.0 * elapsed / jnp.maximum(rate + root, 1e-9), first)
+    # time stands still where a dry contact begins, and grows with the square of the variable
+    _, growth = jax.jvp(driven.solid.depth_slope, (start.x,), (rates.x,))
+    root = jnp.sqrt(jnp.maximum(rates.time_us**2 + 2.0 * growth * elapsed, 0.0))
+    first = jnp.where(solid, 2.0 * elapsed / jnp.maximum(rates.time_us + root, 1e-9), elapsed)
     length = lax.fori_loop(0, _NEWTON_STEPS, newton, first)
     end = stepped(length)
     return driven.gap(end.x, phase), end.gap_rate
@@ -359,12 +302,3 @@ def _states_at(
 
 def _filled_up(values: np.ndarray) -> np.ndarray:
     return filled(values, power_of_two(values.size, 64))
-
-
-def _check(simulation: Simulation, times: np.ndarray) -> None:
-    if np.ndim(simulation.count):
-        raise ValueError("a trajectory is of one simulation: pick one of the batch")
-    first, last = float(simulation.start.time_us), float(simulation.final.time_us)
-    rounding = 1e-9 * (1.0 + abs(last))
-    if times.size and not (times.min() >= first - rounding and times.max() <= last + rounding):
-        raise ValueError(f"`times_us` must lie within the simulation, {first:.9g} to {last:.9g} us")

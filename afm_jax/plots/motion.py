@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -12,9 +12,9 @@ from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.motion.observe import peaks_between_contacts, poincare_section
-from afm_jax.motion.record import ContactKind, Contacts, Simulation
-from afm_jax.motion.settle import Settled, is_stuck, settled, window_of
-from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
+from afm_jax.motion.record import Simulation, contacts_of
+from afm_jax.motion.settle import Settled, is_stuck, settled, slower_period_us, window_of
+from afm_jax.motion.trajectory import DensePath, Trajectory
 from afm_jax.plots.picture_style import (
     ACCENT,
     BLUE,
@@ -73,7 +73,7 @@ def draw_motion(
         simulation: of one scene, not of a batch.
         folder: exists and can be written to.
         verdict: what `settled` said, if it is known already.
-        dense: the tip over all that is drawn (`stretch_drawn`), if it is known already.
+        dense: the tip at any time, if that is at hand.
 
     Returns:
         The files, in the order above.
@@ -83,9 +83,9 @@ def draw_motion(
     """
     look = look_at(scene, simulation, verdict=verdict, dense=dense)
     figures = {"time_course": course_figure, "spectrum": spectrum_figure}
-    if np.isfinite(look.departure_us).any():
+    if np.isfinite(look.dense.contacts.departure_time_us).any():
         figures |= {"poincare": section_figure}
-    if look.used.any() and isinstance(scene.interaction, Contact):
+    if look.dense.contacts.kind.size and isinstance(scene.interaction, Contact):
         figures |= {"force_gap": force_gap_figure}
     files = []
     for name, figure in figures.items():
@@ -125,39 +125,25 @@ def _responses_shown(scene: Scene, simulation: Simulation, verdict: Settled, to_
 class Look(NamedTuple):
     """A simulation and the stretch of it that is shown."""
 
-    scene: Scene
-    simulation: Simulation
+    dense: DensePath
+    """The tip at any time."""
     drive: DrivePeriod
     responses: Responses
     """What the spectrum is made of."""
     from_us: float
     to_us: float
-    dense: DensePath
-    """Over the stretch and the responses."""
     path: Trajectory
     """Over the stretch, fine enough for its contacts."""
-    used: Bool[np.ndarray, " rows"]
-    """Which rows of the table of contacts are contacts."""
 
     @property
-    def contacts(self) -> Contacts:
-        """The table of contacts."""
-        return self.simulation.contacts
+    def scene(self) -> Scene:
+        """The scene that was simulated."""
+        return self.dense.scene
 
     def between(self, from_us: float, to_us: float) -> Trajectory:
         """Return the part of the path between two times."""
         inside = (self.path.time_us >= from_us) & (self.path.time_us <= to_us)
         return Trajectory(*(column[inside] for column in self.path))
-
-    @property
-    def arrival_us(self) -> Float[np.ndarray, " contacts"]:
-        """When each contact began."""
-        return np.asarray(self.contacts.arrival_time_us)[self.used]
-
-    @property
-    def departure_us(self) -> Float[np.ndarray, " contacts"]:
-        """When each contact ended; infinite where it did not."""
-        return np.asarray(self.contacts.departure_time_us)[self.used]
 
 
 def look_at(
@@ -169,44 +155,25 @@ def look_at(
         scene: the scene that was simulated.
         simulation: of one scene.
         verdict: what `settled` said, if it is known already.
-        dense: the tip over all that is drawn (`stretch_drawn`), if it is known already.
+        dense: the tip at any time, if that is at hand.
 
     Raises:
         ValueError: if the simulation is a batch, or did not get beyond its start.
     """
     begin, end = _course_shown(scene, simulation)
     verdict = settled(scene, simulation) if verdict is None else verdict
-    responses = _responses_shown(scene, simulation, verdict, end)
-    if dense is None:
-        dense = dense_path(scene, simulation, *_both((begin, end), responses))
-    rows = simulation.contacts
-    used = np.asarray(rows.kind) != ContactKind.NONE
-    times = np.linspace(begin, end, _POINTS)
-    if used.any():
-        times = np.union1d(times, dense.nodes(begin, end)[0])
-        edges = _edges(rows, used)
+    dense = DensePath(scene, simulation) if dense is None else dense
+    rows, times = dense.contacts, np.linspace(begin, end, _POINTS)
+    if rows.kind.size:
+        # where the phase of contact changes the force jumps, and the velocity of a law
+        jumps = [rows.arrival_time_us, rows.departure_time_us]
+        if rows.detail is not None:
+            jumps += [rows.detail.junction_forms_us, rows.detail.junction_breaks_us]
+        edges = np.concatenate(jumps)
         edges = edges[(edges > begin + _BESIDE_US) & (edges < end - _BESIDE_US)]
-        times = np.union1d(times, np.concatenate([edges - _BESIDE_US, edges, edges + _BESIDE_US]))
-    return Look(scene, simulation, drive_of(scene), responses, begin, end, dense, dense.at(times), used)
-
-
-def stretch_drawn(scene: Scene, simulation: Simulation, verdict: Settled) -> tuple[float, float]:
-    """Return beginning and end, in us, of all that is drawn of a motion: what has to be known of its contacts.
-
-    Args:
-        scene: the scene that was simulated.
-        simulation: of one scene.
-        verdict: what `settled` said.
-
-    Raises:
-        ValueError: if the simulation is a batch, or did not get beyond its start.
-    """
-    course = _course_shown(scene, simulation)
-    return _both(course, _responses_shown(scene, simulation, verdict, course[1]))
-
-
-def _both(course: tuple[float, float], responses: Responses) -> tuple[float, float]:
-    return min(course[0], responses.from_us), max(course[1], responses.to_us)
+        times = np.unique([*times, *dense.nodes(begin, end)[0], *edges - _BESIDE_US, *edges, *edges + _BESIDE_US])
+    responses = _responses_shown(scene, simulation, verdict, end)
+    return Look(dense, drive_of(scene), responses, begin, end, dense.at(times))
 
 
 def _course_shown(scene: Scene, simulation: Simulation) -> tuple[float, float]:
@@ -216,25 +183,14 @@ def _course_shown(scene: Scene, simulation: Simulation) -> tuple[float, float]:
     first, last = float(simulation.start.time_us), float(simulation.final.time_us)
     if not last > first:
         raise ValueError("the simulation did not get beyond its start: there is nothing to draw")
-    drive, rows = drive_of(scene), simulation.contacts
-    used = np.asarray(rows.kind) != ContactKind.NONE
-    arrival, departure = np.asarray(rows.arrival_time_us)[used], np.asarray(rows.departure_time_us)[used]
-    period = max(drive.period_us, 1e3 / float(scene.cantilever.frequency_khz))
-    end, begin = last, last - _PERIODS_SHOWN * period
-    if used.any():
-        if not np.isfinite(departure[-1]):
+    rows, period = contacts_of(simulation), slower_period_us(scene)
+    arrival, begin, end = rows.arrival_time_us, last - _PERIODS_SHOWN * period, last
+    if arrival.size:
+        if not np.isfinite(rows.departure_time_us[-1]):
             end = min(last, float(arrival[-1]) + _LONGEST_HELD * period)
         shown = float(arrival[-min(_CONTACTS_SHOWN, arrival.size)])
         begin = min(shown - 0.3 * period, end - 2.0 * period)
     return max(begin, first), end
-
-
-def _edges(rows: Contacts, used: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " edges"]:
-    """Return when the phase of contact changes: there the force jumps, and the velocity of a law."""
-    columns = [rows.arrival_time_us, rows.departure_time_us]
-    if rows.detail is not None:
-        columns += [rows.detail.junction_forms_us, rows.detail.junction_breaks_us]
-    return np.concatenate([np.asarray(column)[used] for column in columns])
 
 
 def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
@@ -249,7 +205,7 @@ def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
 
 def course_figure(look: Look) -> Figure:
     """Return the time course, of many contacts with the peaks of the whole motion below."""
-    overview = int(look.used.sum()) >= _MANY
+    overview = len(look.dense.contacts.kind) >= _MANY
     picture = new_figure(9.0, 7.0 if overview else 4.6)
     axes = picture.subplots(1 + overview, 1, squeeze=False)[:, 0]
     _course(axes[0], look)
@@ -271,9 +227,9 @@ def _course(axes: Axes, look: Look) -> None:
     with_zero_line(axes)
     axes.set_xlim(look.from_us, look.to_us)
     _with_legend_above(axes, x="time (µs)", y="height (nm)")
-    shown = int(look.used.sum())
-    what = f"The last contacts of {shown}" if shown else "Last periods"
-    if is_stuck(look.scene, look.simulation):
+    count = len(look.dense.contacts.kind)
+    what = f"The last contacts of {count}" if count else "Last periods"
+    if is_stuck(look.scene, look.dense.simulation):
         what += ", the sample holds the tip"
     axes.set_title(what, fontsize=12, loc="left")
 
@@ -288,11 +244,8 @@ def _with_legend_above(axes: Axes, *, x: str, y: str) -> None:
 
 def _peaks(axes: Axes, look: Look) -> None:
     """Draw the peak after each contact over the whole motion, and mark the stretch above."""
-    peaks = peaks_between_contacts(look.scene, look.simulation)
-    kind = np.asarray(look.contacts.kind)[look.used]
-    time = look.arrival_us[: peaks.size]
-    left = kind[: peaks.size] != ContactKind.HELD
-    axes.plot(time[left], peaks[left], ".", color=BLUE, markersize=4.0)
+    peaks = peaks_between_contacts(look.scene, look.dense.simulation)
+    axes.plot(look.dense.contacts.arrival_time_us[:-1], peaks, ".", color=BLUE, markersize=4.0)
     axes.axvspan(look.from_us, look.to_us, color=GRID, alpha=0.4, linewidth=0, label="shown above")
     with_zero_line(axes)
     what = "contact" if isinstance(look.scene.interaction, Contact) else "impact"
@@ -301,24 +254,22 @@ def _peaks(axes: Axes, look: Look) -> None:
 
 def _around(look: Look, row: int) -> tuple[float, float]:
     """Return the times between which a contact is shown: from and to a gap of a few nm."""
-    arrival, departure = look.arrival_us[row], look.departure_us[row]
-    approach = max(float(np.asarray(look.contacts.approach_speed_nm_per_us)[look.used][row]), 1.0)
+    arrival, departure = look.dense.contacts.arrival_time_us[row], look.dense.contacts.departure_time_us[row]
+    approach = max(float(look.dense.contacts.approach_speed_nm_per_us[row]), 1.0)
     lead = 0.4 * min(_GAP_SHOWN_NM / approach, 0.25 * look.drive.period_us)
     end = departure if np.isfinite(departure) else arrival + look.drive.period_us
-    first, last = float(look.simulation.start.time_us), float(look.simulation.final.time_us)
-    return max(first, min(arrival, end) - lead), min(last, max(arrival, end) + lead)
+    return min(arrival, end) - lead, max(arrival, end) + lead
 
 
 def force_gap_figure(look: Look) -> Figure:
     """Return the force against the gap through the last contacts: all of it, and the attractive part."""
     picture = new_figure(12.0, 5.0)
     whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
-    rows = np.arange(look.arrival_us.size)[-_CURVES:]
+    rows = np.arange(len(look.dense.contacts.kind))[-_CURVES:]
     least = 0.0
     for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
         path_of_row = look.between(*_around(look, int(row)))
-        lost = float(np.asarray(look.contacts.energy_lost_aj)[look.used][row])
-        over = np.isfinite(look.departure_us[row])
+        lost, over = look.dense.contacts.energy_lost_aj[row], np.isfinite(look.dense.contacts.departure_time_us[row])
         label = f"contact {row + 1}: " + (f"{lost:.1f} aJ lost" if over else "not over")
         least = min(least, float(path_of_row.force_nn.min()))
         for axes in (whole, part):
@@ -344,10 +295,10 @@ _LEAST_SHOWN = 0.02
 
 def section_figure(look: Look) -> Figure:
     """Return the Poincaré section, the order in time as a shade."""
-    section = poincare_section(look.scene, look.simulation)
+    phase, rows = poincare_section(look.scene, look.dense.simulation)
     picture = new_figure(7.5, 5.4)
     axes = picture.subplots()
-    phase, velocity = section.drive_phase_deg, section.departure_velocity_nm_per_us
+    velocity = rows.departure_velocity_nm_per_us
     size = 30 if phase.size < 100 else 8
     axes.plot(phase[-1], velocity[-1], "o", color="black", markersize=11, fillstyle="none", label="the last one")
     shades = axes.scatter(phase, velocity, c=np.arange(1, phase.size + 1), s=size, cmap="viridis_r", zorder=3)

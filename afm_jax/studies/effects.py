@@ -31,7 +31,7 @@ from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import last_fifth
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
-from afm_jax.motion.trajectory import dense_path
+from afm_jax.motion.trajectory import DensePath
 from afm_jax.results import Result
 from afm_jax.studies.timing import Compiled, compiled_for, time_compiled
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
@@ -452,9 +452,9 @@ def _periods_read(observed: Observed) -> int:
 
 def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
     """Return a reading of a simulation over a window."""
-    motion = MotionWindow(dense_path(scene, simulation, *window), *window)
+    motion = MotionWindow(DensePath(scene, simulation), *window)
     value = motion.height.lockin(angular_frequency)
-    lost = motion.rows.energy_lost_aj[motion.begun]
+    lost = motion.dense.contacts.energy_lost_aj[motion.begun]
     return Reading(
         peak_amplitude_nm=motion.height.largest,
         lockin_amplitude_nm=float(abs(value)),

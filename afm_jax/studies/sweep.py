@@ -512,7 +512,7 @@ def _lyapunov(
 
 _REFUSED = -1
 _SIMULATION_VARIABLES = (
-    *_variables(**{observable.name: observable.meaning for observable in OBSERVABLES}),
+    *_variables(**{name: observable.meaning for name, observable in OBSERVABLES.items()}),
     Variable("settled", "the motion repeats", "bool"),
     Variable("stuck", "the sample holds the tip", "bool"),
     Variable("order", "drive periods of a repetition, 0 where nothing repeats", "int32"),
@@ -554,7 +554,7 @@ def _simulation(
         if outcome not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
             return results | {MESSAGE.name: outcome.sentence}
         seen = observe(one, found, verdict=verdict)
-        values = {each.name: getattr(seen, each.name) for each in OBSERVABLES}
+        values = {name: getattr(seen, name) for name in OBSERVABLES}
         told = {} if seen.window.responses else {MESSAGE.name: TOO_SHORT}
         return results | {name: value for name, value in values.items() if value is not None} | told
 

@@ -27,7 +27,7 @@ from afm_jax.motion.observe import MotionWindow
 from afm_jax.motion.periodic import close_periods, ends_in_flight
 from afm_jax.motion.record import Simulation, State
 from afm_jax.motion.simulate import simulate
-from afm_jax.motion.trajectory import dense_path
+from afm_jax.motion.trajectory import DensePath
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.lanes import in_blocks
 from afm_jax.units import within_turn
@@ -168,7 +168,7 @@ def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: 
 def _readings(scene: Scene, motion: Simulation, begin_us: float, order: int) -> Readings:
     """Return what is read of one response period."""
     end_us = begin_us + order * scene.platform.period_us
-    window = MotionWindow(dense_path(scene, motion, begin_us, float(end_us)), begin_us, float(end_us))
+    window = MotionWindow(DensePath(scene, motion), begin_us, float(end_us))
     value = window.height.lockin(float(scene.platform.angular_frequency) / order)
     degrees = within_turn(np.degrees(np.angle(value)), 360.0 / order)
     return window.height.largest, float(abs(value)), float(degrees)
