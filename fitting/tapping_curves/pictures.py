@@ -77,19 +77,11 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
         axes.plot(curve.height_nm, curve.energy_aj, color=colour, lw=1.2)
         axes.fill_between(curve.height_nm, curve.energy_low_aj, curve.energy_high_aj, color=colour, alpha=0.15, lw=0)
         ends += [float(curve.energy_aj.max()), *np.percentile(curve.energy_high_aj, [0.0, 90.0]).tolist()]
-    if result.fit is not None and result.described:
-        for i, group in enumerate(result.groups):
-            heights = result.curve.offset_nm[result.fit.used & group.rows]
-            energy, _, (low, high) = result.constant(i)
-            axes.plot(
-                [heights.min(), heights.max()],
-                [energy, energy],
-                "--",
-                color=DARK,
-                lw=1.0,
-                label=result.in_unit(f"one energy, {side_of(group.repulsive)}: {energy:.3g} aJ"),
-            )
-            ends += [low, high]
+    for group in () if result.fit is None or result.why_not_constant else result.fit.groups:
+        heights, energy = result.curve.offset_nm[group.rows], [group.energy_aj] * 2
+        label = result.in_unit(f"one energy, {side_of(group.repulsive)}: {group.energy_aj:.3g} aJ")
+        axes.plot([heights.min(), heights.max()], energy, "--", color=DARK, lw=1.0, label=label)
+        ends += group.interval95_aj
     return min(ends), max(ends)
 
 

@@ -211,8 +211,8 @@ def _scaled(e: Any) -> list[tuple[str, float]]:
 
 WARNINGS: Rules[Any] = [
     Rule(
-        lambda e: e.valid and e.fit is not None and not e.described,
-        "one energy for all taps is not given: {e.why_not_constant}",
+        lambda e: e.why_not_constant if e.valid and e.fit is not None else "",
+        "one energy for all taps is not given: {case}",
     ),
     Rule(
         _scaled,
