@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.checks import check_count, check_parameter, checked, in_float64
 from afm_jax.columns import rows_of
 from afm_jax.impact.law import extrapolation_of
-from afm_jax.results import JudgedResult, public_result, words_of
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, known, text_table, with_error
@@ -37,6 +37,20 @@ _EXACT = (
     "The quality factor is assumed to be exact, which makes every forecast too good: give it with its error, such "
     "as '40 +- 2'."
 )
+
+
+_PRINTED = {
+    "order": ("N", "d"),
+    "drive_frequency_khz": ("kHz", ".8g"),
+    "drive_amplitude_nm": ("nm", ".5g"),
+    "free_amplitude_nm": ("free nm", ".5g"),
+    "offset_nm": ("offset", ".4g"),
+    "expected_peak_amplitude_nm": ("peak nm", ".2f"),
+    "expected_lockin_amplitude_nm": ("lock-in nm", ".2f"),
+    "expected_phase_lag_deg": ("lag deg", ".2f"),
+    "expected_approach_speed_nm_per_us": ("u_in", ".1f"),
+}
+"""Head and format of the columns that are printed."""
 
 
 @public_result(picture="fitting.experiments.picture:design_figure", rows="points")
@@ -134,8 +148,9 @@ class Design(JudgedResult):
         """Return the verdict, the points, what they will determine, and notes."""
         usable, points = self.candidates.usable, self.points()
         table = {
-            words_of(name.removeprefix("expected_")): [f"{value:.6g}" for value in column]
-            for name, column in self.columns.items()
+            head: [f"{value:{form}}" for value in self.columns[name]]
+            for name, (head, form) in _PRINTED.items()
+            if name in self.columns
         }
         for name in self.interest[:4]:
             table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in points]
@@ -151,7 +166,7 @@ class Design(JudgedResult):
             *bullets("Reasons:", self.reasons),
             "",
             *text_table([*table], zip(*table.values(), strict=True), words=()),
-            "  in kHz, nm, degrees, nm/us; +-: standard errors expected once this point and those above are measured",
+            "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
             f"After all: {', '.join(then)}",
             *bullets(f"{usable.sum()} of {usable.size} drives can be planned with.", left_out),
             *bullets("Notes:", self.warnings),

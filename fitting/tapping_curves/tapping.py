@@ -121,7 +121,7 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
     stretches = smooth_stretches(curve, touching, repulsive)
     functions = energies_along(lever, [stretches], [repulsive])[0]
     alike = touching & ~early & ~functions.outliers, repulsive, functions.smooth
-    fit, followed, used = one_energy(lever, *alike), None, np.zeros(curve.rows, bool)
+    fit, with_drifts, used = one_energy(lever, *alike), None, np.zeros(curve.rows, bool)
     if fit is not None:
         used, scale = fit.used, np.sqrt(fit.minimum.chi2 / max(fit.minimum.degrees_of_freedom, 1))
         if scale_errors and scale > 1.0:
@@ -129,7 +129,7 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
         if curve.time is None and used.sum() >= _FEWEST_TO_FOLLOW:
             # with drifts, as if the rows stood in the order of time
             in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
-            followed = one_energy(Lever([in_order], [free]), *alike)
+            with_drifts = one_energy(Lever([in_order], [free]), *alike)
     silent = np.isnan(curve.lag_deg)
     alone = touching & ~used & ~np.isin(np.arange(curve.rows), np.concatenate([np.zeros(0, int), *stretches]))
     # why a row is not in the fit, or what it is for: the first that holds
@@ -158,7 +158,7 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
         fit=fit,
         functions=functions,
         scale_errors=scale_errors,
-        followed=followed,
+        fit_with_drifts=with_drifts,
         bound_aj=None if curve.has_phase else _bound(curve, rows.largest_energy_aj[~free & ~held]),
         hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
         speeds=None if fit is None else speeds(functions, used),
