@@ -350,8 +350,7 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]
         here = kinds == kind
         rows, start, error = np.flatnonzero(here & free & np.isfinite(off)), zero, _ANY_ZERO_DEG
         if len(rows):
-            first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
-            start, error = float(first + np.average(turned(off[rows] - first), weights=weights)), _WIDE_ZERO_DEG
+            start, error = float(off[rows[0]]), _WIDE_ZERO_DEG
         found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, error)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
     each = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
@@ -572,16 +571,12 @@ class EnergyCurve:
 
     def to_dict(self) -> dict[str, Any]:
         """Return amplitude ratio, height, energy and virial with their bands, and what is said of each point."""
-        return {
-            "amplitude_ratio": self.amplitude_ratio,
-            "height_nm": self.height_nm,
-            "energy_aj": self.energy_aj,
-            "energy_low_aj": self.energy_low_aj,
-            "energy_high_aj": self.energy_high_aj,
+        names = ("amplitude_ratio", "height_nm", "energy_aj", "energy_low_aj", "energy_high_aj", "virial_aj")
+        half = TWO_SIDED_95 * self.virial_error_aj
+        return {name: getattr(self, name) for name in names} | {
             "said": [said_of(*ends) for ends in zip(self.energy_low_aj, self.energy_high_aj, strict=True)],
-            "virial_aj": self.virial_aj,
-            "virial_low_aj": self.virial_aj - TWO_SIDED_95 * self.virial_error_aj,
-            "virial_high_aj": self.virial_aj + TWO_SIDED_95 * self.virial_error_aj,
+            "virial_low_aj": self.virial_aj - half,
+            "virial_high_aj": self.virial_aj + half,
         }
 
 

@@ -1,5 +1,7 @@
 """Pictures of a tapping curve: amplitude, phase and energy over height; several curves together."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -54,18 +56,17 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
     """Draw rows: filled on approach, squares on retract, hollow where excluded, grey where free."""
     curve, free = result.curve, result.rows.free
     aside = np.array([note.startswith("excluded") for note in result.rows.note])
-    for back, marker in ((False, "o"), (True, "s")):
-        for chosen, colour, filled, label in (
+    for back, marker, colour in ((False, "o", BLUE), (True, "s", ACCENT)):
+        for chosen, edge, filled, label in (
             (free, GRID, GRID, "free"),
-            (~free & ~aside, ACCENT if back else BLUE, ACCENT if back else BLUE, way_of(back)),
+            (~free & ~aside, colour, colour, way_of(back)),
             (~free & aside, DARK, "none", "excluded"),
         ):
             here = chosen & (curve.retract == back) & np.isfinite(values)
             if here.any():
-                style = {"fmt": marker, "ms": 4, "lw": 0.8, "color": colour, "mfc": filled}
-                new = label not in axes.get_legend_handles_labels()[1]
-                style |= {"label": label if new else None}
-                axes.errorbar(curve.offset_nm[here], values[here], errors[here], **style)
+                style: dict[str, Any] = {"fmt": marker, "ms": 4, "lw": 0.8, "color": edge, "mfc": filled}
+                once = None if label in axes.get_legend_handles_labels()[1] else label
+                axes.errorbar(curve.offset_nm[here], values[here], errors[here], label=once, **style)
 
 
 def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:

@@ -256,12 +256,9 @@ class Tapping(JudgedResult):
     def _fits(self) -> dict[str, Any]:
         """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
         fit, functions = self.fit, self.functions
-        smooth = {
-            "valid": not self.why_not_functions,
-            "reason": self.why_not_functions or None,
-            **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
-            "nuisances": nuisances_as_dict(functions.nuisances),
-        }
+        smooth = {name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")}
+        smooth |= {"valid": not self.why_not_functions, "reason": self.why_not_functions or None}
+        smooth |= {"nuisances": nuisances_as_dict(functions.nuisances)}
         names = ("chi2", "degrees_of_freedom", "p_value")
         return {
             "functions": smooth if functions.branches else None,
