@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,7 +26,7 @@ from fitting.instruments.lag import free_lag_deg
 SPRING_CONSTANT, QUALITY_FACTOR, FREE_FREQUENCY_KHZ, DRIVE_KHZ = 44.0, 230.0, 344.604, 344.6
 FREE_NM, NM_PER_VOLT, PHASE_ZERO_DEG = 13.4, 42.0, 12.3
 EXAMPLE = Path(__file__).with_name("raw_tapping.txt")
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     "columns": "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg",
     "drive": "force",
     "nm_per_volt": "slope",

@@ -127,14 +127,6 @@ class Report:
         parts = [[one for one in each.parts if isinstance(one, Picture) or lines_of(one)] for each in self.sections]
         return [ReportSection(each.title, held) for each, held in zip(self.sections, parts, strict=True) if held]
 
-    def __str__(self) -> str:
-        """Return the report as a terminal shows it."""
-        return text_of(self)
-
-    def _repr_html_(self) -> str:
-        """Return the report as a notebook shows it."""
-        return page_of(self)
-
 
 def text_of(report: Report) -> str:
     """Return a report as text: blocks with an empty line between; pictures, captions and headings are the page's."""

@@ -21,7 +21,7 @@ from fitting.report.sections import (
     text_of,
 )
 from fitting.tapping_curves.branches import CurveBranch, Hysteresis
-from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, said_of
+from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, said_of, within
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
@@ -236,13 +236,16 @@ def _write(folder: Path, name: str, result: Tapping | TappingTogether, report: R
     return write_report_files(folder, name, text=text, data=data, picture=picture, page=page)
 
 
+_OF_CURVES = ("energy_aj", "energy_scatter_aj", "energy_own_error_aj", "energy_common_error_aj")
+
+
 def together_report(result: TappingTogether) -> Report:
     """Return what several curves of one lever say together: mean and scatter of each branch, the instrument."""
     cells = [
         [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", *(f"{error:.2g}" for error in at[1:])]
         for one in result.scatter
         for ratio in HEADLINE
-        if (at := one.at(ratio)) is not None
+        if (at := within(ratio, one.amplitude_ratio, *(getattr(one, name) for name in _OF_CURVES))) is not None
     ]
     head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
     caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"

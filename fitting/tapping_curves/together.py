@@ -20,7 +20,6 @@ from fitting.tapping_curves.energy import (
     TappingBranch,
     energies_along,
     estimates_at,
-    within,
 )
 from fitting.tapping_curves.measured import CurveLike, measured
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
@@ -51,11 +50,6 @@ class CurveScatter(CurveBranch):
     energy_scatter_aj: Float[np.ndarray, " points"]
     energy_own_error_aj: Float[np.ndarray, " points"]
     energy_common_error_aj: Float[np.ndarray, " points"]
-
-    def at(self, ratio: float) -> tuple[float, ...] | None:
-        """Return mean, scatter, own and common error at an amplitude, of the free one; None where not measured."""
-        columns = (self.energy_aj, self.energy_scatter_aj, self.energy_own_error_aj, self.energy_common_error_aj)
-        return within(ratio, self.amplitude_ratio, *columns)
 
 
 @public_result(picture="fitting.tapping_curves.pictures:together_figure", rows="rows")
