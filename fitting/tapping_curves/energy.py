@@ -350,7 +350,8 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]
         here = kinds == kind
         rows, start, error = np.flatnonzero(here & free & np.isfinite(off)), zero, _ANY_ZERO_DEG
         if len(rows):
-            start, error = float(off[rows[0]]), _WIDE_ZERO_DEG
+            first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
+            start, error = float(first + np.average(turned(off[rows] - first), weights=weights)), _WIDE_ZERO_DEG
         found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, error)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
     each = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]
