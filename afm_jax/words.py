@@ -65,7 +65,8 @@ def value_and_error(text: str) -> tuple[float, float | None]:
     except ValueError:
         value, error = math.nan, []
     if not all(map(math.isfinite, (value, *error))) or len(error) > 1 or (error and error[0] <= 0.0):
-        raise ValueError(f"`{cut_short(text.strip(), 60)}` is no value, nor one with a positive error; write '40 +- 2'")
+        said = cut_short(text.strip(), 60)
+        raise ValueError(f"`{said}` is neither a number nor one with a positive error; write 40 or '40 +- 2'")
     return value, error[0] if error else None
 
 
