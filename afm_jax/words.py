@@ -50,6 +50,26 @@ def with_error(value: float | None, error: float | None) -> str:
     return f"{value:z.{digits}f} +- {error:.{digits}f}"
 
 
+def value_and_error(text: str) -> tuple[float, float | None]:
+    """Return the value and the standard error that a text says, with +-, +/- or ± between them; None without an error.
+
+    >>> value_and_error("40 +- 2"), value_and_error("40")
+    ((40.0, 2.0), (40.0, None))
+
+    Raises:
+        ValueError: if it says no finite number, or an error that is not above 0.
+    """
+    parts = text.replace("±", "+-").replace("+/-", "+-").split("+-")
+    try:
+        value, *error = map(float, parts)
+    except ValueError:
+        value, error = math.nan, []
+    if not all(map(math.isfinite, (value, *error))) or len(error) > 1 or (error and error[0] <= 0.0):
+        said = cut_short(text.strip(), 60)
+        raise ValueError(f"`{said}` is neither a number nor one with a positive error; write 40 or '40 +- 2'")
+    return value, error[0] if error else None
+
+
 def interval(low: float, high: float) -> str:
     """Return an interval with two digits of its width.
 

@@ -32,7 +32,8 @@ def test_faults_are_named():
 
 
 def test_measured_drives_are_recognised_up_to_rounding():
-    drives = drive_grid(orders=(1, 2), amplitudes_nm=(0.3,), detunings=(1.0, 181.0 / 180.0), free_frequency_khz=90.0)
+    lists = {"orders": (1, 2), "amplitudes_nm": (0.3,), "detunings": (1.0, 181.0 / 180.0), "offsets_nm": (0.0,)}
+    drives = drive_grid(**lists, free_frequency_khz=90.0)
     measured = np.array([[1, 180.0 + 1e-9, 0.1 + 0.2, -0.0]])
     assert same_drives(drives, measured).tolist() == [True, False, False, False]
 

@@ -19,6 +19,7 @@ from fitting.instruments.curve import MeasuredCurve, table_text
 from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
 from fitting.tapping_curves.measured import is_table
+from fitting.tapping_curves.tapping import tapping
 from tests.instrument_files import asylum_ramp, nanonis_ramp, separated, tapping_rows
 from tests.strict_reading import strictly
 
@@ -471,12 +472,22 @@ def test_files_that_say_another_mode_are_refused_by_name(tmp_path: Path, head: s
         read_curve(path)
 
 
-@pytest.mark.xfail(strict=True, reason="the results: a curve that was read is a table of `tapping`")
-def test_a_curve_that_was_read_leads_to_tapping():
-    import fitting  # noqa: PLC0415
-
-    curve: Any = read_curve(EXAMPLE, **OPTIONS)
-    assert fitting.tapping(curve, law=False).valid
+def test_tapping_takes_a_curve_that_was_read_and_its_file_alike():
+    of_file, of_curve = (
+        tapping(source, law=False, **options).to_dict()
+        for source, options in ((EXAMPLE, OPTIONS), (read_curve(EXAMPLE, **OPTIONS), {}))
+    )
+    assert of_file["valid"]
+    assert of_file["branches"] == of_curve["branches"]
+    # a file of several curves asks which
+    with pytest.raises(TableError, match="several curves; choose one, `curve=1`"):
+        tapping(AMPLITUDES, law=False, nm_per_volt=1090.0)
+    with pytest.raises(TableError, match="refused curve 2; The free amplitude jumps"):
+        tapping(AMPLITUDES, law=False, nm_per_volt="1090 +- 20", curve=2)
+    with pytest.raises(TableError, match="is for an instrument's file"):
+        tapping(REAL.parent / "tapping_resonance.csv", law=False, nm_per_volt=42.0)
+    stated = tapping(REAL.parent / "tapping_resonance.csv", law=False, quality_factor="210 +- 3")
+    assert stated.curve.quality_factor == (210.0, 3.0)
 
 
 # ---- the command

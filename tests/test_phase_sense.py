@@ -13,10 +13,11 @@ from click.testing import CliRunner
 from afm_jax.cli.main import main
 from fitting import read_curve
 from fitting.instruments.curve import table_text
+from fitting.instruments.lag import PhaseSense
 from fitting.tables.table import AmplitudeTable, parse_table, write_table
 from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.result import Tapping
-from fitting.tapping_curves.tapping import tapping, with_sense_of_phase
+from fitting.tapping_curves.tapping import curve_of, tapping, with_sense_of_phase
 from tests.instrument_files import separated
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_forces import QUALITIES, RATIOS, SAMPLES, curve_of_force
@@ -53,6 +54,11 @@ def recorded(tip: Tip, table: AmplitudeTable, folder: Path, **options: Any) -> A
         "spring_constant_n_per_m": (table.spring_constant_n_per_m, table.spring_constant_error_n_per_m),
     }
     return parse_table(table_text(read_curve(path, **(lever | options))), "curve")
+
+
+def sense_of(table: AmplitudeTable) -> PhaseSense:
+    """Return what is known of the sense of a table's phase."""
+    return with_sense_of_phase(curve_of(table), table.phase_sense).phase
 
 
 def rows_off(result: Tapping, truth: Truth) -> np.ndarray:
@@ -107,7 +113,7 @@ def test_a_phase_is_taken_right_or_as_assumed_or_the_curve_refused(
         said = outcome(tip, truth, sign, tapping(table, law=False))
         # what is known of the sense does not depend on who reads the curve
         of_file = recorded(tip, table, tmp_path)
-        again = with_sense_of_phase(of_file)[1]
+        again = sense_of(of_file)
         assert again.assumed == (said != "right")
         assert bool(again.reason) == (said == "refused")
         if ratio > 1.0:
@@ -117,7 +123,7 @@ def test_a_phase_is_taken_right_or_as_assumed_or_the_curve_refused(
             assert of_file.phase_lag_deg is not None
             np.testing.assert_allclose(of_file.phase_lag_deg, _true_lag(tip, table, sign), atol=2.0)
         # who says it needs no curve that decides
-        stated = with_sense_of_phase(replace(table, phase_sense="lag" if sign > 0.0 else "lead"))[1]
+        stated = sense_of(replace(table, phase_sense="lag" if sign > 0.0 else "lead"))
         assert (stated.sign, stated.origin, stated.reason) == (sign, "stated", "")
 
 
@@ -155,7 +161,7 @@ def test_a_sign_that_is_stated_is_taken_and_not_asked_for(tmp_path: Path):
         for options in ({"phase_sense": word}, {"columns": f"phase_lag_deg=Phase:{factor}"}):
             told = recorded(tip, table, tmp_path, **options)
             assert told.phase_sense == "lag"
-            assert with_sense_of_phase(told)[1].origin == "stated"
+            assert sense_of(told).origin == "stated"
             assert not any(one.startswith("Sign") for one in told.remarks)
             assert told.phase_lag_deg is not None
             np.testing.assert_allclose(told.phase_lag_deg, _true_lag(tip, table, float(factor)), atol=2.0)
@@ -187,5 +193,5 @@ def test_a_zero_that_is_stated_decides_off_resonance():
     tip, truth = curve_of_force("repulsive", 150.0, 0.99, "force")
     table = replace(measured(tip, truth), calibration={"phase_zero_deg": (0.0, 0.3)})
     for way, sign in ((1.0, 1.0), (-1.0, -1.0)):
-        found = with_sense_of_phase(replace(table, phase_lag_deg=way * np.asarray(table.phase_lag_deg)))[1]
+        found = sense_of(replace(table, phase_lag_deg=way * np.asarray(table.phase_lag_deg)))
         assert (found.sign, found.origin) == (sign, "zero")

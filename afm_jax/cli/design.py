@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import click
-import numpy as np
 from click import IntRange
 
 from afm_jax.cli.command import Output
@@ -17,10 +16,6 @@ from fitting.experiments.candidates import drive_grid
 from fitting.experiments.design import design
 from fitting.experiments.prior import Prior, prior_of_values, read_prior
 from fitting.parameters import LAW_NAMES, PRIOR_NUISANCES
-
-_TIP = {"orders": (1,), "detunings": (1.02, 1.04, 1.06, 1.08, 1.1), "amplitudes_nm": (40.0, 80.0)}
-_SAMPLE = {"orders": (1, 2, 3, 4), "detunings": np.arange(97, 106) / 100, "amplitudes_nm": (2.0, 4.0, 7.0, 10.0)}
-"""What is looked at if a call does not say, where the tip or the sample is driven."""
 
 
 def planned(  # noqa: PLR0913
@@ -76,16 +71,12 @@ def planned(  # noqa: PLR0913
     """
     stated = {"mass_ng": mass_ng, "drive": drive} | law_and_instrument
     prior = prior_of(fit, model, uncertainty, {name: value for name, value in stated.items() if value is not None})
-    places, tapping = {"offsets_nm": offsets_nm, "heights": heights}, prior.problem.tapping
-    if offsets_nm is None and heights is None:
-        places = {"heights": np.arange(1, 10) / 10} if tapping else {"offsets_nm": (-1.0, 0.0, 1.0)}
-    asked = {"orders": orders, "detunings": detunings, "amplitudes_nm": amplitudes_nm}
-    lists = {name: asked[name] or usual for name, usual in (_TIP if tapping else _SAMPLE).items()}
     with session.working("forecasting (the first run compiles for some seconds)"):
+        lists = {"orders": orders, "detunings": detunings, "amplitudes_nm": amplitudes_nm}
         known = {"free_frequency_khz": prior.free_frequency_khz, "drive": prior.problem.drive}
         result = design(
             prior,
-            drive_grid(**lists, **places, **known),
+            drive_grid(**lists, offsets_nm=offsets_nm, heights=heights, **known),
             points=points,
             noise=noise,
             interest=interest,

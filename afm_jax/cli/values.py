@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import click
 
-from afm_jax.words import cut_short
+from afm_jax.words import cut_short, value_and_error
 from fitting.parameters import MODELS
 
 _MOST_NUMBERS = 1_000_000
@@ -193,15 +193,7 @@ class ValueAndError(ValueKind):
 
     def read(self, text: str) -> Any:
         """Return the value and its error, None if exact; or what a word stands for."""
-        if text in self.words:
-            return self.words[text]
-        try:
-            value, *error = parse_around_plus_minus(text)
-        except ValueError as fault:
-            raise ValueError(f"{fault}; write 40 or '40 +- 2'") from fault
-        if len(error) > 1 or (error and error[0] <= 0.0):
-            raise ValueError(f"`{text}` is no value with a positive error; write '40 +- 2'")
-        return value, error[0] if error else None
+        return self.words[text] if text in self.words else value_and_error(text)
 
 
 class Grid(ValueKind):
@@ -237,25 +229,25 @@ class Fixed(ValueKind):
     """A parameter held at a value: NAME=VALUE."""
 
     name = "value"
-    form, count = "NAME=VALUE such as modulus_gpa=80", 1
+    form, has_error = "NAME=VALUE such as modulus_gpa=80", False
 
     def read(self, text: str) -> tuple[str, Any]:
         """Return the name before an equals sign, and the number after it, or the numbers around +-."""
         name, _, numbers = text.partition("=")
         try:
-            values = parse_around_plus_minus(numbers)
-        except ValueError as error:
-            raise ValueError(f"must be {self.form}, but is {text}") from error
-        if not name.strip() or len(values) != self.count:
+            value, error = value_and_error(numbers)
+        except ValueError as fault:
+            raise ValueError(f"must be {self.form}, but is {text}") from fault
+        if not name.strip() or (error is not None) != self.has_error:
             raise ValueError(f"must be {self.form}, but is {text}")
-        return name.strip().replace("-", "_"), values[0] if self.count == 1 else tuple(values)
+        return name.strip().replace("-", "_"), (value, error) if self.has_error else value
 
 
 class Constraint(Fixed):
     """What is known of a parameter: NAME=VALUE+-ERROR."""
 
     name = "constraint"
-    form, count = "NAME=VALUE+-ERROR such as tip_calibration=1+-0.02", 2
+    form, has_error = "NAME=VALUE+-ERROR such as tip_calibration=1+-0.02", True
 
 
 class Names(ValueKind):
@@ -274,19 +266,6 @@ class Names(ValueKind):
 def option_of(parameter: str) -> str:
     """Return the option of a parameter: of tip_radius_nm, --tip-radius-nm."""
     return f"--{parameter.replace('_', '-')}"
-
-
-def parse_around_plus_minus(text: str) -> list[float]:
-    """Return the numbers that a text has around +-, +/- or ±.
-
-    >>> parse_around_plus_minus("40 +- 2")
-    [40.0, 2.0]
-
-    Raises:
-        ValueError: if one of them is no finite number.
-    """
-    parts = text.replace("±", "+-").replace("+/-", "+-").split("+-")
-    return [_number(part, "value", positive=False) for part in parts]
 
 
 def _number_or_nan(text: str) -> float:

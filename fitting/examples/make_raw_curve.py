@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -25,13 +26,13 @@ from fitting.instruments.lag import free_lag_deg
 SPRING_CONSTANT, QUALITY_FACTOR, FREE_FREQUENCY_KHZ, DRIVE_KHZ = 44.0, 230.0, 344.604, 344.6
 FREE_NM, NM_PER_VOLT, PHASE_ZERO_DEG = 13.4, 42.0, 12.3
 EXAMPLE = Path(__file__).with_name("raw_tapping.txt")
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     "columns": "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg",
     "drive": "force",
     "nm_per_volt": "slope",
-    "spring_constant_n_per_m": (44.0, 4.0),
-    "quality_factor": (230.0, 5.0),
-    "free_frequency_khz": (344.60, 0.01),
+    "spring_constant_n_per_m": "44 +- 4",
+    "quality_factor": "230 +- 5",
+    "free_frequency_khz": "344.60 +- 0.01",
 }
 """What its reader knows of the instrument: the arguments of `read_curves` for the example."""
 _HEIGHTS = (0.0, 30.0, 31.5, 34.0, 37.0, 40.0, 41.0, 41.5, 42.1, 42.7, 43.3)

@@ -1,5 +1,6 @@
 """The drives among which an experiment is designed: what each would read, and what it would say of the law."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,29 +32,38 @@ PHASE_NOISE_DEG = 0.2
 Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
 
 
+_USUAL = {
+    "orders": ((1, 2, 3, 4), (1,)),
+    "detunings": (np.arange(97, 106) / 100, (1.02, 1.04, 1.06, 1.08, 1.1)),
+    "amplitudes_nm": ((2.0, 4.0, 7.0, 10.0), (40.0, 80.0)),
+    "places": ((-1.0, 0.0, 1.0), np.arange(1, 10) / 10),
+}
+"""What is looked at if nothing is said, where the sample or the tip is driven."""
+
+
 @checked
 def drive_grid(
     *,
-    orders: Numbers,
-    amplitudes_nm: Numbers,
-    detunings: Numbers,
     free_frequency_khz: float,
-    offsets_nm: Numbers | None = None,
     drive: str = "sample",
+    orders: Numbers | None = None,
+    amplitudes_nm: Numbers | None = None,
+    detunings: Numbers | None = None,
+    offsets_nm: Numbers | None = None,
     heights: Numbers | None = None,
 ) -> Drives:
     """Return every combination of what can be driven, each once.
 
     Args:
-        orders: N, drive periods per impact; 1 where the cantilever is driven itself.
-        amplitudes_nm: of the platform; of the free tip where that is driven.
-        detunings: drive frequencies as multiples of each order's resonance 2 N f0 (of f0 where the cantilever is driven
-            itself).
         free_frequency_khz: f0.
-        offsets_nm: mean heights of the platform above the tip's rest position; None: 0 alone.
         drive: what is driven: "sample", "force" (on the tip) or "base".
+        orders: N, drive periods per impact, else 1 to 4; 1 where the cantilever is driven itself.
+        amplitudes_nm: of the platform, else 2, 4, 7, 10; of the free tip where that is driven, else 40, 80.
+        detunings: drive frequencies as multiples of each order's resonance 2 N f0, else 0.97 to 1.05; of f0 where the
+            cantilever is driven itself, else 1.02 to 1.1.
+        offsets_nm: mean heights of the platform above the tip's rest position; else -1, 0, 1.
         heights: in place of the offsets, distances of the sample from the rest position of a tip that is driven itself,
-            as shares of its free amplitude: 0.9 is where it begins to tap.
+            as shares of its free amplitude, else 0.1 to 0.9; 0.9 is where it begins to tap.
 
     Raises:
         ValueError: if a list is empty or a number impossible, or there are too many combinations.
@@ -61,24 +71,25 @@ def drive_grid(
     check_drive(drive)
     if offsets_nm is not None and heights is not None:
         raise ValueError("`offsets_nm` and `heights` both say where the sample can be; give one")
-    sample, places = drive == "sample", heights if offsets_nm is None else offsets_nm
-    places = (0.0,) if places is None else places
-    positive = {"free_frequency_khz": free_frequency_khz, "orders": orders, "amplitudes_nm": amplitudes_nm}
-    for name, numbers in (positive | {"detunings": detunings}).items():
-        check_parameter(name, np.asarray(numbers), "positive")
-    check_parameter("offsets_nm" if heights is None else "heights", np.asarray(places), "finite")
-    if any(order != int(order) or not (sample or order == 1) for order in orders):
-        allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
-        raise ValueError(f"`orders` must hold {allowed}, but is {list(orders)}")
+    sample = drive == "sample"
     if heights is not None and sample:
         raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
-    count = len(orders) * len(detunings) * len(amplitudes_nm) * len(places)
+    asked = (orders, detunings, amplitudes_nm, heights if offsets_nm is None else offsets_nm)
+    pairs = zip(_USUAL.items(), asked, strict=True)
+    lists = {name: usual[not sample] if given is None else given for (name, usual), given in pairs}
+    check_parameter("free_frequency_khz", free_frequency_khz, "positive")
+    check_parameter("offsets_nm" if heights is None else "heights", np.asarray(lists["places"]), "finite")
+    for name in ("orders", "detunings", "amplitudes_nm"):
+        check_parameter(name, np.asarray(lists[name]), "positive")
+    if any(order != int(order) or not (sample or order == 1) for order in lists["orders"]):
+        allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
+        raise ValueError(f"`orders` must hold {allowed}, but is {list(lists['orders'])}")
+    count = math.prod(map(len, lists.values()))
     if count > MOST:
         raise ValueError(f"these are {count} drives, more than the {MOST} a design looks at; take coarser steps")
-    grid = np.meshgrid(orders, detunings, amplitudes_nm, places)
-    order, detuning, amplitude, place = (np.ravel(axis).astype(float) for axis in grid)
+    order, detuning, amplitude, place = (np.ravel(axis).astype(float) for axis in np.meshgrid(*lists.values()))
     frequency = (2.0 if sample else 1.0) * free_frequency_khz * order * detuning
-    offset = place if heights is None else -place * amplitude
+    offset = place if sample or offsets_nm is not None else -place * amplitude
     # rounded to what an instrument is told: a thousandth of a hertz, a femtometre
     columns = np.unique(np.round([order, frequency, amplitude, offset], 6), axis=1)
     return Drives(columns[0].astype(np.int64), *columns[1:])
@@ -241,29 +252,17 @@ def standard_errors(information: Float[np.ndarray, "... p p"]) -> Float[np.ndarr
     return np.sqrt(np.diagonal(covariance_of(information), axis1=-2, axis2=-1))
 
 
-def forecast(
-    prior: Prior, rows: Explained, candidates: Candidates, chosen: Int[np.ndarray, " points"]
-) -> Float[np.ndarray, "steps p"]:
-    """Return the standard errors that a fit will state, before and after each chosen point.
+def stated_errors(prior: Prior, rows: Explained, chosen: Int[np.ndarray, " points"]) -> Float[np.ndarray, " p"]:
+    """Return the standard errors that a fit of some of the rows states, whose impacts last.
 
-    Where impacts last these contain what a formula leaves out, and are those of the formula closest to the law. A prior
-    that a fit left is of that formula already.
+    They contain what a formula leaves out, and are those of the formula closest to the law. A prior that a fit left is
+    of that formula already.
 
     Args:
         prior: the law and the instrument.
         rows: the drives, from `explained`.
-        candidates: the same drives.
-        chosen: numbers of the points.
+        chosen: numbers of the rows.
     """
-    each = candidates.information[chosen]
-    errors = standard_errors(prior.information + np.cumsum([np.zeros_like(prior.information), *each], axis=0))
-    if prior.problem.lasting and chosen.size:
-        errors[1:] = [_stated(prior, rows, chosen[: 1 + last]) for last in range(len(chosen))]
-    return errors
-
-
-def _stated(prior: Prior, rows: Explained, chosen: Int[np.ndarray, " points"]) -> Float[np.ndarray, " p"]:
-    """Return the standard errors that a fit of some of the rows states: with everything unknown that it has."""
     law, own, measured = rows.model.law, prior.problem.own, np.isin(np.arange(len(rows.found.number)), chosen)[:, None]
     orbits = rows.end.orbits._replace(x=np.where(measured, rows.end.orbits.x, np.nan))
     if isinstance(law, FormulaLaw):

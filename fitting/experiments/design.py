@@ -6,7 +6,7 @@ such that the joint confidence region of the parameters that matter becomes smal
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,17 +18,27 @@ from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, known, text_table, with_error
-from fitting.experiments.candidates import LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, explained, forecast
+from fitting.experiments.candidates import (
+    LEFT_OUT,
+    PHASE_NOISE_DEG,
+    Candidates,
+    candidates_of,
+    drive_grid,
+    explained,
+    standard_errors,
+    stated_errors,
+)
 from fitting.experiments.prior import Prior, prior_of_fit
 from fitting.infer.result import FitResult
 from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import Drives
 
-AMPLITUDES = ("both", "peak", "lockin")
 _EXACT = (
     "The quality factor is assumed to be exact, which makes every forecast too good: give it with its error, such "
     "as '40 +- 2'."
 )
+
+
 _PRINTED = {
     "order": ("N", "d"),
     "drive_frequency_khz": ("kHz", ".8g"),
@@ -77,13 +87,14 @@ class Design(JudgedResult):
     @property
     def columns(self) -> dict[str, list[Any]]:
         """The drives under the names of a table's columns, and the readings to expect."""
-        found, chosen, tapping = self.candidates, self.chosen, self.prior.problem.tapping
-        names = "order", "drive_frequency_khz", f"{'free' if tapping else 'drive'}_amplitude_nm", "offset_nm"
+        found, amplitude = self.candidates, "free" if self.prior.problem.tapping else "drive"
+        names = "order", "drive_frequency_khz", f"{amplitude}_amplitude_nm", "offset_nm"
         columns: dict[str, Any] = dict(zip(names, self.drives, strict=True))
-        readings = zip(("peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg"), found.readings.T, strict=True)
-        read = {f"expected_{name}": reading[chosen] for name, reading in readings}
-        columns |= {name: reading for name, reading in read.items() if np.isfinite(reading).all()}
-        columns["expected_approach_speed_nm_per_us"] = found.approach_speed_nm_per_us[chosen]
+        readings = "peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg"
+        for name, reading in zip(readings, found.readings[self.chosen].T, strict=True):
+            if np.isfinite(reading).all():
+                columns[f"expected_{name}"] = reading
+        columns["expected_approach_speed_nm_per_us"] = found.approach_speed_nm_per_us[self.chosen]
         return {name: column.tolist() for name, column in columns.items()}
 
     def points(self) -> list[dict[str, Any]]:
@@ -116,14 +127,13 @@ class Design(JudgedResult):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax design`; what is not known is None."""
-        names = ("valid", "reasons", "warnings", "noise", "expected", "measured_so_far")
+        names = ("valid", "reasons", "warnings", "noise", "interest", "expected", "measured_so_far")
         return {
             "format": "afm-jax design",
             "format_version": 2,
             "drive": self.prior.problem.drive,
             "model": self.prior.problem.model,
             **{name: getattr(self, name) for name in names},
-            "interest": list(self.interest),
             "points": self.points(),
             "candidates": int(self.candidates.usable.sum()),
             "left_out": self.candidates.left_out,
@@ -167,12 +177,12 @@ class Design(JudgedResult):
 @in_float64
 def design(  # noqa: PLR0913
     prior: Prior | FitResult,
-    drives: Drives,
+    drives: Drives | None = None,
     *,
     points: int = 8,
     noise: float = 0.01,
     interest: Sequence[str] | None = None,
-    amplitudes: str = "both",
+    amplitudes: Literal["both", "peak", "lockin"] = "both",
     largest_nm: float | None = None,
     phase_noise_deg: float = PHASE_NOISE_DEG,
 ) -> Design:
@@ -185,7 +195,7 @@ def design(  # noqa: PLR0913
 
     Args:
         prior: from `prior_of_values`, or a fit whose measurements are to be added to.
-        drives: what can be driven, from `drive_grid`.
+        drives: what can be driven, from `drive_grid`; None: what that looks at if nothing is said.
         points: how many to choose.
         noise: standard error of an amplitude relative to it (0.01 stands for 1 %).
         interest: the parameters to be known well, all others being unknown too; None: those of the law.
@@ -211,17 +221,20 @@ def design(  # noqa: PLR0913
     if not interest or len({*interest}) < len(interest):
         raise ValueError("`interest` must name at least one parameter, and none twice")
     check_count("points", points, 1)
-    if amplitudes not in AMPLITUDES:
-        raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
     check_parameter("noise", noise, "between 0 and 1")
     check_parameter("largest_nm", largest_nm, "positive", optional=True)
     check_parameter("phase_noise_deg", phase_noise_deg, "positive")
+    if drives is None:
+        drives = drive_grid(free_frequency_khz=prior.free_frequency_khz, drive=prior.problem.drive)
     rows = explained(prior, drives, noise=noise, amplitudes=amplitudes, phase_noise_deg=phase_noise_deg)
     candidates = candidates_of(prior, drives, rows, largest_nm or np.inf)
     usable = np.flatnonzero(candidates.usable)
     matters = np.array([name in interest for name in names])
     chosen = usable[choose_points(prior.information, candidates.information[usable], points, matters)]
-    errors = forecast(prior, rows, candidates, chosen)
+    each = candidates.information[chosen]
+    errors = standard_errors(prior.information + np.cumsum([np.zeros_like(prior.information), *each], axis=0))
+    if prior.problem.lasting and chosen.size:
+        errors[1:] = [stated_errors(prior, rows, chosen[: 1 + last]) for last in range(len(chosen))]
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
     left_out = "; ".join(f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items())
     reasons = {

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.words import printable
+from afm_jax.words import printable, value_and_error
 from fitting.tables.csv_text import NUMBER, TableError
 
 _SIZES = {
@@ -160,7 +160,7 @@ def given_numbers(
     """Return what a caller gives of the instrument, by name.
 
     Args:
-        numbers: each a number or a pair with its standard error; None: not given.
+        numbers: each a number, a pair with its standard error, or both as a text, '44 +- 4'; None: not given.
         units: of those that may be given.
         any_sign: those that need not be above 0.
 
@@ -174,7 +174,8 @@ def given_numbers(
             raise TypeError(f"there is no option `{key}`; it is one of {', '.join(units)}")
         if value is None:
             continue
-        number, error = value if isinstance(value, tuple) else (float(value), None)
+        pair = value_and_error(value) if isinstance(value, str) else value
+        number, error = pair if isinstance(pair, tuple) else (float(pair), None)
         sound = np.isfinite(number) and (number > 0.0 or key in any_sign) and (error is None or error > 0.0)
         if not sound:
             raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")

@@ -59,13 +59,13 @@ def fit_report(result: FitResult, comparison: Comparison | None = None, posterio
         title=f"Impact law of {result.table.source} ({counted(result.table.rows, 'row')}), model {result.model}:",
         about=[line for line in (*formulas(result), held_in_words(result)) if line],
         valid=result.valid,
-        verdict="VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
+        doubt="" if result.valid else "the numbers below are not a measurement of the law.",
         reasons=result.reasons,
         sections=[
-            ReportSection("Parameters", [Table("Fitted parameters", head, cells, words=head[-1:])], "Parameters"),
+            ReportSection("Parameters", [Table("Fitted parameters", head, cells, words=head[-1:])]),
             ReportSection("Goodness of fit", [Text("\n".join(goodness), "lines")]),
             *_table_sections(result),
-            ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"),
+            ReportSection("Notes", [Bullets(result.warnings, "Notes:")]),
             *([] if comparison is None else [_compared(comparison)]),
             *([] if posterior is None else [_sampled(posterior)]),
         ],
@@ -80,21 +80,19 @@ def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
 
 def _table_sections(result: FitResult) -> list[ReportSection]:
     """Return each of several tables' pull, what it has to itself, and the energy lost in an impact."""
-    sections, pulls, own = [], [], []
+    pulls, own = [], []
     for one in result.tables:
         pulls.append([one.name, f"{one.used}/{one.rows}", f"{one.chi2:.1f}/{one.readings}", known(one.pull, ".2f")])
         own += [[one.name, *_parameter_cells(name, parameter)] for name, parameter in one.nuisances.items()]
-    if pulls:
-        head = ["table", "rows used", "chi2/readings", "pull"]
-        sections.append(ReportSection("Tables", [Table("Tables", head, pulls), Text(PULLS)]))
-    if own:
-        head = ["table", "its nuisance", "value", "std. error", "95 % interval"]
-        sections.append(ReportSection("Nuisances", [Table("Of each table", head, own, words=(head[1], head[-1]))]))
+    table = Table("Tables", ["table", "rows used", "chi2/readings", "pull"], pulls)
+    head = ["table", "its nuisance", "value", "std. error", "95 % interval"]
+    loss = ["loss of an impact", "95 % interval"]
     losses = losses_in_words(result) if result.valid else []
-    if losses:
-        head = ["loss of an impact", "95 % interval"]
-        sections.append(ReportSection("Losses", [Table("Energy lost in an impact", head, losses, words=head)]))
-    return sections
+    return [
+        ReportSection("Tables", [table, Text(PULLS if pulls else "")]),
+        ReportSection("Nuisances", [Table("Of each table", head, own, words=(head[1], head[-1]))]),
+        ReportSection("Losses", [Table("Energy lost in an impact", loss, losses, words=loss)]),
+    ]
 
 
 def _compared(comparison: Comparison) -> ReportSection:
@@ -205,10 +203,10 @@ def fit_page(result: FitResult, report: Report, pictures: Sequence[bytes]) -> st
         "The law over the approach speed, with its 95 % band.",
         "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
     )
-    seen = ReportSection("Pictures", pictures_of(pictures, shows), "Pictures")
+    seen = ReportSection("Pictures", pictures_of(pictures, shows))
     inputs = [
         Bullets([remark for table in result.table.tables for remark in table.remarks]),
         pairs("Options of the fit", ("option", "value"), result.settings),
         pairs("Versions of what computed it", ("package", "version"), result.versions),
     ]
-    return page_of(replace(report, sections=[seen, *report.sections, ReportSection("Inputs", inputs, "Inputs")]))
+    return page_of(replace(report, sections=[seen, *report.sections, ReportSection("Inputs", inputs)]))

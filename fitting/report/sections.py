@@ -88,19 +88,17 @@ class ReportSection:
     """A section: a block of the terminal's text, a heading with what is below it on the page.
 
     Attributes:
-        title: the heading of the page.
-        parts: what it holds, from top to bottom.
-        link: its name among the links at the top of the page; "": it has none.
+        title: the heading of the page, and its link at the top.
+        parts: what it holds, from top to bottom; those that hold nothing are left out.
     """
 
     title: str
     parts: Sequence[Part]
-    link: str = ""
 
     @property
     def name(self) -> str:
         """The section's place in the page's address."""
-        return (self.link or self.title).split()[0].lower()
+        return self.title.split()[0].lower()
 
 
 @dataclass(frozen=True)
@@ -110,46 +108,46 @@ class Report:
     Attributes:
         title: what it is about.
         valid: whether the result may be used.
-        verdict: the verdict's line in the terminal; "VALID" if it is.
         reasons: why it is not valid.
-        sections: the rest.
+        sections: the rest; those that hold nothing are left out.
         about: lines below the title in the terminal; on the page paragraphs below the verdict.
+        doubt: what a result that is not valid is no measurement of, a sentence behind the verdict.
     """
 
     title: str
     valid: bool
-    verdict: str
     reasons: Sequence[str]
     sections: Sequence[ReportSection]
     about: Sequence[str] = ()
+    doubt: str = ""
 
-    def __str__(self) -> str:
-        """Return the report as a terminal shows it."""
-        return text_of(self)
-
-    def _repr_html_(self) -> str:
-        """Return the report as a notebook shows it."""
-        return page_of(self)
+    @property
+    def shown(self) -> list[ReportSection]:
+        """The sections that hold something, without the parts that do not."""
+        parts = [[one for one in each.parts if isinstance(one, Picture) or lines_of(one)] for each in self.sections]
+        return [ReportSection(each.title, held) for each, held in zip(self.sections, parts, strict=True) if held]
 
 
 def text_of(report: Report) -> str:
     """Return a report as text: blocks with an empty line between; pictures, captions and headings are the page's."""
-    title, verdict = [report.title, *(f"  {line}" for line in report.about)], [report.verdict]
+    title = [report.title, *(f"  {line}" for line in report.about)]
+    verdict = ["VALID" if report.valid else f"NOT VALID{report.doubt and f': {report.doubt}'}"]
     verdict += [f"  - {reason}" for reason in report.reasons]
     blocks = [title, verdict] if report.about else [title + verdict]
-    blocks += [[line for part in section.parts for line in lines_of(part)] for section in report.sections]
+    blocks += [[line for part in section.parts for line in lines_of(part)] for section in report.shown]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
 def lines_of(part: Part) -> list[str]:
-    """Return the lines of a part in a terminal."""
+    """Return the lines of a part in a terminal; none of one that holds nothing."""
     match part:
         case Text(words):
-            return [words]
+            return [words] if words else []
         case Bullets(items, title):
-            return [*([title] if title and items else []), *(f"  - {item}" for item in items)]
+            return [*filter(None, [title]), *(f"  - {item}" for item in items)] if items else []
         case Table(head=head, rows=rows, words=words):
-            return text_table(head, rows, words=[k for k, name in enumerate(head) if name in words or k == 0])
+            columns = [k for k, name in enumerate(head) if name in words or k == 0]
+            return text_table(head, rows, words=columns) if rows else []
         case Picture():
             return []
 
@@ -165,10 +163,7 @@ def page_of(report: Report) -> str:
         lstrip_blocks=True,
     )
     environment.filters["signed"] = signed
-    verdict = "" if report.verdict in {"VALID", "NOT VALID"} else report.verdict.removeprefix("NOT VALID: ")
-    return environment.get_template("page.html.jinja").render(
-        result=report, title=report.title, lead=[*map(Text, report.about)], words=verdict
-    )
+    return environment.get_template("page.html.jinja").render(result=report, lead=[*map(Text, report.about)])
 
 
 def _allowed(value: Any) -> Any:

@@ -6,7 +6,6 @@ on the way back. Each such pair of heights is a `Hysteresis`.
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,7 +30,8 @@ _UNIFORM = 12.0**-0.5
 """Standard deviation of what lies anywhere within a unit."""
 
 
-class Height(NamedTuple):
+@dataclass(frozen=True)
+class Height:
     """A height in nm and its standard error."""
 
     offset_nm: float
@@ -64,12 +64,6 @@ class Hysteresis:
             return None
         error = float(np.hypot(self.approach.standard_error, self.retract.standard_error))
         return self.approach.offset_nm - self.retract.offset_nm, error
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the change with its heights as mappings, and its width."""
-        ends = {"approach": self.approach, "retract": self.retract}
-        mapped = {name: None if end is None else end._asdict() for name, end in ends.items()}
-        return {**vars(self), **mapped, "width_nm": self.width_nm}
 
 
 def way_of(retract: bool | np.bool_) -> str:  # noqa: FBT001

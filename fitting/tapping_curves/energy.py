@@ -37,7 +37,7 @@ from afm_jax.solve.least_squares import IMPROBABLE, Sum, chi2_tail, covariance_o
 from afm_jax.units import TWO_SIDED_95
 from fitting.instruments.lag import turned
 from fitting.parameters import USUAL_DRIFTS
-from fitting.tapping_curves.branches import FEWEST_ROWS, CurveBranch, free_ends, ways
+from fitting.tapping_curves.branches import FEWEST_ROWS, CurveBranch, free_ends, side_of, ways
 from fitting.tapping_curves.curve import (
     HARMONICS_FACTOR,
     Given,
@@ -138,7 +138,7 @@ class Nuisance(NamedTuple):
     """Something of the instrument that is not known exactly.
 
     Attributes:
-        name: its key, with a number where each drive has its own.
+        name: its key, with a number from the second of its kind on: each drive may have its own.
         kind: its key without the number.
         given: what is stated of it, the unit that of the key; an error of infinity: nothing.
         value: at the minimum.
@@ -319,11 +319,8 @@ class Lever:
                 error *= value
             elif kind == "phase_zero_deg":
                 given = curve.phase_zero_deg or Given(value, np.inf)
-            name = (
-                f"{kind}_{sum(one.kind == kind for one in found)}"
-                if kind in {"phase_zero_deg", "free_amplitude"}
-                else kind
-            )
+            count = sum(one.kind == kind for one in found)
+            name = f"{kind}_{count}" if count else kind
             found.append(Nuisance(name, kind, given, value, error))
         return tuple(found)
 
@@ -573,16 +570,12 @@ class EnergyCurve:
 
     def to_dict(self) -> dict[str, Any]:
         """Return amplitude ratio, height, energy and virial with their bands, and what is said of each point."""
-        return {
-            "amplitude_ratio": self.amplitude_ratio,
-            "height_nm": self.height_nm,
-            "energy_aj": self.energy_aj,
-            "energy_low_aj": self.energy_low_aj,
-            "energy_high_aj": self.energy_high_aj,
+        names = ("amplitude_ratio", "height_nm", "energy_aj", "energy_low_aj", "energy_high_aj", "virial_aj")
+        half = TWO_SIDED_95 * self.virial_error_aj
+        return {name: getattr(self, name) for name in names} | {
             "said": [said_of(*ends) for ends in zip(self.energy_low_aj, self.energy_high_aj, strict=True)],
-            "virial_aj": self.virial_aj,
-            "virial_low_aj": self.virial_aj - TWO_SIDED_95 * self.virial_error_aj,
-            "virial_high_aj": self.virial_aj + TWO_SIDED_95 * self.virial_error_aj,
+            "virial_low_aj": self.virial_aj - half,
+            "virial_high_aj": self.virial_aj + half,
         }
 
 
@@ -845,27 +838,6 @@ def _densest(mean: float, error: float, low: float, high: float) -> tuple[float,
     return mean + error * float(ends[0]), mean + error * float(ends[1])
 
 
-def least_on_frequency(functions: EnergyFunctions) -> dict[str, Any] | None:
-    """Return the energy of a curve that depends least on the free frequency, relative to itself, and where.
-
-    It is the middle of its band, beside how much of it a standard error of the frequency, as known, is; None where no
-    energy is positive.
-    """
-    with_frequency = functions.lever.minimum.covariance[0]
-    found = [
-        {
-            "branch": number,
-            "amplitude_ratio": float(c.amplitude_ratio[n]),
-            "energy_aj": float(c.energy_aj[n]),
-            "interval95_aj": (float(c.energy_low_aj[n]), float(c.energy_high_aj[n])),
-            "by_frequency_aj": float(abs(c.by_instrument[n] @ with_frequency) / np.sqrt(with_frequency[0])),
-        }
-        for number, c in enumerate(branch.curve for branch in functions.branches)
-        for n in np.flatnonzero(c.certain & (c.energy_low_aj > 0.0))
-    ]
-    return min(found, key=lambda at: at["by_frequency_aj"] / at["energy_aj"], default=None)
-
-
 def largest_of(branches: Sequence[TappingBranch]) -> tuple[int, int]:
     """Return the branch and the point at which the middle of the band is largest."""
     tops = [int(np.argmax(branch.curve.energy_aj)) for branch in branches]
@@ -936,20 +908,48 @@ def estimates_at(curve: EnergyCurve, ratio: np.ndarray) -> tuple[np.ndarray, np.
 
 
 @dataclass(frozen=True, kw_only=True)
+class EnergyGroup:
+    """One energy of rows of one drive and one side of the phase.
+
+    Attributes:
+        drive: frequency in kHz and free amplitude in nm.
+        repulsive: whether the lag is below the free tip's.
+        rows: numbers of the rows.
+        energy_aj: of a tap.
+        error_aj: its standard error.
+    """
+
+    drive: tuple[float, float]
+    repulsive: bool
+    rows: Int[np.ndarray, " some"]
+    energy_aj: float
+    error_aj: float
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        frequency, amplitude = self.drive
+        return f"{side_of(self.repulsive)}, {frequency:g} kHz, free amplitude {amplitude:.4g} nm"
+
+    @property
+    def interval95_aj(self) -> tuple[float, float]:
+        """Its 95 % interval."""
+        return self.energy_aj - TWO_SIDED_95 * self.error_aj, self.energy_aj + TWO_SIDED_95 * self.error_aj
+
+
+@dataclass(frozen=True, kw_only=True)
 class OneEnergy:
     """One energy for each group of rows, fitted together with the instrument.
 
     Attributes:
-        energy_aj: of each group.
-        error_aj: its standard error but for spring constant and calibration.
+        groups: rows and energies.
         nuisances: of the instrument.
         residual: of the rows fitted, in standard errors; NaN elsewhere.
         minimum: chi2 of rows, free rows and what is stated, its degrees of freedom.
         scale: what the rows' own errors were multiplied by.
     """
 
-    energy_aj: Float[np.ndarray, " groups"]
-    error_aj: Float[np.ndarray, " groups"]
+    groups: tuple[EnergyGroup, ...]
     nuisances: tuple[Nuisance, ...]
     residual: Rows
     minimum: Solution
@@ -961,16 +961,25 @@ class OneEnergy:
         return np.isfinite(self.residual)
 
 
-def one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve, scale: float = 1.0) -> OneEnergy:
-    """Return one energy for each group of rows of a lever's only curve, the instrument free within what is stated.
+def one_energy(
+    lever: Lever, usable: Mask, repulsive: Mask, smooth: TappingCurve, scale: float = 1.0
+) -> OneEnergy | None:
+    """Return one energy for each drive and side of a lever's only curve, the instrument free within what is stated.
 
     Args:
         lever: the curve, and its instrument.
-        groups: rows that share an energy.
+        usable: rows that may share an energy; None where no drive and side has enough of them.
+        repulsive: rows of the repulsive branch.
         smooth: the curve with smooth readings, at which errors of energies are taken.
         scale: what the rows' own errors are multiplied by.
     """
     curve, count = lever.curves[0], len(lever.unknowns)
+    columns = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm, ~repulsive], axis=1)
+    kinds = np.unique(columns[usable], axis=0)
+    groups = [np.flatnonzero(usable & np.all(columns == kind, axis=1)) for kind in kinds]
+    groups = [rows for rows in groups if len(rows) >= FEWEST_ROWS]
+    if not groups:
+        return None
     rows, group = np.concatenate(groups), np.repeat(np.arange(len(groups)), [len(part) for part in groups])
     own = (group[:, None] == np.arange(len(groups))).astype(float)
 
@@ -1003,9 +1012,18 @@ def one_energy(lever: Lever, groups: Sequence[np.ndarray], smooth: TappingCurve,
     minimum = _minimum(residual, jacobian, x)
     residuals = np.full(curve.rows, np.nan)
     residuals[rows] = np.divide(*off(minimum.at))
+    found = zip(groups, minimum.at[count:].tolist(), np.sqrt(np.diag(minimum.covariance)[count:]).tolist(), strict=True)
     return OneEnergy(
-        energy_aj=minimum.at[count:],
-        error_aj=np.sqrt(np.diag(minimum.covariance)[count:]),
+        groups=tuple(
+            EnergyGroup(
+                drive=(float(curve.drive_frequency_khz[part[0]]), float(curve.free_amplitude_nm[part[0]])),
+                repulsive=bool(repulsive[part[0]]),
+                rows=part,
+                energy_aj=energy,
+                error_aj=float(np.hypot(error, curve.relative_error * energy)),
+            )
+            for part, energy, error in found
+        ),
         nuisances=lever.nuisances(0, minimum),
         residual=residuals,
         minimum=minimum,

@@ -23,31 +23,32 @@ def map_report(result: TappingMap) -> Report:
     counts, unit, numbers = result.counts, result.unit, result.to_dict()
     rows, columns = result.state.shape
     masked = [f"{count} {name}" for name, count in counts.items() if count and name != "used"]
-    sections = []
-    if counts["used"]:
-        head = ["", f"2.5 % ({unit})", "median", "97.5 %", "error of a pixel", "error of all in common"]
-        cells = [
-            [
-                name,
-                *(f"{numbers[key][end]:.3g}" for end in ("percentile_2_5", "median", "percentile_97_5")),
-                f"{numbers[f'{key}_error']['median']:.2g}",
-                f"{numbers[f'{key}_common_error']:.2g}",
-            ]
-            for name, key in (("energy of a tap", "energy"), ("virial", "virial"))
+    head = ["", f"2.5 % ({unit})", "median", "97.5 %", "error of a pixel", "error of all in common"]
+    cells = [
+        [
+            name,
+            *(f"{numbers[key][end]:.3g}" for end in ("percentile_2_5", "median", "percentile_97_5")),
+            f"{numbers[f'{key}_error']['median']:.2g}",
+            f"{numbers[f'{key}_common_error']:.2g}",
         ]
-        parts = [f"{words_of(name)} {value:+.2g}" for name, value in result.common.items()]
-        common = f"The common error of the energy comes of ({unit}, one standard error each): {', '.join(parts)}."
-        table = Table("95 of 100 pixels lie between the first and the third number", head, cells)
-        sections = [ReportSection("Energy and virial", [table]), ReportSection("Errors", [Text(common)])]
+        for name, key in (("energy of a tap", "energy"), ("virial", "virial"))
+        if counts["used"]
+    ]
+    parts = ", ".join(f"{words_of(name)} {value:+.2g}" for name, value in result.common.items())
+    common = f"The common error of the energy comes of ({unit}, one standard error each): {parts}."
     known = [[words_of(key), f"{one.value:.7g}", one.unit, one.origin] for key, one in result.known.items()]
-    head = ["known", "value", "unit", "from"]
-    sections.append(ReportSection("What is known", [Table("Of the instrument", head, known, words=head[2:])]))
-    sections.append(ReportSection("Notes", [Bullets(result.notes, "Notes:")]))
+    of_known = ["known", "value", "unit", "from"]
+    table = Table("95 of 100 pixels lie between the first and the third number", head, cells)
+    sections = [
+        ReportSection("Energy and virial", [table]),
+        ReportSection("Errors", [Text(common if cells else "")]),
+        ReportSection("What is known", [Table("Of the instrument", of_known, known, words=of_known[2:])]),
+        ReportSection("Notes", [Bullets(result.notes, "Notes:")]),
+    ]
     return Report(
         title=f"Map {result.source}: {rows} x {columns} pixels, {counts['used']} used, "
         + (f"masked: {', '.join(masked)}" if masked else "none masked"),
         valid=result.valid,
-        verdict="VALID" if result.valid else "NOT VALID",
         reasons=result.reasons,
         sections=sections,
     )

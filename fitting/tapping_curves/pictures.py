@@ -1,5 +1,7 @@
 """Pictures of a tapping curve: amplitude, phase and energy over height; several curves together."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -54,18 +56,17 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
     """Draw rows: filled on approach, squares on retract, hollow where excluded, grey where free."""
     curve, free = result.curve, result.rows.free
     aside = np.array([note.startswith("excluded") for note in result.rows.note])
-    for back, marker in ((False, "o"), (True, "s")):
-        for chosen, colour, filled, label in (
+    for back, marker, colour in ((False, "o", BLUE), (True, "s", ACCENT)):
+        for chosen, edge, filled, label in (
             (free, GRID, GRID, "free"),
-            (~free & ~aside, ACCENT if back else BLUE, ACCENT if back else BLUE, way_of(back)),
+            (~free & ~aside, colour, colour, way_of(back)),
             (~free & aside, DARK, "none", "excluded"),
         ):
             here = chosen & (curve.retract == back) & np.isfinite(values)
             if here.any():
-                style = {"fmt": marker, "ms": 4, "lw": 0.8, "color": colour, "mfc": filled}
-                new = label not in axes.get_legend_handles_labels()[1]
-                style |= {"label": label if new else None}
-                axes.errorbar(curve.offset_nm[here], values[here], errors[here], **style)
+                style: dict[str, Any] = {"fmt": marker, "ms": 4, "lw": 0.8, "color": edge, "mfc": filled}
+                once = None if label in axes.get_legend_handles_labels()[1] else label
+                axes.errorbar(curve.offset_nm[here], values[here], errors[here], label=once, **style)
 
 
 def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
@@ -77,19 +78,11 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
         axes.plot(curve.height_nm, curve.energy_aj, color=colour, lw=1.2)
         axes.fill_between(curve.height_nm, curve.energy_low_aj, curve.energy_high_aj, color=colour, alpha=0.15, lw=0)
         ends += [float(curve.energy_aj.max()), *np.percentile(curve.energy_high_aj, [0.0, 90.0]).tolist()]
-    if result.fit is not None and result.described:
-        for i, group in enumerate(result.groups):
-            heights = result.curve.offset_nm[result.fit.used & group.rows]
-            energy, _, (low, high) = result.constant(i)
-            axes.plot(
-                [heights.min(), heights.max()],
-                [energy, energy],
-                "--",
-                color=DARK,
-                lw=1.0,
-                label=result.in_unit(f"one energy, {side_of(group.repulsive)}: {energy:.3g} aJ"),
-            )
-            ends += [low, high]
+    for group in () if result.fit is None or result.why_not_constant else result.fit.groups:
+        heights, energy = result.curve.offset_nm[group.rows], [group.energy_aj] * 2
+        label = result.in_unit(f"one energy, {side_of(group.repulsive)}: {group.energy_aj:.3g} aJ")
+        axes.plot([heights.min(), heights.max()], energy, "--", color=DARK, lw=1.0, label=label)
+        ends += group.interval95_aj
     return min(ends), max(ends)
 
 

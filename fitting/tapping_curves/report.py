@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
-from afm_jax.words import broken, interval, percent, with_error
+from afm_jax.words import interval, percent, with_error
 from fitting.report.files import write_report_files
 from fitting.report.sections import (
     Bullets,
@@ -21,11 +21,12 @@ from fitting.report.sections import (
     text_of,
 )
 from fitting.tapping_curves.branches import CurveBranch, Hysteresis
-from fitting.tapping_curves.energy import HEADLINE, said_of
+from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, said_of, within
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
-_WIDTH = 150
+QUOTED = 0.8
+"""Amplitude, as a fraction of the free one, at which the first line gives the energy."""
 _CHANGES = {
     "contact": "contact: the amplitude leaves the free one",
     "half": "half of the free amplitude is left",
@@ -36,13 +37,7 @@ WriteTable = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
 
 def tapping_summary(result: Tapping) -> str:
     """Return the result as text: verdict, energy, thresholds, speeds, law or what to record instead, notes."""
-    return _printed(tapping_report(result), result.in_unit)
-
-
-def _printed(report: Report, in_unit: Callable[[str], str]) -> str:
-    """Return a report as text, long lines broken, in the unit that energies have."""
-    lines = text_of(report).split("\n")
-    return in_unit("\n".join(piece for line in lines for piece in broken(line, _WIDTH, "    ")))
+    return result.in_unit(text_of(tapping_report(result)))
 
 
 def tapping_report(result: Tapping) -> Report:
@@ -57,35 +52,40 @@ def tapping_report(result: Tapping) -> Report:
         law = summary(result.law)
     sections = [
         *_along_the_branches(result),
-        *_one_energy(result),
-        *_thresholds(result),
-        *_speeds(result),
-        ReportSection("Impact law", [Text(law, "lines" if result.law else "")], "Impact law"),
-        ReportSection("What the numbers assume", [Bullets(result.assumptions, "Assumed:")], "Assumptions"),
+        _one_energy(result),
+        _thresholds(result),
+        _speeds(result),
+        ReportSection("Impact law", [Text(law, "lines" if result.law else "")]),
+        ReportSection("What the numbers assume", [Bullets(result.assumptions, "Assumed:")]),
+        ReportSection("Notes", [Bullets(result.warnings, "Notes:")]),
     ]
-    if result.warnings:
-        sections.append(ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"))
     return Report(
         title=f"Tapping curve {result.table.source}: {len(states)} rows, {counts}",
-        about=[f"Energy of a tap: {energy_in_words(result)}"],
+        about=energy_in_words(result),
         valid=result.valid,
-        verdict="VALID" if result.valid else "NOT VALID",
         reasons=result.reasons,
         sections=sections,
     )
 
 
-def energy_in_words(result: Tapping) -> str:
-    """Return the energy of a tap in aJ and eV, where it is largest."""
+def energy_in_words(result: Tapping) -> list[str]:
+    """Return the energy of a tap in aJ and eV at 0.8 of the free amplitude if measured there, and the largest."""
     top, over_k = result.largest, result.curve.over_spring_constant
     if result.bound_aj is not None:
-        return f"at most {result.bound_aj:.3g} aJ" + ("" if over_k else f", {EV_PER_AJ * result.bound_aj:.3g} eV")
+        electronvolts = "" if over_k else f", {EV_PER_AJ * result.bound_aj:.3g} eV"
+        return [f"Energy of a tap: at most {result.bound_aj:.3g} aJ{electronvolts}"]
     if top is None or not (result.valid or "only bracketed" in result.why_not_functions):
-        return "not known"
-    low, high = top["interval95"]
-    where = f"at {top['amplitude_ratio']:.2f} of the free amplitude, where it is largest"
-    electronvolts = "" if over_k else f", {interval(EV_PER_AJ * low, EV_PER_AJ * high)} eV"
-    return f"{_band_in_words(low, high)} aJ {where} (95 %: {interval(low, high)} aJ{electronvolts})"
+        return ["Energy of a tap: not known"]
+    quoted = [one for one in result.energies_at if one["amplitude_ratio"] == QUOTED]
+    places = [(max(quoted, key=lambda one: one["energy_aj"]), "interval95_aj", "Energy of a tap")] if quoted else []
+    places.append((top, "interval95", "Largest energy of a tap" if quoted else "Energy of a tap, where it is largest"))
+    lines = []
+    for at, band, what in places:
+        low, high = at[band]
+        where = f"at {at['amplitude_ratio']:.2f} of the free amplitude, {result.branches[at['branch']].name}"
+        electronvolts = "" if over_k else f", {interval(EV_PER_AJ * low, EV_PER_AJ * high)} eV"
+        lines.append(f"{what}: {_band_in_words(low, high)} aJ {where} (95 %: {interval(low, high)} aJ{electronvolts})")
+    return lines
 
 
 def _band_in_words(low: float, high: float) -> str:
@@ -114,15 +114,8 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
         f"  retract less approach, {result.branches[one['approach']].side}: "
         f"{with_error(one['energy_aj'], one['standard_error'])} aJ at A/A0 = {one['amplitude_ratio']:.2f}, where the "
         "difference is largest in units of its error"
-        for one in result.way_differences
+        for one in differences_of_ways(functions)
     ]
-    least = result.least_on_frequency
-    if least is not None:
-        lines.append(
-            f"  depends least on the free frequency at A/A0 = {least['amplitude_ratio']:.3f} "
-            f"({result.branches[least['branch']].name}): {_band_in_words(*least['interval95_aj'])} aJ; the "
-            f"frequency contributes an error of {least['by_frequency_aj']:.2g}"
-        )
     energy = Table(
         "Energy of a tap by the amplitude over the free one: value and standard error where measured, else the band of "
         "95 %",
@@ -133,7 +126,7 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     chi2 = f"chi2 {functions.rows_chi2:.1f} for {functions.rows_freedom:.0f} degrees of freedom{scaled}"
     known = [
         [
-            one.name.removesuffix("_0"),
+            one.name,
             str(one.given) if np.isfinite(one.given.error) else "not known",
             with_error(one.value, one.standard_error),
         ]
@@ -142,8 +135,8 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     caption = "The instrument as stated, and fitted to its free rows"
     instrument = Table(caption, ["instrument, from statements and free rows", "given", "fitted"], known)
     return [
-        ReportSection("Energy along the branches", [energy, *_lines(lines)], "Energy"),
-        ReportSection("Instrument", [instrument, *_lines([f"  rows about smooth energies: {chi2}"])]),
+        ReportSection("Energy along the branches", [energy, Text("\n".join(lines), "lines")]),
+        ReportSection("Instrument", [instrument, Text(f"  rows about smooth energies: {chi2}", "lines")]),
     ]
 
 
@@ -153,23 +146,18 @@ def _of_drive(one: CurveBranch | Hysteresis, others: Sequence[CurveBranch | Hyst
     return f", {one.drive_frequency_khz:g} kHz, {one.free_amplitude_nm:.4g} nm" if several else ""
 
 
-def _lines(lines: Sequence[str]) -> list[Text]:
-    return [Text("\n".join(lines), "lines")] if lines else []
-
-
-def _one_energy(result: Tapping) -> list[ReportSection]:
+def _one_energy(result: Tapping) -> ReportSection:
     """Return the one energy of all taps of each branch, where that describes the rows."""
     fit, epsilon = result.fit, result.epsilon
-    if fit is None or not result.described:
-        return []
+    if fit is None or result.why_not_constant:
+        return ReportSection("One energy for all taps", [])
     assumed = (
         "Assuming that every tap of a branch loses the same energy (the curve cannot test it along A sqrt(A0^2 - A^2)):"
     )
     cells = []
-    for i, group in enumerate(result.groups):
-        value, error, ends = result.constant(i)
-        known = interval(*ends) if np.isfinite(ends).all() else "open"
-        cells.append([group.name, f"{np.sum(fit.used & group.rows)}", with_error(value, error), known])
+    for one in fit.groups:
+        known = interval(*one.interval95_aj) if np.isfinite(one.error_aj) else "open"
+        cells.append([one.name, f"{len(one.rows)}", with_error(one.energy_aj, one.error_aj), known])
     table = Table("One energy a branch", ["branch", "rows", "energy (aJ)", "95 %"], cells)
     least, pull = fit.minimum, fit.nuisances[0].pull
     chi2 = f"chi2/dof = {least.chi2:.1f}/{least.degrees_of_freedom}, probability {least.p_value:.2g}"
@@ -178,37 +166,32 @@ def _one_energy(result: Tapping) -> list[ReportSection]:
         scaled = with_error(epsilon["value"], epsilon["standard_error"])
         of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
         lines.append(f"  epsilon = 2 E/m = {scaled} nm^2/us^2{of_mass}")
-    return [ReportSection("One energy for all taps", [Text(assumed), table, *_lines(lines)], "One energy")]
+    return ReportSection("One energy for all taps", [Text(assumed), table, Text("\n".join(lines), "lines")])
 
 
-def _thresholds(result: Tapping) -> list[ReportSection]:
+def _thresholds(result: Tapping) -> ReportSection:
     """Return the heights at which the curve changes, a row for each change."""
-    if not result.hysteresis:
-        return []
-    cells = [
-        [
-            _CHANGES[one.change] + _of_drive(one, result.hysteresis),
-            *("-" if found is None else with_error(*found) for found in (one.approach, one.retract, one.width_nm)),
-        ]
-        for one in result.hysteresis
-    ]
+    cells = []
+    for one in result.hysteresis:
+        heights = (end and (end.offset_nm, end.standard_error) for end in (one.approach, one.retract))
+        words = ["-" if found is None else with_error(*found) for found in (*heights, one.width_nm)]
+        cells.append([_CHANGES[one.change] + _of_drive(one, result.hysteresis), *words])
     head = ["threshold (height in nm)", "approach", "retract", "approach - retract"]
     table = Table("Heights of the sample over the tip's rest position", head, cells)
-    return [ReportSection("Thresholds", [table], "Thresholds")]
+    return ReportSection("Thresholds", [table])
 
 
-def _speeds(result: Tapping) -> list[ReportSection]:
+def _speeds(result: Tapping) -> ReportSection:
     """Return the speeds of the impacts."""
-    found = result.speeds
-    if found is None:
-        return []
-    here = np.isfinite(found.approach_speed_nm_per_us)
-    u, error = found.approach_speed_nm_per_us[here], found.approach_speed_error_nm_per_us[here]
-    if not here.any():
-        return [ReportSection("Speeds of the impacts", [Text("Impact speeds cannot be determined from this curve.")])]
-    known = f"known to {percent(float(np.median(error / u)))} in the median"
-    words = f"Impact speeds: {u.min():.3g} to {u.max():.3g} nm/us in {len(u)} rows, {known}"
-    return [ReportSection("Speeds of the impacts", [Text(words)], "Speeds")]
+    found, words = result.speeds, ""
+    if found is not None:
+        here = np.isfinite(found.approach_speed_nm_per_us)
+        u, error = found.approach_speed_nm_per_us[here], found.approach_speed_error_nm_per_us[here]
+        words = "Impact speeds cannot be determined from this curve."
+        if len(u):
+            known = f"known to {percent(float(np.median(error / u)))} in the median"
+            words = f"Impact speeds: {u.min():.3g} to {u.max():.3g} nm/us in {len(u)} rows, {known}"
+    return ReportSection("Speeds of the impacts", [Text(words)])
 
 
 def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> list[Path]:
@@ -230,7 +213,7 @@ def write_tapping(result: Tapping, folder: Path, write_table: WriteTable) -> lis
         "its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; grey: free."
     )
     written = _write(folder, "tapping", result, tapping_report(result), shows)
-    records = result.keyed(result.records())
+    records = result.in_unit(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
     if result.law is None:
         return written
@@ -246,13 +229,14 @@ def _write(folder: Path, name: str, result: Tapping | TappingTogether, report: R
 
     # SVG files have the layout of the PNG drawn before
     picture = png_of(figure := result.plot())
-    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]), "Picture")
+    seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]))
     page = result.in_unit(page_of(replace(report, sections=[seen, *report.sections])))
     kind = "tapping" if name == "tapping" else f"tapping {name}"
-    data = {"format": f"afm-jax {kind}", "format_version": 1, **result.to_dict()}
-    return write_report_files(
-        folder, name, text=_printed(report, result.in_unit), data=data, picture=picture, page=page
-    )
+    data, text = {"format": f"afm-jax {kind}", "format_version": 1, **result.to_dict()}, result.in_unit(text_of(report))
+    return write_report_files(folder, name, text=text, data=data, picture=picture, page=page)
+
+
+_OF_CURVES = ("energy_aj", "energy_scatter_aj", "energy_own_error_aj", "energy_common_error_aj")
 
 
 def together_report(result: TappingTogether) -> Report:
@@ -261,7 +245,7 @@ def together_report(result: TappingTogether) -> Report:
         [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", *(f"{error:.2g}" for error in at[1:])]
         for one in result.scatter
         for ratio in HEADLINE
-        if (at := one.at(ratio)) is not None
+        if (at := within(ratio, one.amplitude_ratio, *(getattr(one, name) for name in _OF_CURVES))) is not None
     ]
     head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
     caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"
@@ -273,18 +257,17 @@ def together_report(result: TappingTogether) -> Report:
     return Report(
         title=f"{len(result.curves)} curves of one lever",
         valid=result.valid,
-        verdict="VALID" if result.valid else "NOT VALID",
         reasons=result.reasons,
         sections=[
-            *([ReportSection("Branches", [Table(caption, head, cells)])] if cells else []),
-            ReportSection("What the curves have in common", _lines(common)),
+            ReportSection("Branches", [Table(caption, head, cells)]),
+            ReportSection("What the curves have in common", [Text("\n".join(common), "lines")]),
         ],
     )
 
 
 def together_summary(result: TappingTogether) -> str:
     """Return what several curves of one lever say together as text."""
-    return _printed(together_report(result), result.in_unit)
+    return result.in_unit(text_of(together_report(result)))
 
 
 def write_together(result: TappingTogether, folder: Path) -> list[Path]:

@@ -12,7 +12,7 @@ from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95, effective_mass_ng
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.table import AmplitudeTable
-from fitting.tapping_curves.branches import Hysteresis, side_of, way_of
+from fitting.tapping_curves.branches import Hysteresis, way_of
 from fitting.tapping_curves.curve import Mask, Rows, TappingCurve
 from fitting.tapping_curves.energy import (
     HEADLINE,
@@ -23,9 +23,9 @@ from fitting.tapping_curves.energy import (
     TappingBranch,
     differences_of_ways,
     largest_of,
-    least_on_frequency,
     said_of,
 )
+from fitting.tapping_curves.speeds import MeasuredSpeeds
 from fitting.tapping_curves.verdict import (
     ASSUMPTIONS,
     NO_CONSTANT,
@@ -36,22 +36,6 @@ from fitting.tapping_curves.verdict import (
 
 if TYPE_CHECKING:
     from fitting.infer.result import FitResult
-
-
-@dataclass(frozen=True, eq=False)
-class EnergyGroup:
-    """Rows that may share an energy, those of one drive and one branch, whether or not all are in the fit."""
-
-    drive_frequency_khz: float
-    free_amplitude_nm: float
-    repulsive: bool
-    rows: Mask
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-        side = side_of(self.repulsive)
-        return f"{side}, {self.drive_frequency_khz:g} kHz, free amplitude {self.free_amplitude_nm:.4g} nm"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,31 +67,6 @@ class TapRows:
         return np.array([state == "free" for state in self.state])
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasuredSpeeds:
-    """Speeds of the impacts; NaN where they are not known to a quarter.
-
-    Attributes:
-        approach_speed_nm_per_us: u_in.
-        approach_speed_error_nm_per_us: from noise, calibration and the origin of the heights.
-        rebound_speed_nm_per_us: u_out.
-        contact_us: time of contact.
-        pull: speed that lever and drive give the tip in that time, over u_in.
-        in_capture_speeds: u_in in units of sqrt(2 E/m).
-        fast: rows whose impact a law describes.
-        why_not: why there are too few of them for a law, and what to record instead.
-    """
-
-    approach_speed_nm_per_us: Rows
-    approach_speed_error_nm_per_us: Rows
-    rebound_speed_nm_per_us: Rows
-    contact_us: Rows
-    pull: Rows
-    in_capture_speeds: Rows
-    fast: Mask
-    why_not: str
-
-
 @public_result(picture="fitting.tapping_curves.pictures:curve_figure")
 @dataclass(frozen=True, kw_only=True)
 class Tapping(JudgedResult):
@@ -117,11 +76,10 @@ class Tapping(JudgedResult):
         table: what was read.
         curve: the table's rows with an amplitude, and what is known of the instrument.
         rows: state, energy and virial of each row of the table.
-        groups: the kinds of rows that may share an energy.
-        fit: one energy for each group, fitted with the instrument; None without a phase or rows.
+        fit: one energy for each drive and side, fitted with the instrument; None without a phase or rows.
         functions: the energy as a smooth function along each branch, the instrument cut off from it.
         scale_errors: whether errors are multiplied where the rows scatter more.
-        followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
+        fit_with_drifts: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: upper bound of the energy lost in a tap, where only the amplitude was recorded; else None.
         hysteresis: changes of the motion that come at different heights on approach and retract.
         speeds: speeds of the impacts; None where there is no energy.
@@ -132,11 +90,10 @@ class Tapping(JudgedResult):
     table: AmplitudeTable
     curve: TappingCurve
     rows: TapRows
-    groups: tuple[EnergyGroup, ...]
     fit: OneEnergy | None
     functions: EnergyFunctions
     scale_errors: bool
-    followed: OneEnergy | None
+    fit_with_drifts: OneEnergy | None
     bound_aj: float | None
     hysteresis: tuple[Hysteresis, ...]
     speeds: MeasuredSpeeds | None
@@ -153,13 +110,6 @@ class Tapping(JudgedResult):
         """Effective mass, from spring constant and free frequency."""
         return effective_mass_ng(self.curve.spring_constant_n_per_m.value, self.curve.free_frequency_khz.value)
 
-    def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
-        """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
-        assert self.fit is not None  # noqa: S101
-        value = float(self.fit.energy_aj[number])
-        error = float(np.hypot(self.fit.error_aj[number], self.curve.relative_error * value))
-        return value, error, (value - TWO_SIDED_95 * error, value + TWO_SIDED_95 * error)
-
     @property
     def why_not_constant(self) -> str:
         """Why one energy for each branch does not explain the rows; empty where it does."""
@@ -173,7 +123,7 @@ class Tapping(JudgedResult):
     @property
     def reasons(self) -> list[str]:
         """What makes the energy no measurement: where it is largest along the branches it is not measured."""
-        return judge(REASONS, self)
+        return [self.in_unit(reason) for reason in judge(REASONS, self)]
 
     @property
     def warnings(self) -> list[str]:
@@ -197,27 +147,21 @@ class Tapping(JudgedResult):
             return blank | {"interval95": (0.0, self.bound_aj), "kind": "upper bound", "reason": ""}
         if self.fit is None or self.why_not_constant:
             return blank | {"reason": self.why_not_constant}
-        repulsive = [i for i, group in enumerate(self.groups) if group.repulsive]
-        chosen = repulsive or list(range(len(self.groups)))
-        value, error, interval = self.constant(chosen[0])
-        if len(chosen) > 1:
-            each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
+        groups = [one for one in self.fit.groups if one.repulsive] or list(self.fit.groups)
+        if len(groups) > 1:
+            each = "; ".join(f"{one.name}: {one.energy_aj:.3g} aJ" for one in groups)
             return blank | {"reason": f"each drive has its own: {each}"}
+        value, error = groups[0].energy_aj, groups[0].error_aj
         if not value > 0.0:
             return blank | {"reason": "the energy of a tap is not positive: frequency, Q or the phase's zero is wrong"}
         return {
             "value": value,
             "standard_error": error,
-            "interval95": np.maximum(interval, 0.0),
+            "interval95": np.maximum(groups[0].interval95_aj, 0.0),
             "kind": "bracket" if not error < MEASURED * value else "fit",
             "reason": "",
             "free_frequency_pull": self.fit.nuisances[0].pull,
         }
-
-    @property
-    def described(self) -> bool:
-        """Whether one energy for each branch describes the rows."""
-        return not self.why_not_constant
 
     @property
     def largest(self) -> dict[str, Any] | None:
@@ -237,11 +181,6 @@ class Tapping(JudgedResult):
         }
 
     @property
-    def least_on_frequency(self) -> dict[str, Any] | None:
-        """The energy that depends least on the free frequency, and where; None where no energy is positive."""
-        return least_on_frequency(self.functions)
-
-    @property
     def energies_at(self) -> list[dict[str, Any]]:
         """Energy of a tap at some amplitudes of each branch that has them, in aJ."""
         return [
@@ -258,29 +197,22 @@ class Tapping(JudgedResult):
             if (band := branch.curve.at(ratio)) is not None
         ]
 
-    @property
-    def way_differences(self) -> list[dict[str, Any]]:
-        """By how much the energy differs between approach and retract, by the numbers of the branches."""
-        return differences_of_ways(self.functions)
+    def in_unit(self, said: Any) -> Any:
+        """Return a text about energies in aJ, or mappings of such, with the unit that they have: nm^2 without k.
 
-    def in_unit(self, text: str) -> str:
-        """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant.
-
-        Where the sign of the phase is assumed, attractive and repulsive may be exchanged, and are marked by `?`.
+        Keys `..._aj` of mappings become `..._over_k_nm2`. Where the sign of the phase is assumed, attractive and
+        repulsive may be exchanged, and are marked by `?`.
         """
+        over_k = self.curve.over_spring_constant
+        if isinstance(said, dict) and over_k:
+            return {re.sub("_aj$", "_over_k_nm2", str(key)): self.in_unit(value) for key, value in said.items()}
+        if isinstance(said, list) and over_k:
+            return [self.in_unit(value) for value in said]
+        if not isinstance(said, str):
+            return said
         if self.curve.phase.assumed:
-            text = re.sub(r"\b(attractive|repulsive)\b(?!\?)", r"\1?", text)
-        return re.sub(r"\baJ\b(?! over)", "nm^2", text) if self.curve.over_spring_constant else text
-
-    def keyed(self, payload: Any) -> Any:
-        """Return mappings with keys `..._aj` as they are, or without a spring constant as `..._over_k_nm2`."""
-        if not self.curve.over_spring_constant:
-            return payload
-        if isinstance(payload, dict):
-            return {re.sub("_aj$", "_over_k_nm2", str(key)): self.keyed(value) for key, value in payload.items()}
-        if isinstance(payload, list):
-            return [self.keyed(value) for value in payload]
-        return self.in_unit(payload) if isinstance(payload, str) else payload
+            said = re.sub(r"\b(attractive|repulsive)\b(?!\?)", r"\1?", said)
+        return re.sub(r"\baJ\b(?! over)", "nm^2", said) if over_k else said
 
     @property
     def epsilon(self) -> dict[str, Any]:
@@ -315,25 +247,24 @@ class Tapping(JudgedResult):
 
     def _constant_of(self, branch: TappingBranch) -> dict[str, Any]:
         """Return whether one energy explains the rows of a branch, and which."""
-        groups = [i for i, group in enumerate(self.groups) if self.described and group.rows[branch.rows[0]]]
-        names = ("constant", "energy_aj", "standard_error_aj", "interval95_aj")
-        return dict(zip(names, (True, *self.constant(groups[0])) if groups else (False, None, None, None), strict=True))
+        groups = () if self.fit is None or self.why_not_constant else self.fit.groups
+        one = next((one for one in groups if (one.drive, one.repulsive) == (branch.drive, branch.repulsive)), None)
+        found = (None, None, None) if one is None else (one.energy_aj, one.error_aj, one.interval95_aj)
+        names = ("energy_aj", "standard_error_aj", "interval95_aj")
+        return {"constant": one is not None, **dict(zip(names, found, strict=True))}
 
     def _fits(self) -> dict[str, Any]:
         """Return how well one energy and a smooth one describe the rows, and what they make of the instrument."""
         fit, functions = self.fit, self.functions
-        smooth = {
-            "valid": not self.why_not_functions,
-            "reason": self.why_not_functions or None,
-            **{name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")},
-            "nuisances": nuisances_as_dict(functions.nuisances),
-        }
+        smooth = {name: getattr(functions, name) for name in ("rows_chi2", "rows_freedom", "scale")}
+        smooth |= {"valid": not self.why_not_functions, "reason": self.why_not_functions or None}
+        smooth |= {"nuisances": nuisances_as_dict(functions.nuisances)}
         names = ("chi2", "degrees_of_freedom", "p_value")
         return {
             "functions": smooth if functions.branches else None,
             **{name: None if fit is None else getattr(fit.minimum, name) for name in names},
             "scale": None if fit is None else fit.scale,
-            "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and self.described else {},
+            "nuisances_of_one_energy": nuisances_as_dict(fit.nuisances) if fit and not self.why_not_constant else {},
         }
 
     def records(self) -> list[dict[str, Any]]:
@@ -366,9 +297,8 @@ class Tapping(JudgedResult):
                 "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
                 "energy_per_tap_reason": energy["reason"] or None,
                 "largest_energy_aj": self.largest,
-                "least_on_frequency": self.least_on_frequency,
                 "energies_at": self.energies_at,
-                "way_differences": self.way_differences,
+                "way_differences": differences_of_ways(self.functions),
                 "epsilon_nm2_per_us2": self.epsilon,
                 "assumptions": self.assumptions,
                 "phase_sense": {**self.curve.phase._asdict(), "assumed": self.curve.phase.assumed},
@@ -386,7 +316,7 @@ class Tapping(JudgedResult):
                     for branch in self.branches
                 ],
                 **self._fits(),
-                "hysteresis": [one.to_dict() for one in self.hysteresis],
+                "hysteresis": [{**vars(one), "width_nm": one.width_nm} for one in self.hysteresis],
                 "law": None if law is None else law["law"],
                 "reason": self.reason,
                 "fit": law,
@@ -399,7 +329,7 @@ class Tapping(JudgedResult):
         if not self.curve.over_spring_constant:
             return payload
         why = "the spring constant is not known: energies are over it, in nm^2"
-        return {**self.keyed(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
+        return {**self.in_unit(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
 
 
 def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:

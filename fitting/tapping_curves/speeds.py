@@ -9,13 +9,16 @@ its end. The spring constant does not enter.
 back what a Hertz contact does to tip and readings. Here the tip counts as resting on the sample during the contact.
 """
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
-from afm_jax.units import RAD_PER_US_PER_KHZ
-from fitting.tapping_curves.curve import Instrument, Rows, TappingCurve, motion_of
+from afm_jax.units import RAD_PER_US_PER_KHZ, effective_mass_ng
+from fitting.tapping_curves.curve import Given, Instrument, Mask, Rows, TappingCurve, motion_of
+from fitting.tapping_curves.energy import EnergyFunctions
 
 _STEPS = 1e-5 * np.eye(3)[:, :, None]
 """Of differences by the unknowns, in units of their own."""
@@ -23,24 +26,102 @@ _CLOSING = Newton(rounds=120, residual_tolerance=5e-10, halvings=6)
 """Of the free amplitude, each of three equations: 1e-9 together."""
 
 
-class TapSpeeds(NamedTuple):
-    """Of every row, NaN where no flight fits.
+@dataclass(frozen=True, kw_only=True)
+class MeasuredSpeeds:
+    """Speeds of the impacts; NaN where they are not known to a quarter.
 
     Attributes:
         approach_speed_nm_per_us: u_in > 0.
         rebound_speed_nm_per_us: u_out > 0.
         contact_us: tau, from where the flight meets the sample to where it leaves it.
         pull: g tau/u_in, the speed that lever and drive give the tip during contact, of its own.
+        approach_speed_error_nm_per_us: from noise, calibration and the origin of the heights.
+        in_capture_speeds: u_in in units of sqrt(2 E/m).
+        fast: rows whose impact a law describes.
+        why_not: why there are too few of them for a law, and what to record instead.
     """
 
     approach_speed_nm_per_us: Rows
     rebound_speed_nm_per_us: Rows
     contact_us: Rows
     pull: Rows
+    approach_speed_error_nm_per_us: Rows
+    in_capture_speeds: Rows
+    fast: Mask
+    why_not: str
 
 
-def speeds(curve: TappingCurve, instrument: Instrument) -> TapSpeeds:
-    """Return speeds and time of contact of every row.
+_FEWEST_FOR_LAW = 6
+"""Rows with a fast impact: the law has two parameters, its delay three."""
+_SLOWEST = 2.5
+"""In capture speeds."""
+_PULLED = 0.8
+"""Largest share of its speed that lever and drive may give the tip during an impact."""
+_VAGUE = 0.25
+"""Relative error from which a speed counts as not measured."""
+
+
+def speeds(functions: EnergyFunctions, used: Mask) -> MeasuredSpeeds:
+    """Return the impact speeds of some rows, with their errors from noise, calibration and origin of height.
+
+    Args:
+        functions: energies along the branches of the curve.
+        used: the rows.
+    """
+    curve, instrument = functions.lever.curves[functions.number], functions.instrument
+    start = u, _, _, pull = flights(curve, instrument)
+    moved = [
+        replace(curve, amplitude_nm=curve.amplitude_nm + curve.amplitude_error_nm),
+        replace(curve, lag_deg=curve.lag_deg + curve.lag_error_deg),
+        replace(curve, offset_nm=curve.offset_nm + curve.origin_error_nm),
+        replace(curve, tip_calibration=Given(sum(curve.tip_calibration))),
+    ]
+    changes = np.stack([flights(other, instrument)[0] - u for other in moved])
+    # a flight that a standard error undoes is no measurement
+    error = np.linalg.norm(np.where(np.isfinite(changes), changes, np.inf), axis=0)
+    known = used & np.isfinite(u) & (error < _VAGUE * u)
+    energy, ratio = np.zeros(curve.rows), curve.amplitude_nm / curve.free_amplitude_nm
+    for branch in functions.branches:
+        along = branch.curve
+        energy[branch.rows] = np.interp(ratio[branch.rows], along.amplitude_ratio, along.estimate_aj)
+    mass = effective_mass_ng(curve.spring_constant_n_per_m.value, curve.free_frequency_khz.value)
+    capture = np.sqrt(2.0 * np.maximum(energy, 0.0) / mass)
+    in_capture = np.divide(u, capture, out=np.full(curve.rows, np.nan), where=known & (capture > 0.0))
+    fast = known & (in_capture >= _SLOWEST) & (np.abs(pull) < _PULLED)
+    blank = np.where(known, 1.0, np.nan)
+    return MeasuredSpeeds(
+        **dict(zip(_COLUMNS, blank * start, strict=True)),
+        approach_speed_error_nm_per_us=error * blank,
+        in_capture_speeds=in_capture,
+        fast=fast,
+        why_not=_why_not(curve, fast, known, in_capture),
+    )
+
+
+def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_capture: np.ndarray) -> str:
+    """Return why the rows do not allow a law, and what to record instead; empty where they do."""
+    if fast.sum() >= _FEWEST_FOR_LAW:
+        return ""
+    f0 = curve.free_frequency_khz.value
+    s, largest = curve.drive_frequency_khz / f0, np.max(in_capture, where=np.isfinite(in_capture), initial=0.0)
+    where = f"{s.min():.3f}" if np.ptp(s) < 5e-4 else f"{s.min():.3f} to {s.max():.3f}"
+    what = f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
+    if not known.any():
+        what = (
+            "the speed of its impacts cannot be determined from this curve: it depends on the origin of heights and "
+            "on the calibration more finely than these are known"
+        )
+    elif 0.0 < largest < _SLOWEST:
+        what = f"its impacts are slow, {largest:.2g} times the capture speed at most"
+    advice = f"drive 3 to 10 % above resonance ({1.03 * f0:.4g} to {1.1 * f0:.4g} kHz)"
+    return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}"
+
+
+_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "contact_us", "pull")
+
+
+def flights(curve: TappingCurve, instrument: Instrument) -> Float[np.ndarray, "4 rows"]:
+    """Return approach speed, rebound speed, time of contact and pull of every row, NaN where no flight fits.
 
     Args:
         curve: the curve, heights over the tip's rest position.
@@ -103,6 +184,5 @@ def speeds(curve: TappingCurve, instrument: Instrument) -> TapSpeeds:
         x = roots.x.T * unit
         found = roots.converged & (np.abs(x[2]) < np.pi / omega)
         _, approach, pull = flight(x)
-    good = found & (approach > 0.0) & (x[1] > 0.0)
-    columns = (approach, x[1], x[2], pull * x[2] / approach)
-    return TapSpeeds(*(np.where(good, column, np.nan) for column in columns))
+        columns = np.stack([approach, x[1], x[2], pull * x[2] / approach])
+    return np.where(found & (approach > 0.0) & (x[1] > 0.0), columns, np.nan)

@@ -10,10 +10,10 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.version import version_of
 from afm_jax.words import printable
 from fitting.instruments.curve import zero_of_free_rows
-from fitting.instruments.lag import AS_STATED, PhaseReadings, PhaseSense, sense_of_phase, turned
+from fitting.instruments.lag import PhaseReadings, sense_of_phase, turned
 from fitting.parameters import USUAL_ERRORS
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable, TableLike, as_table
+from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import (
     FEWEST_ROWS,
     changes,
@@ -38,55 +38,159 @@ from fitting.tapping_curves.curve import (
 from fitting.tapping_curves.energy import (
     FEWEST_FREE_ROWS,
     Lever,
-    OneEnergy,
     energies_along,
     largest_energies,
     noise_of,
     one_energy,
 )
-from fitting.tapping_curves.result import EnergyGroup, MeasuredSpeeds, Tapping, TapRows
+from fitting.tapping_curves.measured import CurveLike, measured
+from fitting.tapping_curves.result import Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
 
 LAW_MODEL = "viscous+delay"
-_FEWEST_FOR_LAW = 6
-"""Rows with a fast impact: the law has two parameters, its delay three."""
 _FEWEST_TO_FOLLOW = 8
 """Rows from which a drift along them is looked for."""
-_SLOWEST = 2.5
-"""In capture speeds."""
-_PULLED = 0.8
-"""Largest share of its speed that lever and drive may give the tip during an impact."""
-_VAGUE = 0.25
-"""Relative error from which a speed counts as not measured."""
 _ORIGIN_NM = 0.3
 """What the height's origin is uncertain by where the table does not say."""
 
 
 @checked
 @in_float64
-def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale_errors: bool = False) -> Tapping:
+def tapping(
+    source: CurveLike,
+    *,
+    curve: int | None = None,
+    noise: float | None = None,
+    law: bool = True,
+    model: str = LAW_MODEL,
+    scale_errors: bool = False,
+    **reading: Any,
+) -> Tapping:
     """Return the energy of a tap along a tapping curve, its branches and hysteresis, and the law if rows allow it.
 
     Args:
-        table: with `drive` "force" or "base"; see `read_table`.
+        source: a table with `drive` "force" or "base" (see `read_table`), a curve from `read_curve`, or the path of a
+            table or of an instrument's file.
+        curve: only this curve of an instrument's file, from 1.
+        noise: relative error of amplitudes without one in a table's file (0.01 stands for 1 %).
         law: whether to fit the impact law where the rows allow it (that imports JAX and compiles for half a minute).
         model: of the law, as for `fit`.
         scale_errors: multiply the errors of the rows where these scatter more, instead of refusing their energy.
+        reading: how an instrument's file is read, as `read_curves` takes it: `nm_per_volt=42`,
+            `spring_constant_n_per_m="44 +- 4"`, `drive="force"`. Of a table free_frequency_khz, quality_factor,
+            spring_constant_n_per_m and phase_sense replace its own.
 
     Raises:
-        TableError: if the table is none of a driven cantilever, something is missing that no energy can do without, or
-            the free tip's lag is none that frequency and Q allow.
+        TableError: if the table is none of a driven cantilever, something is missing that no energy can do without,
+            the free tip's lag is none that frequency and Q allow, or the file's curve must not be used.
     """
-    table = as_table(table)
-    table, sense = with_sense_of_phase(table)
-    curve = _with_zero_of_free_rows(replace(curve_of(table), phase=sense), table.remarks)
-    if sense.origin == "assumed":
+    read = measured([source], curve=curve, noise=noise, **reading)
+    if len(read.tables) + len(read.refused) > 1:
+        raise TableError(
+            f"{source}: holds several curves; choose one, `curve=1`, or analyse all as curves of one lever by "
+            "`fitting.tapping_together`"
+        )
+    for one in read.refused:
+        raise TableError(f"{one['file']}: refused curve {one['curve']}; {one['reason']}")
+    (table,) = read.tables.values()
+    result = energies_of_table(table, scale_errors=scale_errors)
+    return with_law(result, model) if law and result.law_allowed else result
+
+
+def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> Tapping:
+    """Return everything that `tapping` says of a table but the law.
+
+    Raises:
+        TableError: as `tapping`.
+    """
+    curve = with_sense_of_phase(curve_of(table), table.phase_sense)
+    curve = _with_zero_of_free_rows(curve, table.remarks)
+    if curve.phase.origin == "assumed":
         # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
         frequency, detuning = curve.free_frequency_khz, phase_readings(curve, np.zeros(curve.rows, bool)).detuning
         error = float(np.hypot(frequency.error, detuning * frequency.value))
         curve = replace(curve, free_frequency_khz=Given(frequency.value, error))
-    result = _energies(table, curve, scale_errors=scale_errors)
-    return with_law(result, model) if law and result.law_allowed else result
+    free, held = free_rows(curve), held_rows(curve)
+    lever = Lever([curve], [free])
+    instrument = lever.instrument(0)
+    touching = ~free & ~held & np.isfinite(curve.lag_deg)
+    departure = turned(curve.lag_deg - lag_of_free_tip(curve, instrument))
+    repulsive = ~free & repulsive_rows(curve, touching, departure)
+    early = touching & hardly_touching_rows(motion_of(curve, instrument))
+    early &= (touching & ~early).sum() >= FEWEST_ROWS
+    stretches = smooth_stretches(curve, touching, repulsive)
+    functions = energies_along(lever, [stretches], [repulsive])[0]
+    alike = touching & ~early & ~functions.outliers, repulsive, functions.smooth
+    fit, with_drifts, used = one_energy(lever, *alike), None, np.zeros(curve.rows, bool)
+    if fit is not None:
+        used, scale = fit.used, np.sqrt(fit.minimum.chi2 / max(fit.minimum.degrees_of_freedom, 1))
+        if scale_errors and scale > 1.0:
+            fit = one_energy(lever, *alike, float(scale))
+        if curve.time is None and used.sum() >= _FEWEST_TO_FOLLOW:
+            # with drifts, as if the rows stood in the order of time
+            in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
+            with_drifts = one_energy(Lever([in_order], [free]), *alike)
+    silent = np.isnan(curve.lag_deg)
+    alone = touching & ~used & ~np.isin(np.arange(curve.rows), np.concatenate([np.zeros(0, int), *stretches]))
+    # why a row is not in the fit, or what it is for: the first that holds
+    notes = {
+        "free: fixes the zero of the phase" if curve.has_phase else "free": free,
+        "excluded: the tip is held, a tenth of the free amplitude is left or less": held,
+        "excluded: no phase, only a bound": silent,
+        "not in the one energy: hardly touching yet, taps need not come every period": early,
+        "excluded: its energy is more than 4 standard errors from the others'": functions.outliers,
+        f"excluded: fewer than {FEWEST_ROWS} rows of this branch": alone,
+    }
+    states = {"free": free, "held": held, "touching": silent, "repulsive": repulsive}
+    rows = TapRows(
+        state=_named(states, "attractive"),
+        energy_aj=functions.energies.energy_aj,
+        energy_noise_aj=noise_of(curve, functions.energies)[0],
+        virial_aj=functions.energies.virial_aj,
+        largest_energy_aj=largest_energies(curve, instrument),
+        used=used,
+        note=_named(notes, ""),
+    )
+    return Tapping(
+        table=table,
+        curve=curve,
+        rows=rows,
+        fit=fit,
+        functions=functions,
+        scale_errors=scale_errors,
+        fit_with_drifts=with_drifts,
+        bound_aj=None if curve.has_phase else _bound(curve, rows.largest_energy_aj[~free & ~held]),
+        hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
+        speeds=None if fit is None else speeds(functions, used),
+        versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
+    )
+
+
+def _named(rows: dict[str, Mask], others: str) -> tuple[str, ...]:
+    """Return of each row the name of the first rows that it is among."""
+    return tuple(np.select(list(rows.values()), list(rows), others).tolist())
+
+
+def _bound(curve: TappingCurve, largest_aj: Rows) -> float | None:
+    """Return the bound that holds for every tap of rows with such largest energies, with 95 % for its errors."""
+    quality = curve.quality_factor
+    share = np.hypot(curve.relative_error, quality.error / quality.value)
+    return float(np.max(largest_aj) * np.exp(1.645 * share)) if len(largest_aj) else None
+
+
+def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
+    """Return a result with the law fitted to its fast rows."""
+    from fitting.infer.fit import fit  # noqa: PLC0415
+
+    if result.speeds is None:
+        return result
+    curve, fast, table = result.curve, result.speeds.fast, result.table
+    rows = part_of(table, np.isin(table.lines, curve.lines[fast]))
+    # the zero of the phase, which free rows fixed that are left out; of several drives that of the first
+    zero = next((one.value, one.standard_error) for one in result.functions.nuisances if one.kind == "phase_zero_deg")
+    calibration = table.calibration | {"phase_zero_deg": zero}
+    rows = replace(rows, phase_lag_deg=curve.lag_deg[fast], phase_sense="lag", calibration=calibration)
+    return replace(result, law=fit(rows, model))
 
 
 def curve_of(table: AmplitudeTable) -> TappingCurve:
@@ -168,39 +272,36 @@ _OFF_DEG = 30.0
 """What the free tip's lag may be off by: zeros and frequencies are known better."""
 
 
-def with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, PhaseSense]:
-    """Return a table whose phases are lags, which of the free tip are those of frequency and Q up to a small zero.
+def with_sense_of_phase(curve: TappingCurve, stated: str) -> TappingCurve:
+    """Return a curve whose phases are lags, which of the free tip are those of frequency and Q up to a small zero.
+
+    Args:
+        curve: its phase as read.
+        stated: sense of the phase, as in a table.
 
     Raises:
         TableError: if the phases are radians, or the zero that is stated is none of the free rows.
     """
-    curve, lag = curve_of(table), table.phase_lag_deg
-    if lag is None or not curve.has_phase:
-        return table, AS_STATED
-    readings = phase_readings(curve, free_rows(curve), ways(curve))
-    if table.phase_sense == "either":
-        # a zero that was set by the free tip says nothing of the sign
-        readings = readings._replace(zero=None)
-    sense, zero = sense_of_phase(readings, table.phase_sense), curve.phase_zero_deg
-    stated = 0.0 if zero is None else zero.value
-    off = float(turned(sense.zero_deg - stated))
-    calibration = {key: pair for key, pair in table.calibration.items() if key != "phase_zero_deg"}
+    if not curve.has_phase:
+        return curve
+    readings, zero = phase_readings(curve, free_rows(curve), ways(curve)), curve.phase_zero_deg
+    # a zero that was set by the free tip says nothing of the sign
+    sense = sense_of_phase(readings._replace(zero=None) if stated == "either" else readings, stated)
+    lag, left = curve.lag_deg, sense.sign * sense.zero_deg
+    off = float(turned(sense.zero_deg - (zero.value if zero else 0.0)))
     if abs(off) > _OFF_DEG:
-        _check_zero(curve, readings, stated, off)
-        lag, left = lag - sense.zero_deg, 0.0
-    else:
-        left = sense.sign * sense.zero_deg
-        if zero is not None and not sense.assumed:
-            # of a phase that leads the zero turns, too
-            calibration["phase_zero_deg"] = (sense.sign * stated, zero.error)
-    word = "either" if sense.assumed else "lag"
-    table = replace(table, phase_lag_deg=sense.sign * lag, calibration=calibration, phase_sense=word)
+        _check_zero(curve, readings, off)
+        lag, left, zero = lag - sense.zero_deg, 0.0, None
+    elif zero is not None:
+        # of a phase that leads the zero turns, too
+        zero = None if sense.assumed else Given(sense.sign * zero.value, zero.error)
+    curve = replace(curve, lag_deg=sense.sign * lag, phase_zero_deg=zero, phase=sense)
     if not sense.reason:
-        _check_range(curve_of(table), left)
-    return table, sense
+        _check_range(curve, left)
+    return curve
 
 
-def _check_zero(curve: TappingCurve, readings: PhaseReadings, stated: float, off: float) -> None:
+def _check_zero(curve: TappingCurve, readings: PhaseReadings, off: float) -> None:
     """Check a phase whose free rows are far from their lag, by as much as `off` degrees.
 
     Raises:
@@ -209,6 +310,7 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, stated: float, off
     seen, name = readings.seen_free, printable(curve.source)
     if not seen.any():
         return
+    stated = curve.phase_zero_deg.value if curve.phase_zero_deg else 0.0
     middle, wanted = float(np.median(curve.lag_deg[seen] - stated)), float(np.median(readings.free_lag_deg[seen]))
     if np.nanmax(np.abs(curve.lag_deg)) < 2.0 * np.pi and abs(np.rad2deg(abs(middle)) - wanted) < _OFF_DEG:
         raise TableError(
@@ -254,164 +356,3 @@ def _check_range(curve: TappingCurve, zero: float) -> None:
             f"zero {zero:.1f}), outside 0 to 180, as {beyond.sum()} of {curve.rows} rows do: no tap that loses energy "
             "does; mend the phase or leave its cell blank"
         )
-
-
-def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool) -> Tapping:
-    """Return everything but the law."""
-    free, held = free_rows(curve), held_rows(curve)
-    lever = Lever([curve], [free])
-    instrument = lever.instrument(0)
-    departure = turned(curve.lag_deg - lag_of_free_tip(curve, instrument))
-    touching = ~free & ~held & np.isfinite(curve.lag_deg)
-    repulsive = ~free & repulsive_rows(curve, touching, departure)
-    early = touching & hardly_touching_rows(motion_of(curve, instrument))
-    early &= (touching & ~early).sum() >= FEWEST_ROWS
-    stretches = smooth_stretches(curve, touching, repulsive)
-    functions = energies_along(lever, [stretches], [repulsive])[0]
-    usable = touching & ~early & ~functions.outliers
-    groups = _groups(curve, touching, usable, repulsive)
-    alike = [np.flatnonzero(group.rows & usable) for group in groups]
-    fitted = followed = None
-    if groups:
-        fitted = one_energy(lever, alike, functions.smooth)
-        scale = np.sqrt(fitted.minimum.chi2 / max(fitted.minimum.degrees_of_freedom, 1))
-        if scale_errors and scale > 1.0:
-            fitted = one_energy(lever, alike, functions.smooth, float(scale))
-    if curve.time is None and sum(map(len, alike)) >= _FEWEST_TO_FOLLOW:
-        # with drifts, as if the rows stood in the order of time
-        in_order = replace(curve, time=np.linspace(-0.5, 0.5, curve.rows))
-        followed = one_energy(Lever([in_order], [free]), alike, functions.smooth)
-    silent = np.isnan(curve.lag_deg)
-    alone = touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
-    # why a row is not in the fit, or what it is for: the first that holds
-    notes = {
-        "free: fixes the zero of the phase" if curve.has_phase else "free": free,
-        "excluded: the tip is held, a tenth of the free amplitude is left or less": held,
-        "excluded: no phase, only a bound": silent,
-        "not in the one energy: hardly touching yet, taps need not come every period": early,
-        "excluded: its energy is more than 4 standard errors from the others'": functions.outliers,
-        f"excluded: fewer than {FEWEST_ROWS} rows of this branch": alone,
-    }
-    states = {"free": free, "held": held, "touching": silent, "repulsive": repulsive}
-    rows = TapRows(
-        state=_named(states, "attractive"),
-        energy_aj=functions.energies.energy_aj,
-        energy_noise_aj=noise_of(curve, functions.energies)[0],
-        virial_aj=functions.energies.virial_aj,
-        largest_energy_aj=largest_energies(curve, instrument),
-        used=np.zeros(curve.rows, bool) if fitted is None else fitted.used,
-        note=_named(notes, ""),
-    )
-    result = Tapping(
-        table=table,
-        curve=curve,
-        rows=rows,
-        groups=tuple(groups),
-        fit=fitted,
-        functions=functions,
-        scale_errors=scale_errors,
-        followed=followed,
-        bound_aj=None if curve.has_phase else _bound(curve, instrument, ~free & ~held),
-        hysteresis=tuple(changes(curve, free=free, repulsive=repulsive)),
-        speeds=None,
-        versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
-    )
-    return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
-
-
-def _named(rows: dict[str, Mask], others: str) -> tuple[str, ...]:
-    """Return of each row the name of the first rows that it is among."""
-    return tuple(np.select(list(rows.values()), list(rows), others).tolist())
-
-
-def _energies_along(result: Tapping) -> Rows:
-    """Return the energy of each row's tap, that of its branch."""
-    curve, found = result.curve, np.full(result.curve.rows, np.nan)
-    ratio = curve.amplitude_nm / curve.free_amplitude_nm
-    for branch in result.branches:
-        along = branch.curve
-        found[branch.rows] = np.interp(ratio[branch.rows], along.amplitude_ratio, along.estimate_aj)
-    return found
-
-
-def _groups(curve: TappingCurve, touching: Mask, usable: Mask, repulsive: Mask) -> list[EnergyGroup]:
-    """Return the kinds of rows that may share an energy (drive, attractive or repulsive), if enough are usable."""
-    kinds = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm, ~repulsive], axis=1)
-    each = [(kind, np.all(kinds == kind, axis=1)) for kind in np.unique(kinds[usable], axis=0).tolist()]
-    return [
-        EnergyGroup(frequency, amplitude, repulsive=not attractive, rows=here & touching)
-        for (frequency, amplitude, attractive), here in each
-        if np.sum(here & usable) >= FEWEST_ROWS
-    ]
-
-
-def _bound(curve: TappingCurve, instrument: Instrument, touching: Mask) -> float | None:
-    """Return the least of the rows' largest energies that hold for every tap of the curve, with 95 % for its errors."""
-    if not touching.any():
-        return None
-    quality = curve.quality_factor
-    share = np.hypot(curve.relative_error, quality.error / quality.value)
-    return float(np.max(largest_energies(curve, instrument)[touching]) * np.exp(1.645 * share))
-
-
-def _speeds(result: Tapping, fitted: OneEnergy) -> MeasuredSpeeds:
-    """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
-    curve = result.curve
-    instrument = result.functions.instrument
-    start = speeds(curve, instrument)
-    moved = [
-        speeds(replace(curve, amplitude_nm=curve.amplitude_nm + curve.amplitude_error_nm), instrument),
-        speeds(replace(curve, lag_deg=curve.lag_deg + curve.lag_error_deg), instrument),
-        speeds(replace(curve, offset_nm=curve.offset_nm + curve.origin_error_nm), instrument),
-        speeds(replace(curve, tip_calibration=Given(sum(curve.tip_calibration))), instrument),
-    ]
-    u = start.approach_speed_nm_per_us
-    changes = np.stack([one.approach_speed_nm_per_us - u for one in moved])
-    # a flight that a standard error undoes is no measurement
-    changes = np.where(np.isfinite(changes), changes, np.inf)
-    error = np.sqrt(np.sum(changes**2, axis=0))
-    known = fitted.used & np.isfinite(u) & (error < _VAGUE * u)
-    capture = np.sqrt(2.0 * np.maximum(np.nan_to_num(_energies_along(result)), 0.0) / result.mass_ng)
-    in_capture = np.where(known & (capture > 0.0), u / np.where(capture > 0.0, capture, 1.0), np.nan)
-    fast = known & (in_capture >= _SLOWEST) & (np.abs(start.pull) < _PULLED)
-    blank = np.where(known, 1.0, np.nan)
-    return MeasuredSpeeds(
-        **{name: column * blank for name, column in start._asdict().items()},
-        approach_speed_error_nm_per_us=error * blank,
-        in_capture_speeds=in_capture,
-        fast=fast,
-        why_not=_why_not(curve, fast, known, in_capture),
-    )
-
-
-def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_capture: np.ndarray) -> str:
-    """Return why the rows do not allow a law, and what to record instead; empty where they do."""
-    if fast.sum() >= _FEWEST_FOR_LAW:
-        return ""
-    f0 = curve.free_frequency_khz.value
-    s, largest = curve.drive_frequency_khz / f0, np.max(in_capture, where=np.isfinite(in_capture), initial=0.0)
-    where = f"{s.min():.3f}" if np.ptp(s) < 5e-4 else f"{s.min():.3f} to {s.max():.3f}"
-    what = f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
-    if not known.any():
-        what = (
-            "the speed of its impacts cannot be determined from this curve: it depends on the origin of heights and "
-            "on the calibration more finely than these are known"
-        )
-    elif 0.0 < largest < _SLOWEST:
-        what = f"its impacts are slow, {largest:.2g} times the capture speed at most"
-    advice = f"drive 3 to 10 % above resonance ({1.03 * f0:.4g} to {1.1 * f0:.4g} kHz)"
-    return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}"
-
-
-def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
-    """Return a result with the law fitted to its fast rows."""
-    from fitting.infer.fit import fit  # noqa: PLC0415
-
-    if result.speeds is None:
-        return result
-    chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
-    table = part_of(result.table, chosen)
-    # the zero of the phase, which free rows fixed that are left out; of several drives that of the first
-    zeros = [(one.value, one.standard_error) for one in result.functions.nuisances if one.kind == "phase_zero_deg"]
-    calibration = {"phase_zero_deg": zeros[0]} if zeros else {}
-    return replace(result, law=fit(replace(table, calibration=table.calibration | calibration), model))

@@ -12,7 +12,6 @@ from afm_jax.results import JudgedResult, public_result
 from afm_jax.solve.least_squares import IMPROBABLE
 from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import TableLike, as_table
 from fitting.tapping_curves.branches import CurveBranch, smooth_stretches
 from fitting.tapping_curves.energy import (
     COMMON,
@@ -21,10 +20,10 @@ from fitting.tapping_curves.energy import (
     TappingBranch,
     energies_along,
     estimates_at,
-    within,
 )
+from fitting.tapping_curves.measured import CurveLike, measured
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
-from fitting.tapping_curves.tapping import tapping
+from fitting.tapping_curves.tapping import energies_of_table
 from fitting.tapping_curves.verdict import ORIGINS
 
 _SAME = 0.03
@@ -52,11 +51,6 @@ class CurveScatter(CurveBranch):
     energy_own_error_aj: Float[np.ndarray, " points"]
     energy_common_error_aj: Float[np.ndarray, " points"]
 
-    def at(self, ratio: float) -> tuple[float, ...] | None:
-        """Return mean, scatter, own and common error at an amplitude, of the free one; None where not measured."""
-        columns = (self.energy_aj, self.energy_scatter_aj, self.energy_own_error_aj, self.energy_common_error_aj)
-        return within(ratio, self.amplitude_ratio, *columns)
-
 
 @public_result(picture="fitting.tapping_curves.pictures:together_figure", rows="rows")
 @dataclass(frozen=True, kw_only=True)
@@ -67,11 +61,13 @@ class TappingTogether(JudgedResult):
         curves: the result of each curve, with the instrument of all.
         lever: the curves that have an energy, and their instrument; None where fewer than two have one.
         scatter: how the energies of each branch scatter from curve to curve.
+        refused: file, number and reason of curves that must not be used.
     """
 
     curves: tuple[Tapping, ...]
     lever: Lever | None
     scatter: tuple[CurveScatter, ...]
+    refused: tuple[dict[str, Any], ...] = ()
 
     @property
     def common_nuisances(self) -> tuple[Nuisance, ...]:
@@ -93,7 +89,8 @@ class TappingTogether(JudgedResult):
     @property
     def reasons(self) -> list[str]:
         """What makes it no measurement."""
-        found = [f"{one.table.source}: {one.reasons[0]}" for one in self.curves if not one.valid]
+        found = [f"{one['file']}: refused curve {one['curve']}; {one['reason']}" for one in self.refused]
+        found += [f"{one.table.source}: {one.reasons[0]}" for one in self.curves if not one.valid]
         probable = self.agreement_p_value
         if probable is not None and probable < IMPROBABLE:
             found.append(
@@ -102,62 +99,76 @@ class TappingTogether(JudgedResult):
             )
         return found
 
-    def in_unit(self, text: str) -> str:
-        """Return a text about energies in aJ with the unit that they have, that of the first curve."""
-        return self.curves[0].in_unit(text)
+    def in_unit(self, said: Any) -> Any:
+        """Return a text or mappings about energies in aJ with the unit that they have, that of the first curve."""
+        return self.curves[0].in_unit(said) if self.curves else said
 
     def to_dict(self) -> dict[str, Any]:
         """Return what all curves say together as plain lists, numbers and strings; each curve's own is in `curves`."""
-        payload = plain(
-            {
-                "valid": self.valid,
-                "reasons": self.reasons,
-                "curves": [one.table.source for one in self.curves],
-                "common_nuisances": nuisances_as_dict(self.common_nuisances),
-                "agreement_p_value": self.agreement_p_value,
-                "branches": [{**vars(one), "branch": one.way} for one in self.scatter],
-            }
+        return self.in_unit(
+            plain(
+                {
+                    "valid": self.valid,
+                    "reasons": self.reasons,
+                    "curves": [one.table.source for one in self.curves],
+                    "common_nuisances": nuisances_as_dict(self.common_nuisances),
+                    "agreement_p_value": self.agreement_p_value,
+                    "branches": [{**vars(one), "branch": one.way} for one in self.scatter],
+                }
+            )
         )
-        return self.curves[0].keyed(payload) if self.curves else payload
 
 
 @checked
 @in_float64
-def tapping_together(tables: Sequence[TableLike], *, scale_errors: bool = False) -> TappingTogether:
+def tapping_together(
+    sources: CurveLike | Sequence[CurveLike],
+    *,
+    curve: int | None = None,
+    noise: float | None = None,
+    scale_errors: bool = False,
+    **reading: Any,
+) -> TappingTogether:
     """Return the energies of several curves of one lever, frequency and Q fitted to all of them.
 
     Args:
-        tables: of the curves, each as for `tapping`; the same is stated of the lever in all of them.
-        scale_errors: as for `tapping`.
+        sources: curves, each as for `tapping`, or one file that holds several; the same is stated of the lever in all.
+        curve: as for `tapping`, like all that follow.
+        noise: of amplitudes.
+        scale_errors: of rows.
+        reading: of instruments' files.
 
     Raises:
         TableError: if something else is stated of the lever in one of them, or as `tapping`.
     """
-    return together([tapping(table, law=False, scale_errors=scale_errors) for table in map(as_table, tables)])
+    several: Any = sources if isinstance(sources, list | tuple) else [sources]
+    read = measured(several, curve=curve, noise=noise, **reading)
+    results = [energies_of_table(table, scale_errors=scale_errors) for table in read.tables.values()]
+    return together(results, read.refused)
 
 
-def together(curves: Sequence[Tapping]) -> TappingTogether:
+def together(curves: Sequence[Tapping], refused: Sequence[dict[str, Any]] = ()) -> TappingTogether:
     """Return curves that were analysed one by one with one instrument for all of them.
 
     Raises:
         TableError: if not the same is stated of their lever.
     """
-    _same_lever(curves)
-    moved, chosen = list(curves), [i for i, one in enumerate(curves) if one.branches]
+    _check_lever(curves)
+    chosen = [i for i, one in enumerate(curves) if one.branches]
     if len(chosen) < 2:
-        return TappingTogether(curves=tuple(moved), lever=None, scatter=())
-    lever = Lever([curves[i].curve for i in chosen], [curves[i].rows.free for i in chosen])
+        return TappingTogether(curves=tuple(curves), lever=None, scatter=(), refused=tuple(refused))
+    moved, lever = list(curves), Lever([curves[i].curve for i in chosen], [curves[i].rows.free for i in chosen])
     states = [np.array(curves[i].rows.state) for i in chosen]
     repulsive = [state == "repulsive" for state in states]
-    touching = [(state == "attractive") | (state == "repulsive") for state in states]
+    touching = [np.isin(state, ["attractive", "repulsive"]) for state in states]
     stretches = list(map(smooth_stretches, lever.curves, touching, repulsive))
     for i, functions in zip(chosen, energies_along(lever, stretches, repulsive), strict=True):
         rows = replace(curves[i].rows, energy_aj=functions.energies.energy_aj)
         moved[i] = replace(curves[i], functions=functions, rows=rows)
-    return TappingTogether(curves=tuple(moved), lever=lever, scatter=_scatters(moved))
+    return TappingTogether(curves=tuple(moved), lever=lever, scatter=_scatters(moved), refused=tuple(refused))
 
 
-def _same_lever(curves: Sequence[Tapping]) -> None:
+def _check_lever(curves: Sequence[Tapping]) -> None:
     """Refuse curves in which not the same is stated of the lever.
 
     Raises:
@@ -187,9 +198,11 @@ def _scatters(curves: Sequence[Tapping]) -> tuple[CurveScatter, ...]:
 
 
 def _alike(one: TappingBranch, other: TappingBranch) -> bool:
+    """Say whether two branches are compared: of one frequency, way and side, and nearly one free amplitude."""
     apart = abs(one.free_amplitude_nm - other.free_amplitude_nm)
-    sides = [(b.drive_frequency_khz, b.retract, b.repulsive) for b in (one, other)]
-    return sides[0] == sides[1] and apart < _SAME * one.free_amplitude_nm
+    return (one.drive_frequency_khz, one.name) == (other.drive_frequency_khz, other.name) and (
+        apart < _SAME * one.free_amplitude_nm
+    )
 
 
 def _scatter(members: list[tuple[Tapping, TappingBranch]]) -> CurveScatter | None:

@@ -52,15 +52,15 @@ def _torn(fit: EnergyFunctions | OneEnergy) -> list[str]:
     return [f"{' and '.join(parts)} would be needed"] if parts else []
 
 
-def _followed(e: Any) -> list[str]:
+def _drifts_of_rows(e: Any) -> list[str]:
     """Return by what drift rows about one energy follow their order, which the table does not state as that in time."""
-    if e.followed is None or not e.followed.minimum.p_value > IMPROBABLE:
+    if e.fit_with_drifts is None or not e.fit_with_drifts.minimum.p_value > IMPROBABLE:
         return []
     units = {"phase_drift_deg": (1.0, "degrees"), "free_amplitude_drift": (100.0, "%")}
     return [
         f"{ORIGINS[one.kind]} of {units[one.kind][0] * one.value:+.2g} +- "
         f"{units[one.kind][0] * one.standard_error:.1g} {units[one.kind][1]}"
-        for one in e.followed.nuisances
+        for one in e.fit_with_drifts.nuisances
         if one.kind in units and abs(one.value) > _FOLLOWING * one.standard_error
     ][:1]
 
@@ -79,7 +79,7 @@ NO_CONSTANT: tuple[Rule[Any], ...] = (
     ),
     Rule(lambda e: _torn(e.fit), "one energy for each branch contradicts the instrument: {case}"),
     Rule(
-        _followed,
+        _drifts_of_rows,
         f"residuals of one energy for each branch follow the order of the rows, as with a {{case}}: {_SAY_SO}",
     ),
 )
@@ -211,8 +211,8 @@ def _scaled(e: Any) -> list[tuple[str, float]]:
 
 WARNINGS: Rules[Any] = [
     Rule(
-        lambda e: e.valid and e.fit is not None and not e.described,
-        "one energy for all taps is not given: {e.why_not_constant}",
+        lambda e: e.why_not_constant if e.valid and e.fit is not None else "",
+        "one energy for all taps is not given: {case}",
     ),
     Rule(
         _scaled,
