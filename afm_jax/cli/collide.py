@@ -51,11 +51,6 @@ def collide(
         points: with --make-law: number of speeds that formulas are fitted to; else 512.
         **contact: what is changed of the contact.
     """
-    for option, value in (("--speed-range", speed_range), ("--points", points)):
-        if value is not None and not make_law:
-            raise click.UsageError(f"{option} is of the formulas of a law: add --make-law")
-    if make_law and speeds is not None:
-        raise click.UsageError("--make-law chooses its own speeds: leave --speeds out")
     chosen, mass, description = chosen_contact(scene, contact)
     told = {"contact": description, "mass_ng": mass}
     if make_law:

@@ -29,7 +29,6 @@ import click
 from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE, described
 from afm_jax.cli.session import Session, session_options, write_json
-from afm_jax.cli.values import Share
 from afm_jax.compilation_cache import silence_xla
 from afm_jax.whole_files import arguments_named, in_callers_words
 
@@ -118,6 +117,9 @@ class Command:
         more: options besides those of the function: some, or a class that has them, named likewise (`described`).
         computes: whether JAX is started, before the function's module is imported.
         out_file: what the file is called that --out names, for a command that writes a single one; empty: a folder.
+        apart: pairs of options that contradict each other, "one other".
+        needs: pairs of options of which the first needs the second.
+        one_of: an argument and an option, one of which is given, "argument option".
     """
 
     name: str
@@ -126,6 +128,9 @@ class Command:
     more: Sequence[click.Option | str] = ()
     computes: bool = True
     out_file: str = ""
+    apart: Sequence[str] = ()
+    needs: Sequence[str] = ()
+    one_of: str = ""
 
     @property
     def summary(self) -> str:
@@ -142,11 +147,35 @@ class Command:
         return click.Command(self.name, callback=run, params=parameters, help=text.replace("\\b\n", "\b\n"))
 
 
+def check_together(row: Command, options: Mapping[str, Any]) -> None:
+    """Check that the options of a call fit together, before anything is computed.
+
+    Raises:
+        click.UsageError: if they do not; names them.
+    """
+    named = {str(each.name): each for each in click.get_current_context().command.params}
+
+    def spelled(pair: str) -> list[str]:
+        chosen = [named[name] for name in pair.split()]
+        return [each.opts[0] if isinstance(each, click.Option) else f"{each.metavar}".strip("[].") for each in chosen]
+
+    def given(pair: str) -> list[bool]:
+        return [options[name] not in (None, False, ()) for name in pair.split()]
+
+    for pair in row.apart:
+        if all(given(pair)):
+            raise click.UsageError("{} and {} contradict each other: leave one of them out".format(*spelled(pair)))
+    for pair in row.needs:
+        if given(pair) == [True, False]:
+            raise click.UsageError("{} needs {}: give it, too".format(*spelled(pair)))
+    if row.one_of and sum(given(row.one_of)) != 1:
+        raise click.UsageError("give {}, or {} for the bundled file, not both".format(*spelled(row.one_of)))
+
+
 _ARGUMENT = re.compile(r"`(\w+)=([^`]*?)(?:, \1_error=([^`]*))?`")
 _NAME = re.compile(r"`(\w+)`")
 _QUOTES = re.compile(r'\\?"|&#34;')
 """Of a Python text, also within JSON and HTML."""
-_ENTRY = re.compile(r"\{(\w+): (?:\((\S+), (\S+)\)|(\S+))\}")
 
 
 def in_options(text: str, options: Mapping[str, click.Option]) -> str:
@@ -166,13 +195,9 @@ def in_options(text: str, options: Mapping[str, click.Option]) -> str:
         name, value, error = found.groups()
         if name not in options:
             return found[0]
-        kind = options[name]
         value = "" if value in {"...", "True"} else _QUOTES.sub("", value)
-        value = _ENTRY.sub(lambda entry: f"{entry[1]}={entry[4] or f'{entry[2]}+-{entry[3]}'}", value)
-        if isinstance(kind.type, Share) and value:
-            value = f"{100.0 * float(value):g}%"
         value = value if error is None else f"'{value} +- {error}'"
-        return f"{kind.opts[0]} {value}".rstrip()
+        return f"{options[name].opts[0]} {value}".rstrip()
 
     first = _NAME.match(text)
     if first is not None and first[1] in options:
@@ -184,6 +209,7 @@ def run_in_options(row: Command, **options: Any) -> None:
     """Run a command, and let all that it prints, writes and refuses name its options, not the library's arguments."""
     parameters = click.get_current_context().command.params
     named = {str(each.name): each for each in parameters if isinstance(each, click.Option)}
+    check_together(row, options)
     with arguments_named(partial(in_options, options=named)), _naming(None):
         run_command(row, **options)
 

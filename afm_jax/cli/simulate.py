@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import click
 import numpy as np
 
 from afm_jax.apparatus.scene import Scene, drive_of
@@ -77,15 +76,6 @@ def simulation(  # noqa: PLR0913
         noise: with --heights: noise of the amplitudes in curve.csv; else 0.3%.
         phase_noise_deg: with --heights: noise of the lags in curve.csv; else 0.2.
     """
-    if duration_us is not None and periods is not None:
-        raise click.UsageError("--duration-us and --periods say the same: give one of them")
-    if samples and session.out is None:
-        raise click.UsageError("--samples writes a trace: say into which folder by --out DIR")
-    if heights is not None and (duration_us is not None or samples):
-        raise click.UsageError("--heights follows every height until it settles: leave out --duration-us, --samples")
-    for option, value in (("--noise", noise), ("--phase-noise-deg", phase_noise_deg)):
-        if value is not None and heights is None:
-            raise click.UsageError(f"{option} is that of an approach curve: give --heights, too")
     if heights is not None:
         settings = {"longest_periods": periods and math.ceil(periods), "accuracy": accuracy}
         errors = {"noise": noise or NOISE, "phase_noise_deg": phase_noise_deg or PHASE_NOISE_DEG}

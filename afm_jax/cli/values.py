@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 import click
 
-from afm_jax.words import cut_short
 from fitting.parameters import MODELS
 
 _MOST_NUMBERS = 1_000_000
@@ -20,11 +19,10 @@ class ValueKind(click.ParamType):
     """A kind of value; each defines how its text is read.
 
     Attributes:
-        wanted: what every message begins with.
         advice: what every message ends with.
     """
 
-    wanted = advice = ""
+    advice = ""
 
     def read(self, text: str) -> Any:
         """Return the value that a text says.
@@ -43,7 +41,7 @@ class ValueKind(click.ParamType):
         try:
             return self.read(value) if isinstance(value, str) else value
         except ValueError as error:
-            self.fail(f"{self.wanted}{error}{self.advice}", param, ctx)
+            self.fail(f"{error}{self.advice}", param, ctx)
 
 
 class Finite(ValueKind):
@@ -57,11 +55,7 @@ class Finite(ValueKind):
 
     def read(self, text: str) -> float:
         """Return the number that a text says."""
-        number = _number_or_nan(text)
-        if not (number > 0.0 if self.positive else math.isfinite(number)):
-            wanted = "positive" if self.positive else "finite"
-            raise ValueError(f"must be a {wanted} number, but is {cut_short(text, 60)}")
-        return number
+        return _number(text, "value", positive=self.positive)
 
 
 class Numbers(ValueKind):
@@ -76,7 +70,6 @@ class Numbers(ValueKind):
     def __init__(self, what: str = "number", *, positive: bool = True, example: str = "1,2,5"):
         """Say what the numbers are, one of them in a word, and whether they must be positive."""
         self.what, self.positive = what, positive
-        self.wanted = "must hold positive numbers: " if positive else ""
         self.advice = f"; write {example} or start:stop:step"
 
     def read(self, text: str) -> tuple[float, ...]:
@@ -86,18 +79,13 @@ class Numbers(ValueKind):
         numbers: list[float] = []
         for part in text.split(","):
             numbers += self._range(part) if ":" in part else [_number(part, self.what, positive=self.positive)]
-            if len(numbers) > _MOST_NUMBERS:
-                raise ValueError(f"names more than {_MOST_NUMBERS} {self.what}s")
         return tuple(numbers)
 
     def _range(self, part: str) -> list[float]:
         ends = part.split(":")
         if len(ends) != 3:
             raise ValueError(f"`{part.strip()}` is no range")
-        start, stop = (
-            _number(ends[0], "start", positive=self.positive),
-            _number(ends[1], "stop", positive=self.positive),
-        )
+        start, stop = (_number(end, "end", positive=self.positive) for end in ends[:2])
         step = _number(ends[2], "step", positive=True)
         if stop < start:
             raise ValueError(f"`{part.strip()}` ends below its start")
@@ -147,10 +135,8 @@ class Ends(ValueKind):
 
     def read(self, text: str) -> tuple[float, float]:
         """Return the two numbers."""
-        ends = text.split(":")
-        if len(ends) != 2:
-            raise ValueError(f"`{text.strip()}` is no range")
-        low, high = _number(ends[0], "lower end", positive=True), _number(ends[1], "upper end", positive=True)
+        lower, _, upper = text.partition(":")
+        low, high = (_number(end, "end", positive=True) for end in (lower, upper))
         if high <= low:
             raise ValueError(f"`{text.strip()}` does not rise")
         return low, high
@@ -226,11 +212,10 @@ class Course(ValueKind):
     def read(self, text: str) -> tuple[float, ...]:
         """Return the numbers, both ends among them."""
         parts = re.fullmatch(r"([^:]+):([^:]+):([0-9]{1,4})", text)
-        first, last = (_number_or_nan(parts[1]), _number_or_nan(parts[2])) if parts else (math.nan, math.nan)
-        count = int(parts[3]) if parts else 0
-        if not (math.isfinite(first) and math.isfinite(last)) or first == last or count < 2:
-            raise ValueError(f"must be from:to:count as in -50:-4:24, but is {cut_short(text, 60)}")
-        return tuple(first + (last - first) * index / (count - 1) for index in range(count))
+        first, last, count = (_number(part, "part", positive=False) for part in parts.groups()) if parts else (0, 0, 0)
+        if first == last or count < 2:
+            raise ValueError(f"must be from:to:count as in -50:-4:24, but is {text}")
+        return tuple(first + (last - first) * index / (count - 1) for index in range(int(count)))
 
 
 class Fixed(ValueKind):

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -78,7 +78,7 @@ class LawRecord(NamedTuple):
 
 
 @compiled_quickly(static_argnames=("max_contacts", "reverse"))
-def follow_law(
+def follow_law(  # noqa: PLR0913
     scene: Scene,
     surface: Platform | Surface,
     response: Surface | None,
@@ -86,6 +86,7 @@ def follow_law(
     until: Float[Array, ""],
     *,
     max_contacts: int,
+    tolerance: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
     reverse: bool = False,
 ) -> Simulation:
     """Return a scene with an impact law followed in time.
@@ -104,6 +105,7 @@ def follow_law(
             an impact at speed 0.
         until: time of the end in us.
         max_contacts: rows for contacts.
+        tolerance: of the times of impacts, in us.
         reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
 
     Raises:
@@ -121,8 +123,7 @@ def follow_law(
         jnp.ones((), bool),
         LawRecord(none, rows, none + jnp.int32(MotionOutcome.FINISHED), none),
     )
-    tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, until.dtype)
-    search = Search(_FLIGHT_STEPS, tolerance, until, from_above=True)
+    search = Search(_FLIGHT_STEPS, jnp.asarray(tolerance, until.dtype), until, from_above=True)
     through = partial(_written_down, seen, until)
     tip, _ = follow_tip(seen, tip, through, search, impacts=max_contacts + 1, until_ended=True, reverse=reverse)
     record = tip.record

@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -66,10 +65,6 @@ def _layers(found: "xarray.Dataset", axes: Sequence[str]) -> "list[xarray.Datase
     further = next((name for name in found.dims if name not in axes), None)
     if further is None:
         return [found]
-    values = found[further].values
-    if np.issubdtype(values.dtype, np.floating) and np.all(values == np.round(values)):
-        # titles say order = 1, not 1.0
-        found = found.assign_coords({further: values.astype(int)})
     return [found.isel({further: place}) for place in range(min(found.sizes[further], _MOST_ROWS))]
 
 
