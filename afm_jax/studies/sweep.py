@@ -36,7 +36,7 @@ from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbit
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.starts import sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
-from afm_jax.impact.law import TabulatedLaw, axes_of_one, extrapolation_of, impact_law_of
+from afm_jax.impact.law import TabulatedLaw, extrapolation_of, impact_law_of
 from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import OBSERVABLES, TOO_SHORT, observe
 from afm_jax.motion.record import MotionOutcome
@@ -265,20 +265,9 @@ def _setting(key: str, value: Any, usual: Any) -> Any:
     return tuple(numbers) if several else type(usual)(value)
 
 
-def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
-    """Return the function from columns of parameters to a batch of scenes, every number of one value a row."""
-    family = scene_family(scene, *paths)
-
-    def made(columns: Columns) -> Scene:
-        count = len(next(iter(columns.values())))
-        batch = jax.vmap(family)(*(columns[path] for path in paths)) if paths else scene
-        return jax.tree.map(
-            lambda leaf, axes: jnp.broadcast_to(leaf, (count, *leaf.shape)) if leaf.ndim == axes else leaf,
-            batch,
-            axes_of_one(scene),
-        )
-
-    return made
+def _scenes(scene: Scene, paths: Sequence[str], columns: Columns) -> Scene:
+    """Return a batch of scenes from columns of parameters; the scene where none of it changes."""
+    return scene_batch(scene, {path: columns[path] for path in paths}) if paths else scene
 
 
 def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Columns]:
@@ -314,10 +303,9 @@ def _orbits(
     if isinstance(scene.interaction, Contact):
         record = partial(_contact_orbits, scene, orders, accuracy)
         return Recorder(_one_by_one(record), 16, ("peak_amplitude_nm", "stable"), extra, alone=True)
-    made = _scenes(scene, paths)
 
     def record_batch(columns: Columns) -> Columns:
-        scenes = made(columns)
+        scenes = _scenes(scene, paths, columns)
         found = highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float), names=names)
         if not isinstance(scene.interaction, TabulatedLaw):
             return found
@@ -363,12 +351,11 @@ def _collisions(
     """Record collisions of free tips with the contacts of scenes."""
     if not isinstance(scene.interaction, Contact):
         raise ValueError("'collide' is about a resolved contact: the scene needs model = \"contact\"")  # noqa: TRY004
-    made = _scenes(scene, paths)
 
     def record(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
         speeds = jnp.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
-        scenes = made(columns)
+        scenes = _scenes(scene, paths, columns)
         found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
         trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
         # 0 of a tip that is captured
@@ -388,7 +375,7 @@ def _lyapunov(
     sample_driven(scene)
     resolved = isinstance(scene.interaction, Contact)
     lanes = 16 if resolved else LANES
-    made = jax.jit(_scenes(scene, paths))
+    made = jax.jit(partial(_scenes, scene, paths))
     exponents = ("exponents_per_impact", "exponents_per_us", "exponents_per_impact_error", "exponents_per_us_error")
 
     def work(columns: Columns) -> Columns:
@@ -559,10 +546,23 @@ def _is_begun(folder: Path, plan: SweepPlan) -> bool:
         # as Zarr names it
         if place.suffix == ".partial":
             place.unlink()
-    begun = (store / "zarr.json").exists()
-    if begun:
-        _check_same(folder, plan)
-    return begun
+    head = store / "zarr.json"
+    if not head.exists():
+        return False
+    try:
+        attributes = json.loads(head.read_bytes())["attributes"]
+        kept, version = json.loads(attributes["input"]), attributes["format_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{store}: is not a sweep of afm-jax; choose another folder") from error
+    if version != FORMAT_VERSION:
+        raise ValueError(f"{store}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
+    for name, wanted in plan.given.items():
+        if kept.get(name) != wanted:
+            difference = f"{name} is {json.dumps(kept.get(name))}, not {json.dumps(wanted)}"
+            raise ValueError(
+                f"{folder}: holds another sweep, in which {difference}: choose another folder, or restore the input"
+            )
+    return True
 
 
 def _make(store: Path, plan: SweepPlan, results: Columns) -> None:
@@ -603,22 +603,6 @@ def _fill(group: Any, plan: SweepPlan, results: Columns) -> None:
             dimension_names=[*axes, *plan.recorder.extra][: array.ndim],
             attributes={"long_name": words_of(name), **units, **flags, "coordinates": " ".join(others)},
         )
-
-
-def _check_same(folder: Path, plan: SweepPlan) -> None:
-    try:
-        attributes = json.loads((folder / STORE / "zarr.json").read_bytes())["attributes"]
-        kept, version = json.loads(attributes["input"]), attributes["format_version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / STORE}: is not a sweep of afm-jax; choose another folder") from error
-    if version != FORMAT_VERSION:
-        raise ValueError(f"{folder / STORE}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
-    for name, wanted in plan.given.items():
-        if kept.get(name) != wanted:
-            difference = f"{name} is {json.dumps(kept.get(name))}, not {json.dumps(wanted)}"
-            raise ValueError(
-                f"{folder}: holds another sweep, in which {difference}: choose another folder, or restore the input"
-            )
 
 
 class SweepRun(NamedTuple):
