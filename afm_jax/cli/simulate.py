@@ -144,8 +144,7 @@ def _dense(scene: Scene, run: LongRun, *, to_files: bool) -> DensePath:
     window = window_of(scene, run.simulation, run.verdict)
     stretches = [(window.from_us, window.to_us)]
     if to_files:
-        stretches.append(stretch_written(run.simulation, window))
-        stretches.append(stretch_drawn(scene, run.simulation, run.verdict))
+        stretches += stretch_written(run.simulation, window), stretch_drawn(scene, run.simulation, run.verdict)
     begin, end = zip(*stretches, strict=True)
     return dense_path(scene, run.simulation, min(begin), max(end))
 
