@@ -143,20 +143,20 @@ class Command:
         more = [described(each)[1] if isinstance(each, str) else (each,) for each in self.more]
         parameters = [*parameters, *(option for options in more for option in options)]
         parameters += session_options(self.out_file)
-        run = partial(run_in_options, self)
-        return click.Command(self.name, callback=run, params=parameters, help=text.replace("\\b\n", "\b\n"))
+        return click.Command(
+            self.name, callback=partial(run_command, self), params=parameters, help=text.replace("\\b\n", "\b\n")
+        )
 
 
-def check_together(row: Command, options: Mapping[str, Any]) -> None:
+def check_together(row: Command, parameters: Mapping[str, click.Parameter], options: Mapping[str, Any]) -> None:
     """Check that the options of a call fit together, before anything is computed.
 
     Raises:
         click.UsageError: if they do not; names them.
     """
-    named = {str(each.name): each for each in click.get_current_context().command.params}
 
     def spelled(pair: str) -> list[str]:
-        chosen = [named[name] for name in pair.split()]
+        chosen = [parameters[name] for name in pair.split()]
         return [each.opts[0] if isinstance(each, click.Option) else f"{each.metavar}".strip("[].") for each in chosen]
 
     def given(pair: str) -> list[bool]:
@@ -205,17 +205,10 @@ def in_options(text: str, options: Mapping[str, click.Option]) -> str:
     return _ARGUMENT.sub(option, text)
 
 
-def run_in_options(row: Command, **options: Any) -> None:
-    """Run a command, and let all that it prints, writes and refuses name its options, not the library's arguments."""
-    parameters = click.get_current_context().command.params
-    named = {str(each.name): each for each in parameters if isinstance(each, click.Option)}
-    check_together(row, options)
-    with arguments_named(partial(in_options, options=named)), _naming(None):
-        run_command(row, **options)
-
-
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
     """Run a command: start JAX, load the scene, call the function, hand out the result.
+
+    All that it prints, writes and refuses names its options, not the library's arguments.
 
     Args:
         row: the command.
@@ -227,23 +220,22 @@ def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **
     Raises:
         NotValid: if the result is not valid; it has been handed out then.
     """
-    session = Session(json, out, verbose)
-    silence_xla()
-    if row.computes:
-        session.start_computing()
-    scene: Any = None
-    if SCENE in described(row.runs)[1]:
-        load_named = import_module("afm_jax.cli.scenes").load_named
-        scene = options["scene"] = load_named(options["scene"], options.pop("law", None))
-    module, _, name = row.runs.partition(":")
-    function = getattr(import_module(module, __package__), name)
-    with _naming(scene):
-        output = function(session, **options)
-    if output is None:
-        return
-    if scene is not None:
-        output = _with_scene(output, scene, options)
-    hand_out(session, output)
+    parameters = {str(each.name): each for each in click.get_current_context().command.params}
+    check_together(row, parameters, {**options, "out": out})
+    named = {name: each for name, each in parameters.items() if isinstance(each, click.Option)}
+    with arguments_named(partial(in_options, options=named)), _naming(options):
+        session = Session(json, out, verbose)
+        silence_xla()
+        if row.computes:
+            session.start_computing()
+        has_scene = SCENE in described(row.runs)[1]
+        if has_scene:
+            load_named = import_module("afm_jax.cli.scenes").load_named
+            options["scene"] = load_named(options["scene"], options.pop("law", None))
+        module, _, name = row.runs.partition(":")
+        output = getattr(import_module(module, __package__), name)(session, **options)
+        if output is not None:
+            hand_out(session, _with_scene(output, options) if has_scene else output)
 
 
 def hand_out(session: Session, output: Output) -> None:
@@ -268,8 +260,9 @@ def hand_out(session: Session, output: Output) -> None:
         raise NotValid(in_callers_words(output.not_valid))
 
 
-def _with_scene(output: Output, scene: Any, options: Mapping[str, Any]) -> Output:
+def _with_scene(output: Output, options: Mapping[str, Any]) -> Output:
     """Return a result that names its scene, and where its law is extrapolated."""
+    scene = options["scene"]
     scene_tables = import_module("afm_jax.scenefile.scenefile").scene_tables
     payload, text = {**output.payload, "scene": scene_tables(scene.scene)}, list(output.text)
     if scene.unknowns is not None and "draws" in options:
@@ -282,14 +275,14 @@ def _with_scene(output: Output, scene: Any, options: Mapping[str, Any]) -> Outpu
 
 
 @contextmanager
-def _naming(scene: Any) -> Iterator[None]:
-    """Let messages about wrong values speak in the caller's words, and begin with the scene's name if there is one."""
+def _naming(options: Mapping[str, Any]) -> Iterator[None]:
+    """Let messages about wrong values speak in the caller's words, and begin with the scene's name once it is read."""
     try:
         yield
     except ValueError as error:
-        said = in_callers_words(str(error))
-        if scene is not None and not said.startswith(scene.name):
-            said = f"{scene.name}: {said}"
+        said, name = in_callers_words(str(error)), getattr(options.get("scene"), "name", "")
+        if not said.startswith(name):
+            said = f"{name}: {said}"
         if is_inner(error) or said == str(error):
             raise
         raise ValueError(said) from error

@@ -127,11 +127,9 @@ def _axis(table: Mapping[str, Any], sample: str) -> Axis:
     if len(kinds) != 1:
         raise ValueError(f"has {' and '.join(kinds) or 'no values'}; give one of {', '.join(KINDS)}, as in {_EXAMPLE}")
     kind = kinds[0]
-    keys = {kind, "count", "seed"} if kind == "random" else {kind, "parameter"}
-    if set(table) != keys:
-        raise ValueError(
-            f"has {', '.join(table)}; an axis of this kind has {', '.join(sorted(keys))}, as in {_EXAMPLE}"
-        )
+    keys = (kind, "count", "seed") if kind == "random" else ("parameter", kind)
+    if set(table) != set(keys):
+        raise ValueError(f"has {', '.join(table)}; an axis of this kind has {', '.join(keys)}, as in {_EXAMPLE}")
     values, parameter = table[kind], table.get("parameter")
     if kind == "random":
         if not isinstance(values, Mapping) or not values:
