@@ -24,7 +24,7 @@ def collide(
     session: Session,
     scene: Annotated[str | None, "[SCENE.toml|PRESET]"] = None,
     *,
-    speeds: Annotated[tuple[float, ...] | None, Numbers("speed", example="12,15,20"), "LIST"] = None,
+    speeds: Annotated[tuple[float, ...] | None, Numbers(), "LIST"] = None,
     accuracy: Positive = 1e-9,
     make_law: bool = False,
     speed_range: Annotated[tuple[float, float] | None, Ends(), "LOW:HIGH"] = None,

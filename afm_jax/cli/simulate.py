@@ -41,7 +41,7 @@ def simulation(  # noqa: PLR0913
     heights: Annotated[tuple[float, ...] | None, Course(), "FROM:TO:COUNT"] = None,
     duration_us: Positive | None = None,
     periods: Positive | None = None,
-    harmonics: Annotated[tuple[int, ...], Orders("multiple")] = (1,),
+    harmonics: Annotated[tuple[int, ...], Orders()] = (1,),
     accuracy: Positive = 1e-9,
     samples: Literal["uniform"] | None = None,
     noise: Annotated[float | None, Share("a relative error")] = None,

@@ -67,18 +67,19 @@ class Numbers(ValueKind):
 
     name = "numbers"
 
-    def __init__(self, what: str = "number", *, positive: bool = True, example: str = "1,2,5"):
-        """Say what the numbers are, one of them in a word, and whether they must be positive."""
-        self.what, self.positive = what, positive
-        self.advice = f"; write {example} or start:stop:step"
+    advice = "; write 1,2,5 or start:stop:step"
+
+    def __init__(self, *, positive: bool = True):
+        """Say whether they must be positive."""
+        self.positive = positive
 
     def read(self, text: str) -> tuple[float, ...]:
         """Return the numbers in their order."""
         if not text.strip():
-            raise ValueError(f"names no {self.what}")
+            raise ValueError("names no number")
         numbers: list[float] = []
         for part in text.split(","):
-            numbers += self._range(part) if ":" in part else [_number(part, self.what, positive=self.positive)]
+            numbers += self._range(part) if ":" in part else [_number(part, "number", positive=self.positive)]
         return tuple(numbers)
 
     def _range(self, part: str) -> list[float]:
@@ -92,7 +93,7 @@ class Numbers(ValueKind):
         # a hair more than the quotient, so that rounding does not cost the stop
         steps = (stop - start) / step * (1.0 + 1e-12) + 1e-9
         if steps > _MOST_NUMBERS:
-            raise ValueError(f"`{part.strip()}` has more than {_MOST_NUMBERS} {self.what}s")
+            raise ValueError(f"`{part.strip()}` has more than {_MOST_NUMBERS} numbers")
         # rounded to what was meant: 0.97 + 3 * 0.01 is 1
         return [float(f"{start + step * index:.12g}") for index in range(math.floor(steps) + 1)]
 
@@ -107,10 +108,6 @@ class Orders(ValueKind):
     name = "orders"
     advice = "; write 1,2 or 1-4"
 
-    def __init__(self, what: str = "order"):
-        """Say what one of the numbers is."""
-        self.what = what
-
     def read(self, text: str) -> tuple[int, ...]:
         """Return the orders, without repetitions."""
         orders: list[int] = []
@@ -118,7 +115,7 @@ class Orders(ValueKind):
             ends = re.fullmatch(r"\s*([0-9]{1,3})\s*(?:-\s*([0-9]{1,3})\s*)?", part)
             low, high = (0, 0) if ends is None else (int(ends[1]), int(ends[2] or ends[1]))
             if not 1 <= low <= high:
-                raise ValueError(f"`{part.strip()}` is no {self.what}")
+                raise ValueError(f"`{part.strip()}` is no positive whole number")
             orders += range(low, high + 1)
         return tuple(dict.fromkeys(orders))
 

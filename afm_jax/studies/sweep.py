@@ -633,7 +633,9 @@ def run_plan(
         what = "is no folder, or lies in none; choose another `out`"
         raise NotADirectoryError(errno.ENOTDIR, what, str(folder)) from error
     store, begun = folder / STORE, _is_begun(folder, plan)
-    marks = zarr.open_group(str(store), mode="r")[_MARK][...] if begun else np.zeros(plan.shape, bool)
+    marks: Any = np.zeros(plan.shape, bool)
+    if begun:
+        marks = zarr.open_array(str(store / _MARK), mode="r")[...]
     missing = [region for region in regions if not marks[region].all()]
     kept = len(regions) - len(missing)
     try:
@@ -642,7 +644,7 @@ def run_plan(
             results[_MARK] = np.ones_like(marks[region])
             if not (begun or done):
                 _make(store, plan, results)
-            group = zarr.open_group(str(store), mode="r+")
+            group: Any = zarr.open_group(str(store), mode="r+")
             for name, values in results.items():
                 group[name][(*region, ...)] = values
             done += 1
