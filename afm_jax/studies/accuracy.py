@@ -185,7 +185,8 @@ class AccuracyProblem:
         """Return values and slopes, by programs that compile quickly: they are not timed."""
         value = partial(self.solve, setting)
         both = [compiled_for(each, self.at, options=quick_options(0)) for each in (value, jax.jacfwd(value))]
-        return tuple(np.asarray(each.run(self.at)) for each in both)
+        values, slopes = (np.asarray(each.run(self.at)) for each in both)
+        return values, slopes
 
     def errors(self, values: Any, slopes: Any, tips: Any = slice(None)) -> tuple[float, float]:
         """Return the largest errors of value and gradient; of a slope relative to its largest among the tips."""

@@ -260,7 +260,7 @@ def _setting(key: str, value: Any, usual: Any) -> Any:
     if not numbers or not all(type(each) in kinds and each > 0 for each in numbers):
         kind = "positive number" if float in kinds else "positive whole number"
         raise ValueError(f"[record]: `{key}` must be a {kind}{', or several' * several}, but is {value!r}")
-    return tuple(numbers) if several else type(usual)(value)
+    return tuple(numbers) if several else type(usual)(numbers[0])
 
 
 def _scenes(scene: Scene, paths: Sequence[str], columns: Columns) -> Scene:
