@@ -53,7 +53,7 @@ def sweep_figure(found: "xarray.Dataset", names: Sequence[str]) -> Figure:
 def _is_geometric(values: np.ndarray) -> bool:
     """Say whether values have equal ratios; few values, and those at equal distances, have none to speak of."""
     values = np.unique(values)
-    return values.size > 2 and values[0] > 0.0 and float(np.ptp(np.diff(np.log(values)))) < 1e-6
+    return bool(values.size > 2 and values[0] > 0.0 and np.ptp(np.diff(np.log(values))) < 1e-6)
 
 
 def _layers(found: "xarray.Dataset", axes: Sequence[str]) -> "list[xarray.Dataset]":
