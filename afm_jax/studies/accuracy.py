@@ -273,7 +273,6 @@ def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters
     def phase_of(tip: Tip) -> Tip:
         down, up = motion.levels(tip.phase)
         ends = [lambda _, y, *__, **___: y[0] - down, lambda _, y, *__, **___: y[0] - up]
-
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda _, y, __: motion.rates(tip.phase, *y)),
             diffrax.Dopri8(),
@@ -565,7 +564,6 @@ def rebound_speeds(tips: int) -> AccuracyProblem:
 
 IN_TIME = (DrivenSetting(None, 12.0, 400), DrivenSetting(None, 9.0, 300))
 """References of contacts in time, in fine steps: the better one first."""
-_BEYOND_US = 1e-3
 
 
 def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
@@ -582,15 +580,16 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     if isinstance(scene.interaction, Law):
         motion = EquationOfMotion(scene.cantilever, surface, scene.interaction)
         settings: Mapping[str, Any] = {f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US}
-        finest, reference = _FINEST_US, "root tolerance 1e-15 us"
+        # the coarsest of them may be as late
+        finest, reference, beyond_us = _FINEST_US, "root tolerance 1e-15 us", 2.0 * _ROOT_TOLERANCES_US[0]
     else:
         driven = driven_by(scene.interaction, scene.cantilever, surface)
         motion = EquationOfMotion(scene.cantilever, surface, None, driven, scene.interaction.spans)
         settings = {f"accuracy {level:g}": setting for level, setting in DRIVEN_SETTINGS.items()}
-        finest, reference = IN_TIME, "every contact in time, in fine steps"
+        finest, reference, beyond_us = IN_TIME, "every contact in time, in fine steps", 1e-3
     left = times_of_contact(scene, contacts, start.time_us + _LONGEST_US * contacts, finest[0], start)[1]
     # no longer than until the last of them has left
-    until = jnp.where(jnp.isfinite(left), left + _BEYOND_US, start.time_us)
+    until = jnp.where(jnp.isfinite(left), left + beyond_us, start.time_us)
 
     def moved(parameters: Parameters) -> State:
         return start._replace(velocity_nm_per_us=start.velocity_nm_per_us + parameters[0])
