@@ -272,7 +272,9 @@ def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters
 
     def phase_of(tip: Tip) -> Tip:
         down, up = motion.levels(tip.phase)
-        ends = [lambda _, y, *__, **___: y[0] - down, lambda _, y, *__, **___: y[0] - up]
+        # called by position or by these names
+        falls: Any = lambda t, y, args, **_: y[0] - down  # noqa: ARG005, E731
+        rises: Any = lambda t, y, args, **_: y[0] - up  # noqa: ARG005, E731
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda _, y, __: motion.rates(tip.phase, *y)),
             diffrax.Dopri8(),
@@ -284,7 +286,7 @@ def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters
                 rtol=tolerance, atol=1e-3 * tolerance, dtmax=_longest_step(motion, tip.phase)
             ),
             # downwards alone: a tip leaves a surface with a gap of 0
-            event=diffrax.Event(ends, optimistix.Newton(1e-14, 1e-14), direction=[False, True]),
+            event=diffrax.Event([falls, rises], optimistix.Newton(1e-14, 1e-14), direction=[False, True]),
             adjoint=diffrax.ForwardMode(),
             max_steps=None,
             throw=False,

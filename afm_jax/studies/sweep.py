@@ -89,7 +89,7 @@ class Axis(NamedTuple):
         return len(next(iter(self.columns.values())))
 
 
-def axes_of(given: Sequence[Mapping[str, Any]]) -> tuple[Axis, ...]:
+def axes_of(given: Any) -> tuple[Axis, ...]:
     """Return the axes that tables describe.
 
     >>> axes_of([{"parameter": "interaction.r", "linear": [0.5, 0.9, 5]}])[0].columns["interaction.r"].tolist()
