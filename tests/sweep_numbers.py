@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from afm_jax.studies.sweep import MESSAGE, Axis, Columns, Recorder, SweepPlan, Variable, plan_of, run_plan
+from afm_jax.studies.sweep import MESSAGE, Axis, Columns, Recorder, SweepPlan, plan_of, run_plan
 
 SIZES = (7, 12)
 """Of the axes; the chunks of ten points do not fill them evenly."""
@@ -25,15 +25,10 @@ def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noq
         found = columns["x"] + 0.1 * columns["y"]
         sums = np.where(found < 2.0, np.nan, found)
         why = np.where(found < 2.0, "the sum is below 2 \u00e4", "")
-        return {"sum_nm": sums, "large": found > 4.0, "parts": np.stack([found] * 2, 1), MESSAGE.name: why}
+        results = {"sum_nm": sums, "large": found > 4.0, "parts": np.stack([found] * 2, 1)}
+        return results | ({MESSAGE: why} if record.get("explained") else {})
 
-    variables = (
-        Variable("sum_nm", "x and a tenth of y"),
-        Variable("large", "it is above 4", "bool"),
-        Variable("parts", "the same twice", dimensions=("part",)),
-    )
-    variables += (MESSAGE,) * bool(record.get("explained"))
-    return Recorder(variables, work, points=10, extra={"part": [1.0, 2.0]})
+    return Recorder(work, 10, ("sum_nm", "large"), {"part": (1, 2)})
 
 
 def plan(*, chunk: int | None = None, last: float = 11.0, **record: Any) -> SweepPlan:

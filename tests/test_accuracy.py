@@ -1,5 +1,6 @@
 """The accuracy study: its references, its rivals, and the command. No times are judged."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -8,12 +9,9 @@ import numpy as np
 import pytest
 
 from afm_jax import Cantilever, ForceDrive, ImpactLaw, Platform, Scene
-from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.driven import driven_by
 from afm_jax.contact.junction import Phase
 from afm_jax.motion.record import State
-from afm_jax.motion.simulate import simulate
-from afm_jax.motion.start import start_of
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import load_scene, save_scene
 from afm_jax.studies import accuracy
@@ -82,7 +80,7 @@ def test_the_reference_of_a_contact_scene_is_that_of_an_independent_integration(
     )
     last = course.contacts[2]
     until = jnp.asarray(last.departure_time_us + 1e-3)
-    found = accuracy.contact_arrival(scene, surface_of(scene), 3, until, accuracy.IN_TIME[0], start)
+    found = accuracy.times_of_contact(scene, 3, until, accuracy.IN_TIME[0], start)[0]
     # two contacts multiply rounding and step errors by less than a thousand
     assert float(found) == pytest.approx(last.arrival_time_us, abs=1e-9)
 
@@ -105,10 +103,10 @@ def test_rivals_follow_straight_and_turning_contacts(course, rival: str):
         ends = [accuracy.by_scipy(programs, programs.vector(motion), tip, 1, 1e-9) for tip in alone]
         rebounds, left = ([float(getattr(end, name)) for end in ends] for name in ("rate", "time_us"))
     else:
-        problem = accuracy.rebound_speeds(2)._replace(begin=lambda _: (motion, tips))
+        problem = replace(accuracy.rebound_speeds(2), begin=lambda _: (motion, tips))
         rebounds, left = (
             jax.jit(
-                lambda read=read: accuracy.by_diffrax(problem._replace(read=read), jnp.asarray(1e-9), jnp.zeros(2))
+                lambda read=read: accuracy.by_diffrax(replace(problem, read=read), jnp.asarray(1e-9), jnp.zeros(2))
             )()
             for read in (lambda tip: tip.rate, lambda tip: tip.time_us)
         )
@@ -133,14 +131,6 @@ def test_law_scenes_are_measured_however_they_are_driven(scene: str, tmp_path: P
         # times of 20 us; the slope grows where the tip is slow
         assert row["error"] < (1.0 if coarse else 1e-4 if row["of"] == "gradient" else 1e-6), row
     assert {row["method"] for row in found["rows"]} == {"afm-jax", "SciPy DOP853", "Diffrax Dopri8"}
-
-
-def test_a_forced_scene_arrives_when_its_simulation_does():
-    start = start_of(FORCED, None)
-    found = accuracy.law_arrival(FORCED, surface_of(FORCED), 4, jnp.asarray(1e-13), start)
-    times = simulate(FORCED, start, 200.0).contacts.arrival_time_us
-    # the search of both stops at 1e-13 us
-    assert float(found) == pytest.approx(float(times[3]), abs=1e-11)
 
 
 def test_a_tip_with_fewer_contacts_is_refused(tmp_path: Path):

@@ -92,7 +92,7 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
         lambda path: fitting.read_table(path / "no_errors.csv"),
         "give the relative noise (`noise=0.01`)",
         ("fit", "no_errors.csv"),
-        "give the relative noise (--noise 1%)",
+        "give the relative noise (--noise 0.01)",
     ),
     "a curve's Q": (
         lambda path: fitting.tapping(path / "tap.csv"),
@@ -186,8 +186,6 @@ def test_what_becomes_of_an_argument():
         "`drive` must go with `bin_nm`, not `offset_nm`": "--drive must go with --bin-nm, not `offset_nm`",
         "f.csv: `curve` must be 1": "f.csv: `curve` must be 1",
         "(`robust=True`, `bin_nm=...`)": "(--robust, --bin-nm)",
-        '`fixed={"r": 0.9}` or `constraints={"quality_factor": (40, 0.2)}`': "--fix r=0.9 or --constrain "
-        "quality_factor=40+-0.2",
         "try `quality_factor=none`, `order=1`": "try --quality-factor none, `order=1`",
         "`quality_factor=40, quality_factor_error=2`": "--quality-factor '40 +- 2'",
     }.items():

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import chi2 as chi2_distribution
 
-from afm_jax.cli.fit import parameters_of
+from afm_jax.cli.fit import parameters_of_contact
 from afm_jax.cli.main import main
 from fitting import fit
 from fitting.tables.table import TABLE, read_table, write_table
@@ -169,7 +169,7 @@ def test_packages_are_asked_for_before_the_fit(monkeypatch):
 
 
 def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():
-    settings = parameters_of("contact", None, {"modulus_gpa": 90.0}, ("viscous",))
+    settings = parameters_of_contact(None, {"modulus_gpa": 90.0}, ("viscous",))
     assert settings["free"] == ("relative_humidity", "adhesion_energy_j_per_m2")
     assert settings["effects"] == ("capillary", "structural", "core", "jkr")
 

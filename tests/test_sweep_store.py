@@ -51,7 +51,7 @@ def test_results_open_with_xarray_alone(whole: Path):
     np.testing.assert_array_equal(found["parts"].sel(part=2.0), SUM)
     np.testing.assert_array_equal(found["x"], X)
     assert found["large"].dtype == bool
-    assert found["sum_nm"].attrs == {"long_name": "x and a tenth of y", "units": "nm"}
+    assert found["sum_nm"].attrs == {"long_name": "sum", "units": "nm"}
     given = json.loads(found.attrs["input"])
     assert given["axes"][1] == {"parameter": "y", "linear": [0.0, 11.0, 12]}
     assert {"jax", "afm-jax", "numpy"} <= set(given["versions"])

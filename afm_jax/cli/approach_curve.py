@@ -8,7 +8,7 @@ import numpy as np
 from afm_jax.cli.command import Output, picture_of
 from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
-from afm_jax.columns import Cell, printed_table
+from afm_jax.columns import Cell, printed_table, rows_of
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome, approach_curve
 from afm_jax.scenefile.scenefile import scene_tables
 from fitting.simulated.experiment import table_of_curve
@@ -46,7 +46,6 @@ def approach(
     with session.working("following heights (the first run compiles for some seconds)", "heights") as report:
         curve = approach_curve(scene.scene, heights, report=report, **settings)
     points = _points(curve)
-    rows = [dict(zip(points, row, strict=True)) for row in zip(*points.values(), strict=True)]
     counted = {kind: int(np.count_nonzero(curve.outcome == kind)) for kind in CurveOutcome}
     repeats = sum(counted[kind] for kind in (CurveOutcome.TAPS, CurveOutcome.FREE, CurveOutcome.OTHER_ORBIT))
     free_tip = (
@@ -65,9 +64,9 @@ def approach(
             "settings": settings | errors,
         },
         text=[
-            partial(_table, rows),
+            printed_table("Approach curve", _CELLS, rows_of(points)),
             free_tip,
-            *(f"{count} of {len(rows)}: {kind.sentence}" for kind, count in counted.items() if count),
+            *(f"{count} of {len(curve.reasons)}: {kind.sentence}" for kind, count in counted.items() if count),
         ],
         tables={"curve_points.csv": points},
         files={
@@ -86,7 +85,7 @@ def _points(curve: ApproachCurve) -> dict[str, list[Any]]:
     names = ("height_nm", "amplitude_nm", "phase_lag_deg", "dissipated_in_contact_aj", "virial_aj")
     told = curve.periods > 0
     return {
-        **{name: [value if np.isfinite(value) else None for value in getattr(curve, name).tolist()] for name in names},
+        **{name: getattr(curve, name) for name in names},
         "direction": np.where(curve.retract, "retract", "approach").tolist(),
         **{
             name: [n if t else None for n, t in zip(getattr(curve, name).tolist(), told, strict=True)]
@@ -95,7 +94,3 @@ def _points(curve: ApproachCurve) -> dict[str, list[Any]]:
         "outcome": [CurveOutcome(kind).name.lower() for kind in curve.outcome.tolist()],
         "reason": list(curve.reasons),
     }
-
-
-def _table(rows: list[dict[str, Any]]) -> Any:
-    return printed_table("Approach curve", _CELLS, rows)

@@ -24,7 +24,7 @@ def collide(
     session: Session,
     scene: Annotated[str | None, "[SCENE.toml|PRESET]"] = None,
     *,
-    speeds: Annotated[tuple[float, ...] | None, Numbers("speed", example="12,15,20"), "LIST"] = None,
+    speeds: Annotated[tuple[float, ...] | None, Numbers(), "LIST"] = None,
     accuracy: Positive = 1e-9,
     make_law: bool = False,
     speed_range: Annotated[tuple[float, float] | None, Ends(), "LOW:HIGH"] = None,
@@ -51,11 +51,6 @@ def collide(
         points: with --make-law: number of speeds that formulas are fitted to; else 512.
         **contact: what is changed of the contact.
     """
-    for option, value in (("--speed-range", speed_range), ("--points", points)):
-        if value is not None and not make_law:
-            raise click.UsageError(f"{option} is of the formulas of a law: add --make-law")
-    if make_law and speeds is not None:
-        raise click.UsageError("--make-law chooses its own speeds: leave --speeds out")
     chosen, mass, description = chosen_contact(scene, contact)
     told = {"contact": description, "mass_ng": mass}
     if make_law:

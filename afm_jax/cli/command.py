@@ -29,7 +29,6 @@ import click
 from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE, described
 from afm_jax.cli.session import Session, session_options, write_json
-from afm_jax.cli.values import Share
 from afm_jax.compilation_cache import silence_xla
 from afm_jax.whole_files import arguments_named, in_callers_words
 
@@ -118,6 +117,9 @@ class Command:
         more: options besides those of the function: some, or a class that has them, named likewise (`described`).
         computes: whether JAX is started, before the function's module is imported.
         out_file: what the file is called that --out names, for a command that writes a single one; empty: a folder.
+        apart: pairs of options that contradict each other, "one other".
+        needs: pairs of options of which the first needs the second.
+        one_of: an argument and an option, one of which is given, "argument option".
     """
 
     name: str
@@ -126,6 +128,9 @@ class Command:
     more: Sequence[click.Option | str] = ()
     computes: bool = True
     out_file: str = ""
+    apart: Sequence[str] = ()
+    needs: Sequence[str] = ()
+    one_of: str = ""
 
     @property
     def summary(self) -> str:
@@ -138,15 +143,39 @@ class Command:
         more = [described(each)[1] if isinstance(each, str) else (each,) for each in self.more]
         parameters = [*parameters, *(option for options in more for option in options)]
         parameters += session_options(self.out_file)
-        run = partial(run_in_options, self)
-        return click.Command(self.name, callback=run, params=parameters, help=text.replace("\\b\n", "\b\n"))
+        return click.Command(
+            self.name, callback=partial(run_command, self), params=parameters, help=text.replace("\\b\n", "\b\n")
+        )
+
+
+def check_together(row: Command, parameters: Mapping[str, click.Parameter], options: Mapping[str, Any]) -> None:
+    """Check that the options of a call fit together, before anything is computed.
+
+    Raises:
+        click.UsageError: if they do not; names them.
+    """
+
+    def spelled(pair: str) -> list[str]:
+        chosen = [parameters[name] for name in pair.split()]
+        return [each.opts[0] if isinstance(each, click.Option) else f"{each.metavar}".strip("[].") for each in chosen]
+
+    def given(pair: str) -> list[bool]:
+        return [options[name] not in (None, False, ()) for name in pair.split()]
+
+    for pair in row.apart:
+        if all(given(pair)):
+            raise click.UsageError("{} and {} contradict each other: leave one of them out".format(*spelled(pair)))
+    for pair in row.needs:
+        if given(pair) == [True, False]:
+            raise click.UsageError("{} needs {}: give it, too".format(*spelled(pair)))
+    if row.one_of and sum(given(row.one_of)) != 1:
+        raise click.UsageError("give {}, or {} for the bundled file, not both".format(*spelled(row.one_of)))
 
 
 _ARGUMENT = re.compile(r"`(\w+)=([^`]*?)(?:, \1_error=([^`]*))?`")
 _NAME = re.compile(r"`(\w+)`")
 _QUOTES = re.compile(r'\\?"|&#34;')
 """Of a Python text, also within JSON and HTML."""
-_ENTRY = re.compile(r"\{(\w+): (?:\((\S+), (\S+)\)|(\S+))\}")
 
 
 def in_options(text: str, options: Mapping[str, click.Option]) -> str:
@@ -166,13 +195,9 @@ def in_options(text: str, options: Mapping[str, click.Option]) -> str:
         name, value, error = found.groups()
         if name not in options:
             return found[0]
-        kind = options[name]
         value = "" if value in {"...", "True"} else _QUOTES.sub("", value)
-        value = _ENTRY.sub(lambda entry: f"{entry[1]}={entry[4] or f'{entry[2]}+-{entry[3]}'}", value)
-        if isinstance(kind.type, Share) and value:
-            value = f"{100.0 * float(value):g}%"
         value = value if error is None else f"'{value} +- {error}'"
-        return f"{kind.opts[0]} {value}".rstrip()
+        return f"{options[name].opts[0]} {value}".rstrip()
 
     first = _NAME.match(text)
     if first is not None and first[1] in options:
@@ -180,16 +205,10 @@ def in_options(text: str, options: Mapping[str, click.Option]) -> str:
     return _ARGUMENT.sub(option, text)
 
 
-def run_in_options(row: Command, **options: Any) -> None:
-    """Run a command, and let all that it prints, writes and refuses name its options, not the library's arguments."""
-    parameters = click.get_current_context().command.params
-    named = {str(each.name): each for each in parameters if isinstance(each, click.Option)}
-    with arguments_named(partial(in_options, options=named)), _naming(None):
-        run_command(row, **options)
-
-
 def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
     """Run a command: start JAX, load the scene, call the function, hand out the result.
+
+    All that it prints, writes and refuses names its options, not the library's arguments.
 
     Args:
         row: the command.
@@ -201,23 +220,22 @@ def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **
     Raises:
         NotValid: if the result is not valid; it has been handed out then.
     """
-    session = Session(json, out, verbose)
-    silence_xla()
-    if row.computes:
-        session.start_computing()
-    scene: Any = None
-    if SCENE in described(row.runs)[1]:
-        load_named = import_module("afm_jax.cli.scenes").load_named
-        scene = options["scene"] = load_named(options["scene"], options.pop("law", None))
-    module, _, name = row.runs.partition(":")
-    function = getattr(import_module(module, __package__), name)
-    with _naming(scene):
-        output = function(session, **options)
-    if output is None:
-        return
-    if scene is not None:
-        output = _with_scene(output, scene, options)
-    hand_out(session, output)
+    parameters = {str(each.name): each for each in click.get_current_context().command.params}
+    check_together(row, parameters, {**options, "out": out})
+    named = {name: each for name, each in parameters.items() if isinstance(each, click.Option)}
+    with arguments_named(partial(in_options, options=named)), _naming(options):
+        session = Session(json, out, verbose)
+        silence_xla()
+        if row.computes:
+            session.start_computing()
+        has_scene = SCENE in described(row.runs)[1]
+        if has_scene:
+            load_named = import_module("afm_jax.cli.scenes").load_named
+            options["scene"] = load_named(options["scene"], options.pop("law", None))
+        module, _, name = row.runs.partition(":")
+        output = getattr(import_module(module, __package__), name)(session, **options)
+        if output is not None:
+            hand_out(session, _with_scene(output, options) if has_scene else output)
 
 
 def hand_out(session: Session, output: Output) -> None:
@@ -242,8 +260,9 @@ def hand_out(session: Session, output: Output) -> None:
         raise NotValid(in_callers_words(output.not_valid))
 
 
-def _with_scene(output: Output, scene: Any, options: Mapping[str, Any]) -> Output:
+def _with_scene(output: Output, options: Mapping[str, Any]) -> Output:
     """Return a result that names its scene, and where its law is extrapolated."""
+    scene = options["scene"]
     scene_tables = import_module("afm_jax.scenefile.scenefile").scene_tables
     payload, text = {**output.payload, "scene": scene_tables(scene.scene)}, list(output.text)
     if scene.unknowns is not None and "draws" in options:
@@ -256,14 +275,14 @@ def _with_scene(output: Output, scene: Any, options: Mapping[str, Any]) -> Outpu
 
 
 @contextmanager
-def _naming(scene: Any) -> Iterator[None]:
-    """Let messages about wrong values speak in the caller's words, and begin with the scene's name if there is one."""
+def _naming(options: Mapping[str, Any]) -> Iterator[None]:
+    """Let messages about wrong values speak in the caller's words, and begin with the scene's name once it is read."""
     try:
         yield
     except ValueError as error:
-        said = in_callers_words(str(error))
-        if scene is not None and not said.startswith(scene.name):
-            said = f"{scene.name}: {said}"
+        said, name = in_callers_words(str(error)), getattr(options.get("scene"), "name", "")
+        if not said.startswith(name):
+            said = f"{name}: {said}"
         if is_inner(error) or said == str(error):
             raise
         raise ValueError(said) from error

@@ -31,19 +31,6 @@ class NotValid(Exception):  # noqa: N818
     """The command ran and has printed its output, but the result is not valid; the message says why."""
 
 
-_FORESEEN = (
-    NotValid,
-    click.Abort,
-    click.ClickException,
-    ModuleNotFoundError,
-    OSError,
-    ValueError,
-    ArithmeticError,
-    MemoryError,
-    RuntimeError,
-)
-
-
 _LONGEST_WORD, _LONGEST_LINE = 300, 2000
 """Letters of a message's words, and of the whole message, at most."""
 
@@ -59,7 +46,7 @@ def exit_code_of(run: Callable[[], object]) -> int:
     """
     try:
         code = run()
-    except _FORESEEN as error:
+    except Exception as error:
         line, code = _verdict(error)
         if not line or (code == 1 and os.environ.get(_TRACEBACK)):
             raise
@@ -70,7 +57,7 @@ def exit_code_of(run: Callable[[], object]) -> int:
 
 
 def _verdict(error: Exception) -> tuple[str, int]:
-    """Return what to say of a failure and the exit code; nothing where it is no fault of the user."""
+    """Return what to say of a failure and the exit code; nothing where no one foresaw it."""
     match error:
         case NotValid():
             return f"not valid: {error}", 3
@@ -100,6 +87,8 @@ def _wrong_values(error: Exception) -> tuple[str, int]:
     if isinstance(error, ValueError) and not is_inner(error):
         # thus also TableError, SceneError and the checks of the objects: the data are wrong
         return str(error) or name, 2
+    if not isinstance(error, ValueError | ArithmeticError | MemoryError | RuntimeError):
+        return "", 1
     what = f"{name}: {error}" if str(error) else name
     return f"the program failed, which is not the input's fault ({what}); {_TRACEBACK}=1 shows where", 1
 

@@ -1,6 +1,6 @@
 """`afm-jax fit TABLE.csv`: the impact law from measured vibration amplitudes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,11 +14,11 @@ from afm_jax.cli.session import Session
 from afm_jax.cli.tables import example_path, tables_with
 from afm_jax.cli.values import Constraint, Fixed, ModelName, Names, QualityFactor, Share
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
-from afm_jax.whole_files import in_callers_words
 from fitting.infer.comparison import compare as compared_models
 from fitting.infer.comparison import rivals
 from fitting.infer.fit import fit as fit_tables
-from fitting.parameters import CONTACT_DEFAULT, model_parameters
+from fitting.infer.result import FitResult
+from fitting.parameters import CONTACT_DEFAULT
 from fitting.report.report import summary, write_report
 from fitting.sampling.posterior import posterior as sampled_posterior
 from fitting.sampling.posterior import require_blackjax, sampled_by_gaussian
@@ -44,7 +44,7 @@ def fit(  # noqa: PLR0913
     posterior: bool = False,
     seed: Annotated[int, IntRange(0)] = 0,
     share: Annotated[tuple[str, ...] | None, Names()] = None,
-    example: bool = False,
+    example: bool = False,  # noqa: ARG001 (stands for a table: the command's row)
 ) -> Output | None:
     """Fit the impact law to a table of vibration amplitudes, or one law to several tables.
 
@@ -84,13 +84,14 @@ def fit(  # noqa: PLR0913
             its own.
         example: fit the bundled table instead of a file.
     """
-    if example == bool(tables):
-        both = "not both: " if example else ""
-        raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
     if posterior and len(tables) > 1:
         raise click.UsageError("--posterior is about one table: give one, or leave it out")
+    if no and model != "contact":
+        raise click.UsageError("--no is about the contact's effects; add --model contact")
     settings: dict[str, Any] = {"scale_errors": scale_errors, "robust": robust, "constraints": dict(constraints)}
-    settings |= parameters_of(model, free, dict(fixed), no) | ({"share": share} if share else {})
+    settings |= {"free": free, "fixed": dict(fixed)} | ({"share": share} if share else {})
+    if model == "contact":
+        settings |= parameters_of_contact(free, settings["fixed"], no or ())
     if posterior and not sampled_by_gaussian(model):
         require_blackjax()
     read = tables_with(tables or (example_path(),), noise, quality_factor)
@@ -99,10 +100,9 @@ def fit(  # noqa: PLR0913
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
     with session.working(f"fitting {rows}, model {model} ({first})"):
         result = fit_tables(measured, model, **settings)
-    extras: dict[str, Any] = {}
-    failure = None
     if posterior and not result.valid:
         session.note("no posterior: the fit is not valid")
+    extras: dict[str, Any] = {}
     try:
         if compare:
             models = rivals(result.model, settings["fixed"])
@@ -112,42 +112,32 @@ def fit(  # noqa: PLR0913
         if posterior and result.valid:
             with session.working("sampling the posterior"):
                 extras["posterior"] = sampled_posterior(result, seed=seed)
-    except Exception as error:  # noqa: BLE001
-        failure = error
+    except Exception:
+        # the fit itself stands
+        hand_out(session, _output(result, extras))
+        raise
+    return _output(result, extras)
+
+
+def _output(result: FitResult, extras: Mapping[str, Any]) -> Output:
+    """Return what is handed out of a fit, with a comparison and a posterior where there are some."""
     output = Output.of_report(result, partial(summary, result, **extras), partial(write_report, result, **extras))
-    output = replace(output, payload={**output.payload, **{name: extra.to_dict() for name, extra in extras.items()}})
-    if failure is None:
-        return output
-    # the fit itself stands
-    hand_out(session, output)
-    raise failure
+    return replace(output, payload={**output.payload, **{name: extra.to_dict() for name, extra in extras.items()}})
 
 
-def parameters_of(
-    model: str, free: tuple[str, ...] | None, fixed: dict[str, float], no: tuple[str, ...] | None
-) -> dict[str, Any]:
-    """Return which parameters `fitting.fit` fits and fixes, and the effects of a contact.
+def parameters_of_contact(free: Sequence[str] | None, fixed: Mapping[str, float], no: Sequence[str]) -> dict[str, Any]:
+    """Return which parameters of a contact `fitting.fit` fits, and the effects that it has.
 
     Raises:
-        click.UsageError: if options contradict each other or the model.
+        click.UsageError: if the options contradict each other.
     """
-    settings: dict[str, Any] = {"free": free, "fixed": fixed}
-    if model == "contact":
-        for name in no or ():
-            if name not in REMOVABLE_EFFECTS:
-                raise click.UsageError(f"--no takes {', '.join(REMOVABLE_EFFECTS)}, but one is {name!r}")
-        effects = tuple(name for name in EFFECTS if name not in (no or ()))
-        for option, names in (("--free", free or ()), ("--fix", fixed)):
-            for name in names:
-                missing = idle_without(name, effects)
-                if missing:
-                    raise click.UsageError(f"{option} {name} changes nothing without the effect {' or '.join(missing)}")
-        usual = tuple(name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects))
-        settings |= {"effects": effects, "free": free or usual}
-    elif no:
-        raise click.UsageError("--no is about the contact's effects; add --model contact")
-    try:
-        model_parameters(model, settings["free"], fixed)
-    except ValueError as error:
-        raise click.UsageError(in_callers_words(str(error))) from error
-    return settings
+    for name in no:
+        if name not in REMOVABLE_EFFECTS:
+            raise click.UsageError(f"--no takes {', '.join(REMOVABLE_EFFECTS)}, but one is {name!r}")
+    effects = tuple(name for name in EFFECTS if name not in no)
+    for name in (*(free or ()), *fixed):
+        missing = idle_without(name, effects)
+        if missing:
+            raise click.UsageError(f"{name} changes nothing without the effect {' or '.join(missing)}: leave it out")
+    usual = tuple(name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects))
+    return {"effects": effects, "free": free or usual}

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import click
-
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.tables import example_path, tables_with
@@ -18,7 +16,7 @@ def inversion(
     *,
     noise: Annotated[float | None, Share("a relative error")] = None,
     quality_factor: QualityFactor | None = None,
-    example: bool = False,
+    example: bool = False,  # noqa: ARG001 (the row says that it stands for a table)
 ) -> Output:
     """Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
 
@@ -34,8 +32,6 @@ def inversion(
         quality_factor: instead of the table's; '40 +- 2', or none: no air damping.
         example: invert the bundled table instead of a file.
     """
-    if example == (table is not None):
-        raise click.UsageError("give a table to invert, `afm-jax invert TABLE.csv`, or --example for the bundled one")
     (measured,) = tables_with([table or example_path()], noise, quality_factor)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured)

@@ -4,7 +4,6 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import click
 import numpy as np
 
 from afm_jax.apparatus.scene import Scene, drive_of
@@ -41,7 +40,7 @@ def simulation(  # noqa: PLR0913
     heights: Annotated[tuple[float, ...] | None, Course(), "FROM:TO:COUNT"] = None,
     duration_us: Positive | None = None,
     periods: Positive | None = None,
-    harmonics: Annotated[tuple[int, ...], Orders("multiple")] = (1,),
+    harmonics: Annotated[tuple[int, ...], Orders()] = (1,),
     accuracy: Positive = 1e-9,
     samples: Literal["uniform"] | None = None,
     noise: Annotated[float | None, Share("a relative error")] = None,
@@ -76,15 +75,6 @@ def simulation(  # noqa: PLR0913
         noise: with --heights: noise of the amplitudes in curve.csv; else 0.3%.
         phase_noise_deg: with --heights: noise of the lags in curve.csv; else 0.2.
     """
-    if duration_us is not None and periods is not None:
-        raise click.UsageError("--duration-us and --periods say the same: give one of them")
-    if samples and session.out is None:
-        raise click.UsageError("--samples writes a trace: say into which folder by --out DIR")
-    if heights is not None and (duration_us is not None or samples):
-        raise click.UsageError("--heights follows every height until it settles: leave out --duration-us, --samples")
-    for option, value in (("--noise", noise), ("--phase-noise-deg", phase_noise_deg)):
-        if value is not None and heights is None:
-            raise click.UsageError(f"{option} is that of an approach curve: give --heights, too")
     if heights is not None:
         settings = {"longest_periods": periods and math.ceil(periods), "accuracy": accuracy}
         errors = {"noise": noise or NOISE, "phase_noise_deg": phase_noise_deg or PHASE_NOISE_DEG}

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import click
 
-from afm_jax.words import cut_short, value_and_error
+from afm_jax.words import value_and_error
 from fitting.parameters import MODELS
 
 _MOST_NUMBERS = 1_000_000
@@ -20,11 +20,10 @@ class ValueKind(click.ParamType):
     """A kind of value; each defines how its text is read.
 
     Attributes:
-        wanted: what every message begins with.
         advice: what every message ends with.
     """
 
-    wanted = advice = ""
+    advice = ""
 
     def read(self, text: str) -> Any:
         """Return the value that a text says.
@@ -43,7 +42,7 @@ class ValueKind(click.ParamType):
         try:
             return self.read(value) if isinstance(value, str) else value
         except ValueError as error:
-            self.fail(f"{self.wanted}{error}{self.advice}", param, ctx)
+            self.fail(f"{error}{self.advice}", param, ctx)
 
 
 class Finite(ValueKind):
@@ -57,11 +56,7 @@ class Finite(ValueKind):
 
     def read(self, text: str) -> float:
         """Return the number that a text says."""
-        number = _number_or_nan(text)
-        if not (number > 0.0 if self.positive else math.isfinite(number)):
-            wanted = "positive" if self.positive else "finite"
-            raise ValueError(f"must be a {wanted} number, but is {cut_short(text, 60)}")
-        return number
+        return _number(text, "value", positive=self.positive)
 
 
 class Numbers(ValueKind):
@@ -73,38 +68,33 @@ class Numbers(ValueKind):
 
     name = "numbers"
 
-    def __init__(self, what: str = "number", *, positive: bool = True, example: str = "1,2,5"):
-        """Say what the numbers are, one of them in a word, and whether they must be positive."""
-        self.what, self.positive = what, positive
-        self.wanted = "must hold positive numbers: " if positive else ""
-        self.advice = f"; write {example} or start:stop:step"
+    advice = "; write 1,2,5 or start:stop:step"
+
+    def __init__(self, *, positive: bool = True):
+        """Say whether they must be positive."""
+        self.positive = positive
 
     def read(self, text: str) -> tuple[float, ...]:
         """Return the numbers in their order."""
         if not text.strip():
-            raise ValueError(f"names no {self.what}")
+            raise ValueError("names no number")
         numbers: list[float] = []
         for part in text.split(","):
-            numbers += self._range(part) if ":" in part else [_number(part, self.what, positive=self.positive)]
-            if len(numbers) > _MOST_NUMBERS:
-                raise ValueError(f"names more than {_MOST_NUMBERS} {self.what}s")
+            numbers += self._range(part) if ":" in part else [_number(part, "number", positive=self.positive)]
         return tuple(numbers)
 
     def _range(self, part: str) -> list[float]:
         ends = part.split(":")
         if len(ends) != 3:
             raise ValueError(f"`{part.strip()}` is no range")
-        start, stop = (
-            _number(ends[0], "start", positive=self.positive),
-            _number(ends[1], "stop", positive=self.positive),
-        )
+        start, stop = (_number(end, "end", positive=self.positive) for end in ends[:2])
         step = _number(ends[2], "step", positive=True)
         if stop < start:
             raise ValueError(f"`{part.strip()}` ends below its start")
         # a hair more than the quotient, so that rounding does not cost the stop
         steps = (stop - start) / step * (1.0 + 1e-12) + 1e-9
         if steps > _MOST_NUMBERS:
-            raise ValueError(f"`{part.strip()}` has more than {_MOST_NUMBERS} {self.what}s")
+            raise ValueError(f"`{part.strip()}` has more than {_MOST_NUMBERS} numbers")
         # rounded to what was meant: 0.97 + 3 * 0.01 is 1
         return [float(f"{start + step * index:.12g}") for index in range(math.floor(steps) + 1)]
 
@@ -119,10 +109,6 @@ class Orders(ValueKind):
     name = "orders"
     advice = "; write 1,2 or 1-4"
 
-    def __init__(self, what: str = "order"):
-        """Say what one of the numbers is."""
-        self.what = what
-
     def read(self, text: str) -> tuple[int, ...]:
         """Return the orders, without repetitions."""
         orders: list[int] = []
@@ -130,7 +116,7 @@ class Orders(ValueKind):
             ends = re.fullmatch(r"\s*([0-9]{1,3})\s*(?:-\s*([0-9]{1,3})\s*)?", part)
             low, high = (0, 0) if ends is None else (int(ends[1]), int(ends[2] or ends[1]))
             if not 1 <= low <= high:
-                raise ValueError(f"`{part.strip()}` is no {self.what}")
+                raise ValueError(f"`{part.strip()}` is no positive whole number")
             orders += range(low, high + 1)
         return tuple(dict.fromkeys(orders))
 
@@ -147,10 +133,8 @@ class Ends(ValueKind):
 
     def read(self, text: str) -> tuple[float, float]:
         """Return the two numbers."""
-        ends = text.split(":")
-        if len(ends) != 2:
-            raise ValueError(f"`{text.strip()}` is no range")
-        low, high = _number(ends[0], "lower end", positive=True), _number(ends[1], "upper end", positive=True)
+        lower, _, upper = text.partition(":")
+        low, high = (_number(end, "end", positive=True) for end in (lower, upper))
         if high <= low:
             raise ValueError(f"`{text.strip()}` does not rise")
         return low, high
@@ -218,11 +202,10 @@ class Course(ValueKind):
     def read(self, text: str) -> tuple[float, ...]:
         """Return the numbers, both ends among them."""
         parts = re.fullmatch(r"([^:]+):([^:]+):([0-9]{1,4})", text)
-        first, last = (_number_or_nan(parts[1]), _number_or_nan(parts[2])) if parts else (math.nan, math.nan)
-        count = int(parts[3]) if parts else 0
-        if not (math.isfinite(first) and math.isfinite(last)) or first == last or count < 2:
-            raise ValueError(f"must be from:to:count as in -50:-4:24, but is {cut_short(text, 60)}")
-        return tuple(first + (last - first) * index / (count - 1) for index in range(count))
+        first, last, count = (_number(part, "part", positive=False) for part in parts.groups()) if parts else (0, 0, 0)
+        if first == last or count < 2:
+            raise ValueError(f"must be from:to:count as in -50:-4:24, but is {text}")
+        return tuple(first + (last - first) * index / (count - 1) for index in range(int(count)))
 
 
 class Fixed(ValueKind):

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -68,7 +68,7 @@ class LawRow(NamedTuple):
 
 
 @compiled_quickly(static_argnames=("max_contacts", "reverse"))
-def follow_law(
+def follow_law(  # noqa: PLR0913
     scene: Scene,
     surface: Platform | Surface,
     response: Surface | None,
@@ -76,6 +76,7 @@ def follow_law(
     until: Float[Array, ""],
     *,
     max_contacts: int,
+    tolerance: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
     reverse: bool = False,
 ) -> Simulation:
     """Return a scene with an impact law followed in time.
@@ -94,6 +95,7 @@ def follow_law(
             an impact at speed 0.
         until: time of the end in us.
         max_contacts: rows for contacts.
+        tolerance: of the times of impacts, in us.
         reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
 
     Raises:
@@ -108,7 +110,8 @@ def follow_law(
     no_row, begun = LawRow(*[jnp.zeros_like(gap)] * len(LawRow._fields)), jnp.int32(MotionOutcome.FINISHED)
     course = FollowedTip.begun(departure, no_row, begun, rows=max_contacts)
     # one more, which finds no room
-    course = follow_rounds(partial(_one_flight, seen, until), course, rounds=max_contacts + 1, reverse=reverse)
+    search = Search(_FLIGHT_STEPS, jnp.asarray(tolerance, until.dtype), until, from_above=True)
+    course = follow_rounds(partial(_one_flight, seen, search), course, rounds=max_contacts + 1, reverse=reverse)
     row, no_gap = LawRow(*course.rows.T), jnp.zeros(max_contacts)
     arrival, departure = State(row.arrival_us, no_gap, -row.approach), State(row.departure_us, no_gap, row.rebound)
     lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
@@ -122,10 +125,10 @@ def follow_law(
     )
 
 
-def _one_flight(seen: Scene, until: Array, course: FollowedTip) -> FollowedTip:
+def _one_flight(seen: Scene, search: Search, course: FollowedTip) -> FollowedTip:
     """Return a tip after a flight, its impact and the rest that follows, with its row; as it was where it has ended."""
-    departure, flies = course.tip, ~course.done
-    impact = impact_after(seen, departure, Search(_FLIGHT_STEPS, until_us=until, from_above=True), flies=flies)
+    departure, flies, until = course.tip, ~course.done, search.until_us
+    impact = impact_after(seen, departure, search, flies=flies)
     impact = where(course.contacts == 0, or_rest(seen, departure, impact), impact)
     ended = impact.outcome
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)

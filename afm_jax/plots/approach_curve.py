@@ -1,7 +1,5 @@
 """Picture of an approach curve: amplitude and lag against the sample's height, approach and retract."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -57,12 +55,6 @@ def _draw(axes: Axes, curve: ApproachCurve, values: np.ndarray) -> None:
                 (~read, np.full(np.count_nonzero(~read), 0.04), axes.get_xaxis_transform()),
             ):
                 if part.any():
-                    style: dict[str, Any] = {
-                        "color": DARK,
-                        "ms": 6,
-                        "mfc": "none",
-                        "transform": transform,
-                        "label": label,
-                    }
-                    axes.plot(curve.height_nm[those][part], height, marker, ls="", **style)
-                    label = None  # noqa: PLW2901
+                    (marks,) = axes.plot(curve.height_nm[those][part], height, marker, transform=transform)
+                    marks.set(linestyle="", color=DARK, markersize=6, markerfacecolor="none", label=label)
+                    label = ""  # noqa: PLW2901

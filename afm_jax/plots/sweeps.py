@@ -1,6 +1,5 @@
 """Pictures of sweeps of one or two axes: lines, planes, or points where the values are random; drawn by xarray."""
 
-import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,6 @@ from matplotlib.figure import Figure
 
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import label_axes, new_figure
-from afm_jax.studies.sweep import dimension_of
 
 if TYPE_CHECKING:
     import xarray
@@ -46,19 +44,16 @@ def sweep_figure(found: "xarray.Dataset", names: Sequence[str]) -> Figure:
     for column, name in enumerate(names):
         for row, panel in enumerate(panels[:, column]):
             if row < len(layers[name]):
-                _draw(panel, layers[name][row], name, plane if is_plane else plane[:1], _logarithmic(found))
+                _draw(panel, layers[name][row], name, plane if is_plane else plane[:1])
             else:
                 panel.set_visible(False)
     return figure
 
 
-def _logarithmic(found: "xarray.Dataset") -> list[str]:
-    """Return the names of parameters that are spread logarithmically."""
-    names: list[str] = []
-    for axis in json.loads(found.attrs["input"])["axes"]:
-        names += [axis["parameter"]] if "log" in axis else []
-        names += [name for name, ends in axis.get("random", {}).items() if isinstance(ends, dict)]
-    return [dimension_of(name) for name in names]
+def _is_geometric(values: np.ndarray) -> bool:
+    """Say whether values have equal ratios; few values, and those at equal distances, have none to speak of."""
+    values = np.unique(values)
+    return bool(values.size > 2 and values[0] > 0.0 and np.ptp(np.diff(np.log(values))) < 1e-6)
 
 
 def _layers(found: "xarray.Dataset", axes: Sequence[str]) -> "list[xarray.Dataset]":
@@ -66,20 +61,18 @@ def _layers(found: "xarray.Dataset", axes: Sequence[str]) -> "list[xarray.Datase
     further = next((name for name in found.dims if name not in axes), None)
     if further is None:
         return [found]
-    values = found[further].values
-    if np.issubdtype(values.dtype, np.floating) and np.all(values == np.round(values)):
-        # titles say order = 1, not 1.0
-        found = found.assign_coords({further: values.astype(int)})
     return [found.isel({further: place}) for place in range(min(found.sizes[further], _MOST_ROWS))]
 
 
-def _draw(panel: Axes, found: "xarray.Dataset", name: str, swept: Sequence[str], log: Sequence[str]) -> None:
+def _draw(panel: Axes, found: "xarray.Dataset", name: str, swept: Sequence[str]) -> None:
     """Draw one variable against a parameter, or over two of them: cells of a grid, or points."""
     x, *others = swept
     labels = [label_of(found[each].attrs["parameter"]) for each in swept] + [label_of(name)]
     # cells have neighbours
     on_axes = all(found.sizes.get(each, 1) > 1 for each in swept)
-    scales: Any = {f"{side}scale": "log" for side, each in zip("xy", swept, strict=False) if each in log}
+    scales: Any = {
+        f"{side}scale": "log" for side, each in zip("xy", swept, strict=False) if _is_geometric(found[each].values)
+    }
     colours: Any = {"cmap": "cividis", "cbar_kwargs": {"label": labels[-1]}}
     if not others:
         found[name].plot.line(ax=panel, x=x, marker=".", ms=3.0, lw=0.8 if on_axes else 0.0)

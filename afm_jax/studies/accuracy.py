@@ -13,7 +13,8 @@ Runs in a process of its own on one core (`afm_jax.studies.timing.run_in_own_pro
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -26,26 +27,24 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 from scipy.integrate import solve_ivp
 
-from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.apparatus.surface import surface_of
 from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip
+from afm_jax.contact.driven import ContactState, driven_by, free_tip
 from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.contact.parameters import PAPER
 from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting, Setting
 from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.lasting_impact import speeds_of_impact
 from afm_jax.impact.law import Law
-from afm_jax.impact.map import Departure, Search, follow_impacts, impact_after, iterate_map
+from afm_jax.impact.map import iterate_map
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.contact_motion import follow_contacts
+from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import ContactKind, State, to_gap
 from afm_jax.motion.start import start_of
-from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.scenefile import load_scene, read_scene
 from afm_jax.studies.timing import compiled_for, progress, time_compiled
 
@@ -90,17 +89,17 @@ class EquationOfMotion(eqx.Module):
         spans: whether there is a bridge between flight and junction.
     """
 
-    cantilever: Cantilever | None = None
-    surface: Platform | Surface | None = None
-    law: Law | None = None
-    driven: Driven | None = None
+    cantilever: Any = None
+    surface: Any = None
+    law: Any = None
+    driven: Any = None
     spans: bool = eqx.field(static=True, default=True)
 
     def rates(self, phase: Any, x: Any, rate: Any, time_us: Any) -> tuple[Array, Array, Array]:
         """Return the rates of gap (or s), gap rate and time by the time (in the junction: fictitious time)."""
         state = ContactState(x, rate, time_us, jnp.zeros_like(x))
         found = (x, x, x) if self.driven is None else self.driven.rates(state, jnp.asarray(phase == Phase.JUNCTION))[:3]
-        if self.cantilever is None or self.surface is None:
+        if self.cantilever is None:
             return found
         height, speed = self.surface.position_and_velocity(time_us)
         pull = self.cantilever.acceleration(x + height, rate + speed) - self.surface.acceleration(time_us)
@@ -120,9 +119,6 @@ class EquationOfMotion(eqx.Module):
     def after(self, tip: Tip, risen: Bool[Array, ""]) -> Tip:
         """Return what follows the end of a phase; the rate of a tip that a law captures is NaN."""
         if self.driven is None:
-            assert self.law is not None  # a law or a contact  # noqa: S101
-            assert self.cantilever is not None  # noqa: S101
-            assert self.surface is not None  # noqa: S101
             speeds = speeds_of_impact(self.law, -tip.rate, tip.time_us, self.cantilever, self.surface)
             rebound = jnp.where(speeds.rebound > 0.0, speeds.rebound, jnp.nan)
             leaves = tip.time_us + speeds.delay
@@ -143,42 +139,58 @@ class EquationOfMotion(eqx.Module):
         )
 
 
-class AccuracyProblem(NamedTuple):
+@dataclass(frozen=True)
+class AccuracyProblem:
     """A value of some tips as a function of parameters; the study gives errors of value and gradient.
 
     Attributes:
         what: the value in words, with its unit.
-        relative: whether the error of the value is relative.
         at: the parameters.
         solve: from a setting and the parameters the values.
         settings: by their names; numbers are arguments of one program, others shape theirs.
         reference: what errors are taken against, in words.
-        exact: values, and slopes by the parameters, of the reference.
-        doubt: the reference's own errors of value and gradient.
+        finest: its setting, and a coarser one that shows how far it is converged.
         begin: from the parameters the motion and the tips that rivals follow.
         crossings: how far they follow them, and of the last tip...
         read: ...what the value is.
         events: impacts or contacts of a tip.
+        relative: whether the error of the value is relative.
         options: of the compiler, as users' programs have them.
     """
 
     what: str
-    relative: bool
     at: Parameters
     solve: Callable[[Any, Parameters], Values]
     settings: Mapping[str, Any]
     reference: str
-    exact: tuple[Values, Slopes]
-    doubt: tuple[float, float]
+    finest: tuple[Any, Any]
     begin: Callable[[Parameters], tuple[EquationOfMotion, Tip]]
     crossings: int
     read: Callable[[Tip], Any]
     events: int = 1
+    relative: bool = False
     options: dict[str, Any] | None = None
+
+    @cached_property
+    def exact(self) -> tuple[Values, Slopes]:
+        """Values, and slopes by the parameters, of the reference."""
+        return self._with_slopes(self.finest[0])
+
+    @cached_property
+    def doubt(self) -> tuple[float, float]:
+        """The reference's own errors of value and gradient."""
+        return self.errors(*self._with_slopes(self.finest[1]))
+
+    def _with_slopes(self, setting: Any) -> tuple[Values, Slopes]:
+        """Return values and slopes, by programs that compile quickly: they are not timed."""
+        value = partial(self.solve, setting)
+        both = [compiled_for(each, self.at, options=quick_options(0)) for each in (value, jax.jacfwd(value))]
+        values, slopes = (np.asarray(each.run(self.at)) for each in both)
+        return values, slopes
 
     def errors(self, values: Any, slopes: Any, tips: Any = slice(None)) -> tuple[float, float]:
         """Return the largest errors of value and gradient; of a slope relative to its largest among the tips."""
-        exact, exact_slopes = (np.asarray(part)[tips] for part in self.exact)
+        exact, exact_slopes = (part[tips] for part in self.exact)
         scale = np.abs(exact) if self.relative else 1.0
         size = np.max(np.abs(exact_slopes), axis=0)
         value = np.max(np.abs(np.asarray(values) - exact) / scale)
@@ -248,7 +260,7 @@ def _compiled_rows(
 
 def _longest_step(motion: EquationOfMotion, phase: Any) -> Array:
     """Return the longest step in us that sees every end of a flight; infinite in contact."""
-    if motion.surface is None or motion.cantilever is None:
+    if motion.cantilever is None:
         return jnp.asarray(jnp.inf)
     fastest = jnp.maximum(motion.surface.fastest_angular_frequency, motion.cantilever.angular_frequency)
     return jnp.where(phase == Phase.DRY, 2.0 * jnp.pi / fastest / _STEPS_A_PERIOD, jnp.inf)
@@ -260,21 +272,11 @@ def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters
 
     def phase_of(tip: Tip) -> Tip:
         down, up = motion.levels(tip.phase)
-
-        def falls(t: Any, y: Any, args: Any, **extra: Any) -> Any:
-            del t, args, extra
-            return y[0] - down
-
-        def rises(t: Any, y: Any, args: Any, **extra: Any) -> Any:
-            del t, args, extra
-            return y[0] - up
-
-        def rates(t: Any, y: Any, args: Any) -> Any:
-            del t, args
-            return motion.rates(tip.phase, *y)
-
+        # called by position or by these names
+        falls: Any = lambda t, y, args, **_: y[0] - down  # noqa: ARG005, E731
+        rises: Any = lambda t, y, args, **_: y[0] - up  # noqa: ARG005, E731
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(rates),
+            diffrax.ODETerm(lambda _, y, __: motion.rates(tip.phase, *y)),
             diffrax.Dopri8(),
             0.0,
             jnp.where(tip.phase == Phase.DRY, _LONGEST_US, _LONGEST_TOUCH_US),
@@ -370,8 +372,6 @@ class ScipyPrograms:
 def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
     """Return Omega^2, Omega/Q, the longest step, offset and ramp of the surface, and its cosines as rows."""
     cantilever, surface = motion.cantilever, motion.surface
-    assert cantilever is not None  # it flies  # noqa: S101
-    assert surface is not None  # noqa: S101
     waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in surface.waves])
     own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, Phase.DRY)
     return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
@@ -409,8 +409,6 @@ def _touched_by_scipy(
     rates, (down, up) = programs.rates[Phase(int(tip.phase))], levels
     ends: list[Any] = [lambda _, y: y[0] - down]
     ends += [lambda _, y: y[0] - up] if math.isfinite(up) else []
-    for event, direction in zip(ends, (-1.0, 1.0), strict=False):
-        vars(event).update(terminal=True, direction=direction)
     state = [float(tip.x), float(tip.rate), float(tip.time_us)]
     met, _, (_, rate, now) = _to_event(lambda _, y: np.asarray(rates(vector, y)), state, ends, tolerance)
     return np.asarray(met == 1), tip._replace(rate=np.asarray(rate), time_us=np.asarray(now))
@@ -437,7 +435,6 @@ def _flown_by_scipy(
     def rates(_: float, y: Any) -> tuple[float, float]:
         return y[1], -square * y[0] - friction * y[1]
 
-    vars(gap).update(terminal=True, direction=-1.0)
     state = [float(tip.x) + height(start), float(tip.rate) + speed(start)]
     _, flown, (_, velocity) = _to_event(rates, state, [gap], tolerance, (_LONGEST_US, longest))
     rate = velocity - speed(start + flown)
@@ -453,9 +450,13 @@ def _to_event(
 ) -> tuple[int, float, np.ndarray]:
     """Return which event ends a phase, when, and the state there; `longest` are the phase's length and its steps'.
 
+    The first of the events is a fall through 0, the second a rise.
+
     Raises:
         ValueError: if none does.
     """
+    for event, direction in zip(events, (-1.0, 1.0), strict=False):
+        vars(event).update(terminal=True, direction=direction)
     # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
     with np.errstate(all="ignore"):
         path = solve_ivp(
@@ -501,22 +502,17 @@ def impact_times(tips: int) -> AccuracyProblem:
         motion = EquationOfMotion(scene.cantilever, scene.platform, scene.interaction)
         return motion, tips_at(Phase.DRY, jnp.zeros_like(rate), rate, now)
 
-    at = jnp.zeros(2)
-    exact, coarser = (_value_and_slopes(partial(solve, each), at) for each in _FINEST_US)
-    problem = AccuracyProblem(
+    return AccuracyProblem(
         what="time of the next impact (us)",
-        relative=False,
-        at=at,
+        at=jnp.zeros(2),
         solve=solve,
         settings={f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US},
         reference="root tolerance 1e-15 us",
-        exact=exact,
-        doubt=(0.0, 0.0),
+        finest=_FINEST_US,
         begin=begin,
         crossings=1,
         read=lambda tip: tip.arrived_us,
     )
-    return problem._replace(doubt=problem.errors(*coarser))
 
 
 def tips_at(phase: Phase, x: Any, rate: Any, now: Any) -> Tip:
@@ -550,12 +546,10 @@ def rebound_speeds(tips: int) -> AccuracyProblem:
         rate = -speeds * jnp.exp(parameters[0])
         return EquationOfMotion(driven=driven), tips_at(Phase.BRIDGE, driven.forms_nm, rate, 0.0)
 
-    at = jnp.zeros(2)
-    exact, coarser = (_value_and_slopes(partial(solve, setting), at) for setting in _QUADRATURES)
-    problem = AccuracyProblem(
+    return AccuracyProblem(
         what="rebound speed (relative)",
         relative=True,
-        at=at,
+        at=jnp.zeros(2),
         solve=solve,
         settings={
             f"{method}, accuracy {level:g}": setting
@@ -563,26 +557,15 @@ def rebound_speeds(tips: int) -> AccuracyProblem:
             for level, setting in levels.items()
         },
         reference="a quadrature converged to rounding",
-        exact=exact,
-        doubt=(0.0, 0.0),
+        finest=_QUADRATURES,
         begin=begin,
         crossings=1,
         read=lambda tip: tip.rate,
     )
-    return problem._replace(doubt=problem.errors(*coarser))
-
-
-def _value_and_slopes(function: Callable[[Parameters], Values], at: Parameters) -> tuple[Values, Slopes]:
-    """Return values and slopes, by programs that compile quickly: they are not timed."""
-    options = quick_options(0)
-    both = [compiled_for(each, at, options=options).run(at) for each in (function, jax.jacfwd(function))]
-    return np.asarray(both[0]), np.asarray(both[1])
 
 
 IN_TIME = (DrivenSetting(None, 12.0, 400), DrivenSetting(None, 9.0, 300))
 """References of contacts in time, in fine steps: the better one first."""
-_BEYOND_US = 1e-3
-_FLIGHT_STEPS = 100_000
 
 
 def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
@@ -591,94 +574,70 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     Raises:
         ValueError: if the tip is free, or has fewer contacts.
     """
-    read = read_scene(name)
-    scene = read.scene
+    scene, begins, _ = read_scene(name)
     if scene.interaction is None:
         raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")
-    start = start_of(scene, read.start)
-    world = surface_of(scene)
+    start, world = start_of(scene, begins), surface_of(scene)
     surface = world[0]
-    law, driven, spans = None, None, True
     if isinstance(scene.interaction, Law):
-        law = scene.interaction
-        arrival = partial(law_arrival, scene, world, contacts)
+        motion = EquationOfMotion(scene.cantilever, surface, scene.interaction)
         settings: Mapping[str, Any] = {f"root tolerance {each:g} us": each for each in _ROOT_TOLERANCES_US}
-        references, reference = _FINEST_US, "root tolerance 1e-15 us"
+        # the coarsest of them may be as late
+        finest, reference, beyond_us = _FINEST_US, "root tolerance 1e-15 us", 2.0 * _ROOT_TOLERANCES_US[0]
     else:
-        driven, spans = driven_by(scene.interaction, scene.cantilever, surface), scene.interaction.spans
-        longest = start.time_us + _LONGEST_US * contacts
-        followed = follow_contacts(scene, *world, start, longest, max_contacts=contacts, setting=IN_TIME[0])
-        # no longer than until the last of them has left
-        until = followed.contacts.departure_time_us[contacts - 1] + _BEYOND_US
-        until = jnp.where(jnp.isfinite(until), until, start.time_us)
-        arrival = partial(contact_arrival, scene, world, contacts, until)
+        driven = driven_by(scene.interaction, scene.cantilever, surface)
+        motion = EquationOfMotion(scene.cantilever, surface, None, driven, scene.interaction.spans)
         settings = {f"accuracy {level:g}": setting for level, setting in DRIVEN_SETTINGS.items()}
-        references, reference = IN_TIME, "every contact in time, in fine steps"
+        finest, reference, beyond_us = IN_TIME, "every contact in time, in fine steps", 1e-3
+    left = times_of_contact(scene, contacts, start.time_us + _LONGEST_US * contacts, finest[0], start)[1]
+    # no longer than until the last of them has left
+    until = jnp.where(jnp.isfinite(left), left + beyond_us, start.time_us)
+
+    def moved(parameters: Parameters) -> State:
+        return start._replace(velocity_nm_per_us=start.velocity_nm_per_us + parameters[0])
 
     def solve(setting: Any, parameters: Parameters) -> Values:
-        return arrival(setting, start._replace(velocity_nm_per_us=start.velocity_nm_per_us + parameters[0]))[None]
+        return times_of_contact(scene, contacts, until, setting, moved(parameters))[:1]
 
     def begin(parameters: Parameters) -> tuple[EquationOfMotion, Tip]:
-        faster = start._replace(velocity_nm_per_us=start.velocity_nm_per_us + parameters[0])
-        gap, rate = _gap_of(world, faster)
-        motion = EquationOfMotion(scene.cantilever, surface, law, driven, spans)
-        return motion, tips_at(Phase.DRY, gap[None], rate[None], faster.time_us)
+        gap, rate = to_gap(*world, moved(parameters))
+        # a start on the surface but for rounding lies on it
+        return motion, tips_at(Phase.DRY, jnp.where(jnp.abs(gap) < 1e-9, 0.0, gap)[None], rate[None], start.time_us)
 
-    at = jnp.zeros(1)
-    exact, coarser = (_value_and_slopes(partial(solve, setting), at) for setting in references)
-    if not np.isfinite(exact[0]).all():
-        raise ValueError(
-            f"{name}: the tip has not as many as {contacts} contacts before it is held or flies on: lower "
-            "`contacts=...`, or start elsewhere"
-        )
     problem = AccuracyProblem(
         what=f"arrival of contact {contacts} (us)",
-        relative=False,
-        at=at,
+        at=jnp.zeros(1),
         solve=solve,
         settings=settings,
         reference=reference,
-        exact=exact,
-        doubt=(0.0, 0.0),
+        finest=finest,
         begin=begin,
         crossings=2 * contacts - 1,
         read=lambda tip: tip.arrived_us,
         events=contacts,
         options=quick_options(),
     )
-    return problem._replace(doubt=problem.errors(*coarser))
+    if not np.isfinite(problem.exact[0]).all():
+        raise ValueError(
+            f"{name}: the tip has not as many as {contacts} contacts before it is held or flies on: lower "
+            "`contacts=...`, or start elsewhere"
+        )
+    return problem
 
 
-World = tuple[Platform | Surface, Surface | None]
-"""The surface that the free tip sees, and its steady response to base and force."""
+def times_of_contact(scene: Scene, number: int, until: Any, setting: Any, start: State) -> Float[Array, "2"]:
+    """Return arrival and departure in us at one of the contacts of a tip; NaN if it has not left again by a time.
 
-
-def _gap_of(world: World, start: State) -> tuple[Array, Array]:
-    """Return gap and gap rate of a start; one that lies on the surface but for rounding lies on it."""
-    gap, rate = to_gap(*world, start)
-    return jnp.where(jnp.abs(gap) < 1e-9, 0.0, gap), rate
-
-
-def law_arrival(scene: Scene, world: World, contacts: int, tolerance: Any, start: State) -> Array:
-    """Return when a tip arrives at an impact with a law; NaN if it is captured, or flies on, before."""
-    surface = world[0]
-    seen = eqx.tree_at(lambda parts: parts.platform, scene, surface)
-    gap, rate = _gap_of(world, start)
-    leaving = Departure(start.time_us, gap, rate + surface.velocity(start.time_us))
-    first = impact_after(seen, leaving, Search(_FLIGHT_STEPS, tolerance, from_above=True))
-    good, arrived = first.outcome == Outcome.IMPACT, first.arrival_time_us
-    if contacts > 1:
-        after = Departure(first.time_us, None, first.velocity_after_nm_per_us)
-        finest = jnp.asarray(tolerance)
-        rows = follow_impacts(seen, after, finest, impacts=contacts - 1, max_steps=_FLIGHT_STEPS)
-        good, arrived = jnp.all(rows.outcome[:-1] == Outcome.IMPACT) & good, rows.arrival_time_us[-1]
-    return jnp.where(good & jnp.isfinite(arrived), arrived, jnp.nan)
-
-
-def contact_arrival(
-    scene: Scene, world: World, contacts: int, until: Array, setting: DrivenSetting, start: State
-) -> Array:
-    """Return when a tip arrives at a resolved contact; NaN if it has not left it again by a time."""
-    found = follow_contacts(scene, *world, start, until, max_contacts=contacts, setting=setting).contacts
-    left = found.kind[contacts - 1] == ContactKind.IMPACT
-    return jnp.where(left, found.arrival_time_us[contacts - 1], jnp.nan)
+    Args:
+        scene: with a law or a contact.
+        number: of the contact, from 1.
+        until: the time, in us.
+        setting: of a law the root tolerance in us, of a contact how finely it is resolved.
+        start: of the tip.
+    """
+    follow = partial(follow_law, tolerance=setting)
+    if not isinstance(scene.interaction, Law):
+        follow = partial(follow_contacts, setting=setting)
+    found = follow(scene, *surface_of(scene), start, jnp.asarray(until), max_contacts=number).contacts
+    times = jnp.stack([found.arrival_time_us[number - 1], found.departure_time_us[number - 1]])
+    return jnp.where(found.kind[number - 1] == ContactKind.IMPACT, times, jnp.nan)

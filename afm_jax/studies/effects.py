@@ -6,9 +6,10 @@ full scene is. What the two readings differ by is what the effect changes; what 
 it costs.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -49,10 +50,16 @@ class SceneEffect(NamedTuple):
     """One effect of a scene."""
 
     name: str
-    without: Callable[[Scene], Scene]
-    """The scene without it; nothing of it is left in the compiled program, unless it is a number of the impact law."""
+    path: str
+    """Of the part of a scene that it is, or is in."""
+    neutral: Callable[[Scene], Any]
+    """What stands there without it; nothing of it is left in the program, unless it is a number of the impact law."""
     required: str | None = None
     """Why the scene cannot do without it; None: it can be left out."""
+
+    def without(self, scene: Scene) -> Scene:
+        """Return a scene without this effect."""
+        return eqx.tree_at(attrgetter(self.path), scene, self.neutral(scene), is_leaf=lambda leaf: leaf is None)
 
 
 _OF_LAWS = {"restitution": ("r", 1.0), "adhesion": ("epsilon", 0.0), "viscous_loss": ("viscous_loss", 0.0)}
@@ -62,62 +69,54 @@ _AMPLITUDES = {"platform": "amplitude_nm", "base": "amplitude_nm", "force": "amp
 
 def effects_in(scene: Scene) -> list[SceneEffect]:
     """Return all effects that a scene has: those of its interaction first, then the air, then how it is driven."""
-    interaction = scene.interaction
-    effects: list[SceneEffect] = []
-    if isinstance(interaction, Contact):
-        effects += map(_of_contact, interaction.effects)
-    elif isinstance(interaction, ImpactLaw):
-        for name, (number, neutral) in _OF_LAWS.items():
-            effects.append(SceneEffect(name, _putting(jnp.asarray(neutral), "interaction", number)))
-        if interaction.delay is not None:
-            effects.append(SceneEffect("delay", _putting(None, "interaction", "delay")))
-        if interaction.lasts:
-            effects.append(SceneEffect("delay_corrections", _without_corrections))
+    effects = _of_interaction(scene.interaction)
     if scene.cantilever.quality_factor is not None:
-        effects.append(SceneEffect("air_damping", _putting(None, "cantilever", "quality_factor")))
-    return effects + list(_of_drives(scene))
-
-
-def _putting(value: Any, *path: str) -> Callable[[Scene], Scene]:
-    """Return the function that puts something in the place of a part of a scene, which may be None there."""
-
-    def part(scene: Any) -> Any:
-        for name in path:
-            scene = getattr(scene, name)
-        return scene
-
-    return lambda scene: eqx.tree_at(part, scene, value, is_leaf=lambda leaf: leaf is None)
-
-
-def _of_contact(name: str) -> SceneEffect:
-    def without(scene: Scene) -> Scene:
-        terms = scene.interaction.forces.terms
-        # forces are the first of the effects, in their order
-        kept = tuple(term for term, own in zip(terms, scene.interaction.effects, strict=False) if own != name)
-        return eqx.tree_at(lambda one: one.interaction.forces.terms, scene, kept)
-
-    return SceneEffect(name, without, WHY_REQUIRED.get(name))
-
-
-def _without_corrections(scene: Scene) -> Scene:
-    """Return a scene with nothing that moving sample, spring and air change while an impact lasts."""
-    delay = scene.interaction.delay
-    return scene if delay is None else _putting(replace(delay, corrections=False), "interaction", "delay")(scene)
-
-
-def _of_drives(scene: Scene) -> Iterator[SceneEffect]:
-    """Yield the ramp, second frequencies, and the drives of base and tip."""
+        effects.append(_putting("air_damping", "cantilever.quality_factor"))
     if scene.platform.offset_rate_nm_per_us != 0.0:
-        yield SceneEffect("ramp", _putting(jnp.asarray(0.0), "platform", "offset_rate_nm_per_us"))
+        effects.append(_putting("ramp", "platform.offset_rate_nm_per_us", 0.0))
     driven = {name: getattr(scene, name) for name in _AMPLITUDES if getattr(scene, name) is not None}
     moving = [name for name, drive in driven.items() if getattr(drive, _AMPLITUDES[name]) != 0.0]
     for name, drive in driven.items():
+        own = "" if name == "platform" else f"{name}_"
         if drive.second is not None:
-            own = "second_frequency" if name == "platform" else f"{name}_second_frequency"
-            yield SceneEffect(own, _putting(None, name, "second"))
-        if name != "platform":
+            effects.append(_putting(f"{own}second_frequency", f"{name}.second"))
+        if own:
             only = "it is the scene's only drive" if moving == [name] else None
-            yield SceneEffect(f"{name}_drive", _putting(None, name), only)
+            effects.append(_putting(f"{own}drive", name)._replace(required=only))
+    return effects
+
+
+def _of_interaction(interaction: Any) -> list[SceneEffect]:
+    if isinstance(interaction, Contact):
+        terms = "interaction.forces.terms"
+        return [
+            SceneEffect(name, terms, partial(_terms_without, name), WHY_REQUIRED.get(name))
+            for name in interaction.effects
+        ]
+    if not isinstance(interaction, ImpactLaw):
+        return []
+    effects = [_putting(name, f"interaction.{number}", neutral) for name, (number, neutral) in _OF_LAWS.items()]
+    if interaction.delay is not None:
+        effects.append(_putting("delay", "interaction.delay"))
+    if interaction.lasts:
+        effects.append(SceneEffect("delay_corrections", "interaction.delay", _plain_delay))
+    return effects
+
+
+def _putting(name: str, path: str, number: float | None = None) -> SceneEffect:
+    """Return an effect in whose place there is nothing, or a number."""
+    return SceneEffect(name, path, lambda _: None if number is None else jnp.asarray(number))
+
+
+def _terms_without(name: str, scene: Scene) -> tuple[Any, ...]:
+    """Return the forces of a scene's contact without one of them; they are the first of its effects, in their order."""
+    named = zip(scene.interaction.forces.terms, scene.interaction.effects, strict=False)
+    return tuple(term for term, effect in named if effect != name)
+
+
+def _plain_delay(scene: Scene) -> Any:
+    """Return a delay without what moving sample, spring and air change while an impact lasts; None if there is none."""
+    return scene.interaction.delay and replace(scene.interaction.delay, corrections=False)
 
 
 # --- what is compared -------------------------------------------------------------------------------------------------
@@ -172,16 +171,6 @@ class EffectReport(NamedTuple):
     cost: float | None
     """Of the scene without it (see `EffectStudy`); None without a motion to time."""
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        return {
-            "name": self.effect.name,
-            "required": self.effect.required is not None,
-            "change": self.change._asdict(),
-            "reason": self.reason,
-            "time_us_per_period": self.cost,
-        }
-
 
 class Reduction(NamedTuple):
     """What the wanted accuracy of the amplitude does not need."""
@@ -229,7 +218,15 @@ class EffectStudy:
                 "time_us_per_period": self.cost,
             },
             "effects": [
-                {**report.to_dict(), "needed": report.effect.name not in reduction.left_out} for report in self.effects
+                {
+                    "name": report.effect.name,
+                    "required": report.effect.required is not None,
+                    "change": report.change._asdict(),
+                    "reason": report.reason,
+                    "time_us_per_period": report.cost,
+                    "needed": report.effect.name not in reduction.left_out,
+                }
+                for report in self.effects
             ],
             "accuracy": self.accuracy,
             "not_needed": list(reduction.left_out),
@@ -274,11 +271,9 @@ class EffectStudy:
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of effects.csv, a row an effect."""
-        rows = []
-        for effect in self.to_dict()["effects"]:
-            changes = {f"change_{name}": value for name, value in effect.pop("change").items()}
-            rows.append(effect | changes)
-        return {"effects.csv": columns_of(rows)}
+        rows = self.to_dict()["effects"]
+        changes = [{f"change_{name}": value for name, value in row.pop("change").items()} for row in rows]
+        return {"effects.csv": columns_of([row | change for row, change in zip(rows, changes, strict=True)])}
 
 
 def _percent(share: float | None) -> str:

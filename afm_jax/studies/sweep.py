@@ -36,14 +36,14 @@ from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbit
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.starts import sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
-from afm_jax.impact.law import TabulatedLaw, axes_of_one, extrapolation_of, impact_law_of
+from afm_jax.impact.law import TabulatedLaw, extrapolation_of, impact_law_of
 from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import OBSERVABLES, TOO_SHORT, observe
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.results import unit_of
+from afm_jax.results import unit_of, words_of
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     check_ranges,
@@ -89,7 +89,7 @@ class Axis(NamedTuple):
         return len(next(iter(self.columns.values())))
 
 
-def axes_of(given: Sequence[Mapping[str, Any]]) -> tuple[Axis, ...]:
+def axes_of(given: Any) -> tuple[Axis, ...]:
     """Return the axes that tables describe.
 
     >>> axes_of([{"parameter": "interaction.r", "linear": [0.5, 0.9, 5]}])[0].columns["interaction.r"].tolist()
@@ -102,17 +102,16 @@ def axes_of(given: Sequence[Mapping[str, Any]]) -> tuple[Axis, ...]:
     Raises:
         ValueError: if one is no such table, or a parameter changes along two of them.
     """
-    if not given:
-        raise ValueError(f"a sweep needs at least one axis; add [[axes]], as in {_EXAMPLE}")
+    if not given or not isinstance(given, list) or not all(isinstance(table, dict) for table in given):
+        raise ValueError(f"a sweep needs axes, tables written as [[axes]], as in {_EXAMPLE}")
     axes: list[Axis] = []
     for number, table in enumerate(given, 1):
         samples = sum(axis.dimension.startswith("sample") for axis in axes)
         try:
             axes.append(_axis(table, f"sample_{samples + 1}" if samples else "sample"))
-        except (TypeError, ValueError) as error:
+        except ValueError as error:
             raise ValueError(f"axis {number}: {error}") from error
-    names = Counter(name for axis in axes for name in axis.columns)
-    for name, times in names.items():
+    for name, times in Counter(name for axis in axes for name in axis.columns).items():
         if times > 1:
             raise ValueError(f"the parameter {name} changes along two axes: leave one of them out")
     return tuple(axes)
@@ -128,27 +127,25 @@ def _axis(table: Mapping[str, Any], sample: str) -> Axis:
     if len(kinds) != 1:
         raise ValueError(f"has {' and '.join(kinds) or 'no values'}; give one of {', '.join(KINDS)}, as in {_EXAMPLE}")
     kind = kinds[0]
-    keys = (kind, "count", "seed") if kind == "random" else (kind, "parameter")
-    for key in table:
-        if key not in keys:
-            raise ValueError(f"unknown key {key}; an axis of this kind has {', '.join(keys)}")
-    values = table[kind]
+    keys = (kind, "count", "seed") if kind == "random" else ("parameter", kind)
+    if set(table) != set(keys):
+        raise ValueError(f"has {', '.join(table)}; an axis of this kind has {', '.join(keys)}, as in {_EXAMPLE}")
+    values, parameter = table[kind], table.get("parameter")
     if kind == "random":
         if not isinstance(values, Mapping) or not values:
             raise ValueError('`random` must name parameters with their ends, as in { "interaction.r" = [0.9, 0.99] }')
-        generator = np.random.default_rng(_whole(table.get("seed"), "seed", 0, 1 << 63))
-        shares = generator.random((len(values), _whole(table.get("count"), "count", 1, _MOST)))
+        generator = np.random.default_rng(_whole(table["seed"], "seed", 0, 1 << 63))
+        shares = generator.random((len(values), _whole(table["count"], "count", 1, _MOST)))
         pairs = zip(values.items(), shares, strict=True)
-        return Axis(sample, {parameter: _drawn(parameter, ends, share) for (parameter, ends), share in pairs})
-    parameter = str(table.get("parameter", ""))
-    if not parameter:
-        raise ValueError(f"`parameter` is missing; name one, as in {_EXAMPLE}")
+        return Axis(sample, {name: _drawn(name, ends, share) for (name, ends), share in pairs})
+    if not isinstance(parameter, str):
+        raise ValueError(f"`parameter` must be a name, but is {parameter!r}")  # noqa: TRY004 (a wrong file)
     if kind == "list":
         column = _numbers(values, "`list`")
         if len(set(column)) < len(column):
             raise ValueError("a value of the list stands there twice: leave one of them out")
         return Axis(dimension_of(parameter), {parameter: np.array(column)})
-    if not isinstance(values, list | tuple) or len(values) != 3:
+    if not isinstance(values, list) or len(values) != 3:
         raise ValueError(f"`{kind}` must be [low, high, count], but is {values}")
     (low, high), count = _ends(values[:2], f"`{kind}`", log=kind == "log"), _whole(values[2], "count", 1, _MOST)
     spread = np.geomspace if kind == "log" else np.linspace
@@ -170,17 +167,14 @@ def _ends(given: Any, what: str, *, log: bool) -> list[float]:
 
 
 def _numbers(given: Any, what: str) -> list[float]:
-    if not isinstance(given, list | tuple) or not 0 < len(given) <= _MOST:
-        raise ValueError(f"{what} must be a list of numbers, at most {_MOST}, but is {given}")
-    for value in given:
-        # JSON, in which inputs are kept, has null for infinity
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ValueError(f"{what} must hold numbers, but one is {'not finite' if value is None else repr(value)}")
+    numbers = isinstance(given, list) and all(type(each) in (int, float) and math.isfinite(each) for each in given)
+    if not numbers or not 0 < len(given) <= _MOST:
+        raise ValueError(f"{what} must be a list of finite numbers, at most {_MOST}, but is {given}")
     return [float(value) for value in given]
 
 
 def _whole(value: Any, name: str, least: int, most: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+    if type(value) is not int or not least <= value <= most:
         raise ValueError(f"`{name}` must be a whole number from {least} to {most}, but is {value!r}")
     return value
 
@@ -188,37 +182,13 @@ def _whole(value: Any, name: str, least: int, most: int) -> int:
 # --- what is recorded of scenes ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Variable:
-    """One of the things that a sweep records of every point.
-
-    Attributes:
-        name: with its unit.
-        meaning: in words.
-        dtype: of the numbers, or "string"; floats are NaN where there is nothing.
-        dimensions: besides those of the axes.
-        codes: of integers that stand for words, what each means.
-    """
-
-    name: str
-    meaning: str
-    dtype: str = "float64"
-    dimensions: tuple[str, ...] = ()
-    codes: Mapping[int, str] = field(default_factory=dict)
-
-    def attributes(self) -> dict[str, Any]:
-        """Return unit and meaning as attributes of the CF conventions."""
-        units = {"units": _unit(self.name)} if self.dtype == "float64" else {}
-        flags = {"flag_values": list(self.codes), "flag_meanings": " ".join(self.codes.values())} if self.codes else {}
-        return {"long_name": self.meaning, **units, **flags}
-
-
-MESSAGE = Variable("message", "why there is no result, or none to be trusted; empty where there is one", "string")
-_MARK = Variable("computed", "this point has been computed", "bool")
+MESSAGE = "message"
+"""The variable that says why there is no result, or none to be trusted; empty where there is one."""
 EXTRAPOLATED = "extrapolated"
-"""The variable of scenes with a law that is a table."""
+"""The variable of scenes with a law that is a table: whether it is used outside the speeds that it is known for."""
 APPROACH_SPEED = "approach_speed_nm_per_us"
 """The axis of `collide` that is no parameter of the scene."""
+_MARK = "computed"
 
 
 @dataclass(frozen=True)
@@ -226,17 +196,20 @@ class Recorder:
     """What a sweep does at its points.
 
     Attributes:
-        variables: what it records, the most telling first.
-        work: from columns of parameters to columns of results, one row a point.
+        work: from columns of parameters to columns of results, one row a point; arrays of two dimensions have the
+            extra one behind.
         points: of a chunk, unless the input says otherwise: some tenths of a second of work at least.
-        extra: values of dimensions besides the axes.
+        shown: the most telling results.
+        extra: name and values of a dimension besides the axes.
+        words: of results that stand for words, what each number means.
         alone: whether a point is computed by itself, on one core: several processes are needed to use several.
     """
 
-    variables: tuple[Variable, ...]
     work: Callable[[Columns], Columns]
     points: int
-    extra: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    shown: tuple[str, ...]
+    extra: Mapping[str, Sequence[int]] = field(default_factory=dict)
+    words: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
     alone: bool = False
 
 
@@ -254,7 +227,7 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
     scene = scene_of_tables(given["scene"], "the sweep's scene")
     record = dict(given["record"])
     what = record.pop("what", None)
-    if what not in _RECORDERS:
+    if what not in list(_RECORDERS):
         raise ValueError(f"[record]: `what` must be one of {', '.join(_RECORDERS)}, but is {what!r}")
     columns = {name: values for axis in axes for name, values in axis.columns.items()}
     if what == "collide":
@@ -264,7 +237,7 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
     for key in record:
         if key not in usual:
             raise ValueError(f"[record]: unknown key {key} of {what!r}; it has {', '.join(usual)}")
-    chosen = {key: _setting(key, record.get(key, value), value) for key, value in usual.items()}
+    chosen = usual | {key: _setting(key, value, usual[key]) for key, value in record.items()}
     accuracy = given.get("accuracy")
     if accuracy is not None:
         if not isinstance(scene.interaction, Contact):
@@ -280,32 +253,19 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
 
 
 def _setting(key: str, value: Any, usual: Any) -> Any:
-    """Return a setting of the kind of its usual value: a number, a whole one, or several different whole ones."""
+    """Return a setting of the kind of its usual value: a number, a whole one, or several whole ones."""
     several = isinstance(usual, tuple)
-    numbers: list[Any] = list(value) if several and isinstance(value, list | tuple) else [value]
+    numbers: Any = value if several and isinstance(value, list) else [value]
     kinds = (int, float) if isinstance(usual, float) else (int,)
-    if not numbers or not all(type(each) in kinds and 0 < each < math.inf for each in numbers):
-        kind = "list of positive whole numbers" if several else f"positive {'whole ' * (len(kinds) == 1)}number"
-        raise ValueError(f"[record]: `{key}` must be a {kind}, but is {value!r}")
-    if len(set(numbers)) < len(numbers):
-        raise ValueError(f"[record]: `{key}` must be different numbers, but is {value!r}")
+    if not numbers or not all(type(each) in kinds and each > 0 for each in numbers):
+        kind = "positive number" if float in kinds else "positive whole number"
+        raise ValueError(f"[record]: `{key}` must be a {kind}{', or several' * several}, but is {value!r}")
     return tuple(numbers) if several else type(usual)(numbers[0])
 
 
-def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
-    """Return the function from columns of parameters to a batch of scenes, every number of one value a row."""
-    family = scene_family(scene, *paths)
-
-    def made(columns: Columns) -> Scene:
-        count = len(next(iter(columns.values())))
-        batch = jax.vmap(family)(*(columns[path] for path in paths)) if paths else scene
-        return jax.tree.map(
-            lambda leaf, axes: jnp.broadcast_to(leaf, (count, *leaf.shape)) if leaf.ndim == axes else leaf,
-            batch,
-            axes_of_one(scene),
-        )
-
-    return made
+def _scenes(scene: Scene, paths: Sequence[str], columns: Columns) -> Scene:
+    """Return a batch of scenes from columns of parameters; the scene where none of it changes."""
+    return scene_batch(scene, {path: columns[path] for path in paths}) if paths else scene
 
 
 def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Columns]:
@@ -326,61 +286,6 @@ def _one_by_one(record: Callable[[dict[str, float]], dict[str, Any]]) -> Callabl
     return work
 
 
-def _beyond(scene: Scene, what: str, dimensions: tuple[str, ...] = ()) -> tuple[Variable, ...]:
-    """Return the variable that says whether a law that is a table is extrapolated; none of other scenes."""
-    law = scene.interaction
-    if not isinstance(law, TabulatedLaw):
-        return ()
-    low, high = float(law.slowest_nm_per_us), float(law.fastest_nm_per_us)
-    meaning = f"{what} outside the speeds that the law is known for, {low:.4g} to {high:.4g} nm/us"
-    return (Variable(EXTRAPOLATED, meaning, "bool", dimensions),)
-
-
-def _variables(*dimensions: str, dtype: str = "float64", **meanings: str) -> tuple[Variable, ...]:
-    """Return variables of one kind, from names and meanings."""
-    return tuple(Variable(name, meaning, dtype, dimensions) for name, meaning in meanings.items())
-
-
-_PEAK = _variables("order", peak_amplitude_nm="largest height above the rest position")
-_MULTIPLIER = _variables("order", largest_multiplier="size of the larger multiplier of the map")
-_ORBIT_VARIABLES = (
-    *_PEAK,
-    *_variables(
-        "order",
-        dtype="int8",
-        stable_orbits="number of admissible stable single-impact orbits",
-        admissible_orbits="number of admissible single-impact orbits",
-    ),
-    *_variables(
-        "order",
-        lockin_amplitude_nm="amplitude at the response frequency omega/N",
-        lockin_phase_deg="its phase, modulo 360/N",
-        approach_speed_nm_per_us="speed towards the platform before the impact",
-        phase_rad="drive phase just after the impact",
-        velocity_after_nm_per_us="velocity in the lab just after the impact",
-    ),
-    *_MULTIPLIER,
-)
-_DRIVEN_ORBIT_VARIABLES = _variables(
-    "order",
-    drive_lockin_amplitude_nm="amplitude at the drive's frequency omega",
-    drive_lockin_phase_deg="its phase",
-    phase_lag_deg="lag of deflection or height behind base or force at omega",
-)
-"""What is recorded besides of orbits that base or force drives."""
-_CONTACT_ORBIT_VARIABLES = (
-    *_PEAK,
-    *_variables(
-        "order",
-        dtype="bool",
-        stable="an admissible single-impact orbit is stable",
-        admissible="there is an admissible single-impact orbit",
-        unresolved="the law closest to the contact has an orbit, but none was found",
-    ),
-    *_MULTIPLIER,
-)
-
-
 def _orbits(
     scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...], accuracy: float = CHART_ACCURACY
 ) -> Recorder:
@@ -392,23 +297,22 @@ def _orbits(
         if "frequency" in path:
             # a little aside: says why not, where another part has the same frequency
             sample_driven(scene_batch(scene, {path: np.array([1.001 * parameter_values(scene)[path]])}))
-    extra = {"order": [float(order) for order in orders]}
+    extra = {"order": orders}
     if isinstance(scene.interaction, Contact):
         record = partial(_contact_orbits, scene, orders, accuracy)
-        return Recorder((*_CONTACT_ORBIT_VARIABLES, MESSAGE), _one_by_one(record), 16, extra, alone=True)
-    law, made = impact_law_of(scene), _scenes(scene, paths)
-    beyond = _beyond(scene, "the stable orbit's impact comes", ("order",))
+        return Recorder(_one_by_one(record), 16, ("peak_amplitude_nm", "stable"), extra, alone=True)
 
     def record_batch(columns: Columns) -> Columns:
-        scenes = made(columns)
+        scenes = _scenes(scene, paths, columns)
         found = highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float), names=names)
-        outside = jax.vmap(lambda law, speed: law.extrapolated(speed)) if beyond else None
-        return found | ({} if outside is None else {EXTRAPOLATED: outside(scenes.interaction, found[APPROACH_SPEED])})
+        if not isinstance(scene.interaction, TabulatedLaw):
+            return found
+        outside = jax.vmap(lambda law, speed: law.extrapolated(speed))
+        return found | {EXTRAPOLATED: outside(scenes.interaction, found[APPROACH_SPEED])}
 
-    driven = () if scene.base is None and scene.force is None else _DRIVEN_ORBIT_VARIABLES
-    names = ORBIT_NUMBERS + (DRIVEN_NUMBERS if driven else ())
-    points = 4096 if law.delay else 1 << 18
-    return Recorder((*_ORBIT_VARIABLES, *driven, *beyond), _in_batches(record_batch), points, extra)
+    names = ORBIT_NUMBERS + (() if scene.base is None and scene.force is None else DRIVEN_NUMBERS)
+    points = 4096 if impact_law_of(scene).delay else 1 << 18
+    return Recorder(_in_batches(record_batch), points, ("peak_amplitude_nm", "stable_orbits"), extra)
 
 
 def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row: dict[str, float]) -> dict[str, Any]:
@@ -417,30 +321,26 @@ def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row:
         one = sample_driven(scene_batch(scene, {name: np.array([value]) for name, value in row.items()}))
         found = single_contact_orbits(one, orders, accuracy=accuracy)
     except ValueError as error:
-        blank = {"float64": math.nan, "bool": False}
-        nothing = {each.name: np.full(len(orders), blank[each.dtype]) for each in _CONTACT_ORBIT_VARIABLES}
-        return nothing | {MESSAGE.name: str(error)}
-    return {each.name: found[each.name][:, 0] for each in _CONTACT_ORBIT_VARIABLES} | {MESSAGE.name: ""}
+        nothing, no = np.full(len(orders), math.nan), np.zeros(len(orders), bool)
+        return dict.fromkeys(_CONTACT_NUMBERS, nothing) | dict.fromkeys(_CONTACT_TRUTHS, no) | {MESSAGE: f"{error}"}
+    return {name: found[name][:, 0] for name in _CONTACT_NUMBERS + _CONTACT_TRUTHS} | {MESSAGE: ""}
+
+
+_CONTACT_NUMBERS, _CONTACT_TRUTHS = ("peak_amplitude_nm", "largest_multiplier"), ("stable", "admissible", "unresolved")
+"""Of the orbits of contacts; unresolved: the law closest to the contact has an orbit, but none was found."""
+_COLLISION_NUMBERS = (
+    "collision_delay_us",
+    "time_in_contact_us",
+    "time_in_junction_us",
+    "deepest_gap_nm",
+    "bridge_hysteresis_aj",
+    "junction_hysteresis_aj",
+    "viscous_loss_aj",
+)
 
 
 def _codes(kinds: Any) -> dict[int, str]:
     return {int(kind): kind.name.lower() for kind in kinds}
-
-
-_COLLISION_VARIABLES = (
-    *_variables(
-        rebound_speed_nm_per_us="speed away from the sample; 0 where the tip is captured",
-        collision_delay_us="time between the crossings of gap 0 by the straight paths in and out, if it leaves",
-        time_in_contact_us="from the formation of the bridge to its breaking",
-        time_in_junction_us="with the solids joined",
-        deepest_gap_nm="smallest gap",
-        bridge_hysteresis_aj="energy that the bridge takes",
-        junction_hysteresis_aj="energy lost in the junction",
-        viscous_loss_aj="energy lost to viscosity",
-    ),
-    Variable("captured", "the tip stays at the sample", "bool"),
-    Variable("outcome", "how the collision ended", "int8", codes=_codes(CollisionOutcome)),
-)
 
 
 def _collisions(
@@ -448,39 +348,22 @@ def _collisions(
 ) -> Recorder:
     """Record collisions of free tips with the contacts of scenes."""
     if not isinstance(scene.interaction, Contact):
-        raise TypeError("'collide' is about a resolved contact: the scene needs model = \"contact\"")
-    made = _scenes(scene, paths)
+        raise ValueError("'collide' is about a resolved contact: the scene needs model = \"contact\"")  # noqa: TRY004
 
     def record(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
         speeds = jnp.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
-        scenes = made(columns)
+        scenes = _scenes(scene, paths, columns)
         found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
         trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
-        results = {variable.name: getattr(found, variable.name) for variable in _COLLISION_VARIABLES}
-        for each in _COLLISION_VARIABLES:
-            if each.dtype == "float64":
-                free = ~found.captured if each.name in ONLY_FREE else True
-                exists = trusted & (free | (each.name == "rebound_speed_nm_per_us"))
-                results[each.name] = jnp.where(exists, results[each.name], jnp.nan)
-        return results
+        # 0 of a tip that is captured
+        exists = dict.fromkeys(("rebound_speed_nm_per_us", *_COLLISION_NUMBERS), trusted)
+        exists |= dict.fromkeys(set(ONLY_FREE) & set(_COLLISION_NUMBERS), trusted & ~found.captured)
+        numbers = {name: jnp.where(known, getattr(found, name), jnp.nan) for name, known in exists.items()}
+        return numbers | {"captured": found.captured, "outcome": found.outcome}
 
-    return Recorder(_COLLISION_VARIABLES, _in_batches(record), 16384)
-
-
-_EXPONENT_VARIABLES = (
-    *_variables(
-        "exponent",
-        exponents_per_impact="Lyapunov exponents, larger first",
-        exponents_per_us="the same in time",
-        exponents_per_impact_error="their standard errors",
-        exponents_per_us_error="their standard errors",
-    ),
-    Variable("impacts", "how many the means are over", "int64"),
-    Variable("kind", "what the motion has come to", "int8", codes=_codes(MotionKind)),
-    Variable("orbit_impacts", "impacts of the orbit, 0 where there is none", "int32"),
-    Variable("orbit_periods", "drive periods of the orbit, 0 where there is none", "int32"),
-)
+    shown, words = ("rebound_speed_nm_per_us", "collision_delay_us"), {"outcome": _codes(CollisionOutcome)}
+    return Recorder(_in_batches(record), 16384, shown, words=words)
 
 
 def _lyapunov(
@@ -490,7 +373,8 @@ def _lyapunov(
     sample_driven(scene)
     resolved = isinstance(scene.interaction, Contact)
     lanes = 16 if resolved else LANES
-    made, beyond = jax.jit(_scenes(scene, paths)), _beyond(scene, "the last impacts come")
+    made = jax.jit(partial(_scenes, scene, paths))
+    exponents = ("exponents_per_impact", "exponents_per_us", "exponents_per_impact_error", "exponents_per_us_error")
 
     def work(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
@@ -499,27 +383,18 @@ def _lyapunov(
         whole = {name: jnp.asarray(filled(column, width)) for name, column in columns.items()}
         found = lyapunov_spectrum(made(whole), impacts=impacts, transient=transient, accuracy=accuracy)
         verdicts = found.verdicts
-        results = {each.name: getattr(found, each.name) for each in _EXPONENT_VARIABLES[:5]}
+        results = {name: getattr(found, name) for name in (*exponents, "impacts")}
         results |= {"kind": verdicts.kind, "orbit_impacts": verdicts.impacts, "orbit_periods": verdicts.periods}
-        if beyond:
+        if isinstance(scene.interaction, TabulatedLaw):
             outside = scene.interaction.extrapolated(found.approach_speed_nm_per_us)
             results[EXTRAPOLATED] = np.asarray(outside).any(axis=1)
         return {name: np.asarray(part)[:count] for name, part in results.items()}
 
-    points = lanes if resolved else 4 * lanes
-    return Recorder((*_EXPONENT_VARIABLES, *beyond), work, points, {"exponent": [1.0, 2.0]}, alone=resolved)
+    points, words = lanes if resolved else 4 * lanes, {"kind": _codes(MotionKind)}
+    return Recorder(work, points, exponents[:2], {"exponent": (1, 2)}, words, alone=resolved)
 
 
 _REFUSED = -1
-_SIMULATION_VARIABLES = (
-    *_variables(**{name: observable.meaning for name, observable in OBSERVABLES.items()}),
-    Variable("settled", "the motion repeats", "bool"),
-    Variable("stuck", "the sample holds the tip", "bool"),
-    Variable("order", "drive periods of a repetition, 0 where nothing repeats", "int32"),
-    Variable("contacts_per_response", "contacts of a repetition, 0 where nothing repeats", "int32"),
-    Variable("impacts", "contacts in all", "int64"),
-    Variable("outcome", "how it ended", "int8", codes={_REFUSED: "not_possible"} | _codes(MotionOutcome)),
-)
 
 
 def _simulation(
@@ -527,9 +402,9 @@ def _simulation(
 ) -> Recorder:
     """Record what an experiment reads of scenes in time, followed until they settle or for some drive periods."""
     family = scene_family(scene, *paths)
-    variables = (*_SIMULATION_VARIABLES, *_beyond(scene, "impacts come"), MESSAGE)
-    empty = {"float64": math.nan, "bool": False, "string": ""}
-    nothing = {each.name: empty.get(each.dtype, 0) for each in variables}
+    nothing = {observable.name: math.nan for observable in OBSERVABLES} | {"settled": False, "stuck": False}
+    nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0) | {"outcome": _REFUSED, MESSAGE: ""}
+    nothing |= {EXTRAPOLATED: False} if isinstance(scene.interaction, TabulatedLaw) else {}
 
     def record(row: dict[str, float]) -> dict[str, Any]:
         one = family(*row.values())
@@ -537,7 +412,7 @@ def _simulation(
             longest = periods * drive_of(one).period_us
             run = follow_long(one, start_of(one, start), longest, until_settled=True, accuracy=accuracy)
         except ValueError as error:
-            return nothing | {"outcome": _REFUSED, MESSAGE.name: str(error)}
+            return nothing | {MESSAGE: str(error)}
         found, verdict = run.simulation, run.verdict
         outcome = MotionOutcome(int(found.outcome))
         results = nothing | {
@@ -552,13 +427,14 @@ def _simulation(
             speeds = found.contacts.approach_speed_nm_per_us
             results[EXTRAPOLATED] = extrapolation_of(one.interaction, speeds) is not None
         if outcome not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
-            return results | {MESSAGE.name: outcome.sentence}
+            return results | {MESSAGE: outcome.sentence}
         seen = observe(one, found, verdict=verdict)
         values = {name: getattr(seen, name) for name in OBSERVABLES}
-        told = {} if seen.window.responses else {MESSAGE.name: TOO_SHORT}
+        told = {} if seen.window.responses else {MESSAGE: TOO_SHORT}
         return results | {name: value for name, value in values.items() if value is not None} | told
 
-    return Recorder(variables, _one_by_one(record), 16, alone=True)
+    words = {"outcome": {_REFUSED: "not_possible"} | _codes(MotionOutcome)}
+    return Recorder(_one_by_one(record), 16, ("peak_amplitude_nm", "lockin_amplitude_nm"), words=words, alone=True)
 
 
 _RECORDERS: dict[str, tuple[Callable[..., Recorder], dict[str, Any]]] = {
@@ -618,12 +494,8 @@ class SweepPlan:
         # a worker has JAX's usual precision, whatever its caller has said
         with jax.enable_x64(True):  # noqa: FBT003
             found = self.recorder.work(dict(zip(names, values, strict=True)))
-        return {
-            each.name: np.asarray(found[each.name], object if each.dtype == "string" else each.dtype).reshape(
-                (*places[0].shape, *(len(self.recorder.extra[name]) for name in each.dimensions))
-            )
-            for each in self.recorder.variables
-        }
+        arrays = {name: np.asarray(column) for name, column in found.items()}
+        return {name: array.reshape(places[0].shape + array.shape[1:]) for name, array in arrays.items()}
 
 
 def plan_of(
@@ -643,20 +515,13 @@ def plan_of(
     whole = json.loads(strict_json({**given, "versions": versions}))
     axes = axes_of(whole.get("axes", ()))
     recorder = recorder_of(whole, axes)
-    taken = [*recorder.extra, *(variable.name for variable in recorder.variables)]
-    for axis in axes:
-        if axis.dimension in taken or any(dimension_of(name) in taken for name in axis.columns):
-            raise ValueError(f"the axis {axis.dimension} has the name of something that is recorded")
     chunk = whole.get("chunk")
     plan = SweepPlan(
         whole | {"chunk": recorder.points if chunk is None else _whole(chunk, "chunk", 1, _MOST)}, axes, recorder
     )
-    if math.prod(plan.shape) > _MOST_CHUNKS * math.prod(plan.block):
+    if math.prod(plan.shape) > 1_000_000 * math.prod(plan.block):
         raise ValueError("that makes too many chunks: `chunk` must be larger, or take fewer values along the axes")
     return plan
-
-
-_MOST_CHUNKS = 1_000_000
 
 
 def _unit(name: str) -> str:
@@ -666,35 +531,51 @@ def _unit(name: str) -> str:
     return named.get(plain) or unit_of(plain).replace("^", "") or "1"
 
 
-def _open(folder: Path, plan: SweepPlan) -> Any:
-    """Return the Zarr group of a sweep in a folder, made if there is none.
+def _is_begun(folder: Path, plan: SweepPlan) -> bool:
+    """Say whether a folder holds this sweep, after clearing what a killed process left unfinished.
 
     Raises:
-        ValueError: if there is one of another sweep; says what differs.
+        ValueError: if there is another sweep; says what differs.
         OSError: if there is a link, a device or a pipe in it; names it.
     """
-    import zarr  # noqa: PLC0415 (an extra package)
-
     store = folder / STORE
     for place in (*folder.glob(f".{STORE}.*part"), store, *store.rglob("*")):
         check_plain(place)
-        # as Zarr names what a killed process left unfinished
+        # as Zarr names it
         if place.suffix == ".partial":
             place.unlink()
-    if (store / "zarr.json").exists():
-        _check_same(folder, plan)
-    else:
-        with whole_folder(store) as fresh:
-            _make(zarr.open_group(str(fresh), mode="w", zarr_format=3), plan)
-            with warnings.catch_warnings():
-                # that xarray opens the store by one file is worth a part of the format that is not settled yet
-                warnings.simplefilter("ignore")
-                zarr.consolidate_metadata(str(fresh))
-    return zarr.open_group(str(store), mode="r+", zarr_format=3)
+    head = store / "zarr.json"
+    if not head.exists():
+        return False
+    try:
+        attributes = json.loads(head.read_bytes())["attributes"]
+        kept, version = json.loads(attributes["input"]), attributes["format_version"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{store}: is not a sweep of afm-jax; choose another folder") from error
+    if version != FORMAT_VERSION:
+        raise ValueError(f"{store}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
+    for name, wanted in plan.given.items():
+        if kept.get(name) != wanted:
+            difference = f"{name} is {json.dumps(kept.get(name))}, not {json.dumps(wanted)}"
+            raise ValueError(
+                f"{folder}: holds another sweep, in which {difference}: choose another folder, or restore the input"
+            )
+    return True
 
 
-def _make(group: Any, plan: SweepPlan) -> None:
-    """Make coordinates, and arrays of what is recorded."""
+def _make(store: Path, plan: SweepPlan, results: Columns) -> None:
+    """Make a Zarr group with coordinates, and arrays for results like those of a chunk."""
+    import zarr  # noqa: PLC0415 (an extra package)
+
+    with whole_folder(store) as fresh:
+        _fill(zarr.open_group(str(fresh), mode="w", zarr_format=3), plan, results)
+        with warnings.catch_warnings():
+            # that xarray opens the store by one file is worth a part of the format that is not settled yet
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(str(fresh))
+
+
+def _fill(group: Any, plan: SweepPlan, results: Columns) -> None:
     about = {"format": "afm-jax sweep", "format_version": FORMAT_VERSION, "afm_jax": __version__}
     group.attrs.update({**about, "input": json.dumps(plan.given)})
     others = []
@@ -705,33 +586,21 @@ def _make(group: Any, plan: SweepPlan) -> None:
             others += [name] if name != axis.dimension else []
     for name, values in plan.recorder.extra.items():
         group.create_array(name, data=np.asarray(values), dimension_names=[name])
-    for each in (*plan.recorder.variables, _MARK):
-        further = tuple(len(plan.recorder.extra[name]) for name in each.dimensions)
+    axes = [axis.dimension for axis in plan.axes]
+    for name, array in results.items():
+        further, is_float = array.shape[len(axes) :], array.dtype.kind == "f"
+        words = plan.recorder.words.get(name, {})
+        flags = {"flag_values": list(words), "flag_meanings": " ".join(words.values())} if words else {}
+        units = {"units": _unit(name)} if is_float else {}
         group.create_array(
-            each.name,
+            name,
             shape=plan.shape + further,
             chunks=plan.block + further,
-            dtype=each.dtype,
-            fill_value={"float64": math.nan, "string": ""}.get(each.dtype, 0),
-            dimension_names=[*(axis.dimension for axis in plan.axes), *each.dimensions],
-            attributes=each.attributes() | {"coordinates": " ".join(others)},
+            dtype="string" if array.dtype.kind == "U" else array.dtype,
+            fill_value=math.nan if is_float else "" if array.dtype.kind == "U" else 0,
+            dimension_names=[*axes, *plan.recorder.extra][: array.ndim],
+            attributes={"long_name": words_of(name), **units, **flags, "coordinates": " ".join(others)},
         )
-
-
-def _check_same(folder: Path, plan: SweepPlan) -> None:
-    try:
-        attributes = json.loads((folder / STORE / "zarr.json").read_bytes())["attributes"]
-        kept, version = json.loads(attributes["input"]), attributes["format_version"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder / STORE}: is not a sweep of afm-jax; choose another folder") from error
-    if version != FORMAT_VERSION:
-        raise ValueError(f"{folder / STORE}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
-    for name, wanted in plan.given.items():
-        if kept.get(name) != wanted:
-            difference = f"{name} is {json.dumps(kept.get(name))}, not {json.dumps(wanted)}"
-            raise ValueError(
-                f"{folder}: holds another sweep, in which {difference}: choose another folder, or restore the input"
-            )
 
 
 class SweepRun(NamedTuple):
@@ -755,21 +624,29 @@ def run_plan(
     report: Progress | None = None,
 ) -> SweepRun:
     """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
+    import zarr  # noqa: PLC0415 (an extra package)
+
     begin, regions, done = time.monotonic(), plan.regions(), 0
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         what = "is no folder, or lies in none; choose another `out`"
         raise NotADirectoryError(errno.ENOTDIR, what, str(folder)) from error
-    group = _open(folder, plan)
-    marks = group[_MARK.name][...]
+    store, begun = folder / STORE, _is_begun(folder, plan)
+    marks: Any = np.zeros(plan.shape, bool)
+    if begun:
+        marks = zarr.open_array(str(store / _MARK), mode="r")[...]
     missing = [region for region in regions if not marks[region].all()]
     kept = len(regions) - len(missing)
     try:
         for region, results in _results(plan, missing, workers=workers, scheduler=scheduler):
+            # the mark is the last of them
+            results[_MARK] = np.ones_like(marks[region])
+            if not (begun or done):
+                _make(store, plan, results)
+            group: Any = zarr.open_group(str(store), mode="r+")
             for name, values in results.items():
                 group[name][(*region, ...)] = values
-            group[_MARK.name][region] = True
             done += 1
             if report is not None:
                 report(round((kept + done) * marks.size / len(regions)), marks.size)
@@ -782,20 +659,16 @@ def run_plan(
 def _results(
     plan: SweepPlan, regions: Sequence[Region], *, workers: int, scheduler: str | None
 ) -> Iterator[tuple[Region, Columns]]:
-    """Give chunks with their results: in this process, or as workers have done them, two under way for each."""
+    """Give chunks with their results: in this process, or as workers have done them."""
     if not regions or (workers <= 1 and scheduler is None):
         yield from ((region, plan.compute(region)) for region in regions)
         return
     from distributed import as_completed  # noqa: PLC0415 (an extra package)
 
     with _client(min(workers, len(regions)), scheduler) as client:
-        work, waiting = partial(compute_chunk, json.dumps(plan.given)), iter(regions)
-        threads: Any = client.ncores()
-        first = itertools.islice(waiting, 2 * sum(threads.values()))
-        under_way = as_completed(client.map(work, list(first), pure=False))
-        for future in under_way:
+        work = partial(compute_chunk, json.dumps(plan.given))
+        for future in as_completed(client.map(work, regions, pure=False)):
             yield future.result()
-            under_way.update(client.map(work, list(itertools.islice(waiting, 1)), pure=False))
 
 
 def compute_chunk(text: str, region: Region) -> tuple[Region, Columns]:
