@@ -194,8 +194,11 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
 def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     offset, amplitude, lag = tapping_rows()
     path = saved(tmp_path, separated({"a": -1e-3 * offset, "b": 0.01 * amplitude, "c": -lag}, ";"))
-    with pytest.raises(TableError, match='among the channels a, b, c; say `columns="offset_nm=CHANNEL:UNIT"`'):
+    with pytest.raises(TableError, match="among the channels a, b, c; say `columns=") as raised:
         read_curve(path)
+    # the line is ready to paste
+    pasted = read_curve(path, columns=str(raised.value).rpartition('columns="')[2].removesuffix('"`'))
+    np.testing.assert_allclose(given(pasted.phase_lag_deg), -lag, atol=1e-5)
     wanted = "offset_nm=a:um:-1,lockin_amplitude_nm=b:V,phase_lag_deg=c:-1"
     curve = read_curve(path, columns=wanted)
     assert (curve.amplitude_unit, "nm_per_volt" in curve.missing) == ("V", True)
@@ -204,7 +207,7 @@ def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     # six decimals of hundredths
     np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
     np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-5)
-    assert "# tip_calibration = 1 +- 0.02\n" in table_text(curve)
+    assert "# tip_calibration = 1.0 +- 0.02\n" in table_text(curve)
 
 
 def test_wrong_column_maps_are_named(tmp_path: Path):
@@ -233,7 +236,7 @@ def test_a_file_that_begins_like_an_instruments_is_no_table(tmp_path: Path):
 
 def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
     curve = read_curve(saved(tmp_path, "Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n"))
-    asked = 'if one of the channels A, P is: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`'
+    asked = 'A, P is, say `columns="offset_nm=Z:nm,lockin_amplitude_nm=A:nm,phase_lag_deg=P:deg"`'
     assert any(asked in note for note in curve.notes)
     with pytest.raises(TableError, match=re.escape(asked)):
         table_text(curve)

@@ -55,7 +55,7 @@ def test_noise_is_a_fraction(tmp_path: Path):
     ("change", "message"),
     [
         ({"offset_nm": np.array([0.0, np.nan])}, ", row 2, column offset_nm: is blank; every row needs it"),
-        ({"peak_amplitude_error_nm": None}, ": peak_amplitude_nm and peak_amplitude_error_nm come together; "),
+        ({"peak_amplitude_error_nm": None}, ", column peak_amplitude_nm: has no errors; add the column peak_amplitude"),
         (
             {"peak_amplitude_nm": None, "peak_amplitude_error_nm": None},
             ": there is no amplitude column; add ",

@@ -19,10 +19,10 @@ from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
 from fitting.calibration.sweep import ResonanceSweep, read_sweep
-from fitting.tables.csv_text import TableError
+from fitting.tables.csv_text import TableError, value_and_error
 
-_Pair = tuple[float, float | None]
-"""A value with its standard error, if it has one."""
+_Given = tuple[float, float | None] | float | str | None
+"""A number, a pair with its standard error, or a text such as '225 +- 2'."""
 _LEAST_FREQUENCIES = 6
 """One more than the amplitude has parameters."""
 
@@ -104,7 +104,7 @@ class Calibration(JudgedResult):
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax calibrate`."""
         own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
-        values = {name: vars(value) for name, value in own.items() if isinstance(value, CalibratedValue)}
+        values: dict[str, Any] = {name: vars(v) for name, v in own.items() if isinstance(v, CalibratedValue)}
         values["spring_constant_n_per_m"] = {name: vars(k) for name, k in self.spring_constant_n_per_m.items()}
         more = {"valid": self.valid, "instrument": self.sweep.instrument, "table_comments": self.table_comments}
         return {"format": "afm-jax calibrate", "format_version": 2} | own | values | more
@@ -143,9 +143,9 @@ def calibrate(
     sweep: ResonanceSweep | str | os.PathLike[str],
     *,
     averages: float | None = None,
-    temperature_k: _Pair | float | None = None,
-    length_um: _Pair | float | None = None,
-    width_um: _Pair | float | None = None,
+    temperature_k: _Given = None,
+    length_um: _Given = None,
+    width_um: _Given = None,
     scale_error: float = 0.05,
     static: bool = True,
 ) -> Calibration:
@@ -157,7 +157,8 @@ def calibrate(
         sweep: from `read_sweep`, or a file; its phase is used where it is there. Without errors of the amplitudes these
             are estimated from the misfit, and goodness of fit cannot be judged.
         averages: how many spectra a thermal spectrum is the mean of; None: the file's.
-        temperature_k: of lever and air, a number or a pair with its error; None: the file's, else 296 +- 3.
+        temperature_k: of lever and air, a number, a pair with its error or '296 +- 3', which is assumed of a file
+            that says none.
         length_um: of a rectangular lever, likewise; with the width it gives k by Sader's method.
         width_um: of a rectangular lever, likewise.
         scale_error: relative error of the deflection's scale; that of k by equipartition is twice as large; force
@@ -177,7 +178,8 @@ def calibrate(
     check_parameter("scale_error", scale_error, "positive")
     warm = temperature_k or (sweep.instrument.get("temperature_k", 296.0), 3.0)
     given = {"length_um": length_um, "width_um": width_um, "temperature_k": warm}
-    known = {name: _value_and_error(name, one) for name, one in given.items() if one is not None}
+    pairs = {name: value_and_error(name, one) for name, one in given.items() if one is not None}
+    known = {name: (value, error or 0.0) for name, (value, error) in pairs.items()}
     if ("length_um" in known) != ("width_um" in known):
         raise ValueError("Sader's method needs both `length_um=...` and `width_um=...`")
     sweep = replace(sweep, averages=averages or sweep.averages)
@@ -185,18 +187,6 @@ def calibrate(
     found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep)
     springs = _springs(found, known, scale_error, static=static)
     return _judged(replace(found, spring_constant_n_per_m=springs))
-
-
-def _value_and_error(name: str, given: _Pair | float) -> tuple[float, float]:
-    """Return a value and its error, 0 where there is none.
-
-    Raises:
-        ValueError: if one of them is impossible.
-    """
-    value, error = given if isinstance(given, tuple) else (given, None)
-    check_parameter(name, value, "positive")
-    check_parameter(f"error of {name}", error, "positive", optional=True)
-    return float(value), float(error or 0.0)
 
 
 def _check_sweep(sweep: ResonanceSweep) -> None:
@@ -229,14 +219,13 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
     # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
     fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(best.residual)) < together < 1.0 else 1.0
     covariance, slope = covariance_of(best.jacobian.T @ best.jacobian), best.jacobian.T @ best.residual
-    left = float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope)
     natural, quality_factor = np.exp(place[:2]).tolist()
-    by_place = np.eye(len(place))
 
-    def known(value: float, slopes: Float[np.ndarray, " p"]) -> CalibratedValue:
-        """Return a value whose logarithm has these derivatives by the place."""
+    def known(value: float, *slopes: float) -> CalibratedValue:
+        """Return a value whose logarithm has these derivatives by the first of the place."""
         used = np.flatnonzero(slopes)
-        variance = scale * fewer * float(slopes[used] @ covariance[np.ix_(used, used)] @ slopes[used])
+        by = np.array(slopes)[used]
+        variance = scale * fewer * float(by @ covariance[np.ix_(used, used)] @ by)
         # the variance of a logarithm
         if not variance < 20.0:
             return CalibratedValue(value, None, reason="the scan does not determine it")
@@ -245,12 +234,11 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
         return _known_to(value, float(np.sqrt(variance)))
 
     # the integral of a |L|^2 over all frequencies
-    area = 0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2
-    by_area = by_place[0] - by_place[1] + by_place[2] / place[2]
+    area = float(0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2)
     return Calibration(
-        frequency_khz=known(natural, by_place[0]),
-        quality_factor=known(quality_factor, by_place[1]),
-        mean_square_nm2=known(float(area), by_area) if sweep.spectrum else None,
+        frequency_khz=known(natural, 1.0),
+        quality_factor=known(quality_factor, 0.0, 1.0),
+        mean_square_nm2=known(area, 1.0, -1.0, 1.0 / place[2]) if sweep.spectrum else None,
         model=sweep.model,
         error_origin=origin,
         phase_reversed=reverse,
@@ -259,7 +247,7 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
         p_value=p_value,
         residual_autocorrelation=together,
         chi2_without_resonance=chi2_without_resonance(sweep, error) / scale,
-        left=left / scale,
+        left=float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope) / scale,
         fitted=largest * (np.conj(model) if reverse else model),
         sweep=sweep,
     )
@@ -312,32 +300,29 @@ def _springs(
         scale_error: as of `calibrate`.
         static: as of `calibrate`.
     """
-    frequency, quality, mean = found.frequency_khz, found.quality_factor, found.mean_square_nm2
-    if quality.standard_error is None or frequency.standard_error is None:
+    read = [(one.value, one.standard_error) for one in (found.frequency_khz, found.quality_factor)]
+    if None in (error for _, error in read):
         return {}
-    springs, others = {}, []
-    if "spring_constant_n_per_m" in found.sweep.instrument:
-        others = [("the instrument", found.sweep.instrument["spring_constant_n_per_m"], 0.1)]
+    springs, mean = {}, found.mean_square_nm2
+    who, wanted, share = "the instrument", found.sweep.instrument.get("spring_constant_n_per_m"), 0.1
     if "length_um" in known:
-        read = [(one.value, one.standard_error) for one in (frequency, quality)]
         centre, errors = np.array([*read, *known.values()]).T
-        value = sader(*centre)
-        share = float(np.linalg.norm([sader(*place) / value - 1.0 for place in centre + np.diag(errors)]))
-        springs["sader"], others = _known_to(value, share), [("Sader's method", value, share)]
+        who, wanted = "Sader's method", sader(*centre)
+        share = float(np.linalg.norm([sader(*place) / wanted - 1.0 for place in centre + np.diag(errors)]))
+        springs["sader"] = _known_to(wanted, share)
     if mean is not None and mean.standard_error is not None:
         warm, warm_error = known["temperature_k"]
         value = equipartition(mean.value, warm, static=static)
         own = float(np.linalg.norm((mean.standard_error / mean.value, warm_error / warm, 2.0 * scale_error)))
         springs["equipartition"] = _known_to(value, own)
-        for who, wanted, share in others:
-            apart = float(np.log(value / wanted))
-            # neither is better than 5 %
-            if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((own, share, 0.05)):
-                doubt = (
-                    f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
-                    f"are {np.exp(-0.5 * apart):.3g} times the true ones"
-                )
-                springs["equipartition"] = CalibratedValue(value, None, reason=doubt)
+        apart = 0.0 if wanted is None else float(np.log(value / wanted))
+        # neither is better than 5 %
+        if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((own, share, 0.05)):
+            doubt = (
+                f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
+                f"are {np.exp(-0.5 * apart):.3g} times the true ones"
+            )
+            springs["equipartition"] = CalibratedValue(value, None, reason=doubt)
     return springs
 
 

@@ -15,14 +15,14 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import printable
-from fitting.tables.csv_text import NUMBER, TableError
+from fitting.tables.csv_text import NUMBER, TableError, value_and_error
 
 _SIZES = {
     "length": {"m": 1e9, "mm": 1e6, "um": 1e3, "nm": 1.0, "pm": 1e-3},
     "voltage": {"V": 1.0, "mV": 1e-3},
     "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
     "frequency": {"Hz": 1e-3, "kHz": 1.0, "MHz": 1e3},
-    "force": {"N": 1e9, "nN": 1.0},
+    "force": {"N": 1e9, "nN": 1.0, "pN": 1e-3},
     "stiffness": {"N/m": 1.0},
     "sensitivity": {"m/V": 1e9, "nm/V": 1.0},
     "spectrum": {"m/sqrt(Hz)": 1e9, "nm/sqrt(Hz)": 1.0, "pm/sqrt(Hz)": 1e-3, "fm/sqrt(Hz)": 1e-6},
@@ -70,12 +70,12 @@ class Segment:
     Attributes:
         curve: which curve of the file, from 1.
         branch: "approach", "retract", or empty: determined from the height's direction.
-        channels: numbers by channel name, in the units of `Recording.units`.
+        channels: numbers by channel name, in the units of `Recording.units`; of images arrays of rows and columns.
     """
 
     curve: int
     branch: str
-    channels: dict[str, Float[np.ndarray, " rows"]]
+    channels: dict[str, Float[np.ndarray, "..."]]
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,7 @@ class Recording:
         away: channels that grow with the distance between tip and sample; other heights grow towards the tip.
         remarks: what a reader should know of the format.
         settings: what the header says, as the file spells it.
+        size_m: height and width of images, or None.
     """
 
     format: str
@@ -101,6 +102,7 @@ class Recording:
     away: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
+    size_m: tuple[float, float] | None = None
 
     @property
     def channels(self) -> list[str]:
@@ -160,7 +162,7 @@ def given_numbers(
     """Return what a caller gives of the instrument, by name.
 
     Args:
-        numbers: each a number or a pair with its standard error; None: not given.
+        numbers: each a number, a pair with its standard error or a text such as '44 +- 4'; None: not given.
         units: of those that may be given.
         any_sign: those that need not be above 0.
 
@@ -169,16 +171,12 @@ def given_numbers(
         ValueError: if a value is impossible.
     """
     found = {}
-    for key, value in numbers.items():
+    for key, given in numbers.items():
         if key not in units:
             raise TypeError(f"there is no option `{key}`; it is one of {', '.join(units)}")
-        if value is None:
-            continue
-        number, error = value if isinstance(value, tuple) else (float(value), None)
-        sound = np.isfinite(number) and (number > 0.0 or key in any_sign) and (error is None or error > 0.0)
-        if not sound:
-            raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
-        found[key] = Known(float(number), units[key], f"option `{key}=...`", error)
+        if given is not None:
+            number, error = value_and_error(key, given, any_sign=key in any_sign)
+            found[key] = Known(number, units[key], f"option `{key}=...`", error)
     return found
 
 

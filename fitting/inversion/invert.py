@@ -137,7 +137,7 @@ class Inversion(JudgedResult):
 
 @checked
 @in_float64
-def invert(table: TableLike) -> Inversion:
+def invert(table: TableLike, *, noise: float | None = None, quality_factor: Any = None) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and lines through the losses.
 
     A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
@@ -146,7 +146,9 @@ def invert(table: TableLike) -> Inversion:
     over (1, u_in), a viscous loss, and over (1, u_in^2), a restitution.
 
     Args:
-        table: from `read_table`, with phases; its free frequency is exactly known if it has no error.
+        table: from `read_table`, or its file, with phases; its free frequency is exactly known if it has no error.
+        noise: of a file's amplitudes without an error, relative.
+        quality_factor: in place of the table's: a number, a pair with its error, '40 +- 2', or 'none': no air damping.
 
     Returns:
         Rows with errors, lines and a verdict; see `Inversion`.
@@ -154,7 +156,7 @@ def invert(table: TableLike) -> Inversion:
     Raises:
         TableError: if the table has no phase, or does not say its quality factor.
     """
-    table = as_table(table)
+    table = as_table(table, noise=noise, quality_factor=quality_factor)
     if table.tapping:
         raise TableError(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "

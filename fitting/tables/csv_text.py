@@ -8,6 +8,7 @@ read by the same functions.
 import csv
 import difflib
 import json
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -120,11 +121,9 @@ class Column:
 
     Attributes:
         name: its name in the file.
-        kind: what its numbers must be: "number" (any finite one), "not negative", "positive", "whole" (1, 2, 3, ...) or
-            "flag" (0, 1).
+        kind: what its numbers must be; see `Form.check_numbers`.
         meaning: what its numbers become; empty: the name. Columns of one meaning are aliases; a file has one.
         needed: what it gives, in a word, if every file needs a column that gives it; else empty.
-        required: whether every row needs it.
         error: the name of the column that holds its standard errors, for a measured column.
         amplitude: whether it is a measured amplitude: each row needs one, and a relative noise applies to it.
         convert: makes the unit of the meaning of its numbers; None: they have it.
@@ -134,7 +133,6 @@ class Column:
     kind: Literal["number", "not negative", "positive", "whole", "flag"] = "positive"
     meaning: str = ""
     needed: str = ""
-    required: bool = False
     error: str | None = None
     amplitude: bool = False
     convert: Callable[[Float[np.ndarray, " rows"]], Float[np.ndarray, " rows"]] | None = None
@@ -167,9 +165,9 @@ class Form:
     largest: float = FARTHEST
     strange: Mapping[str, str] = field(default_factory=dict)
 
-    def column(self, name: str) -> Column | None:
-        """Return the column of a name, None if there is none."""
-        return next((column for column in self.columns if column.name == name), None)
+    def column(self, name: str) -> Column:
+        """Return the column of a name that there is."""
+        return self.columns[self.names.index(name)]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -179,7 +177,7 @@ class Form:
     def check_numbers(
         self, name: str, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
     ) -> None:
-        """Note the impossible numbers of a column.
+        """Note the impossible numbers of a column: a "number" is finite, a "whole" one 1, 2, 3, ..., a "flag" 0 or 1.
 
         Args:
             name: of the column, or what it becomes.
@@ -187,21 +185,13 @@ class Form:
             lines: where each stands.
             faults: where the faults are noted.
         """
-        column = next(one for one in self.columns if name in {one.name, one.becomes})
-        lowest, highest = {
-            "number": (-self.largest, self.largest),
-            "not negative": (1.0 / FARTHEST, self.largest),
-            "positive": (1.0 / FARTHEST, self.largest),
-            # a whole number only has to survive the way through 64-bit floats
-            "whole": (1.0, 2.0**53 - 1.0),
-            "flag": (0.0, 1.0),
-        }[column.kind]
-        good = (values >= lowest) & (values <= highest)
+        kind = next(one.kind for one in self.columns if name in {one.name, one.becomes})
+        lowest = {"number": -self.largest, "positive": 1.0 / FARTHEST, "whole": 1.0}.get(kind, 0.0)
+        # a whole number only has to survive the way through 64-bit floats
+        highest = {"whole": 2.0**53 - 1.0, "flag": 1.0}.get(kind, self.largest)
         words = {"whole": "be a positive whole number (1, 2, 3, ...)", "flag": "be 0 or 1"}
-        if column.kind in words:
-            good &= values == np.floor(values)
-        good |= (column.kind == "not negative") & (values == 0.0)
-        must = words.get(column.kind, f"lie between {lowest:g} and {highest:g}")
+        must = words.get(kind, f"lie between {lowest:g} and {highest:g}")
+        good = (values >= lowest) & (values <= highest) & ((kind not in words) | (values == np.floor(values)))
         for row in np.flatnonzero(~(good | (np.isnan(values) & self.blanks))):
             number = repr(float(values[row])).removesuffix(".0")
             faults.add(f"must {must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
@@ -331,20 +321,21 @@ class TextTable(NamedTuple):
     settings: dict[str, tuple[float, float | None]]
 
 
-def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> TextTable:
-    """Read a text of comments, a row of column names, and rows of numbers, whose form is known.
+def read_columns(path: str | Path, form: Form, settings: Settings) -> TextTable:
+    """Read a file of comments, a row of column names, and rows of numbers, whose form is known.
 
     Args:
-        text: all of it.
+        path: the file.
         form: the columns that it may have.
         settings: those that comments may make.
-        faults: where faults are noted; with any, the result is not to be used.
 
     Raises:
-        TableError: as `read_comments` and `read_rows`.
+        TableError: with the first fault of the file.
     """
-    found, _, rows = read_comments(text, settings, faults)
+    faults = Faults(str(path))
+    found, _, rows = read_comments(read_text(path), settings, faults)
     columns, lines = read_rows(rows, form, faults)
+    faults.raise_any()
     used = [column for column in form.columns if column.name in columns]
     numbers = {one.becomes: one.convert(columns[one.name]) if one.convert else columns[one.name] for one in used}
     return TextTable(numbers, tuple(column.name for column in used), lines, found)
@@ -375,6 +366,41 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
     return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
 
 
+def value_and_error(name: str, given: Any, *, any_sign: bool = False) -> tuple[float, float | None]:
+    """Return a value and its standard error, None without one, that a caller gives.
+
+    >>> value_and_error("k", "44 +- 4"), value_and_error("k", 44), value_and_error("k", (44.0, None))
+    ((44.0, 4.0), (44.0, None), (44.0, None))
+
+    Args:
+        name: of the argument, for messages.
+        given: a number, a pair, or a text such as '44 +- 4'.
+        any_sign: whether it need not be above 0.
+
+    Raises:
+        ValueError: if it is none, or is impossible.
+    """
+    if isinstance(given, str):
+        given = _numbers_around(given, f"`{name}`", "write 40 or '40 +- 2'")
+    value, error = given if isinstance(given, tuple) else (given, None)
+    if not (np.isfinite(value) and (value > 0.0 or any_sign) and (error is None or 0.0 < error < np.inf)):
+        raise ValueError(f"`{name}` must be finite and above 0, but is {given!r}")
+    return float(value), None if error is None else float(error)
+
+
+def _numbers_around(text: str, name: str, mend: str) -> tuple[float, float | None]:
+    """Return the number of a text, and the one behind its +-, None without it.
+
+    Raises:
+        ValueError: with the name, what stands where a number must, and how to mend it.
+    """
+    cells = [cell.strip() for cell in _PLUS_MINUS.split(text, maxsplit=1)]
+    for cell in cells:
+        if not NUMBER.fullmatch(cell):
+            raise ValueError(f"{name} has {quoted(cell)} where a number must stand; {mend}")
+    return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
+
+
 def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
     """Return the value and its error of a comment that makes a setting; of a word the word.
 
@@ -396,18 +422,12 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
         raise ValueError(f"{key} must be {' or '.join(setting.choices)}, but is {quoted(value)}")
     if setting.none and value == "none":
         return None, None
-    cells = [cell.strip() for cell in _PLUS_MINUS.split(value)]
-    for cell in cells:
-        if not NUMBER.fullmatch(cell):
-            mend = f"write '{setting.line}', with a decimal point and without the unit"
-            raise ValueError(f"{key} has {quoted(cell)} where a number must stand; {mend}")
-    if len(cells) not in {"never": (1,), "maybe": (1, 2), "always": (2,)}[setting.error]:
-        wrong = "needs its standard error" if len(cells) < 2 else "takes no such error"
+    number, error = _numbers_around(value, key, f"write '{setting.line}', with a decimal point and without the unit")
+    if setting.error == ("always" if error is None else "never"):
+        wrong = "needs its standard error" if error is None else "takes no such error"
         raise ValueError(f"{key} {wrong}; write '{setting.line}'")
-    number, error = float(cells[0]), float(cells[1]) if len(cells) > 1 else None
-    fault = fault_in_number(setting, number, error)
-    if fault is not None:
-        raise ValueError(f"{key} {fault}")
+    if wrong := fault_in_number(setting, number, error):
+        raise ValueError(f"{key} {wrong}")
     return number, error
 
 
@@ -485,44 +505,34 @@ def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns,
     Raises:
         TableError: at once where the column names are wrong: the cells below cannot be judged then.
     """
-    line, text = rows[0]
+    head, text = rows[0]
     looks = next((sign for sign in ",\t; " if sign in text.strip()), ",")
     separator = form.separator or looks
     if looks != separator:
-        faults.add("the columns are not separated by commas; separate them by commas, decimals by points", line=line)
+        faults.add("the columns are not separated by commas; separate them by commas, decimals by points", line=head)
         faults.raise_any()
     names = cells_of(text, separator)
-    check_names(names, form, faults, line=line)
+    check_names(names, form, faults, line=head)
     if not rows[1:]:
-        faults.add(f"there are column names but no rows below them; add a row for each {form.row}", line=line)
+        faults.add(f"there are column names but no rows below them; add a row for each {form.row}", line=head)
     faults.raise_any()
-    table = _table_of(rows[1:], len(names), separator, faults)
-    columns = {}
-    for position, name in enumerate(names):
-        if form.column(name) is not None:
-            columns[name] = numbers = np.full(len(table), np.nan)
-            for row, (line, cells) in enumerate(table):
-                text = cells[position]
-                if NUMBER.fullmatch(text):
-                    numbers[row] = float(text)
-                elif text or not form.blanks:
-                    faults.add(_unreadable(text, form.row), line=line, column=name)
-    return columns, np.array([line for line, _ in table], dtype=np.int64)
-
-
-def _table_of(rows: NumberedLines, width: int, separator: str, faults: Faults) -> list[tuple[int, list[str]]]:
-    """Return the cells of rows, numbered, after noting and leaving out those of another number of cells."""
-    table = []
-    for line, text in rows:
+    columns: dict[str, list[float]] = {name: [] for name in names if name in form.names}
+    lines = []
+    for line, text in rows[1:]:
         cells = cells_of(text, separator)
         if text.count('"') % 2:
             faults.add("a quotation mark is not closed; close or remove it", line=line)
-        elif len(cells) != width:
-            hint = "fill the row up" if len(cells) < width else "a decimal comma must be a point"
-            faults.add(f"there are {len(cells)} cells for {width} columns; {hint}", line=line)
+        elif len(cells) != len(names):
+            hint = "fill the row up" if len(cells) < len(names) else "a decimal comma must be a point"
+            faults.add(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
         else:
-            table.append((line, cells))
-    return table
+            lines.append(line)
+            for name, cell in zip(names, cells, strict=True):
+                if name in columns:
+                    columns[name].append(float(cell) if NUMBER.fullmatch(cell) else math.nan)
+                    if math.isnan(columns[name][-1]) and (cell or not form.blanks):
+                        faults.add(_unreadable(cell, form.row), line=line, column=name)
+    return {name: np.array(column) for name, column in columns.items()}, np.array(lines, dtype=np.int64)
 
 
 def _unreadable(text: str, row: str) -> str:
@@ -547,36 +557,23 @@ def check_names(names: list[str], form: Form, faults: Faults, *, line: int = 0) 
         faults.add("the first row holds numbers; put the row of column names above it", line=line)
         return
     present: set[str] = set()
-    unknown = []
-    for name in names:
-        column = form.column(name)
-        if column is None:
-            unknown.append(name)
-        elif column.becomes in present:
-            faults.add("says again what another column says; remove one", line=line, column=name)
-        else:
-            present.add(column.becomes)
-    _check_unknown(unknown[:_SUGGESTIONS], form, present, line, faults)
+    for column in (form.column(name) for name in names if name in form.names):
+        if column.becomes in present:
+            faults.add("says again what another column says; remove one", line=line, column=column.name)
+        present.add(column.becomes)
+    for name in [name for name in names if name not in form.names][:_SUGGESTIONS]:
+        meant = nearest_name(name, form.names)
+        if name in form.strange:
+            faults.add(form.strange[name], line=line, column=name)
+        elif not form.open or (meant is not None and form.column(meant).becomes not in present):
+            known = f"remove or rename it, the columns are {', '.join(form.names)}"
+            mend = known if meant is None else f"did you mean {meant}?"
+            faults.add(f"unknown column {quoted(name)}; {mend}", line=line)
     # a column that is missing may be one that is misspelt
     for what in dict.fromkeys(column.needed for column in form.columns) if not faults.found else ():
         columns = [column for column in form.columns if column.needed == what]
         if what and not any(column.becomes in present for column in columns):
             faults.add(f"there is no {what} column; add {' or '.join(column.name for column in columns)}", line=line)
-
-
-def _check_unknown(unknown: list[str], form: Form, present: set[str], line: int, faults: Faults) -> None:
-    """Note names that no column has, and what each was meant to be."""
-    for name in unknown:
-        meant = form.column(nearest_name(name, form.names) or "")
-        if name in form.strange:
-            faults.add(form.strange[name], line=line, column=name)
-        elif form.open and (meant is None or meant.becomes in present):
-            continue
-        elif meant is None:
-            known = ", ".join(form.names)
-            faults.add(f"unknown column {quoted(name)}; remove or rename it, the columns are {known}", line=line)
-        else:
-            faults.add(f"unknown column {quoted(name)}; did you mean {meant.name}?", line=line)
 
 
 def plain_name(text: str) -> str:

@@ -69,6 +69,7 @@ from fitting.tables.csv_text import (
     read_text,
     setting_in,
     setting_line,
+    value_and_error,
 )
 
 LEAST_REPEATS = 4
@@ -109,11 +110,11 @@ _CANTILEVER = ("free_frequency_khz", "quality_factor", "mass_ng", "spring_consta
 
 
 _COLUMNS = (
-    Column("order", needed="order", required=True, kind="whole"),
-    Column("drive_frequency_khz", needed="drive frequency", required=True),
-    Column("drive_amplitude_nm", needed="drive amplitude", required=True),
-    Column("free_amplitude_nm", needed="free amplitude", required=True),
-    Column("offset_nm", needed="offset", required=True, kind="number"),
+    Column("order", needed="order", kind="whole"),
+    Column("drive_frequency_khz", needed="drive frequency"),
+    Column("drive_amplitude_nm", needed="drive amplitude"),
+    Column("free_amplitude_nm", needed="free amplitude"),
+    Column("offset_nm", needed="offset", kind="number"),
     Column("peak_amplitude_nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
     Column("peak_amplitude_error_nm"),
     Column("lockin_amplitude_nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
@@ -127,25 +128,21 @@ _COLUMNS = (
 )
 
 
-def _form(others: tuple[str, ...], strange: str, optional: str = "") -> Form:
-    """Return the form of tables that have all columns but those of the other form.
-
-    Args:
-        others: the columns of the other form.
-        strange: what to say of them.
-        optional: a column that may be left out.
-    """
-    columns = [replace(one, needed="") if one.name == optional else one for one in _COLUMNS if one.name not in others]
+def _form_without(*others: str, strange: str, optional: str = "") -> Form:
+    """Return the form of tables that have all columns but those of the other form, of which it says what to do."""
+    columns = [column for column in _COLUMNS if column.name not in others]
+    columns = [replace(column, needed="") if column.name == optional else column for column in columns]
     return Form(tuple(columns), "drive", blanks=True, largest=LARGEST, strange=dict.fromkeys(others, strange))
 
 
-TABLE = _form(
-    ("free_amplitude_nm", "phase_lag_deg", "phase_lag_error_deg", "retract"),
-    "belongs to a cantilever that is driven itself; add the line '# drive = force' or '# drive = base' above the names",
+TABLE = _form_without(
+    *("free_amplitude_nm", "phase_lag_deg", "phase_lag_error_deg", "retract"),
+    strange="belongs to a cantilever that is driven itself; add the line '# drive = force' or '# drive = base' above "
+    "the names",
 )
-TAPPING = _form(
-    ("drive_amplitude_nm", "peak_amplitude_nm", "peak_amplitude_error_nm", "phase_deg", "phase_error_deg"),
-    "belongs to a sample that is driven; where the cantilever is driven the columns are free_amplitude_nm, "
+TAPPING = _form_without(
+    *("drive_amplitude_nm", "peak_amplitude_nm", "peak_amplitude_error_nm", "phase_deg", "phase_error_deg"),
+    strange="belongs to a sample that is driven; where the cantilever is driven the columns are free_amplitude_nm, "
     "lockin_amplitude_nm and phase_lag_deg instead",
     optional="order",
 )
@@ -161,7 +158,7 @@ def columns_of(table: "AmplitudeTable") -> dict[str, Any]:
 
 def required(columns: Collection[str]) -> tuple[Column, ...]:
     """Return the columns of a table in which every row needs a number."""
-    return tuple(column for column in _COLUMNS if column.required and column.name in columns)
+    return tuple(column for column in _COLUMNS if column.needed and not column.amplitude and column.name in columns)
 
 
 def drive_numbers(columns: Columns) -> Int[np.ndarray, " rows"]:
@@ -215,8 +212,7 @@ def _fill_errors_of_repeats(columns: Columns) -> list[str]:
         A remark for each column that errors were added for.
     """
     lacking = [column for column in MEASURED if column.name in columns and str(column.error) not in columns]
-    readable = all(np.isfinite(columns[one.name]).all() for one in required(columns))
-    if not lacking or not columns[lacking[0].name].size or not readable:
+    if not lacking or not all(np.isfinite(columns[one.name]).all() for one in required(columns)):
         return []
     from scipy.stats import t as student_t  # noqa: PLC0415 - fits of other tables need no SciPy
 
@@ -372,7 +368,10 @@ class AmplitudeTable(Result):
         columns = {name: column_of(name, values, rows, faults) for name, values in columns.items()}
         for column in MEASURED:
             if (column.name in columns) != (column.error in columns):
-                faults.add(f"{column.name} and {column.error} come together; give both or none")
+                noise = f"{_OR_NOISE * column.amplitude}, or repeat readings: {LEAST_REPEATS} repeats tell them"
+                mend = f"has no errors; add the column {column.error}{noise}"
+                lacks = mend if column.name in columns else f"comes with {column.name}; give both or none"
+                faults.add(lacks, column=column.name if column.name in columns else column.error)
         _check_header(self, faults)
         faults.raise_any()
         _check_rows(columns, self.form, lines, faults)
@@ -505,17 +504,26 @@ TableLike = AmplitudeTable | str | os.PathLike[str]
 """An amplitude table, or the path of its file."""
 
 
-def as_table(given: TableLike) -> AmplitudeTable:
+def as_table(given: TableLike, *, noise: float | None = None, quality_factor: Any = None) -> AmplitudeTable:
     """Return a table that was given, or is read from its file.
+
+    Args:
+        given: the table or the path.
+        noise: of a file, as for `read_table`.
+        quality_factor: in place of the table's: a number, a pair with its error, '40 +- 2', or 'none'.
 
     Raises:
         TypeError: if it is something else.
         TableError: as `read_table`.
     """
-    if isinstance(given, AmplitudeTable):
+    if not isinstance(given, AmplitudeTable):
+        check_kind("table", given, TableLike)
+        given = read_table(Path(os.fspath(given)), noise)
+    if quality_factor is None:
         return given
-    check_kind("table", given, TableLike)
-    return read_table(Path(os.fspath(given)))
+    none = quality_factor == "none"
+    value, error = (None, None) if none else value_and_error("quality_factor", quality_factor)
+    return replace(given, quality_factor=value, quality_factor_error=error)
 
 
 def parse_table(text: str, source: str, noise: float | None = None) -> AmplitudeTable:
@@ -546,12 +554,10 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
             header |= {ERROR_OF[name]: error} if name in ERROR_OF else {}
     columns, lines = read_rows(rows, FORMS[header.get("drive", "sample")], faults)
     header |= {"source": source, "lines": lines, "remarks": remarks}
-    return _completed(columns, header, noise, faults, head=rows[0][0])
+    return _completed(columns, header, noise, faults)
 
 
-def _completed(
-    columns: Columns, header: dict[str, Any], noise: float | None, faults: Faults, head: int = 0
-) -> AmplitudeTable:
+def _completed(columns: Columns, header: dict[str, Any], noise: float | None, faults: Faults) -> AmplitudeTable:
     """Return a table of columns, with the errors that noise and repeated readings give.
 
     Args:
@@ -559,24 +565,17 @@ def _completed(
         header: the other attributes of the table.
         noise: relative noise of amplitudes without an error.
         faults: where faults are noted.
-        head: line of the column names.
 
     Raises:
         TableError: as `read_table`.
     """
     faults.raise_any()
-    for column in MEASURED if noise is not None else ():
-        if column.amplitude and column.name in columns:
+    for column in MEASURED:
+        if noise is not None and column.amplitude and column.name in columns:
             values, error = columns[column.name], str(column.error)
             errors = columns.get(error, np.full(len(values), np.nan))
-            columns[error] = np.where(np.isnan(errors), (noise or 0.0) * values, errors)
+            columns[error] = np.where(np.isnan(errors), noise * values, errors)
     repeats = _fill_errors_of_repeats(columns)
-    for column in MEASURED:
-        if column.name in columns and column.error not in columns:
-            hint = f"add the column {column.error}" + _OR_NOISE * column.amplitude
-            hint += f", or repeat readings: {LEAST_REPEATS} repeats tell them"
-            faults.add(f"has no errors; {hint}", line=head, column=column.name)
-    faults.raise_any()
     attributes: dict[str, Any] = {**header, **columns, "remarks": (*header.get("remarks", ()), *repeats)}
     return AmplitudeTable(**attributes)
 
