@@ -60,9 +60,6 @@ class Calibration(JudgedResult):
         chi2: sum of squared residuals over their errors.
         degrees_of_freedom: numbers measured less parameters.
         p_value: probability of a larger chi2 if the model is right; NaN where the errors come from the fit itself.
-        residual_autocorrelation: of neighbouring points.
-        chi2_without_resonance: of a parabola.
-        left: estimated distance of chi2 to its minimum.
         fitted: the response at every point, complex as the phase was measured, or the amplitude, in the sweep's unit.
         sweep: what was fitted; of a spectrum the part around the resonance.
         reasons: what makes the result invalid.
@@ -79,9 +76,6 @@ class Calibration(JudgedResult):
     chi2: float
     degrees_of_freedom: int
     p_value: float
-    residual_autocorrelation: float
-    chi2_without_resonance: float
-    left: float
     fitted: np.ndarray
     sweep: ResonanceSweep
     reasons: tuple[str, ...] = ()
@@ -186,7 +180,14 @@ def calibrate(
     _check_sweep(sweep)
     found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep)
     springs = _springs(found, known, scale_error, static=static)
-    return _judged(replace(found, spring_constant_n_per_m=springs))
+    reasons, warnings = list(found.reasons), list(found.warnings)
+    doubt = next((one.reason for one in springs.values() if one.reason is not None), None)
+    if doubt is not None:
+        how = "`length_um=...` and `width_um=...` give k by Sader's method"
+        reasons += [f"The spring constant is not calibrated: {doubt}; {how}."] if len(springs) == 1 else []
+        warnings.append(f"The spring constants contradict each other: {doubt}.")
+    said = {"reasons": tuple(reasons), "warnings": tuple(warnings)}
+    return replace(found, spring_constant_n_per_m=springs, **said)
 
 
 def _check_sweep(sweep: ResonanceSweep) -> None:
@@ -200,7 +201,7 @@ def _check_sweep(sweep: ResonanceSweep) -> None:
 
 
 def _fitted(sweep: ResonanceSweep) -> Calibration:
-    """Return the fit of a scan or of a part of a spectrum, not yet judged."""
+    """Return the fit of a scan or of a part of a spectrum, with what makes it invalid and its warnings."""
     largest, averages = float(sweep.amplitude.max()), sweep.averages if sweep.spectrum else None
     # without errors they are what makes chi2/dof 1
     error, size, origin = np.full(sweep.points, 1.0 if sweep.spectrum else 0.01), 1.0, "estimated"
@@ -235,21 +236,52 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
 
     # the integral of a |L|^2 over all frequencies
     area = float(0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2)
+    frequency, quality = known(natural, 1.0), known(quality_factor, 0.0, 1.0)
+    chi2, unknown = best.value / scale, frequency.reason or quality.reason
+    left = float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope) / scale
+    half, apart = 0.5 * natural / quality_factor, sweep.frequency_khz - natural
+    near, count = min(-apart[0], apart[-1]) / half, int(np.sum(np.abs(apart) < half))
+    khz, inside = f"{natural:.6g} kHz", f"{counted(count, 'point')} within the half-width"
+    faults = {
+        f"The resonance ({khz}) lies outside the sweep: sweep around it.": near < 0.0,
+        f"The resonance ({khz}) lies at the edge of the sweep: sweep at least one half-width (f0/2Q) to both sides.": (
+            near < 1.0
+        ),
+        f"Only {inside}: sweep in finer steps.": not sweep.spectrum and count < 3,
+        f"The model does not explain the sweep: chi2 {chi2:.0f} for {freedom} degrees of freedom. "
+        "Another background, a drift, or too small errors?": p_value < IMPROBABLE,
+        f"Not converged: chi2 lies an estimated {left:.2g} above its minimum.": not left < 1e-3,
+        f"Not identified: {unknown}.": unknown is not None,
+    }
+    # of these faults the first
+    reasons = [said for said, holds in faults.items() if holds][:1]
+    # four more parameters practically never bring such a fall of chi2 about by chance
+    if chi2_without_resonance(sweep, error) / scale - chi2 < 30.0 * max(chi2 / freedom, 1e-300):
+        reasons.insert(0, "No resonance stands out of the sweep: a parabola explains it about as well.")
+    if together > 0.5:
+        reasons.append(
+            f"Neighbouring residuals are strongly correlated ({together:+.2f}): the model misses something (another "
+            "background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
+        )
+    notes = {
+        f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural > 2e4,
+        "The phase rises through the resonance: its sign was reversed.": reverse,
+        f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": sweep.spectrum and count < 3,
+    }
     return Calibration(
-        frequency_khz=known(natural, 1.0),
-        quality_factor=known(quality_factor, 0.0, 1.0),
+        frequency_khz=frequency,
+        quality_factor=quality,
         mean_square_nm2=known(area, 1.0, -1.0, 1.0 / place[2]) if sweep.spectrum else None,
         model=sweep.model,
         error_origin=origin,
         phase_reversed=reverse,
-        chi2=best.value / scale,
+        chi2=chi2,
         degrees_of_freedom=freedom,
         p_value=p_value,
-        residual_autocorrelation=together,
-        chi2_without_resonance=chi2_without_resonance(sweep, error) / scale,
-        left=float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope) / scale,
         fitted=largest * (np.conj(model) if reverse else model),
         sweep=sweep,
+        reasons=tuple(reasons),
+        warnings=tuple(said for said, holds in notes.items() if holds),
     )
 
 
@@ -286,7 +318,7 @@ def _of_spectrum(sweep: ResonanceSweep) -> Calibration:
     found = fits[-1]
     low, high = found.sweep.frequency_khz[[0, -1]]
     note = f"Fitted from {low:.6g} to {high:.6g} kHz: what one resonance and white noise explain."
-    return found if found.sweep.points == sweep.points else replace(found, warnings=(note,))
+    return found if found.sweep.points == sweep.points else replace(found, warnings=(note, *found.warnings))
 
 
 def _springs(
@@ -330,44 +362,3 @@ def _known_to(value: float, share: float) -> CalibratedValue:
     """Return a value whose logarithm has a standard error."""
     ends = (value * float(np.exp(-TWO_SIDED_95 * share)), value * float(np.exp(TWO_SIDED_95 * share)))
     return CalibratedValue(value, value * share, ends)
-
-
-def _judged(e: Calibration) -> Calibration:
-    """Return a calibration with what makes it invalid, of the faults of its fit the first, and its warnings."""
-    natural, quality, springs = e.frequency_khz, e.quality_factor, e.spring_constant_n_per_m.values()
-    half, apart = 0.5 * natural.value / quality.value, e.sweep.frequency_khz - natural.value
-    near, count = min(-apart[0], apart[-1]) / half, int(np.sum(np.abs(apart) < half))
-    coarse, unknown = count < 3, natural.reason or quality.reason
-    khz, inside = f"{natural.value:.6g} kHz", f"{counted(count, 'point')} within the half-width"
-    faults = {
-        f"The resonance ({khz}) lies outside the sweep: sweep around it.": near < 0.0,
-        f"The resonance ({khz}) lies at the edge of the sweep: sweep at least one half-width (f0/2Q) to both sides.": (
-            near < 1.0
-        ),
-        f"Only {inside}: sweep in finer steps.": e.model != "power" and coarse,
-        f"The model does not explain the sweep: chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom. "
-        "Another background, a drift, or too small errors?": e.p_value < IMPROBABLE,
-        f"Not converged: chi2 lies an estimated {e.left:.2g} above its minimum.": not e.left < 1e-3,
-        f"Not identified: {unknown}.": unknown is not None,
-    }
-    reasons = [said for said, holds in faults.items() if holds][:1]
-    # four more parameters practically never bring such a fall of chi2 about by chance
-    if e.chi2_without_resonance - e.chi2 < 30.0 * max(e.chi2 / e.degrees_of_freedom, 1e-300):
-        reasons.insert(0, "No resonance stands out of the sweep: a parabola explains it about as well.")
-    if e.residual_autocorrelation > 0.5:
-        reasons.append(
-            f"Neighbouring residuals are strongly correlated ({e.residual_autocorrelation:+.2f}): the model misses "
-            "something (another background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
-        )
-    doubt = next((one.reason for one in springs if one.reason is not None), None)
-    if doubt is not None and len(springs) == 1:
-        how = "`length_um=...` and `width_um=...` give k by Sader's method"
-        reasons.append(f"The spring constant is not calibrated: {doubt}; {how}.")
-    notes = {
-        f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural.value > 2e4,
-        "The phase rises through the resonance: its sign was reversed.": e.phase_reversed,
-        f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": e.model == "power" and coarse,
-        f"The spring constants contradict each other: {doubt}.": doubt is not None,
-    }
-    warnings = (*e.warnings, *(said for said, holds in notes.items() if holds))
-    return replace(e, reasons=tuple(reasons), warnings=warnings)

@@ -150,10 +150,9 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         text = first_bytes(path, 1 << 16)
     if text.startswith(b"[DataSet]") or _NANONIS.search(text):
         return _sweep_of(read_recording(path))
-    table = read_columns(path, SWEEP, {})
-    unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
-    named: dict[str, Any] = table.columns | {"amplitude_unit": unit, "lines": table.lines, "source": str(path)}
-    return ResonanceSweep(**named)
+    used, columns, lines, _ = read_columns(path, SWEEP, {})
+    unit = _UNITS.get(used["amplitude"].name, "")
+    return ResonanceSweep(**columns, amplitude_unit=unit, lines=lines, source=str(path))
 
 
 _NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)

@@ -9,6 +9,9 @@ errors (noise that is not independent from row to row), all errors are multiplie
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+Rows = Float[np.ndarray, " rows"]
+Bins = Float[np.ndarray, " bins"]
+Places = Int[np.ndarray, " rows"]
 _ROWS = 5
 """Rows in a bin of the usual width, at least; as many are needed for a scatter of their own."""
 _MOST = 200
@@ -20,19 +23,19 @@ _ONE_RAMP = 0.1
 """Share of a branch's rows that the rows of a bin may be spread over, for the bins to be in the order of time."""
 
 
-def ways_of(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> dict[str, Float[np.ndarray, " some"]]:
+def ways_of(offset_nm: Rows, branch: np.ndarray) -> dict[str, Float[np.ndarray, " some"]]:
     """Return the heights of each branch, in the order of the rows."""
     return {name: offset_nm[branch == name] for name in dict.fromkeys(branch.tolist())}
 
 
-def faults_of_order(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> tuple[int, int]:
+def faults_of_order(offset_nm: Rows, branch: np.ndarray) -> tuple[int, int]:
     """Return how many rows repeat a height of their branch, and how many step back against its direction."""
     ways = ways_of(offset_nm, branch).values()
     back = sum(int(np.sum(np.diff(way) * np.sign(way[-1] - way[0]) < 0.0)) for way in ways)
     return sum(len(way) - len(np.unique(way)) for way in ways), back
 
 
-def usual_width(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> float:
+def usual_width(offset_nm: Rows, branch: np.ndarray) -> float:
     """Return the width in nm of bins for a curve whose heights repeat or are not in order.
 
     The width is that of five rows, or of a 200th of them; 0 (only rows of equal height are merged) for few rows.
@@ -42,8 +45,8 @@ def usual_width(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> fl
 
 
 def binned(
-    offset_nm: Float[np.ndarray, " rows"],
-    readings: dict[str, Float[np.ndarray, " rows"]],
+    offset_nm: Rows,
+    readings: dict[str, Rows],
     branch: np.ndarray,
     free: Bool[np.ndarray, " rows"],
     width_nm: float,
@@ -94,14 +97,12 @@ def error_of(name: str) -> str:
     return f"{stem}_error_{unit}"
 
 
-def _means(place: Int[np.ndarray, " rows"], values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " bins"]:
+def _means(place: Places, values: Rows) -> Bins:
     """Return the mean of the values in each place."""
     return np.bincount(place, values) / np.bincount(place)
 
 
-def _scatter(
-    height: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], place: Int[np.ndarray, " rows"]
-) -> Float[np.ndarray, " bins"]:
+def _scatter(height: Rows, values: Rows, place: Places) -> Bins:
     """Return the scatter of single readings about a line over the height, in each bin and its neighbours."""
     # bins of few rows are taken together
     group, held = [0], 0
@@ -123,9 +124,7 @@ def _scatter(
     return np.sqrt(pooled / np.maximum(free, 1.0))[groups]
 
 
-def _excess(
-    values: Float[np.ndarray, " bins"], errors: Float[np.ndarray, " bins"], time: Float[np.ndarray, " bins"]
-) -> float:
+def _excess(values: Bins, errors: Bins, time: Bins) -> float:
     """Return by how much free bins scatter more about a straight line in time than their errors say, 1 at least."""
     known = errors > 0.0
     if known.sum() < _ROWS:

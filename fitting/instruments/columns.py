@@ -162,8 +162,11 @@ def columns_to_paste(recording: Recording, roles: Iterable[str] = _CURVE) -> str
         return f'say `columns="{_EXAMPLE}"` (approach/retract)'
     told = {role: channel_of(recording, role, {}) for role in roles}
     others = iter([name for name in names if name not in {one.channel for one in told.values() if one is not None}])
-    shown = {role: one or ColumnSource(next(others, "CHANNEL"), usual_unit(role)) for role, one in told.items()}
-    parts = [f"{role}={one.channel}:{one.unit}" for role, one in shown.items()]
+    parts = []
+    for role, one in told.items():
+        channel = next(others, "CHANNEL") if one is None else one.channel
+        unit = recording.units.get(channel, "")
+        parts.append(f"{role}={channel}:{unit if quantity_of(unit) in ROLES[role][0] else usual_unit(role)}")
     return f'say `columns="{",".join(parts)}"`'
 
 

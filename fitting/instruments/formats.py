@@ -73,7 +73,7 @@ def read_recording(path: str | Path) -> Recording:
 
 
 _NOT_READ = {
-    (b"\x93NUMPY", b"GWYP", b"PK\x03\x04"): "holds arrays of NumPy or data of Gwyddion; export a curve as text",
+    (b"\x93NUMPY", b"GWYP", b"PK\x03\x04"): "holds arrays of NumPy, or data of Gwyddion or JPK; export a curve as text",
     (b"\x89HDF",): "is HDF5, as Nanosurf's .nhf; export the curve as .nid or CSV",
     (b"ARDF",): "is Asylum's .ARDF; export the curve as .ibw, or as text",
     (b"\\*File list", b"\\*Force file", b"\\*EC File"): "is Bruker's; export the curve as text (NanoScope Analysis)",

@@ -18,6 +18,10 @@ from fitting.predict.orbit import Local, Row
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
 
+Rows = Float[np.ndarray, " rows"]
+Impacts = Float[np.ndarray, "rows 3"]
+Covariances = Float[np.ndarray, "rows 3 3"]
+Shared = Float[np.ndarray, "rows 3 k"]
 _OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _SLOW = 2.5
@@ -73,10 +77,10 @@ class Inversion(JudgedResult):
         warnings: what a reader should know besides.
     """
 
-    approach_speed_nm_per_us: Float[np.ndarray, " rows"]
-    rebound_speed_nm_per_us: Float[np.ndarray, " rows"]
-    collision_delay_us: Float[np.ndarray, " rows"]
-    covariance: Float[np.ndarray, "rows 3 3"]
+    approach_speed_nm_per_us: Rows
+    rebound_speed_nm_per_us: Rows
+    collision_delay_us: Rows
+    covariance: Covariances
     shared: Float[np.ndarray, "rows 3 shared"]
     shared_names: tuple[str, ...]
     note: tuple[str, ...]
@@ -87,7 +91,7 @@ class Inversion(JudgedResult):
     warnings: tuple[str, ...] = ()
 
     @property
-    def errors(self) -> Float[np.ndarray, "rows 3"]:
+    def errors(self) -> Impacts:
         """Standard errors of approach speed, rebound speed and delay, what rows share included."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2) + np.sum(self.shared**2, axis=2))
 
@@ -227,9 +231,7 @@ def _why_not_valid(e: Inversion) -> str | None:
 
 
 def _lines(
-    impact: Float[np.ndarray, "rows 3"],
-    covariance: Float[np.ndarray, "rows 3 3"],
-    shared: Float[np.ndarray, "rows 3 k"],
+    impact: Impacts, covariance: Covariances, shared: Shared
 ) -> tuple[dict[str, Line], Bool[np.ndarray, " rows"]]:
     """Return the lines through the losses, and which rows they go through: those that are not too slow."""
     fast, lines = np.ones(len(impact), dtype=bool), {}
@@ -242,12 +244,7 @@ def _lines(
     return lines, fast
 
 
-def line(
-    impact: Float[np.ndarray, "rows 3"],
-    covariance: Float[np.ndarray, "rows 3 3"],
-    shared: Float[np.ndarray, "rows 3 k"],
-    power: int,
-) -> Line:
+def line(impact: Impacts, covariance: Covariances, shared: Shared, power: int) -> Line:
     """Return the line u_in^2 - u_out^2 = epsilon + slope u_in^n of correlated rows.
 
     The residual of a row varies by (2 u_in - n slope u_in^(n - 1), -2 u_out) times the errors of its speeds, which its

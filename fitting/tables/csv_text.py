@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -42,6 +42,8 @@ SETTING_NAMES = frozenset(
 )
 """What a comment sets in one file or another: where it sets nothing it is refused, never left among the remarks."""
 
+Rows = Float[np.ndarray, " rows"]
+Lines = Int[np.ndarray, " rows"]
 NumberedLines = list[tuple[int, str]]
 """Lines of a file, each with its number."""
 Columns = dict[str, Shaped[np.ndarray, " rows"]]
@@ -78,9 +80,7 @@ class Faults:
         place += "" if column is None else f", column {column}"
         self.found.append((line, f"{printable(self.source)}{place}: {message}"))
 
-    def add_rows(
-        self, bad: Bool[np.ndarray, " rows"], message: str, lines: Int[np.ndarray, " rows"], column: str | None = None
-    ) -> None:
+    def add_rows(self, bad: Bool[np.ndarray, " rows"], message: str, lines: Lines, column: str | None = None) -> None:
         """Note a fault of some rows.
 
         Args:
@@ -135,7 +135,7 @@ class Column:
     needed: str = ""
     error: str | None = None
     amplitude: bool = False
-    convert: Callable[[Float[np.ndarray, " rows"]], Float[np.ndarray, " rows"]] | None = None
+    convert: Callable[[Rows], Rows] | None = None
 
     @property
     def becomes(self) -> str:
@@ -165,18 +165,12 @@ class Form:
     largest: float = FARTHEST
     strange: Mapping[str, str] = field(default_factory=dict)
 
-    def column(self, name: str) -> Column:
-        """Return the column of a name that there is."""
-        return self.columns[self.names.index(name)]
-
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the table's columns."""
         return tuple(column.name for column in self.columns)
 
-    def check_numbers(
-        self, name: str, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
-    ) -> None:
+    def check_numbers(self, name: str, values: Rows, lines: Lines, faults: Faults) -> None:
         """Note the impossible numbers of a column: a "number" is finite, a "whole" one 1, 2, 3, ..., a "flag" 0 or 1.
 
         Args:
@@ -305,23 +299,9 @@ def text_of(data: bytes, path: str | Path, wrong: str, *, latin: bool = False) -
     return text
 
 
-class TextTable(NamedTuple):
-    """What a file with comments and columns says.
-
-    Attributes:
-        columns: the numbers, by what they become, in its unit.
-        names: of the columns that were read.
-        lines: the line of each row.
-        settings: value and error of those that comments make.
-    """
-
-    columns: Columns
-    names: tuple[str, ...]
-    lines: Int[np.ndarray, " rows"]
-    settings: dict[str, tuple[float, float | None]]
-
-
-def read_columns(path: str | Path, form: Form, settings: Settings) -> TextTable:
+def read_columns(
+    path: str | Path, form: Form, settings: Settings
+) -> tuple[dict[str, Column], Columns, Lines, dict[str, tuple[Any, float | None]]]:
     """Read a file of comments, a row of column names, and rows of numbers, whose form is known.
 
     Args:
@@ -329,16 +309,20 @@ def read_columns(path: str | Path, form: Form, settings: Settings) -> TextTable:
         form: the columns that it may have.
         settings: those that comments may make.
 
+    Returns:
+        The columns that were read, and their numbers in the unit of what they become, both by that; the line of each
+        row; value and error of the settings.
+
     Raises:
         TableError: with the first fault of the file.
     """
     faults = Faults(str(path))
     found, _, rows = read_comments(read_text(path), settings, faults)
-    columns, lines = read_rows(rows, form, faults)
+    numbers, lines = read_rows(rows, form, faults)
     faults.raise_any()
-    used = [column for column in form.columns if column.name in columns]
-    numbers = {one.becomes: one.convert(columns[one.name]) if one.convert else columns[one.name] for one in used}
-    return TextTable(numbers, tuple(column.name for column in used), lines, found)
+    used = {column.becomes: column for column in form.columns if column.name in numbers}
+    columns = {key: one.convert(numbers[one.name]) if one.convert else numbers[one.name] for key, one in used.items()}
+    return used, columns, lines, found
 
 
 def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
@@ -486,15 +470,11 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
 def cells_of(text: str, separator: str) -> list[str]:
     """Return the cells of one line, without the spaces and quotation marks around them."""
     # instruments end their lines with a tab, and put several spaces between columns
-    text = text.rstrip(" ").removesuffix("\t") if separator == "\t" else text
-    text = " ".join(text.split()) if separator == " " else text
-    # The csv module is needed for quotation marks only, and costs more than the rest of the reading.
-    quotes = '"' in text
-    cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True)) if quotes else text.split(separator)
-    return [cell.strip() for cell in cells]
+    text = text.rstrip(" ").removesuffix("\t" if separator == "\t" else "")
+    return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
 
 
-def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns, Int[np.ndarray, " rows"]]:
+def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns, Lines]:
     """Return the columns that the form has as numbers (NaN where a cell is blank), and the line of each row.
 
     Args:
@@ -556,17 +536,16 @@ def check_names(names: list[str], form: Form, faults: Faults, *, line: int = 0) 
     if any(NUMBER.fullmatch(name) for name in names):
         faults.add("the first row holds numbers; put the row of column names above it", line=line)
         return
-    present: set[str] = set()
-    for column in (form.column(name) for name in names if name in form.names):
-        if column.becomes in present:
-            faults.add("says again what another column says; remove one", line=line, column=column.name)
-        present.add(column.becomes)
-    for name in [name for name in names if name not in form.names][:_SUGGESTIONS]:
-        meant = nearest_name(name, form.names)
+    becomes = {column.name: column.becomes for column in form.columns}
+    present = [becomes[name] for name in names if name in becomes]
+    for name in {becomes[name]: name for name in names if present.count(becomes.get(name, "")) > 1}.values():
+        faults.add("says again what another column says; remove one", line=line, column=name)
+    for name in [name for name in names if name not in becomes][:_SUGGESTIONS]:
+        meant = nearest_name(name, becomes)
         if name in form.strange:
             faults.add(form.strange[name], line=line, column=name)
-        elif not form.open or (meant is not None and form.column(meant).becomes not in present):
-            known = f"remove or rename it, the columns are {', '.join(form.names)}"
+        elif not form.open or (meant is not None and becomes[meant] not in present):
+            known = f"remove or rename it, the columns are {', '.join(becomes)}"
             mend = known if meant is None else f"did you mean {meant}?"
             faults.add(f"unknown column {quoted(name)}; {mend}", line=line)
     # a column that is missing may be one that is misspelt

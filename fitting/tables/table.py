@@ -72,6 +72,7 @@ from fitting.tables.csv_text import (
     value_and_error,
 )
 
+Rows = Float[np.ndarray, " rows"]
 LEAST_REPEATS = 4
 """Readings beyond the first of each drive from which on their scatter gives errors."""
 ERRORS_OF_REPEATS = "Errors from repeated readings: "
@@ -169,7 +170,7 @@ def drive_numbers(columns: Columns) -> Int[np.ndarray, " rows"]:
 
 
 def scatter_about_means(
-    column: Column, columns: Columns, error: Float[np.ndarray, " rows"] | None
+    column: Column, columns: Columns, error: Rows | None
 ) -> tuple[Bool[np.ndarray, " rows"], int, float]:
     """Return which rows repeat others, degrees of freedom and chi2 of a measured column about each drive's mean.
 
@@ -321,24 +322,24 @@ class AmplitudeTable(Result):
         TableError: if a value is impossible, an error is missing or the lengths differ.
     """
 
-    drive_frequency_khz: Float[np.ndarray, " rows"]
-    offset_nm: Float[np.ndarray, " rows"]
+    drive_frequency_khz: Rows
+    offset_nm: Rows
     free_frequency_khz: float
     free_frequency_error_khz: float | None = None
     drive: str = "sample"
     order: Real[np.ndarray, " orders"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    drive_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    free_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    peak_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    peak_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
-    lockin_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    lockin_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
-    phase_deg: Float[np.ndarray, " rows"] | None = None
-    phase_error_deg: Float[np.ndarray, " rows"] | None = None
-    phase_lag_deg: Float[np.ndarray, " rows"] | None = None
-    phase_lag_error_deg: Float[np.ndarray, " rows"] | None = None
-    retract: Float[np.ndarray, " rows"] | None = None
-    no_orbit: Float[np.ndarray, " rows"] | None = None
+    drive_amplitude_nm: Rows | None = None
+    free_amplitude_nm: Rows | None = None
+    peak_amplitude_nm: Rows | None = None
+    peak_amplitude_error_nm: Rows | None = None
+    lockin_amplitude_nm: Rows | None = None
+    lockin_amplitude_error_nm: Rows | None = None
+    phase_deg: Rows | None = None
+    phase_error_deg: Rows | None = None
+    phase_lag_deg: Rows | None = None
+    phase_lag_error_deg: Rows | None = None
+    retract: Rows | None = None
+    no_orbit: Rows | None = None
     quality_factor: float | None = float("nan")
     quality_factor_error: float | None = None
     mass_ng: float | None = None
@@ -438,14 +439,14 @@ class AmplitudeTable(Result):
         return self.drive != "sample"
 
     @property
-    def excitation_nm(self) -> Float[np.ndarray, " rows"]:
+    def excitation_nm(self) -> Rows:
         """Amplitude in nm of the sample, or of the free tip where the cantilever is driven."""
         found = self.free_amplitude_nm if self.tapping else self.drive_amplitude_nm
         assert found is not None  # checked when it was made  # noqa: S101
         return found
 
     @property
-    def phase_and_error_deg(self) -> tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, " rows"] | None]:
+    def phase_and_error_deg(self) -> tuple[Rows | None, Rows | None]:
         """Phase of the orbit, or lag of the driven tip, and its standard error; None without them."""
         if self.tapping:
             return self.phase_lag_deg, self.phase_lag_error_deg
@@ -455,10 +456,10 @@ class AmplitudeTable(Result):
 def _check_header(table: AmplitudeTable, faults: Faults) -> None:
     for name in _CANTILEVER:
         value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
-        if value is None or (name == "quality_factor" and np.isnan(value)):
-            if error is not None:
-                faults.add(f"{ERROR_OF[name]} stands without {name}; give both or none")
-        elif fault := fault_in_number(SETTINGS[name], value, error):
+        unknown = value is None or (name == "quality_factor" and np.isnan(value))
+        if unknown and error is not None:
+            faults.add(f"{ERROR_OF[name]} stands without {name}; give both or none")
+        elif not unknown and (fault := fault_in_number(SETTINGS[name], value, error)):
             faults.add(f"{name} {fault}")
     if table.spring_constant_n_per_m is not None and table.mass_ng is not None and not faults.found:
         wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
@@ -544,15 +545,12 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     if "free_frequency_khz" not in settings:
         example = SETTINGS["free_frequency_khz"].line
         faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
-    header: dict[str, Any] = {
-        "rows_in_order_of_time": "rows" in settings,
-        "calibration": {key: settings[key] for key in CALIBRATION if key in settings},
-    }
-    for name in ("drive", "phase_sense", *_CANTILEVER):
-        if name in settings:
-            header[name], error = settings[name]
-            header |= {ERROR_OF[name]: error} if name in ERROR_OF else {}
+    known = [name for name in ("drive", "phase_sense", *_CANTILEVER) if name in settings]
+    header: dict[str, Any] = {name: settings[name][0] for name in known}
+    header |= {ERROR_OF[name]: settings[name][1] for name in known if name in ERROR_OF}
     columns, lines = read_rows(rows, FORMS[header.get("drive", "sample")], faults)
+    calibration = {key: settings[key] for key in CALIBRATION if key in settings}
+    header |= {"calibration": calibration, "rows_in_order_of_time": "rows" in settings}
     header |= {"source": source, "lines": lines, "remarks": remarks}
     return _completed(columns, header, noise, faults)
 
@@ -600,22 +598,19 @@ def write_table(table: TableLike, path: str | Path) -> None:
 
 def csv_of(table: AmplitudeTable) -> str:
     """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
-    lines = [f"# drive = {table.drive}"] if table.tapping else []
-    for name in _CANTILEVER:
-        value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
-        if name == "quality_factor" and value is None:
-            lines.append("# quality_factor = none")
-        elif value is not None and not np.isnan(value):
-            lines.append(setting_line(name, float(value), error and float(error)))
-    known = {name: table.calibration[name] for name in CALIBRATION if name in table.calibration}
-    lines += [setting_line(name, float(value), float(error)) for name, (value, error) in known.items()]
-    lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
-    lines += [f"# phase_sense = {table.phase_sense}"] if table.phase_sense else []
+    words = {"drive": table.drive if table.tapping else "", "phase_sense": table.phase_sense}
+    words["rows"] = SETTINGS["rows"].example if table.rows_in_order_of_time else ""
+    numbers = {name: (getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)) for name in _CANTILEVER}
+    numbers |= {name: table.calibration[name] for name in CALIBRATION if name in table.calibration}
+    lines = [setting_line(key, word, None) for key, word in words.items() if word]
+    for key, (value, error) in numbers.items():
+        if value is not None and not np.isnan(value):
+            lines.append(setting_line(key, float(value), error and float(error)))
+    lines += ["# quality_factor = none"] if table.quality_factor is None else []
     lines += [f"# {remark}" for remark in table.remarks]
-    names = [name for name in table.form.names if getattr(table, name) is not None]
+    columns = {name: getattr(table, name) for name in table.form.names if getattr(table, name) is not None}
     if table.tapping and np.all(table.order == 1):
-        names.remove("order")
-    columns = {name: getattr(table, name) for name in names}
+        del columns["order"]
     lines.append(",".join(columns))
     # tolist gives Python numbers, whose repr is the shortest text that reads back as the same number.
     cells = [["" if value != value else repr(value) for value in column.tolist()] for column in columns.values()]  # noqa: PLR0124

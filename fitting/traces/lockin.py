@@ -22,6 +22,7 @@ from afm_jax.units import within_turn
 from afm_jax.words import bullets, printable
 from fitting.tables.csv_text import Column, Faults, FileSetting, Form, TableError, read_columns
 
+Samples = Float[np.ndarray, " samples"]
 HIGHEST_ORDER = 8
 """Subharmonics that are read: the paper's proposal; higher ones are hardly ever seen."""
 SHARE = 0.02
@@ -45,8 +46,8 @@ class Trace(ResultTuple):
         drive_frequency_khz: of the platform, or None where the file does not say it.
     """
 
-    time_us: Float[np.ndarray, " samples"]
-    deflection_nm: Float[np.ndarray, " samples"]
+    time_us: Samples
+    deflection_nm: Samples
     drive_frequency_khz: float | None
 
 
@@ -117,8 +118,8 @@ class LockinResult(JudgedResult):
 
 @checked
 def lockin(
-    time_us: Float[np.ndarray, " samples"] | str | os.PathLike[str],
-    deflection_nm: Float[np.ndarray, " samples"] | None = None,
+    time_us: Samples | str | os.PathLike[str],
+    deflection_nm: Samples | None = None,
     drive_frequency_khz: float | None = None,
     order: int = 1,
 ) -> LockinResult:
@@ -188,14 +189,12 @@ def lockin(
     return replace(found, reasons=reasons, warnings=tuple(warnings))
 
 
-def _whole(time: Float[np.ndarray, " samples"], period_us: float) -> int:
+def _whole(time: Samples, period_us: float) -> int:
     """Return how many whole periods a trace holds."""
     return int((time[-1] - time[0]) / period_us + 1e-9)
 
 
-def _blocks(
-    time: Float[np.ndarray, " samples"], height: Float[np.ndarray, " samples"], period: float, n: int, order: int
-) -> Complex[np.ndarray, " blocks"]:
+def _blocks(time: Samples, height: Samples, period: float, n: int, order: int) -> Complex[np.ndarray, " blocks"]:
     """Return 2/T times the integral of z exp(-i omega t/n) over each of at most twelve blocks; none if too short.
 
     Blocks hold equally many whole periods of both orders, the last ones of the trace.
@@ -229,7 +228,7 @@ def _line(blocks: Complex[np.ndarray, " blocks"]) -> tuple[complex, float, float
     return mean, along, min(across / max(abs(mean), 1e-300), math.pi)
 
 
-def _sampling_error(time: Float[np.ndarray, " samples"], period: float) -> float:
+def _sampling_error(time: Samples, period: float) -> float:
     """Return by which share an amplitude may be wrong as few phases of the period are sampled.
 
     Sampled at M phases, the harmonics M - 1 and M + 1 look like the first; the k-th of a bounce is 3/(4 k^2) of it.
@@ -314,9 +313,9 @@ def read_trace(path: str | Path) -> Trace:
     Raises:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
-    table, faults = read_columns(path, TRACE, SETTINGS), Faults(str(path))
-    for name, numbers in table.columns.items():
-        TRACE.check_numbers(name, numbers, table.lines, faults)
+    (_, columns, lines, settings), faults = read_columns(path, TRACE, SETTINGS), Faults(str(path))
+    for name, numbers in columns.items():
+        TRACE.check_numbers(name, numbers, lines, faults)
     faults.raise_any()
-    frequency, _ = table.settings.get("drive_frequency_khz", (None, None))
-    return Trace(table.columns["time_us"], table.columns["deflection_nm"], frequency)
+    frequency, _ = settings.get("drive_frequency_khz", (None, None))
+    return Trace(columns["time_us"], columns["deflection_nm"], frequency)
