@@ -19,9 +19,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.saved import why_no_fit
-from afm_jax.whole_files import read_whole
+from afm_jax.whole_files import LARGEST_BYTES, read_whole
 from afm_jax.words import printable
 
+# a cell may be as long as a file
+csv.field_size_limit(LARGEST_BYTES)
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
