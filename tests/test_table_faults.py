@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from afm_jax.scenefile.scenefile import SceneError, load_scene
-from fitting.tables.csv_text import Faults, TableError, column_of
+from fitting.tables.csv_text import Source, TableError, column_of
 from fitting.tables.table import read_table, write_table
 from tests.test_table import KEY, TEXT, read, small_table
 
@@ -75,9 +75,7 @@ def test_a_table_in_memory_keeps_the_same_rules(change: dict[str, Any], message:
 
 
 def test_columns_of_a_table_in_memory_have_one_length():
-    faults = Faults("here")
-    column_of("offset_nm", np.zeros(2), 2, faults)
-    faults.raise_any()
-    column_of("offset_nm", np.zeros(3), 2, faults)
+    here = Source("here")
+    column_of("offset_nm", np.zeros(2), 2, here)
     with pytest.raises(TableError, match=r"here, column offset_nm: has the shape \(3,\); every column is a list of"):
-        faults.raise_any()
+        column_of("offset_nm", np.zeros(3), 2, here)

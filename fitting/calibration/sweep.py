@@ -32,7 +32,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.whole_files import first_bytes
 from fitting.instruments.formats import read_recording
 from fitting.instruments.recording import UNITS, Recording
-from fitting.tables.csv_text import Column, Faults, Form, TableError, column_of, read_columns
+from fitting.tables.csv_text import Column, Form, Source, TableError, column_of, read_columns
 
 DENSITY = "nm/sqrt(Hz)"
 """The unit that makes a sweep a thermal spectrum."""
@@ -92,14 +92,12 @@ class ResonanceSweep(Result):
     lines: InitVar[Int[np.ndarray, " points"] | None] = None
 
     def __post_init__(self, lines: Int[np.ndarray, " points"] | None):
-        faults = Faults(self.source, place="row" if lines is None else "line")
+        source = Source(self.source, "row" if lines is None else "line")
         points = np.size(self.frequency_khz)
         columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
-        arrays = {name: column_of(name, values, points, faults) for name, values in columns.items()}
-        faults.raise_any()
+        arrays = {name: column_of(name, values, points, source) for name, values in columns.items()}
         for name, values in arrays.items():
-            SWEEP.check_numbers(name, values, np.arange(1, points + 1) if lines is None else lines, faults)
-        faults.raise_any()
+            SWEEP.check_numbers(name, values, np.arange(1, points + 1) if lines is None else lines, source)
         # The sort is stable: repeated measurements at one frequency keep their order.
         order = np.argsort(arrays["frequency_khz"], kind="stable")
         for name, values in arrays.items():
@@ -143,7 +141,7 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         path: the file; its form is recognised by its content, not by its name.
 
     Raises:
-        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+        TableError: one line that names the first fault, its place, and how to mend it.
     """
     text = b""
     with contextlib.suppress(OSError):

@@ -257,15 +257,15 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     sizes = [int(keys["Points"]) * int(keys["Lines"]) * (int(keys["SaveBits"]) // 8) for keys in sets]
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
         raise cut_off(name, f"the header announces {sum(sizes)} bytes of data, {len(data) - mark - 2} are there")
-    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": "", "Spectrum Fit": ""}
+    # the vendor's fit of a spectrum is left aside
+    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": ""}
     parts: dict[tuple[int, str], dict[str, Any]] = {}
     units: dict[str, str] = {}
     ends = mark + 2 + np.cumsum(sizes)
     for keys, size, end in zip(sets, sizes, ends.tolist(), strict=True):
         frame = keys.get("Frame", "")
         if frame in branches:
-            ending = " (vendor's fit)" if frame == "Spectrum Fit" else ""
-            axis, channel = printable(keys["Dim0Name"]), printable(keys["Dim2Name"] + ending)
+            axis, channel = printable(keys["Dim0Name"]), printable(keys["Dim2Name"])
             units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
             for line, (at, numbers) in enumerate(_nid_lines(keys, data[end - size : end]), start=1):
                 parts.setdefault((line, branches[frame]), {axis: at})[channel] = numbers

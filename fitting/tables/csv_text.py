@@ -56,54 +56,44 @@ class TableError(ValueError):
     """Raised where a file or table cannot be used; the message is one line: what, where, how to mend it."""
 
 
-@dataclass
-class Faults:
-    """Faults of a table: the first one in the file is reported, and the others are counted.
+@dataclass(frozen=True)
+class Source:
+    """What numbers are read from, and how a message names a place in it.
 
     Attributes:
-        source: the table's name, as it begins every message.
-        place: what a row's number is called, "line" for a file and "row" for a table in memory.
-        found: lines and messages.
+        name: of the file or table, as it begins every message.
+        row: what a row's number is called, "line" for a file and "row" for a table in memory.
     """
 
-    source: str
-    place: str = "line"
-    found: list[tuple[int, str]] = field(default_factory=list, init=False)
+    name: str
+    row: str = "line"
 
-    def add(self, message: str, *, line: int = 0, column: str | None = None) -> None:
-        """Note a fault.
+    def fault(self, message: str, *, line: int = 0, column: str | None = None) -> TableError:
+        """Return the error of a fault.
 
         Args:
             message: what is wrong and how to mend it, without the place.
-            line: number of the line (or row) it is in; 0 stands for the table as a whole and comes first.
+            line: number of the line (or row) it is in; 0 stands for the table as a whole.
             column: name of the column it is in.
         """
-        place = f", {self.place} {line}" if line else ""
+        place = f", {self.row} {line}" if line else ""
         place += "" if column is None else f", column {column}"
-        self.found.append((line, f"{printable(self.source)}{place}: {message}"))
+        return TableError(f"{printable(self.name)}{place}: {message}")
 
-    def add_rows(self, bad: Bool[np.ndarray, " rows"], message: str, lines: Lines, column: str | None = None) -> None:
-        """Note a fault of some rows.
+    def refuse(self, bad: Bool[np.ndarray, " rows"], message: str, lines: Lines, column: str | None = None) -> None:
+        """Check that no row is bad.
 
         Args:
-            bad: which rows.
-            message: as for `add`.
+            bad: which rows are.
+            message: as for `fault`.
             lines: number of the line of each row.
-            column: as for `add`.
-        """
-        for line in lines[bad].tolist():
-            self.add(message, line=line, column=column)
-
-    def raise_any(self) -> None:
-        """Raise the first fault, if there is one.
+            column: as for `fault`.
 
         Raises:
-            TableError: with the first fault and the number of the others.
+            TableError: of the first row that is.
         """
-        if self.found:
-            _, message = min(self.found, key=lambda fault: fault[0])
-            more = len(self.found) - 1
-            raise TableError(message + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else ""))
+        if bad.any():
+            raise self.fault(message, line=int(lines[np.argmax(bad)]), column=column)
 
 
 LARGEST = 1e9
@@ -172,14 +162,14 @@ class Form:
         """The names of the table's columns."""
         return tuple(column.name for column in self.columns)
 
-    def check_numbers(self, name: str, values: Rows, lines: Lines, faults: Faults) -> None:
-        """Note the impossible numbers of a column: a "number" is finite, a "whole" one 1, 2, 3, ..., a "flag" 0 or 1.
+    def check_numbers(self, name: str, values: Rows, lines: Lines, source: Source) -> None:
+        """Check the numbers of a column: a "number" is finite, a "whole" one 1, 2, 3, ..., a "flag" 0 or 1.
 
         Args:
             name: of the column, or what it becomes.
             values: its numbers, NaN where nothing was measured.
             lines: where each stands.
-            faults: where the faults are noted.
+            source: for messages.
         """
         kind = next(one.kind for one in self.columns if name in {one.name, one.becomes})
         lowest = {"number": -self.largest, "positive": 1.0 / FARTHEST, "whole": 1.0}.get(kind, 0.0)
@@ -188,9 +178,9 @@ class Form:
         words = {"whole": "be a positive whole number (1, 2, 3, ...)", "flag": "be 0 or 1"}
         must = words.get(kind, f"lie between {lowest:g} and {highest:g}")
         good = (values >= lowest) & (values <= highest) & ((kind not in words) | (values == np.floor(values)))
-        for row in np.flatnonzero(~(good | (np.isnan(values) & self.blanks))):
-            number = repr(float(values[row])).removesuffix(".0")
-            faults.add(f"must {must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
+        bad = ~(good | (np.isnan(values) & self.blanks))
+        number = repr(float(values[np.argmax(bad)])).removesuffix(".0")
+        source.refuse(bad, f"must {must}, but is {number}; correct it or remove the row", lines, name)
 
 
 @dataclass(frozen=True)
@@ -318,10 +308,9 @@ def read_columns(
     Raises:
         TableError: with the first fault of the file.
     """
-    faults = Faults(str(path))
-    found, _, rows = read_comments(read_text(path), settings, faults)
-    numbers, lines = read_rows(rows, form, faults)
-    faults.raise_any()
+    source = Source(str(path))
+    found, _, rows = read_comments(read_text(path), settings, source)
+    numbers, lines = read_rows(rows, form, source)
     used = {column.becomes: column for column in form.columns if column.name in numbers}
     columns = {key: one.convert(numbers[one.name]) if one.convert else numbers[one.name] for key, one in used.items()}
     return used, columns, lines, found
@@ -418,14 +407,14 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
 
 
 def read_comments(
-    text: str, settings: Settings, faults: Faults
+    text: str, settings: Settings, source: Source
 ) -> tuple[dict[str, tuple[Any, float | None]], tuple[str, ...], NumberedLines]:
     """Return value and error of the settings that comments make, other comments, and rows.
 
     Args:
         text: of the whole file.
         settings: those there are.
-        faults: where a misspelt key, a value that is no number and a repeated key are noted.
+        source: for messages of a misspelt key, a value that is no number and a repeated key.
 
     Raises:
         TableError: if something is wrong, or there are no rows: the column names and what stands below.
@@ -439,19 +428,18 @@ def read_comments(
             match = _KEY_AND_VALUE.fullmatch(comment)
             name = "" if match is None else plain_name(match["key"])
             if name in SETTING_NAMES:
-                faults.add(f"{name} sets nothing in such a file; remove the line", line=line)
+                raise source.fault(f"{name} sets nothing in such a file; remove the line", line=line)
             remarks.append(comment)
         elif setting.key in found:
-            faults.add(f"{setting.key} was given already; remove one of the two", line=line)
+            raise source.fault(f"{setting.key} was given already; remove one of the two", line=line)
         else:
             try:
                 found[setting.key] = _value_of(setting, comment)
             except ValueError as error:
-                faults.add(str(error), line=line)
+                raise source.fault(str(error), line=line) from None
     if not rows:
         what = "only comments" if comments else "nothing"
-        faults.add(f"the file holds {what}; add a row of column names and rows of numbers")
-    faults.raise_any()
+        raise source.fault(f"the file holds {what}; add a row of column names and rows of numbers")
     return found, tuple(remarks), rows
 
 
@@ -476,13 +464,13 @@ def cells_of(text: str, separator: str) -> list[str]:
     return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
 
 
-def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns, Lines]:
+def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns, Lines]:
     """Return the columns that the form has as numbers (NaN where a cell is blank), and the line of each row.
 
     Args:
         rows: lines with their numbers, the column names first.
         form: what the file is to be.
-        faults: where the faults are noted.
+        source: for messages.
 
     Raises:
         TableError: at once where the column names are wrong: the cells below cannot be judged then.
@@ -491,29 +479,28 @@ def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns,
     looks = next((sign for sign in ",\t; " if sign in text.strip()), ",")
     separator = form.separator or looks
     if looks != separator:
-        faults.add("the columns are not separated by commas; separate them by commas, decimals by points", line=head)
-        faults.raise_any()
+        raise source.fault(
+            "the columns are not separated by commas; separate them by commas, decimals by points", line=head
+        )
     names = cells_of(text, separator)
-    check_names(names, form, faults, line=head)
+    check_names(names, form, source, line=head)
     if not rows[1:]:
-        faults.add(f"there are column names but no rows below them; add a row for each {form.row}", line=head)
-    faults.raise_any()
+        raise source.fault(f"there are column names but no rows below them; add a row for each {form.row}", line=head)
     columns: dict[str, list[float]] = {name: [] for name in names if name in form.names}
     lines = []
     for line, text in rows[1:]:
         cells = cells_of(text, separator)
         if text.count('"') % 2:
-            faults.add("a quotation mark is not closed; close or remove it", line=line)
-        elif len(cells) != len(names):
+            raise source.fault("a quotation mark is not closed; close or remove it", line=line)
+        if len(cells) != len(names):
             hint = "fill the row up" if len(cells) < len(names) else "a decimal comma must be a point"
-            faults.add(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
-        else:
-            lines.append(line)
-            for name, cell in zip(names, cells, strict=True):
-                if name in columns:
-                    columns[name].append(float(cell) if NUMBER.fullmatch(cell) else math.nan)
-                    if math.isnan(columns[name][-1]) and (cell or not form.blanks):
-                        faults.add(_unreadable(cell, form.row), line=line, column=name)
+            raise source.fault(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
+        lines.append(line)
+        for name, cell in zip(names, cells, strict=True):
+            if name in columns:
+                columns[name].append(float(cell) if NUMBER.fullmatch(cell) else math.nan)
+                if math.isnan(columns[name][-1]) and (cell or not form.blanks):
+                    raise source.fault(_unreadable(cell, form.row), line=line, column=name)
     return {name: np.array(column) for name, column in columns.items()}, np.array(lines, dtype=np.int64)
 
 
@@ -526,35 +513,36 @@ def _unreadable(text: str, row: str) -> str:
     return f"{quoted(text)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
 
 
-def check_names(names: list[str], form: Form, faults: Faults, *, line: int = 0) -> None:
-    """Note every fault of column names.
+def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) -> None:
+    """Check the names of columns.
 
     Args:
         names: of the columns, from left to right.
         form: what the table is to be.
-        faults: where the faults are noted.
+        source: for messages.
         line: where the names stand; 0: in memory.
     """
     if any(NUMBER.fullmatch(name) for name in names):
-        faults.add("the first row holds numbers; put the row of column names above it", line=line)
-        return
+        raise source.fault("the first row holds numbers; put the row of column names above it", line=line)
     becomes = {column.name: column.becomes for column in form.columns}
     present = [becomes[name] for name in names if name in becomes]
     for name in {becomes[name]: name for name in names if present.count(becomes.get(name, "")) > 1}.values():
-        faults.add("says again what another column says; remove one", line=line, column=name)
+        raise source.fault("says again what another column says; remove one", line=line, column=name)
     for name in [name for name in names if name not in becomes][:_SUGGESTIONS]:
         meant = nearest_name(name, becomes)
         if name in form.strange:
-            faults.add(form.strange[name], line=line, column=name)
-        elif not form.open or (meant is not None and becomes[meant] not in present):
+            raise source.fault(form.strange[name], line=line, column=name)
+        if not form.open or (meant is not None and becomes[meant] not in present):
             known = f"remove or rename it, the columns are {', '.join(becomes)}"
             mend = known if meant is None else f"did you mean {meant}?"
-            faults.add(f"unknown column {quoted(name)}; {mend}", line=line)
+            raise source.fault(f"unknown column {quoted(name)}; {mend}", line=line)
     # a column that is missing may be one that is misspelt
-    for what in dict.fromkeys(column.needed for column in form.columns) if not faults.found else ():
+    for what in dict.fromkeys(column.needed for column in form.columns):
         columns = [column for column in form.columns if column.needed == what]
         if what and not any(column.becomes in present for column in columns):
-            faults.add(f"there is no {what} column; add {' or '.join(column.name for column in columns)}", line=line)
+            raise source.fault(
+                f"there is no {what} column; add {' or '.join(column.name for column in columns)}", line=line
+            )
 
 
 def plain_name(text: str) -> str:
@@ -576,9 +564,11 @@ def nearest_name(text: str, known: Iterable[str]) -> str | None:
     return next(iter(difflib.get_close_matches(plain_name(text), list(known), n=1, cutoff=_SIMILAR)), None)
 
 
-def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, faults: Faults) -> Float[np.ndarray, "..."]:
+def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, source: Source) -> Float[np.ndarray, "..."]:
     """Return a copy of a column of a table in memory, after noting another length than that of the table."""
     column = np.array(values, dtype=np.float64)
     if column.shape != (rows,) or rows == 0:
-        faults.add(f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name)
+        raise source.fault(
+            f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name
+        )
     return column

@@ -55,9 +55,9 @@ from fitting.tables.csv_text import (
     LARGEST,
     Column,
     Columns,
-    Faults,
     FileSetting,
     Form,
+    Source,
     TableError,
     check_names,
     column_of,
@@ -235,42 +235,40 @@ def _fill_errors_of_repeats(columns: Columns) -> list[str]:
     return remarks
 
 
-def _check_rows(columns: Columns, form: Form, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
+def _check_rows(columns: Columns, form: Form, lines: Int[np.ndarray, " rows"], source: Source) -> None:
     """Check the numbers of a table.
 
     Args:
         columns: the columns by name, NaN where nothing was measured.
         form: what the table is to be.
         lines: the number of each row's line, for the messages.
-        faults: where the faults are noted.
+        source: for messages.
 
     Raises:
         TableError: with the first fault: of impossible numbers, else of what must or must not stand together.
     """
     for name in columns:
-        form.check_numbers(name, columns[name], lines, faults)
-    faults.raise_any()
+        form.check_numbers(name, columns[name], lines, source)
     blank = {name: np.isnan(values) for name, values in columns.items()}
     for column in required(columns):
-        faults.add_rows(blank[column.name], "is blank; every row needs it", lines, column.name)
+        source.refuse(blank[column.name], "is blank; every row needs it", lines, column.name)
     if form is TAPPING:
         message = "must be 1 where the cantilever is driven: amplitude and lag are read at the drive's frequency"
-        faults.add_rows(columns["order"] > 1.0, f"{message}; remove the row", lines, "order")
+        source.refuse(columns["order"] > 1.0, f"{message}; remove the row", lines, "order")
     present = [column for column in MEASURED if column.name in columns]
     for column in present:
         value, error = blank[column.name], blank[str(column.error)]
         mend = f"fill {column.error} in" + _OR_NOISE * column.amplitude
-        faults.add_rows(error & ~value, f"the value has no error; {mend}", lines, column.name)
-        faults.add_rows(value & ~error, "the error has no value; fill it in or clear this cell", lines, column.error)
+        source.refuse(error & ~value, f"the value has no error; {mend}", lines, column.name)
+        source.refuse(value & ~error, "the error has no value; fill it in or clear this cell", lines, column.error)
     amplitudes = [column.name for column in present if column.amplitude]
     empty, unseen = np.all([blank[name] for name in amplitudes], axis=0), np.zeros(len(lines), bool)
     message = f"the row has no amplitude; fill {' or '.join(amplitudes)} in or remove the row"
     if "no_orbit" in columns:
         unseen = columns["no_orbit"] == 1.0
         message += ", or set no_orbit to 1 if the tip settled on no orbit there"
-    faults.add_rows(empty & ~unseen, message, lines)
-    faults.add_rows(~empty & unseen, "the row has an amplitude; clear it or set no_orbit to 0", lines, "no_orbit")
-    faults.raise_any()
+    source.refuse(empty & ~unseen, message, lines)
+    source.refuse(~empty & unseen, "the row has an amplitude; clear it or set no_orbit to 0", lines, "no_orbit")
 
 
 _OR_NOISE = " or give the relative noise (`noise=0.01`)"
@@ -356,26 +354,26 @@ class AmplitudeTable(Result):
         # Lines of another number are those of the table that this one was made from (`dataclasses.replace`).
         rows = np.size(self.drive_frequency_khz)
         own = len(self.lines) == rows
-        faults = Faults(self.source, place="line" if own else "row")
+        source = Source(self.source, "line" if own else "row")
         for name, choices in (("drive", DRIVES), ("phase_sense", ("", *PHASE_SENSES))):
             if getattr(self, name) not in choices:
-                faults.add(f"{name} must be one of {', '.join(filter(None, choices))}, but is {getattr(self, name)!r}")
-        faults.raise_any()
+                raise source.fault(
+                    f"{name} must be one of {', '.join(filter(None, choices))}, but is {getattr(self, name)!r}"
+                )
         columns = columns_of(self)
         if self.tapping and np.size(self.order) == 0:
             columns["order"] = np.ones(rows)
         lines = np.array(self.lines if own else np.arange(1, rows + 1), dtype=np.int64)
-        check_names(list(columns), self.form, faults)
-        columns = {name: column_of(name, values, rows, faults) for name, values in columns.items()}
+        check_names(list(columns), self.form, source)
+        columns = {name: column_of(name, values, rows, source) for name, values in columns.items()}
         for column in MEASURED:
             if (column.name in columns) != (column.error in columns):
                 noise = f"{_OR_NOISE * column.amplitude}, or repeat readings: {LEAST_REPEATS} repeats tell them"
                 mend = f"has no errors; add the column {column.error}{noise}"
                 lacks = mend if column.name in columns else f"comes with {column.name}; give both or none"
-                faults.add(lacks, column=column.name if column.name in columns else column.error)
-        _check_header(self, faults)
-        faults.raise_any()
-        _check_rows(columns, self.form, lines, faults)
+                raise source.fault(lacks, column=column.name if column.name in columns else column.error)
+        _check_header(self, source)
+        _check_rows(columns, self.form, lines, source)
         if self.mass_ng is None and self.spring_constant_n_per_m is not None:
             mass = effective_mass_ng(self.spring_constant_n_per_m, self.free_frequency_khz)
             object.__setattr__(self, "mass_ng", float(mass))
@@ -400,13 +398,12 @@ class AmplitudeTable(Result):
         known: dict[str, Any] = {"source": "data frame"}
         known |= {name: value for name, value in frame.attrs.items() if name in own} | header
         names = [name for name in frame.columns if name != "lines"]
-        faults = Faults(str(known["source"]), place="row")
-        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), faults)
+        source = Source(str(known["source"]), "row")
+        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), source)
         if "free_frequency_khz" not in known:
             how = "as free_frequency_khz=... to AmplitudeTable.from_dataframe"
-            faults.add(f"free_frequency_khz is missing; give it in `frame.attrs`, or {how}")
-        faults.raise_any()
-        return _completed({name: np.asarray(frame[name], np.float64) for name in names}, known, noise, faults)
+            raise source.fault(f"free_frequency_khz is missing; give it in `frame.attrs`, or {how}")
+        return _completed({name: np.asarray(frame[name], np.float64) for name in names}, known, noise)
 
     @property
     def rows(self) -> int:
@@ -453,22 +450,24 @@ class AmplitudeTable(Result):
         return self.phase_deg, self.phase_error_deg
 
 
-def _check_header(table: AmplitudeTable, faults: Faults) -> None:
+def _check_header(table: AmplitudeTable, source: Source) -> None:
     for name in _CANTILEVER:
         value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
         unknown = value is None or (name == "quality_factor" and np.isnan(value))
         if unknown and error is not None:
-            faults.add(f"{ERROR_OF[name]} stands without {name}; give both or none")
-        elif not unknown and (fault := fault_in_number(SETTINGS[name], value, error)):
-            faults.add(f"{name} {fault}")
-    if table.spring_constant_n_per_m is not None and table.mass_ng is not None and not faults.found:
+            raise source.fault(f"{ERROR_OF[name]} stands without {name}; give both or none")
+        if not unknown and (fault := fault_in_number(SETTINGS[name], value, error)):
+            raise source.fault(f"{name} {fault}")
+    if table.spring_constant_n_per_m is not None and table.mass_ng is not None:
         wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
         if wrong is not None:
-            faults.add(wrong)
+            raise source.fault(wrong)
     for remark in table.remarks:
         plain = remark and remark == remark.strip() and not set(remark) & set("\r\n\0")
         if not plain or setting_in(remark, SETTINGS) is not None:
-            faults.add(f"the remark {quoted(remark)} would not be read back as one; make it one line of free text")
+            raise source.fault(
+                f"the remark {quoted(remark)} would not be read back as one; make it one line of free text"
+            )
 
 
 def check_quality_factor(table: AmplitudeTable) -> None:
@@ -496,7 +495,7 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
             an error of their own; those with one keep it.
 
     Raises:
-        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+        TableError: one line that names the first fault, its place, and how to mend it.
     """
     return parse_table(read_text(path), str(path), noise)
 
@@ -538,36 +537,34 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     Raises:
         TableError: as `read_table`.
     """
-    faults = Faults(source)
+    file = Source(source)
     if noise is not None and not 0.0 < noise < 1.0:
-        faults.add(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
-    settings, remarks, rows = read_comments(text, SETTINGS, faults)
+        raise file.fault(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+    settings, remarks, rows = read_comments(text, SETTINGS, file)
     if "free_frequency_khz" not in settings:
         example = SETTINGS["free_frequency_khz"].line
-        faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
+        raise file.fault(f"the free frequency is missing; add a line such as '{example}' above the column names")
     known = [name for name in ("drive", "phase_sense", *_CANTILEVER) if name in settings]
     header: dict[str, Any] = {name: settings[name][0] for name in known}
     header |= {ERROR_OF[name]: settings[name][1] for name in known if name in ERROR_OF}
-    columns, lines = read_rows(rows, FORMS[header.get("drive", "sample")], faults)
+    columns, lines = read_rows(rows, FORMS[header.get("drive", "sample")], file)
     calibration = {key: settings[key] for key in CALIBRATION if key in settings}
     header |= {"calibration": calibration, "rows_in_order_of_time": "rows" in settings}
     header |= {"source": source, "lines": lines, "remarks": remarks}
-    return _completed(columns, header, noise, faults)
+    return _completed(columns, header, noise)
 
 
-def _completed(columns: Columns, header: dict[str, Any], noise: float | None, faults: Faults) -> AmplitudeTable:
+def _completed(columns: Columns, header: dict[str, Any], noise: float | None) -> AmplitudeTable:
     """Return a table of columns, with the errors that noise and repeated readings give.
 
     Args:
         columns: by name, NaN where nothing was measured; changed in place.
         header: the other attributes of the table.
         noise: relative noise of amplitudes without an error.
-        faults: where faults are noted.
 
     Raises:
         TableError: as `read_table`.
     """
-    faults.raise_any()
     for column in MEASURED:
         if noise is not None and column.amplitude and column.name in columns:
             values, error = columns[column.name], str(column.error)
