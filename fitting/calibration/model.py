@@ -139,11 +139,7 @@ def minimum(sweep: ResonanceSweep, error: Points) -> tuple[Lowest, Response, boo
     _, start, signed = min(starts, key=lambda start: start[0])
     longest = np.append([1.0, 1.0], np.full(len(start) - 2, np.inf))
     best = levenberg_marquardt(
-        lambda place: _evaluate(sweep, signed, error, place)[0],
-        start,
-        settled=_SETTLED,
-        most=_STEPS,
-        longest=longest,
+        lambda place: _evaluate(sweep, signed, error, place)[0], start, settled=_SETTLED, most=_STEPS, longest=longest
     )
     return best, _evaluate(sweep, signed, error, best.place)[1], signed is not measured
 

@@ -6,7 +6,6 @@ towards the tip), `lockin_amplitude_nm`, `phase_lag_deg` (behind the drive) and 
 assumptions, and a message about a missing quantity names the option that gives it.
 """
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
@@ -185,7 +184,7 @@ def read_curves(
     notes = list(recording.remarks)
     sources = _sources(recording, wanted, notes)
     if "lockin_amplitude_nm" in sources:
-        _refuse_modes(recording)
+        refuse_other_modes(recording.settings, recording.source, recording.channels)
     said = {role for role, source in wanted.items() if source.factor is not None}
     sense = phase_sense or ("lag" if "phase_lag_deg" in said else "")
     by_curve = groupby(_ways(recording, sources, notes), key=lambda way: way[0])
@@ -205,33 +204,11 @@ def read_curves(
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
 
 
-_OTHER_CHANNELS = re.compile(
-    r"(amp(litude)?|pha?(se?)?)[ _-]*2\b.*|.*\b(lateral|torsion\w*|friction|pfm|piezo\w*|second (eigen)?mode)\b.*",
-    re.IGNORECASE,
-)
-"""Channels of modes in which amplitude and phase are not those of one flexural mode that taps."""
-
-
 def _refuse_others(recording: Recording) -> None:
     spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
     if spectrum or any(name.startswith("Frequency") for name in recording.channels):
         what = "thermal spectrum" if spectrum else "resonance sweep"
         raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
-
-
-def _refuse_modes(recording: Recording) -> None:
-    """Check that a file with amplitudes, where it says in which mode it was recorded, says tapping.
-
-    Raises:
-        TableError: with the name of the mode, or of the channel that tells it.
-    """
-    refuse_other_modes(recording.settings, recording.source)
-    channel = next((name for name in recording.channels if _OTHER_CHANNELS.fullmatch(name)), None)
-    if channel is not None:
-        raise TableError(
-            f"{recording.source}: holds a channel {channel!r}, which is none of amplitude modulation (tapping) of one "
-            "mode; its amplitude and phase do not give the energy of a tap"
-        )
 
 
 def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: list[str]) -> dict[str, ColumnSource]:

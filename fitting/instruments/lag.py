@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 
 Numbers = float | Float[np.ndarray, "..."]
 Rows = Float[np.ndarray, " rows"]
@@ -122,7 +122,8 @@ class PhaseReadings(NamedTuple):
         It is what the tap takes and what the air takes at the harmonics, so that it is above zero. Under a base the
         deflection is read, D = Z + gamma A0 = -A0 (1 - gamma) a exp(-i Delta).
         """
-        gamma = self._gamma
+        s = self.frequency_ratio
+        gamma = 1.0 - s**2 + 1j * s / self.quality_factor
         phasor = self.ratio * np.exp(1j * np.deg2rad(behind_deg))
         of_height = np.imag(gamma * (phasor - self.ratio**2))
         if self.drive != "base":
@@ -131,18 +132,10 @@ class PhaseReadings(NamedTuple):
         return np.abs(1.0 - gamma) ** 2 * of_height + np.abs(gamma) ** 2 * of_base
 
     @property
-    def _gamma(self) -> Complex[np.ndarray, " rows"]:
-        s = self.frequency_ratio
-        return 1.0 - s**2 + 1j * s / self.quality_factor
-
-    @property
     def detuning(self) -> float:
         """The largest factor of a sin Delta in the energy, all that depends on the sign: 1 - s^2 under a force."""
-        gamma = self._gamma
-        factor = np.real(gamma)
-        if self.drive == "base":
-            factor = np.abs(1.0 - gamma) ** 2 * factor + np.abs(gamma) ** 2 * np.real(1.0 - gamma)
-        return float(np.abs(factor).max())
+        quarter = np.full(len(self.ratio), 90.0)
+        return float(np.max(np.abs(self.energy(quarter) - self.energy(-quarter)) / (2.0 * self.ratio)))
 
     def giving_energy_away(self, sign: float) -> int:
         """Return how many rows have energies below zero beyond all errors, the phase taken with a sign."""

@@ -5,7 +5,7 @@ by those who read it further.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -213,22 +213,30 @@ _STRICT_KEYS = {"ImagingMode", "Op. mode"}
 """Asylum's and NanoSurf's, which name amplitude modulation by the words above."""
 
 
-def refuse_other_modes(settings: Mapping[str, str], source: str) -> None:
+_OTHER_CHANNELS = re.compile(
+    r"(amp(litude)?|pha?(se?)?)[ _-]*2\b.*|.*\b(lateral|torsion\w*|friction|pfm|piezo\w*|second (eigen)?mode)\b.*",
+    re.IGNORECASE,
+)
+"""Channels of modes in which amplitude and phase are not those of one flexural mode that taps."""
+
+
+def refuse_other_modes(settings: Mapping[str, str], source: str, channels: Iterable[str] = ()) -> None:
     """Check that a file, where it says in which mode it was recorded, says amplitude modulation (tapping).
 
     Raises:
-        TableError: with the mode's name.
+        TableError: with the name of the mode, or of the channel that tells it.
     """
+    found = [f"holds a channel {name!r}, which is none of" for name in channels if _OTHER_CHANNELS.fullmatch(name)]
     for key, value in settings.items():
         name = re.split(r"::|[/:]", key)[-1].strip()
         others = _AMPLITUDE_MODES.sub("", value)
         strict = name in _STRICT_KEYS and others == value
         bimodal = name == "DualACMode" and value.strip() not in {"", "0"}
         if bimodal or strict or ((_MODE_KEYS.fullmatch(name) or name in _STRICT_KEYS) and _OTHER_MODES.search(others)):
-            raise TableError(
-                f"{source}: was recorded in the mode {printable(value)!r} ({printable(key)}), not in amplitude "
-                "modulation (tapping); its amplitude and phase do not give the energy of a tap"
-            )
+            found.insert(0, f"was recorded in the mode {printable(value)!r} ({printable(key)}), not in")
+    if found:
+        why = "amplitude modulation (tapping) of one mode; its amplitude and phase do not give the energy of a tap"
+        raise TableError(f"{source}: {found[0]} {why}")
 
 
 @contextmanager

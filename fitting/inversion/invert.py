@@ -1,6 +1,6 @@
 """Direct inversion: amplitude and phase of each row give the speeds of its impact and the collision delay, no law."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -200,7 +200,8 @@ def invert(table: TableLike, *, noise: float | None = None, quality_factor: Any 
         note[i] = f"amplitudes and phase contradict each other (chi2 {chi2[i]:.3g} of one degree of freedom)"
     u, w, delay = impact.T
     unsure = table.quality_factor is not None and table.quality_factor_error is None
-    result = Inversion(
+    reason = _why_not_valid(u, lines, int(fast.sum()))
+    return Inversion(
         approach_speed_nm_per_us=u,
         rebound_speed_nm_per_us=w,
         collision_delay_us=delay,
@@ -211,21 +212,20 @@ def invert(table: TableLike, *, noise: float | None = None, quality_factor: Any 
         in_lines=np.isin(np.arange(table.rows), rows[fast]),
         lines=lines,
         table=table,
+        reasons=() if reason is None else (reason,),
         warnings=("Q comes without an error: its uncertainty is not in the errors here",) if unsure else (),
     )
-    reason = _why_not_valid(result)
-    return replace(result, reasons=() if reason is None else (reason,))
 
 
-def _why_not_valid(e: Inversion) -> str | None:
-    if not np.isfinite(e.approach_speed_nm_per_us).any():
+def _why_not_valid(speed: Rows, lines: dict[str, Line], rows: int) -> str | None:
+    """Return why approach speeds, and the lines through so many rows, are no measurement; None where they are."""
+    if not np.isfinite(speed).any():
         return "no row could be inverted: check the phases' sign and zero (t = 0 when the platform is highest)"
-    lines = e.lines.values()
     if not lines:
-        return f"{e.in_lines.sum()} rows do not determine a line of two coefficients: measure at more drives"
-    if max(one.p_value for one in lines) < IMPROBABLE:
+        return f"{rows} rows do not determine a line of two coefficients: measure at more drives"
+    if max(one.p_value for one in lines.values()) < IMPROBABLE:
         return "neither line explains the rows: check the errors, Q, and the calibration of tip and drive"
-    if all(abs(one.epsilon) < 2 * one.epsilon_error and abs(one.slope) < 2 * one.slope_error for one in lines):
+    if all(abs(one.epsilon) < 2 * one.epsilon_error and abs(one.slope) < 2 * one.slope_error for one in lines.values()):
         return "the rows determine no coefficient of either line to two standard errors: measure more finely"
     return None
 

@@ -398,11 +398,7 @@ class AmplitudeTable(Result):
         known: dict[str, Any] = {"source": "data frame"}
         known |= {name: value for name, value in frame.attrs.items() if name in own} | header
         names = [name for name in frame.columns if name != "lines"]
-        source = Source(str(known["source"]), "row")
-        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), source)
-        if "free_frequency_khz" not in known:
-            how = "as free_frequency_khz=... to AmplitudeTable.from_dataframe"
-            raise source.fault(f"free_frequency_khz is missing; give it in `frame.attrs`, or {how}")
+        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), Source(str(known["source"]), "row"))
         return _completed({name: np.asarray(frame[name], np.float64) for name in names}, known, noise)
 
     @property
