@@ -149,8 +149,8 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
     if text.startswith(b"[DataSet]") or _NANONIS.search(text):
         return _sweep_of(read_recording(path))
     used, columns, lines, _ = read_columns(path, SWEEP, {})
-    unit = _UNITS.get(used["amplitude"].name, "")
-    return ResonanceSweep(**columns, amplitude_unit=unit, lines=lines, source=str(path))
+    named: dict[str, Any] = {**columns, "amplitude_unit": _UNITS.get(used["amplitude"].name, "")}
+    return ResonanceSweep(**named, lines=lines, source=str(path))
 
 
 _NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)

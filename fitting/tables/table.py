@@ -449,10 +449,10 @@ class AmplitudeTable(Result):
 def _check_header(table: AmplitudeTable, source: Source) -> None:
     for name in _CANTILEVER:
         value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
-        unknown = value is None or (name == "quality_factor" and np.isnan(value))
-        if unknown and error is not None:
-            raise source.fault(f"{ERROR_OF[name]} stands without {name}; give both or none")
-        if not unknown and (fault := fault_in_number(SETTINGS[name], value, error)):
+        if value is None or (name == "quality_factor" and np.isnan(value)):
+            if error is not None:
+                raise source.fault(f"{ERROR_OF[name]} stands without {name}; give both or none")
+        elif fault := fault_in_number(SETTINGS[name], value, error):
             raise source.fault(f"{name} {fault}")
     if table.spring_constant_n_per_m is not None and table.mass_ng is not None:
         wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
