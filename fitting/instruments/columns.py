@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from fitting.instruments.recording import UNITS, Recording, Segment, quantity_of, unit_named
+from fitting.instruments.recording import UNITS, Recording, quantity_of, two_ways, unit_named
 from fitting.tables.csv_text import NUMBER, TableError
 
 ROLES = {
@@ -142,14 +142,10 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Record
             f"{recording.source}: {single}={wanted[single].channel} has one channel where other columns have OUT/BACK; "
             f"write two for each, as {_EXAMPLE}"
         )
-    segments = [
-        Segment(segment.curve, branch, {both[role]: segment.channels[pair[way]] for role, pair in pairs.items()})
-        for segment in recording.segments
-        for way, branch in enumerate(("approach", "retract"))
-    ]
+    segments = two_ways(recording.segments, {both[role]: pair for role, pair in pairs.items()})
     units = {both[role]: recording.units.get(pair[0], "") for role, pair in pairs.items()}
     away = tuple(both[role] for role, pair in pairs.items() if pair[0] in recording.away)
-    return replace(recording, segments=tuple(segments), units=units, away=away)
+    return replace(recording, segments=segments, units=units, away=away)
 
 
 _CURVE = ("offset_nm", "lockin_amplitude_nm", "phase_lag_deg")

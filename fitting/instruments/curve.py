@@ -593,13 +593,12 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
     remarks = [f"read from {Path(curve.source).name} ({curve.format}), curve {curve.curve}", *curve.notes]
     header: dict[str, Any] = {key: known[key].value for key in ("free_frequency_khz", *_WANTED) if key in known}
     header |= {ERROR_OF[key]: known[key].error for key in header}
-    calibration = {key: (0.0, known[key].error) for key in ("offset_origin_nm", "phase_zero_deg") if key in known}
-    calibration = {key: (value, error) for key, (value, error) in calibration.items() if error}
-    if "phase_zero_deg" in calibration:
-        remarks.append(zero_of_free_rows(calibration["phase_zero_deg"][1]))
-    scale = known.get("nm_per_volt")
-    if scale is not None and scale.error:
-        calibration["tip_calibration"] = (1.0, scale.error / float(scale.value))
+    errors = {key: one.error for key, one in known.items() if one.error}
+    calibration = {key: (0.0, errors[key]) for key in ("offset_origin_nm", "phase_zero_deg") if key in errors}
+    if "nm_per_volt" in errors:
+        calibration["tip_calibration"] = (1.0, errors["nm_per_volt"] / float(known["nm_per_volt"].value))
+    if "phase_zero_deg" in errors:
+        remarks.append(zero_of_free_rows(errors["phase_zero_deg"]))
     if curve.phase_lag_deg is not None:
         # the zero was set by the free rows: it says nothing of the sign
         header["phase_sense"] = "lag" if "phase_sense" in known else "either"

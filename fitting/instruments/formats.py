@@ -27,6 +27,7 @@ from fitting.instruments.recording import (
     known_from,
     number_in,
     package_for,
+    two_ways,
     unit_named,
 )
 from fitting.tables.csv_text import (
@@ -119,12 +120,11 @@ def parse_text(data: bytes, name: str) -> Recording:
         for way in dict.fromkeys(ways)
         if (rows_of_it := (runs == run) & (np.array(ways) == way)).any()
     ]
-    back = {title.replace("[bwd]", "").strip(): numbers for title, numbers in columns.items() if "[bwd]" in title}
+    back = {title.replace("[bwd]", "").strip(): title for title in columns if "[bwd]" in title}
     if back:
-        forward = {title: numbers for title, numbers in columns.items() if "[bwd]" not in title}
         # the height is written once where forward and backward stood at the same heights
-        heights = {title: numbers for title, numbers in forward.items() if title.startswith("Z")}
-        segments = [Segment(1, "approach", forward), Segment(1, "retract", heights | back)]
+        pairs = {title: (title, back.get(title, title)) for title in columns if title in back or title.startswith("Z")}
+        segments = two_ways(segments, pairs)
     return Recording(kind, name, tuple(segments), units, known_from(header), away, remarks, header)
 
 

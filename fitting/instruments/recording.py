@@ -78,6 +78,15 @@ class Segment:
     channels: dict[str, Float[np.ndarray, "..."]]
 
 
+def two_ways(segments: Iterable[Segment], pairs: Mapping[str, Sequence[str]]) -> tuple[Segment, ...]:
+    """Return an approach and a retract out of every segment, whose channels are each a pair of its channels."""
+    return tuple(
+        Segment(segment.curve, branch, {name: segment.channels[pair[way]] for name, pair in pairs.items()})
+        for segment in segments
+        for way, branch in enumerate(("approach", "retract"))
+    )
+
+
 @dataclass(frozen=True)
 class Recording:
     """All that a file holds.
