@@ -14,6 +14,7 @@ from afm_jax.checks import check_parameter, checked
 from afm_jax.columns import printed_table
 from afm_jax.least_squares import IMPROBABLE, chi2_tail, covariance_of
 from afm_jax.results import JudgedResult, public_result
+from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
@@ -98,10 +99,8 @@ class Calibration(JudgedResult):
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax calibrate`."""
         own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
-        values: dict[str, Any] = {name: vars(v) for name, v in own.items() if isinstance(v, CalibratedValue)}
-        values["spring_constant_n_per_m"] = {name: vars(k) for name, k in self.spring_constant_n_per_m.items()}
         more = {"valid": self.valid, "instrument": self.sweep.instrument, "table_comments": self.table_comments}
-        return {"format": "afm-jax calibrate", "format_version": 2} | own | values | more
+        return plain({"format": "afm-jax calibrate", "format_version": 2} | own | more)
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of calibration_points.csv: the scan and the fit."""

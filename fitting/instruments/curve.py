@@ -116,8 +116,7 @@ class MeasuredCurve(JudgedResult):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        own = {name: value for name, value in vars(self).items() if name != "known"}
-        return plain(own | {"valid": self.valid, "known": {key: vars(one) for key, one in self.known.items()}})
+        return plain(vars(self) | {"valid": self.valid})
 
 
 @checked
