@@ -6,6 +6,8 @@ free tip, because the height does. Where the farther free bins scatter about a s
 errors (noise that is not independent from row to row), all errors are multiplied by that.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -50,11 +52,12 @@ def binned(
     branch: np.ndarray,
     free: Bool[np.ndarray, " rows"],
     width_nm: float,
-    stated: dict[str, float],
+    single: dict[str, float],
+    stated: Collection[str],
 ) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a table, a bin of height each, and whether they stand as they were passed.
 
-    A row has the mean height `offset_nm`, `rows` (how many readings), `branch`, and every reading's mean and error.
+    A row has the mean height `offset_nm`, every reading's mean and error, and `retract`, 1 or 0.
 
     Args:
         offset_nm: heights.
@@ -62,8 +65,8 @@ def binned(
         branch: "approach" or "retract" of each row.
         free: rows of the free tip.
         width_nm: of a bin; 0: rows of equal height are merged.
-        stated: standard error of a single reading, by name, where that is given instead of the scatter; with `width_nm`
-            0 it is needed.
+        single: standard error of a single reading, by name.
+        stated: readings whose error that is, and not the scatter; with `width_nm` 0 all.
     """
     columns: dict[str, list[np.ndarray]] = {}
     in_order = True
@@ -79,13 +82,14 @@ def binned(
         whole = np.bincount(place, free[rows]) == counts
         # the nearer half of the free rows may feel the sample already
         whole &= np.cumsum(whole) <= 0.5 * whole.sum()
-        found = {"offset_nm": _means(place, height), "rows": counts, "branch": np.full(len(counts), name)}
+        found = {"offset_nm": _means(place, height), "retract": np.full(len(counts), float(name == "retract"))}
         for key, values in readings.items():
-            means = _means(place, values[rows])
-            single = np.full(len(counts), stated[key]) if key in stated else _scatter(height, values[rows], place)
-            error = single / np.sqrt(counts)
-            excess = 1.0 if key in stated else _excess(means[whole], error[whole], time[whole])
-            found |= {key: means, error_of(key): excess * error}
+            means, error = _means(place, values[rows]), single[key] / np.sqrt(counts)
+            if key not in stated:
+                scatter = _scatter(height, values[rows], place) / np.sqrt(counts)
+                # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
+                error = np.where(scatter > 0.0, _excess(means[whole], scatter[whole], time[whole]) * scatter, error)
+            found |= {key: means, error_of(key): error}
         for key, column in found.items():
             columns.setdefault(key, []).append(column[:: 1 if name == "approach" else -1])
     return {key: np.concatenate(parts) for key, parts in columns.items()}, in_order

@@ -19,7 +19,7 @@ from afm_jax.checks import checked
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import printable
-from fitting.instruments.bins import binned, error_of, faults_of_order, usual_width, ways_of
+from fitting.instruments.bins import binned, faults_of_order, usual_width, ways_of
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import (
     ROLES,
@@ -622,16 +622,10 @@ def zero_of_free_rows(error: float) -> str:
 def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a curve's table, its bins or the rows as they were read, and if they are in order of time."""
     readings = {"lockin_amplitude_nm": np.asarray(curve.amplitude)}
-    single = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
+    known = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
     if curve.phase_lag_deg is not None:
-        readings["phase_lag_deg"], single["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]
-    width = curve.bin_nm or 0.0
-    stated = {name: float(one.value) for name, one in single.items() if not width or one.origin.startswith("option")}
-    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, width, stated)
-    number, branch = rows.pop("rows"), rows.pop("branch")
-    for name, one in single.items():
-        # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
-        error = rows[error_of(name)]
-        rows[error_of(name)] = np.where(error > 0.0, error, float(one.value) / np.sqrt(number))
-    rows["retract"] = (branch == "retract").astype(float)
+        readings["phase_lag_deg"], known["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]
+    width, single = curve.bin_nm or 0.0, {name: float(one.value) for name, one in known.items()}
+    stated = {name for name, one in known.items() if not width or one.origin.startswith("option")}
+    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, width, single, stated)
     return rows, in_order and (curve.bin_nm is not None or all(_as_named(curve)))
