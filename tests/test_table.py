@@ -85,8 +85,9 @@ def test_names_the_line_of_every_row(tmp_path: Path):
         TEXT.replace("163.3", '"163.3"').replace("349.2", ' "349.2" ').replace("order", '"order"'),
         TEXT.replace("= 90", "= 90,,,,,").replace("163.3", "+1.633e2").replace("349.2", "3492E-1"),
         TEXT.replace(KEY, "") + KEY,
+        *(TEXT.replace(",", sign) for sign in ";\t "),
     ],
-    ids=["mark", "crlf", "cr", "spaces", "quotes", "numbers", "below"],
+    ids=["mark", "crlf", "cr", "spaces", "quotes", "numbers", "below", "semicolons", "tabs", "blanks"],
 )
 def test_writing_habits_make_no_difference(tmp_path: Path, text: str):
     plain = read(tmp_path, TEXT)

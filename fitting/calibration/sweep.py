@@ -52,7 +52,6 @@ SWEEP = Form(
         Column("amplitude_error"),
     ),
     "point",
-    separator="",
 )
 """The columns that a CSV file may have, and the attribute of `ResonanceSweep` that each becomes."""
 _UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}

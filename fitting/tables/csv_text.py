@@ -144,7 +144,6 @@ class Form:
         row: what a row is measured at: a drive, a point, a sample.
         open: whether columns of other names are left alone, not refused.
         blanks: whether cells may be blank (NaN); else every cell is needed.
-        separator: what stands between cells; empty: commas, tabs, semicolons or spaces, as the row of names has them.
         largest: size of any number.
         strange: columns that other files have, and what to do about them.
     """
@@ -153,7 +152,6 @@ class Form:
     row: str
     open: bool = False
     blanks: bool = False
-    separator: str = ","
     largest: float = FARTHEST
     strange: Mapping[str, str] = field(default_factory=dict)
 
@@ -467,6 +465,8 @@ def cells_of(text: str, separator: str) -> list[str]:
 def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns, Lines]:
     """Return the columns that the form has as numbers (NaN where a cell is blank), and the line of each row.
 
+    Commas, tabs, semicolons or spaces stand between cells, as the row of names has them.
+
     Args:
         rows: lines with their numbers, the column names first.
         form: what the file is to be.
@@ -476,12 +476,7 @@ def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns,
         TableError: at once where the column names are wrong: the cells below cannot be judged then.
     """
     head, text = rows[0]
-    looks = next((sign for sign in ",\t; " if sign in text.strip()), ",")
-    separator = form.separator or looks
-    if looks != separator:
-        raise source.fault(
-            "the columns are not separated by commas; separate them by commas, decimals by points", line=head
-        )
+    separator = next((sign for sign in ",\t; " if sign in text.strip()), ",")
     names = cells_of(text, separator)
     check_names(names, form, source, line=head)
     if not rows[1:]:

@@ -296,7 +296,6 @@ TRACE = Form(
     ),
     "sample",
     open=True,
-    separator="",
 )
 SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180")}
 
