@@ -160,9 +160,10 @@ def columns_to_paste(recording: Recording, roles: Iterable[str] = _CURVE) -> str
     others = iter([name for name in names if name not in {one.channel for one in told.values() if one is not None}])
     parts = []
     for role, one in told.items():
-        channel = next(others, "CHANNEL") if one is None else one.channel
+        channel = next(others, "") if one is None else one.channel
         unit = recording.units.get(channel, "")
-        parts.append(f"{role}={channel}:{unit if quantity_of(unit) in ROLES[role][0] else usual_unit(role)}")
+        unit = unit if quantity_of(unit) in ROLES[role][0] else usual_unit(role)
+        parts += [f"{role}={channel}:{unit}"] if channel else []
     return f'say `columns="{",".join(parts)}"`'
 
 
