@@ -260,9 +260,7 @@ def line(impact: Impacts, covariance: Covariances, shared: Shared, power: int) -
     scale = np.array([1.0, np.mean(u**power)])
     design, wanted = np.stack([np.ones_like(u), u**power], axis=1) / scale, u**2 - w**2
 
-    slope = 0.0
-    # the covariance depends on the slope: it settles in a few rounds
-    for _ in range(7):
+    def at(slope: float) -> Line:
         slopes = np.stack([2.0 * u - power * slope * u ** (power - 1), -2.0 * w], axis=1)
         common = np.einsum("ni,nik->nk", slopes, shared[:, :2])
         own = np.einsum("ni,nij,nj->n", slopes, covariance[:, :2, :2], slopes)
@@ -270,7 +268,12 @@ def line(impact: Impacts, covariance: Covariances, shared: Shared, power: int) -
         whiten = np.linalg.inv(np.linalg.cholesky(np.diag(own) + common @ common.T))
         inverse = np.linalg.pinv(whiten @ design)
         found = inverse @ whiten @ wanted
-        slope = float(found[1] / scale[1])
-    chi2, freedom = float(np.sum((whiten @ (design @ found - wanted)) ** 2)), len(u) - 2
-    value, error = (found / scale).tolist(), (np.sqrt(np.sum(inverse**2, axis=1)) / scale).tolist()
-    return Line(value[0], error[0], value[1], error[1], chi2, freedom, chi2_tail(chi2, freedom))
+        chi2, freedom = float(np.sum((whiten @ (design @ found - wanted)) ** 2)), len(u) - 2
+        value, error = found / scale, np.sqrt(np.sum(inverse**2, axis=1)) / scale
+        (epsilon, slope), (epsilon_error, slope_error) = value.tolist(), error.tolist()
+        return Line(epsilon, epsilon_error, slope, slope_error, chi2, freedom, chi2_tail(chi2, freedom))
+
+    found = at(0.0)
+    for _ in range(6):
+        found = at(found.slope)
+    return found
