@@ -161,5 +161,11 @@ def repeats_of(table: AmplitudeTable | SeveralTables) -> RepeatedReadings | None
                 freedom, chi2 = freedom + more, chi2 + squares
     if not freedom:
         return None
-    ratio, probability = float(np.sqrt(chi2 / freedom)), chi2_tail(chi2, freedom)
-    return RepeatedReadings(drives, rows, chi2, freedom, ratio, probability)
+    return RepeatedReadings(
+        drives=drives,
+        rows=rows,
+        chi2=chi2,
+        degrees_of_freedom=freedom,
+        error_ratio=float(np.sqrt(chi2 / freedom)),
+        p_value=chi2_tail(chi2, freedom),
+    )
