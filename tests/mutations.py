@@ -210,7 +210,7 @@ MUTATIONS = {
         "tests/test_scenefile.py::test_reduced_frequency_counts_in_twice_the_free_frequency",
     ),
     "noise that falls with the amplitude": Mutation(
-        "(noise or 0.0) {* => /} values", "tests/test_table.py::test_noise_stands_in_for_missing_errors_only"
+        "np.isnan(errors), noise {* => /} values", "tests/test_table.py::test_noise_stands_in_for_missing_errors_only"
     ),
     "lock-in of a trace with half its height": Mutation(
         "return {2.0 => 1.0} / (length or 1.0)", "tests/test_lockin.py::test_a_bounce_in_closed_form"
@@ -231,7 +231,7 @@ MUTATIONS = {
         "tests/test_calibrate.py::test_a_sweep_without_noise_gives_its_parameters_back[3.0-True]",
     ),
     "thermal motion of half a line": Mutation(
-        "area = {0.5 => 0.25} * np.pi",
+        "area = float({0.5 => 0.25} * np.pi",
         "tests/test_thermal.py::test_the_area_gives_k_where_the_quality_factor_is_hardly_resolved",
     ),
     "Sader's stiffness without a frequency": Mutation(

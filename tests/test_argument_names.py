@@ -60,9 +60,9 @@ LEVER_OPTIONS = ("--free-frequency-khz", "90", "--quality-factor", "200")
 CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
     "which channels": (
         lambda path: fitting.read_curves(path / "abc.csv"),
-        'say `columns="offset_nm=CHANNEL:UNIT"`',
+        'say `columns="offset_nm=a:nm,lockin_amplitude_nm=b:nm,phase_lag_deg=c:deg"`',
         ("read", "abc.csv"),
-        "say --columns offset_nm=CHANNEL:UNIT",
+        "say --columns offset_nm=a:nm,lockin_amplitude_nm=b:nm,phase_lag_deg=c:deg",
     ),
     "radians": (
         lambda path: fitting.read_curves(path / "force.csv", drive="force", **LEVER),
@@ -114,9 +114,9 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
     ),
     "which images": (
         lambda path: read_images(path / "names.npz"),
-        'say `columns="lockin_amplitude_nm=CHANNEL:nm"`',
+        'say `columns="lockin_amplitude_nm=first:nm,phase_lag_deg=second:deg"`',
         ("tapping-map", "names.npz"),
-        "say --columns lockin_amplitude_nm=CHANNEL:nm",
+        "say --columns lockin_amplitude_nm=first:nm,phase_lag_deg=second:deg",
     ),
     "a parameter's value": (
         lambda _: model_parameters("law", fixed={"r": 3.0}),

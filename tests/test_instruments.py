@@ -195,8 +195,11 @@ def test_what_files_say_of_the_lever_is_known_with_its_origin(tmp_path: Path):
 def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     offset, amplitude, lag = tapping_rows()
     path = saved(tmp_path, separated({"a": -1e-3 * offset, "b": 0.01 * amplitude, "c": -lag}, ";"))
-    with pytest.raises(TableError, match='among the channels a, b, c; say `columns="offset_nm=CHANNEL:UNIT"`'):
+    with pytest.raises(TableError, match="among the channels a, b, c; say `columns=") as raised:
         read_curve(path)
+    # the line is ready to paste
+    pasted = read_curve(path, columns=str(raised.value).rpartition('columns="')[2].removesuffix('"`'))
+    np.testing.assert_allclose(given(pasted.phase_lag_deg), -lag, atol=1e-5)
     wanted = "offset_nm=a:um:-1,lockin_amplitude_nm=b:V,phase_lag_deg=c:-1"
     curve = read_curve(path, columns=wanted)
     assert (curve.amplitude_unit, "nm_per_volt" in curve.missing) == ("V", True)
@@ -205,7 +208,43 @@ def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     # six decimals of hundredths
     np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
     np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-5)
-    assert "# tip_calibration = 1 +- 0.02\n" in table_text(curve)
+    assert "# tip_calibration = 1.0 +- 0.02\n" in table_text(curve)
+
+
+def test_pairs_of_names_are_two_ways_and_numbers_count_below_a_head(tmp_path: Path):
+    there, back = tapping_rows(), tapping_rows(retract=True)
+    names = ("Calc_Ramp_{}_nm", "Amplitude_mV_{}", "Phase_{}_deg")
+    both = {
+        name.format(way): numbers
+        for way, rows in (("Ex", there), ("Rt", back))
+        for name, numbers in zip(names, rows, strict=True)
+    }
+    curve = read_curve(saved(tmp_path, separated(both, "\t")), nm_per_volt="1000 +- 20", drive="force")
+    assert curve.branch.tolist() == ["approach"] * 120 + ["retract"] * 120
+    assert curve.known["nm_per_volt"].error == 20.0
+    np.testing.assert_allclose(given(curve.amplitude), np.concatenate([there[1], back[1]]), atol=1e-6)
+    np.testing.assert_allclose(given(curve.phase_lag_deg), np.concatenate([there[2], back[2]]), atol=1e-6)
+    offset, amplitude, lag = there
+    path = saved(tmp_path, separated({"a": offset, "b": amplitude, "c": lag}, ";"))
+    by_name, by_number = (
+        read_curve(path, columns=f"offset_nm={z}:nm,lockin_amplitude_nm={a}:nm,phase_lag_deg={p}:deg")
+        for z, a, p in ("abc", "123")
+    )
+    np.testing.assert_array_equal(by_name.offset_nm, by_number.offset_nm)
+    np.testing.assert_array_equal(given(by_name.phase_lag_deg), given(by_number.phase_lag_deg))
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"\x89HDF\r\n\x1a\n", "Nanosurf's .nhf; export the curve as .nid or CSV"),
+        (b"\x12\x34\x56\x78\x10\0\0\0ARDF", "Asylum's .ARDF; export the curve as .ibw, or as text"),
+        (b"\\*Force file list\r\n", "Bruker's; export the curve as text"),
+    ],
+)
+def test_files_that_are_not_read_say_how_to_export(tmp_path: Path, data: bytes, said: str):
+    with pytest.raises(TableError, match=re.escape(said)):
+        read_curves(saved(tmp_path, data))
 
 
 def test_wrong_column_maps_are_named(tmp_path: Path):
@@ -234,7 +273,7 @@ def test_a_file_that_begins_like_an_instruments_is_no_table(tmp_path: Path):
 
 def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
     curve = read_curve(saved(tmp_path, "Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n"))
-    asked = 'if one of the channels A, P is: `columns="lockin_amplitude_nm=CHANNEL:UNIT"`'
+    asked = 'A, P is, say `columns="offset_nm=Z:nm,lockin_amplitude_nm=A:nm,phase_lag_deg=P:deg"`'
     assert any(asked in note for note in curve.notes)
     with pytest.raises(TableError, match=re.escape(asked)):
         table_text(curve)

@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from matplotlib.image import imread
 
 from afm_jax.cli.main import main
+from fitting import lockin
 from tests.answers import table
 from tests.lockin_traces import bounce
 from tests.strict_reading import strictly
@@ -48,6 +49,8 @@ def test_amplitudes_at_all_orders_are_printed_and_written(tmp_path: Path):
     said = run(*call).stdout
     assert said.startswith("VALID: order 3 of 545.4 kHz")
     assert f"{told['lockin_amplitude_nm']:.6g}" in said
+    # the function takes the file, too
+    assert lockin(path, drive_frequency_khz=545.4, order=3).lockin_amplitude_nm == told["lockin_amplitude_nm"]
 
 
 @pytest.mark.parametrize(("order", "named"), [(1, "over 2, beside"), (2, "use --order 1")])

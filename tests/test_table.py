@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.stats import t as student_t
 
 from fitting.tables.csv_text import TableError, setting_in
-from fitting.tables.table import SETTINGS, TABLE, AmplitudeTable, read_table, write_table
+from fitting.tables.table import SETTINGS, TABLE, AmplitudeTable, as_table, read_table, write_table
 
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"
 KEY = "# free_frequency_khz = 90\n"
@@ -85,8 +85,9 @@ def test_names_the_line_of_every_row(tmp_path: Path):
         TEXT.replace("163.3", '"163.3"').replace("349.2", ' "349.2" ').replace("order", '"order"'),
         TEXT.replace("= 90", "= 90,,,,,").replace("163.3", "+1.633e2").replace("349.2", "3492E-1"),
         TEXT.replace(KEY, "") + KEY,
+        *(TEXT.replace(",", sign) for sign in ";\t "),
     ],
-    ids=["mark", "crlf", "cr", "spaces", "quotes", "numbers", "below"],
+    ids=["mark", "crlf", "cr", "spaces", "quotes", "numbers", "below", "semicolons", "tabs", "blanks"],
 )
 def test_writing_habits_make_no_difference(tmp_path: Path, text: str):
     plain = read(tmp_path, TEXT)
@@ -167,6 +168,21 @@ def test_a_written_curve_reads_back_the_same(tmp_path: Path):
     assert_same(table, read_table(tmp_path / "second.csv"), but=("source", "lines"))
     made = dataclasses.replace(table, source="table in memory", order=np.zeros(0, dtype=int))
     assert_same(table, made, but=("source",))
+
+
+def test_a_call_may_say_the_quality_factor(tmp_path: Path):
+    path = tmp_path / "table.csv"
+    path.write_text(TEXT, "utf-8")
+    for said, wanted in (
+        (40, (40.0, None)),
+        ((40.0, 2.0), (40.0, 2.0)),
+        ("40 +- 2", (40.0, 2.0)),
+        ("none", (None, None)),
+    ):
+        table = as_table(path, quality_factor=said)
+        assert (table.quality_factor, table.quality_factor_error) == wanted
+    with pytest.raises(ValueError, match="`quality_factor` must be finite and above 0, but is -1"):
+        as_table(path, quality_factor=-1)
 
 
 def test_arrays_are_read_only_copies():

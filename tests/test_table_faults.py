@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from afm_jax.scenefile.scenefile import SceneError, load_scene
-from fitting.tables.csv_text import Faults, TableError, column_of
+from fitting.tables.csv_text import Source, TableError, column_of
 from fitting.tables.table import read_table, write_table
 from tests.test_table import KEY, TEXT, read, small_table
 
@@ -55,7 +55,7 @@ def test_noise_is_a_fraction(tmp_path: Path):
     ("change", "message"),
     [
         ({"offset_nm": np.array([0.0, np.nan])}, ", row 2, column offset_nm: is blank; every row needs it"),
-        ({"peak_amplitude_error_nm": None}, ": peak_amplitude_nm and peak_amplitude_error_nm come together; "),
+        ({"peak_amplitude_error_nm": None}, ", column peak_amplitude_nm: has no errors; add the column peak_amplitude"),
         (
             {"peak_amplitude_nm": None, "peak_amplitude_error_nm": None},
             ": there is no amplitude column; add ",
@@ -75,9 +75,7 @@ def test_a_table_in_memory_keeps_the_same_rules(change: dict[str, Any], message:
 
 
 def test_columns_of_a_table_in_memory_have_one_length():
-    faults = Faults("here")
-    column_of("offset_nm", np.zeros(2), 2, faults)
-    faults.raise_any()
-    column_of("offset_nm", np.zeros(3), 2, faults)
+    here = Source("here")
+    column_of("offset_nm", np.zeros(2), 2, here)
     with pytest.raises(TableError, match=r"here, column offset_nm: has the shape \(3,\); every column is a list of"):
-        faults.raise_any()
+        column_of("offset_nm", np.zeros(3), 2, here)

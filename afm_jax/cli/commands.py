@@ -43,7 +43,7 @@ _MEASURE = "Measure: read data, fit and plan"
 _SIMULATE = "Simulate: motions, orbits, basins of a scene"
 _CONTACT = "Contact: forces between tip and sample"
 _CHECK = "Check: equations, accuracy, speed, installation"
-_READING = ".read:ReadingOptions"
+_LEVER, _READING, _IMAGING = ".read:LeverOptions", ".read:ReadingOptions", ".tapping_map:ImagingOptions"
 
 ROWS = (
     Command("calibrate", _MEASURE, ".calibrate:calibration", (".calibrate:CalibrationOptions",), computes=False),
@@ -51,9 +51,9 @@ ROWS = (
     Command("fit", _MEASURE, ".fit:fit", one_of="tables example"),
     Command("invert", _MEASURE, ".invert:inversion", one_of="table example"),
     Command("lockin", _MEASURE, ".lockin:lockin_of_trace", computes=False),
-    Command("read", _MEASURE, ".read:curves_of_a_file", (_READING,), computes=False, out_file="TABLE.csv"),
-    Command("tapping", _MEASURE, ".tapping:energy_of_taps", (_READING,), computes=False),
-    Command("tapping-map", _MEASURE, ".tapping_map:map_of_an_image", (".tapping_map:ImagingOptions",), computes=False),
+    Command("read", _MEASURE, ".read:curves_of_a_file", (_LEVER, _READING), computes=False, out_file="TABLE.csv"),
+    Command("tapping", _MEASURE, ".tapping:energy_of_taps", (_LEVER, _READING), computes=False),
+    Command("tapping-map", _MEASURE, ".tapping_map:map_of_an_image", (_LEVER, _IMAGING), computes=False),
     Command("basins", _SIMULATE, ".basins:basins", (LAW,)),
     Command("bifurcation", _SIMULATE, ".bifurcation:bifurcation", (LAW,)),
     Command("chart", _SIMULATE, ".chart:chart", (LAW,)),

@@ -8,8 +8,7 @@ from click import IntRange
 from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Positive
-from fitting.tables.csv_text import TableError
-from fitting.traces.lockin import lockin, read_trace
+from fitting.traces.lockin import lockin
 
 
 def lockin_of_trace(
@@ -32,14 +31,4 @@ def lockin_of_trace(
         drive_frequency_khz: of the platform; else the file's.
         order: drive periods in a period of the response.
     """
-    read = read_trace(trace)
-    frequency = read.drive_frequency_khz if drive_frequency_khz is None else drive_frequency_khz
-    if frequency is None:
-        raise TableError(
-            f"{trace}: the drive frequency is missing; give `drive_frequency_khz=...` or '# drive_frequency_khz = 180'"
-        )
-    try:
-        result = lockin(read.time_us, read.deflection_nm, frequency, order)
-    except TableError as error:
-        raise TableError(f"{trace}: {error}") from error
-    return Output.of(result, "lockin")
+    return Output.of(lockin(trace, drive_frequency_khz=drive_frequency_khz, order=order), "lockin")

@@ -11,6 +11,29 @@ from fitting.instruments.curve import read_curve, read_curves
 from fitting.instruments.report import curves_payload, curves_summary, write_tables
 
 
+class LeverOptions:
+    """What is said of lever, drive and phase, as `fitting.read_curves` and `fitting.tapping_map` take it.
+
+    Attributes:
+        phase_sense: whether the phase grows (lag) or falls (lead) as the tip lags further behind its drive; else the
+            readings decide if they can.
+        drive_frequency_khz: frequency of the drive; else that of the file, or the free frequency.
+        free_frequency_khz: natural frequency of the free cantilever, '90 +- 0.01' with its error.
+        quality_factor: its quality factor, '200 +- 5' with its error.
+        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; if unknown,
+            energies are divided by it, in nm^2.
+        free_amplitude_nm: amplitude of the free tip, '13.4 +- 0.1'; of a curve else the median of the rows far from the
+            sample.
+    """
+
+    phase_sense: Literal["lag", "lead"] | None = None
+    drive_frequency_khz: Quantity | None = None
+    free_frequency_khz: Quantity | None = None
+    quality_factor: Quantity | None = None
+    spring_constant_n_per_m: Annotated[Quantity | None, "--spring-constant"] = None
+    free_amplitude_nm: Quantity | None = None
+
+
 class ReadingOptions:
     """How an instrument's file becomes rows of a table, as `fitting.read_curves` takes it.
 
@@ -20,18 +43,10 @@ class ReadingOptions:
             in two channels are APPROACH/RETRACT: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.
         drive: what drives the tip: a piezo at its base (assumed without this option), or a force (photothermal,
             magnetic).
-        phase_sense: whether the phase grows (lag) or falls (lead) as the tip lags further behind its drive; else the
-            readings decide if they can.
         nm_per_volt: sensitivity of an amplitude in volts; `slope`: such that the amplitude falls by 1 nm per nm in
             contact.
         bin_nm: width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins of
             five rows where heights repeat or are not in order.
-        drive_frequency_khz: frequency of the drive; else that of the file, or the free frequency.
-        free_frequency_khz: natural frequency of the free cantilever, '90 +- 0.01' with its error.
-        quality_factor: its quality factor, '200 +- 5' with its error.
-        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; if unknown,
-            energies are divided by it, in nm^2.
-        free_amplitude_nm: amplitude of the free tip; else the median of the rows far from the sample.
         offset_origin_nm: height (growing towards the tip) at which the sample is at the tip's rest position.
         amplitude_error_nm: standard error of every amplitude; else the scatter of the free rows.
         phase_error_deg: standard error of every phase; else the scatter of the free rows.
@@ -39,14 +54,8 @@ class ReadingOptions:
 
     columns: Annotated[str, "COLUMN=CHANNEL[:UNIT][:FACTOR],..."] = ""
     drive: Literal["base", "force"] | None = None
-    phase_sense: Literal["lag", "lead"] | None = None
     nm_per_volt: Sensitivity | None = None
     bin_nm: float | None = None
-    drive_frequency_khz: Quantity | None = None
-    free_frequency_khz: Quantity | None = None
-    quality_factor: Quantity | None = None
-    spring_constant_n_per_m: Annotated[Quantity | None, "--spring-constant"] = None
-    free_amplitude_nm: Quantity | None = None
     offset_origin_nm: Quantity | None = None
     amplitude_error_nm: Quantity | None = None
     phase_error_deg: Quantity | None = None
@@ -72,7 +81,7 @@ def curves_of_a_file(
         session: of the call.
         file: the file.
         curve: only this curve of the file.
-        **reading: as `ReadingOptions`.
+        **reading: as `ReadingOptions` and `LeverOptions`.
     """
     curves = read_curves(file, **reading) if curve is None else [read_curve(file, curve=curve, **reading)]
     refused = [each for each in curves if not each.valid]

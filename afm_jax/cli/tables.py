@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import fitting.examples
-from fitting.tables.table import AmplitudeTable, read_table
+from fitting.tables.table import AmplitudeTable, as_table
 
 
 def example_path() -> Path:
@@ -23,9 +23,5 @@ def tables_with(
     Raises:
         TableError: if one cannot be read, or the quality factor is impossible.
     """
-    read = [read_table(path, noise=noise) for path in paths]
-    if quality_factor is None:
-        return read
-    value, error = quality_factor
-    quality = None if math.isinf(value) else value
-    return [replace(table, quality_factor=quality, quality_factor_error=error) for table in read]
+    quality: Any = "none" if quality_factor is not None and math.isinf(quality_factor[0]) else quality_factor
+    return [as_table(path, noise=noise, quality_factor=quality) for path in paths]

@@ -52,7 +52,7 @@ def energy_of_taps(  # noqa: PLR0913
         no_law: do not fit the impact law: energy, thresholds and speeds only.
         scale_errors: multiply the rows' errors (by 3 at most) where rows scatter more, instead of refusing their
             energy.
-        **reading: as `ReadingOptions`.
+        **reading: as `ReadingOptions` and `LeverOptions`.
     """
     if example == bool(curve_files):
         raise click.UsageError("give a curve, `afm-jax tapping CURVE`, or --example for a simulated raw file")

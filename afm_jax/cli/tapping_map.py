@@ -18,14 +18,6 @@ class ImagingOptions:
 
     Attributes:
         drive: what is driven.
-        phase_sense: whether the phase grows (lag) or falls (lead) as the tip lags further behind its drive; else the
-            readings decide if they can.
-        drive_frequency_khz: frequency of the drive; else the free frequency.
-        free_frequency_khz: natural frequency of the free cantilever, '90 +- 0.01' with its error.
-        quality_factor: its quality factor, '200 +- 5' with its error.
-        spring_constant_n_per_m: its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; if unknown,
-            energies are divided by it, in nm^2.
-        free_amplitude_nm: amplitude of the free tip, as the instrument reads it, '13.4 +- 0.1'.
         free_phase_deg: phase of the free tip, as the instrument reads it, '90 +- 0.05' [its error: 0.2].
         nm_per_volt: sensitivity of an amplitude in volts.
         tip_calibration: true over stated amplitude; '1 +- 0.02'.
@@ -34,12 +26,6 @@ class ImagingOptions:
     """
 
     drive: Literal["base", "force"] = "base"
-    phase_sense: Literal["lag", "lead"] | None = None
-    drive_frequency_khz: Quantity | None = None
-    free_frequency_khz: Quantity | None = None
-    quality_factor: Quantity | None = None
-    spring_constant_n_per_m: Annotated[Quantity | None, "--spring-constant"] = None
-    free_amplitude_nm: Quantity | None = None
     free_phase_deg: Quantity | None = None
     nm_per_volt: Quantity | None = None
     tip_calibration: Quantity | None = None
@@ -73,7 +59,7 @@ def map_of_an_image(
         phase_image: the phase, if in a file of its own.
         columns: the image of each quantity, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase.
         formats: of the arrays written into --out (gsf: for Gwyddion), else npz; may be given several times.
-        **imaging: as `ImagingOptions`.
+        **imaging: as `ImagingOptions` and `LeverOptions`.
     """
     result = tapping_map(read_images(image, phase_image, columns=columns), **imaging)
     return Output.of_report(

@@ -14,15 +14,16 @@ from afm_jax.checks import check_parameter, checked
 from afm_jax.columns import printed_table
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.solve.least_squares import IMPROBABLE, chi2_tail, covariance_of
+from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
 from fitting.calibration.sweep import ResonanceSweep, read_sweep
-from fitting.tables.csv_text import TableError
+from fitting.tables.csv_text import TableError, given_value
 
-_Pair = tuple[float, float | None]
-"""A value with its standard error, if it has one."""
+_Given = tuple[float, float | None] | float | str | None
+"""A number, a pair with its standard error, or a text such as '225 +- 2'."""
 _LEAST_FREQUENCIES = 6
 """One more than the amplitude has parameters."""
 
@@ -60,9 +61,6 @@ class Calibration(JudgedResult):
         chi2: sum of squared residuals over their errors.
         degrees_of_freedom: numbers measured less parameters.
         p_value: probability of a larger chi2 if the model is right; NaN where the errors come from the fit itself.
-        residual_autocorrelation: of neighbouring points.
-        chi2_without_resonance: of a parabola.
-        left: estimated distance of chi2 to its minimum.
         fitted: the response at every point, complex as the phase was measured, or the amplitude, in the sweep's unit.
         sweep: what was fitted; of a spectrum the part around the resonance.
         reasons: what makes the result invalid.
@@ -79,9 +77,6 @@ class Calibration(JudgedResult):
     chi2: float
     degrees_of_freedom: int
     p_value: float
-    residual_autocorrelation: float
-    chi2_without_resonance: float
-    left: float
     fitted: np.ndarray
     sweep: ResonanceSweep
     reasons: tuple[str, ...] = ()
@@ -104,10 +99,8 @@ class Calibration(JudgedResult):
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax calibrate`."""
         own = {name: value for name, value in vars(self).items() if name not in {"sweep", "fitted"}}
-        values = {name: vars(value) for name, value in own.items() if isinstance(value, CalibratedValue)}
-        values["spring_constant_n_per_m"] = {name: vars(k) for name, k in self.spring_constant_n_per_m.items()}
         more = {"valid": self.valid, "instrument": self.sweep.instrument, "table_comments": self.table_comments}
-        return {"format": "afm-jax calibrate", "format_version": 2} | own | values | more
+        return plain({"format": "afm-jax calibrate", "format_version": 2} | own | more)
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of calibration_points.csv: the scan and the fit."""
@@ -143,9 +136,9 @@ def calibrate(
     sweep: ResonanceSweep | str | os.PathLike[str],
     *,
     averages: float | None = None,
-    temperature_k: _Pair | float | None = None,
-    length_um: _Pair | float | None = None,
-    width_um: _Pair | float | None = None,
+    temperature_k: _Given = None,
+    length_um: _Given = None,
+    width_um: _Given = None,
     scale_error: float = 0.05,
     static: bool = True,
 ) -> Calibration:
@@ -157,7 +150,8 @@ def calibrate(
         sweep: from `read_sweep`, or a file; its phase is used where it is there. Without errors of the amplitudes these
             are estimated from the misfit, and goodness of fit cannot be judged.
         averages: how many spectra a thermal spectrum is the mean of; None: the file's.
-        temperature_k: of lever and air, a number or a pair with its error; None: the file's, else 296 +- 3.
+        temperature_k: of lever and air, a number, a pair with its error or '296 +- 3', which is assumed of a file
+            that says none.
         length_um: of a rectangular lever, likewise; with the width it gives k by Sader's method.
         width_um: of a rectangular lever, likewise.
         scale_error: relative error of the deflection's scale; that of k by equipartition is twice as large; force
@@ -177,26 +171,22 @@ def calibrate(
     check_parameter("scale_error", scale_error, "positive")
     warm = temperature_k or (sweep.instrument.get("temperature_k", 296.0), 3.0)
     given = {"length_um": length_um, "width_um": width_um, "temperature_k": warm}
-    known = {name: _value_and_error(name, one) for name, one in given.items() if one is not None}
+    pairs = {name: given_value(name, one) for name, one in given.items() if one is not None}
+    known = {name: (value, error or 0.0) for name, (value, error) in pairs.items()}
     if ("length_um" in known) != ("width_um" in known):
         raise ValueError("Sader's method needs both `length_um=...` and `width_um=...`")
     sweep = replace(sweep, averages=averages or sweep.averages)
     _check_sweep(sweep)
     found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep)
     springs = _springs(found, known, scale_error, static=static)
-    return _judged(replace(found, spring_constant_n_per_m=springs))
-
-
-def _value_and_error(name: str, given: _Pair | float) -> tuple[float, float]:
-    """Return a value and its error, 0 where there is none.
-
-    Raises:
-        ValueError: if one of them is impossible.
-    """
-    value, error = given if isinstance(given, tuple) else (given, None)
-    check_parameter(name, value, "positive")
-    check_parameter(f"error of {name}", error, "positive", optional=True)
-    return float(value), float(error or 0.0)
+    reasons, warnings = list(found.reasons), list(found.warnings)
+    doubt = next((one.reason for one in springs.values() if one.reason is not None), None)
+    if doubt is not None:
+        how = "`length_um=...` and `width_um=...` give k by Sader's method"
+        reasons += [f"The spring constant is not calibrated: {doubt}; {how}."] if len(springs) == 1 else []
+        warnings.append(f"The spring constants contradict each other: {doubt}.")
+    said = {"reasons": tuple(reasons), "warnings": tuple(warnings)}
+    return replace(found, spring_constant_n_per_m=springs, **said)
 
 
 def _check_sweep(sweep: ResonanceSweep) -> None:
@@ -210,7 +200,7 @@ def _check_sweep(sweep: ResonanceSweep) -> None:
 
 
 def _fitted(sweep: ResonanceSweep) -> Calibration:
-    """Return the fit of a scan or of a part of a spectrum, not yet judged."""
+    """Return the fit of a scan or of a part of a spectrum, with what makes it invalid and its warnings."""
     largest, averages = float(sweep.amplitude.max()), sweep.averages if sweep.spectrum else None
     # without errors they are what makes chi2/dof 1
     error, size, origin = np.full(sweep.points, 1.0 if sweep.spectrum else 0.01), 1.0, "estimated"
@@ -229,14 +219,13 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
     # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
     fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(best.residual)) < together < 1.0 else 1.0
     covariance, slope = covariance_of(best.jacobian.T @ best.jacobian), best.jacobian.T @ best.residual
-    left = float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope)
     natural, quality_factor = np.exp(place[:2]).tolist()
-    by_place = np.eye(len(place))
 
-    def known(value: float, slopes: Float[np.ndarray, " p"]) -> CalibratedValue:
-        """Return a value whose logarithm has these derivatives by the place."""
+    def known(value: float, *slopes: float) -> CalibratedValue:
+        """Return a value whose logarithm has these derivatives by the first of the place."""
         used = np.flatnonzero(slopes)
-        variance = scale * fewer * float(slopes[used] @ covariance[np.ix_(used, used)] @ slopes[used])
+        by = np.array(slopes)[used]
+        variance = scale * fewer * float(by @ covariance[np.ix_(used, used)] @ by)
         # the variance of a logarithm
         if not variance < 20.0:
             return CalibratedValue(value, None, reason="the scan does not determine it")
@@ -245,23 +234,53 @@ def _fitted(sweep: ResonanceSweep) -> Calibration:
         return _known_to(value, float(np.sqrt(variance)))
 
     # the integral of a |L|^2 over all frequencies
-    area = 0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2
-    by_area = by_place[0] - by_place[1] + by_place[2] / place[2]
+    area = float(0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2)
+    frequency, quality = known(natural, 1.0), known(quality_factor, 0.0, 1.0)
+    chi2, unknown = best.value / scale, frequency.reason or quality.reason
+    left = float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope) / scale
+    half, apart = 0.5 * natural / quality_factor, sweep.frequency_khz - natural
+    near, count = min(-apart[0], apart[-1]) / half, int(np.sum(np.abs(apart) < half))
+    khz, inside = f"{natural:.6g} kHz", f"{counted(count, 'point')} within the half-width"
+    faults = {
+        f"The resonance ({khz}) lies outside the sweep: sweep around it.": near < 0.0,
+        f"The resonance ({khz}) lies at the edge of the sweep: sweep at least one half-width (f0/2Q) to both sides.": (
+            near < 1.0
+        ),
+        f"Only {inside}: sweep in finer steps.": not sweep.spectrum and count < 3,
+        f"The model does not explain the sweep: chi2 {chi2:.0f} for {freedom} degrees of freedom. "
+        "Another background, a drift, or too small errors?": p_value < IMPROBABLE,
+        f"Not converged: chi2 lies an estimated {left:.2g} above its minimum.": not left < 1e-3,
+        f"Not identified: {unknown}.": unknown is not None,
+    }
+    # of these faults the first
+    reasons = [said for said, holds in faults.items() if holds][:1]
+    # four more parameters practically never bring such a fall of chi2 about by chance
+    if chi2_without_resonance(sweep, error) / scale - chi2 < 30.0 * max(chi2 / freedom, 1e-300):
+        reasons.insert(0, "No resonance stands out of the sweep: a parabola explains it about as well.")
+    if together > 0.5:
+        reasons.append(
+            f"Neighbouring residuals are strongly correlated ({together:+.2f}): the model misses something (another "
+            "background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
+        )
+    notes = {
+        f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural > 2e4,
+        "The phase rises through the resonance: its sign was reversed.": reverse,
+        f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": sweep.spectrum and count < 3,
+    }
     return Calibration(
-        frequency_khz=known(natural, by_place[0]),
-        quality_factor=known(quality_factor, by_place[1]),
-        mean_square_nm2=known(float(area), by_area) if sweep.spectrum else None,
+        frequency_khz=frequency,
+        quality_factor=quality,
+        mean_square_nm2=known(area, 1.0, -1.0, 1.0 / place[2]) if sweep.spectrum else None,
         model=sweep.model,
         error_origin=origin,
         phase_reversed=reverse,
-        chi2=best.value / scale,
+        chi2=chi2,
         degrees_of_freedom=freedom,
         p_value=p_value,
-        residual_autocorrelation=together,
-        chi2_without_resonance=chi2_without_resonance(sweep, error) / scale,
-        left=left / scale,
         fitted=largest * (np.conj(model) if reverse else model),
         sweep=sweep,
+        reasons=tuple(reasons),
+        warnings=tuple(said for said, holds in notes.items() if holds),
     )
 
 
@@ -298,7 +317,7 @@ def _of_spectrum(sweep: ResonanceSweep) -> Calibration:
     found = fits[-1]
     low, high = found.sweep.frequency_khz[[0, -1]]
     note = f"Fitted from {low:.6g} to {high:.6g} kHz: what one resonance and white noise explain."
-    return found if found.sweep.points == sweep.points else replace(found, warnings=(note,))
+    return found if found.sweep.points == sweep.points else replace(found, warnings=(note, *found.warnings))
 
 
 def _springs(
@@ -312,32 +331,29 @@ def _springs(
         scale_error: as of `calibrate`.
         static: as of `calibrate`.
     """
-    frequency, quality, mean = found.frequency_khz, found.quality_factor, found.mean_square_nm2
-    if quality.standard_error is None or frequency.standard_error is None:
+    read = [(one.value, one.standard_error) for one in (found.frequency_khz, found.quality_factor)]
+    if None in (error for _, error in read):
         return {}
-    springs, others = {}, []
-    if "spring_constant_n_per_m" in found.sweep.instrument:
-        others = [("the instrument", found.sweep.instrument["spring_constant_n_per_m"], 0.1)]
+    springs, mean = {}, found.mean_square_nm2
+    who, wanted, share = "the instrument", found.sweep.instrument.get("spring_constant_n_per_m"), 0.1
     if "length_um" in known:
-        read = [(one.value, one.standard_error) for one in (frequency, quality)]
         centre, errors = np.array([*read, *known.values()]).T
-        value = sader(*centre)
-        share = float(np.linalg.norm([sader(*place) / value - 1.0 for place in centre + np.diag(errors)]))
-        springs["sader"], others = _known_to(value, share), [("Sader's method", value, share)]
+        who, wanted = "Sader's method", sader(*centre)
+        share = float(np.linalg.norm([sader(*place) / wanted - 1.0 for place in centre + np.diag(errors)]))
+        springs["sader"] = _known_to(wanted, share)
     if mean is not None and mean.standard_error is not None:
         warm, warm_error = known["temperature_k"]
         value = equipartition(mean.value, warm, static=static)
         own = float(np.linalg.norm((mean.standard_error / mean.value, warm_error / warm, 2.0 * scale_error)))
         springs["equipartition"] = _known_to(value, own)
-        for who, wanted, share in others:
-            apart = float(np.log(value / wanted))
-            # neither is better than 5 %
-            if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((own, share, 0.05)):
-                doubt = (
-                    f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
-                    f"are {np.exp(-0.5 * apart):.3g} times the true ones"
-                )
-                springs["equipartition"] = CalibratedValue(value, None, reason=doubt)
+        apart = 0.0 if wanted is None else float(np.log(value / wanted))
+        # neither is better than 5 %
+        if abs(apart) >= TWO_SIDED_95 * np.linalg.norm((own, share, 0.05)):
+            doubt = (
+                f"equipartition gives {value:.3g} N/m, {who} {wanted:.3g}: if that is right, the deflection's nm "
+                f"are {np.exp(-0.5 * apart):.3g} times the true ones"
+            )
+            springs["equipartition"] = CalibratedValue(value, None, reason=doubt)
     return springs
 
 
@@ -345,44 +361,3 @@ def _known_to(value: float, share: float) -> CalibratedValue:
     """Return a value whose logarithm has a standard error."""
     ends = (value * float(np.exp(-TWO_SIDED_95 * share)), value * float(np.exp(TWO_SIDED_95 * share)))
     return CalibratedValue(value, value * share, ends)
-
-
-def _judged(e: Calibration) -> Calibration:
-    """Return a calibration with what makes it invalid, of the faults of its fit the first, and its warnings."""
-    natural, quality, springs = e.frequency_khz, e.quality_factor, e.spring_constant_n_per_m.values()
-    half, apart = 0.5 * natural.value / quality.value, e.sweep.frequency_khz - natural.value
-    near, count = min(-apart[0], apart[-1]) / half, int(np.sum(np.abs(apart) < half))
-    coarse, unknown = count < 3, natural.reason or quality.reason
-    khz, inside = f"{natural.value:.6g} kHz", f"{counted(count, 'point')} within the half-width"
-    faults = {
-        f"The resonance ({khz}) lies outside the sweep: sweep around it.": near < 0.0,
-        f"The resonance ({khz}) lies at the edge of the sweep: sweep at least one half-width (f0/2Q) to both sides.": (
-            near < 1.0
-        ),
-        f"Only {inside}: sweep in finer steps.": e.model != "power" and coarse,
-        f"The model does not explain the sweep: chi2 {e.chi2:.0f} for {e.degrees_of_freedom} degrees of freedom. "
-        "Another background, a drift, or too small errors?": e.p_value < IMPROBABLE,
-        f"Not converged: chi2 lies an estimated {e.left:.2g} above its minimum.": not e.left < 1e-3,
-        f"Not identified: {unknown}.": unknown is not None,
-    }
-    reasons = [said for said, holds in faults.items() if holds][:1]
-    # four more parameters practically never bring such a fall of chi2 about by chance
-    if e.chi2_without_resonance - e.chi2 < 30.0 * max(e.chi2 / e.degrees_of_freedom, 1e-300):
-        reasons.insert(0, "No resonance stands out of the sweep: a parabola explains it about as well.")
-    if e.residual_autocorrelation > 0.5:
-        reasons.append(
-            f"Neighbouring residuals are strongly correlated ({e.residual_autocorrelation:+.2f}): the model misses "
-            "something (another background, drift, a second resonance, too fast a sweep), and the errors mean nothing."
-        )
-    doubt = next((one.reason for one in springs if one.reason is not None), None)
-    if doubt is not None and len(springs) == 1:
-        how = "`length_um=...` and `width_um=...` give k by Sader's method"
-        reasons.append(f"The spring constant is not calibrated: {doubt}; {how}.")
-    notes = {
-        f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural.value > 2e4,
-        "The phase rises through the resonance: its sign was reversed.": e.phase_reversed,
-        f"{inside}: Q is hardly resolved; the area under the line, and k, hold.": e.model == "power" and coarse,
-        f"The spring constants contradict each other: {doubt}.": doubt is not None,
-    }
-    warnings = (*e.warnings, *(said for said, holds in notes.items() if holds))
-    return replace(e, reasons=tuple(reasons), warnings=warnings)

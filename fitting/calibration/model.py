@@ -25,12 +25,14 @@ from jaxtyping import Complex, Float
 from afm_jax.solve.least_squares import Lowest, Sum, levenberg_marquardt
 from fitting.calibration.sweep import ResonanceSweep
 
+Points = Float[np.ndarray, " points"]
+Response = Complex[np.ndarray, " points"]
 _LEAST_SQUARE = 1e-12
 """Of a modelled square, in units of the largest: a trial step may leave less, or a negative one, whose root is none."""
 _STEPS, _SETTLED = 100, 1e-20
 
 
-def measured_response(sweep: ResonanceSweep) -> Complex[np.ndarray, " points"]:
+def measured_response(sweep: ResonanceSweep) -> Response:
     """Return what was measured as complex numbers, in units of the largest amplitude."""
     phase = np.zeros(sweep.points) if sweep.phase_deg is None else np.deg2rad(sweep.phase_deg)
     return sweep.amplitude / sweep.amplitude.max() * np.exp(1j * phase)
@@ -69,11 +71,8 @@ def _parts(numbers: Complex[np.ndarray, "n ..."]) -> Float[np.ndarray, "m ..."]:
 
 
 def _evaluate(
-    sweep: ResonanceSweep,
-    measured: Complex[np.ndarray, " points"],
-    error: Float[np.ndarray, " points"],
-    place: Float[np.ndarray, " p"],
-) -> tuple[Sum, Complex[np.ndarray, " points"]]:
+    sweep: ResonanceSweep, measured: Response, error: Points, place: Float[np.ndarray, " p"]
+) -> tuple[Sum, Response]:
     """Return chi2 and the model at ln f0, ln Q and the linear parameters; arguments as of `_linear`."""
     terms = _terms(sweep, *np.exp(place[:2]).tolist())
     values = np.einsum("ntd,t->nd", terms, place[2:])
@@ -95,7 +94,7 @@ def _evaluate(
 
 
 def _linear(
-    sweep: ResonanceSweep, measured: Complex[np.ndarray, " points"], natural: float, quality_factor: float
+    sweep: ResonanceSweep, measured: Response, natural: float, quality_factor: float
 ) -> tuple[float, Float[np.ndarray, " p"]]:
     """Return the sum of squares about which the best place for a frequency and a quality factor leaves, and it."""
     columns = _terms(sweep, natural, quality_factor)[:, :, 0]
@@ -113,9 +112,7 @@ def _linear(
     return chi2, np.array([np.log(natural), np.log(quality_factor), *found])
 
 
-def minimum(
-    sweep: ResonanceSweep, error: Float[np.ndarray, " points"]
-) -> tuple[Lowest, Complex[np.ndarray, " points"], bool]:
+def minimum(sweep: ResonanceSweep, error: Points) -> tuple[Lowest, Response, bool]:
     """Return the least squares of a scan, from the best place of a grid of frequencies and widths.
 
     A place is ln f0, ln Q and the linear parameters: real and imaginary parts of A, B, C in turn; or a, b, c.
@@ -142,16 +139,12 @@ def minimum(
     _, start, signed = min(starts, key=lambda start: start[0])
     longest = np.append([1.0, 1.0], np.full(len(start) - 2, np.inf))
     best = levenberg_marquardt(
-        lambda place: _evaluate(sweep, signed, error, place)[0],
-        start,
-        settled=_SETTLED,
-        most=_STEPS,
-        longest=longest,
+        lambda place: _evaluate(sweep, signed, error, place)[0], start, settled=_SETTLED, most=_STEPS, longest=longest
     )
     return best, _evaluate(sweep, signed, error, best.place)[1], signed is not measured
 
 
-def chi2_without_resonance(sweep: ResonanceSweep, error: Float[np.ndarray, " points"]) -> float:
+def chi2_without_resonance(sweep: ResonanceSweep, error: Points) -> float:
     """Return chi2 of a parabola through amplitude or response, which has no resonance; arguments as of `minimum`."""
     columns, measured = np.vander(sweep.position, 3).astype(complex), measured_response(sweep)
     # the root of a density has half its relative error

@@ -32,7 +32,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.whole_files import first_bytes
 from fitting.instruments.formats import read_recording
 from fitting.instruments.recording import UNITS, Recording
-from fitting.tables.csv_text import Column, Faults, Form, TableError, column_of, read_columns, read_text
+from fitting.tables.csv_text import Column, Form, Source, TableError, column_of, read_columns
 
 DENSITY = "nm/sqrt(Hz)"
 """The unit that makes a sweep a thermal spectrum."""
@@ -52,7 +52,6 @@ SWEEP = Form(
         Column("amplitude_error"),
     ),
     "point",
-    separator="",
 )
 """The columns that a CSV file may have, and the attribute of `ResonanceSweep` that each becomes."""
 _UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}
@@ -92,14 +91,12 @@ class ResonanceSweep(Result):
     lines: InitVar[Int[np.ndarray, " points"] | None] = None
 
     def __post_init__(self, lines: Int[np.ndarray, " points"] | None):
-        faults = Faults(self.source, place="row" if lines is None else "line")
+        source = Source(self.source, "row" if lines is None else "line")
         points = np.size(self.frequency_khz)
         columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
-        arrays = {name: column_of(name, values, points, faults) for name, values in columns.items()}
-        faults.raise_any()
+        arrays = {name: column_of(name, values, points, source) for name, values in columns.items()}
         for name, values in arrays.items():
-            SWEEP.check_numbers(name, values, np.arange(1, points + 1) if lines is None else lines, faults)
-        faults.raise_any()
+            SWEEP.check_numbers(name, values, np.arange(1, points + 1) if lines is None else lines, source)
         # The sort is stable: repeated measurements at one frequency keep their order.
         order = np.argsort(arrays["frequency_khz"], kind="stable")
         for name, values in arrays.items():
@@ -143,23 +140,19 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         path: the file; its form is recognised by its content, not by its name.
 
     Raises:
-        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+        TableError: one line that names the first fault, its place, and how to mend it.
     """
     text = b""
     with contextlib.suppress(OSError):
         text = first_bytes(path, 1 << 16)
     if text.startswith(b"[DataSet]") or _NANONIS.search(text):
         return _sweep_of(read_recording(path))
-    faults = Faults(str(path))
-    table = read_columns(read_text(path), SWEEP, {}, faults)
-    faults.raise_any()
-    unit = next((_UNITS[name] for name in table.names if name in _UNITS), "")
-    named: dict[str, Any] = table.columns | {"amplitude_unit": unit, "lines": table.lines, "source": str(path)}
-    return ResonanceSweep(**named)
+    used, columns, lines, _ = read_columns(path, SWEEP, {})
+    named: dict[str, Any] = {**columns, "amplitude_unit": _UNITS.get(used["amplitude"].name, "")}
+    return ResonanceSweep(**named, lines=lines, source=str(path))
 
 
 _NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)
-_SHIFT, _CENTRE = "Frequency Shift", "Center Frequency"
 _FOUND = ("frequency_khz", "quality_factor", "spring_constant_n_per_m", "temperature_k")
 
 
@@ -169,30 +162,29 @@ def _sweep_of(recording: Recording) -> ResonanceSweep:
     Raises:
         TableError: if it holds neither.
     """
-    units, channels = recording.units, recording.segments[0].channels
-    kinds = {name: UNITS.get(units[name], ("", 1.0)) for name in channels}
-
-    def first(kind: str, word: str = "") -> Float[np.ndarray, " points"] | None:
-        """Return the first channel of a kind and a name, in this package's unit."""
-        name = next((name for name in channels if kinds[name][0] == kind and name.startswith(word)), None)
-        return None if name is None else channels[name] * kinds[name][1]
-
-    density, amplitude, phase = first("spectrum"), first("length", "Amplitude"), first("angle", "Phase")
-    khz, shift, centre = first("frequency"), first("frequency", _SHIFT), first("frequency", _CENTRE)
-    khz = khz if shift is None else None if centre is None else shift + centre
-    size = amplitude if density is None else density
-    if khz is None or size is None:
+    found: dict[str, Float[np.ndarray, " points"]] = {}
+    for name, numbers in recording.segments[0].channels.items():
+        kind, size = UNITS.get(recording.units[name], ("", 1.0))
+        # in this package's unit, by what it measures, and by its name, too
+        for key in (kind, f"{kind}: {name}"):
+            found.setdefault(key, numbers * size)
+    khz, spectrum = found.get("frequency"), "spectrum" in found
+    if "frequency: Frequency Shift" in found:
+        centre = found.get("frequency: Center Frequency")
+        khz = None if centre is None else found["frequency: Frequency Shift"] + centre
+    amplitude = found.get("spectrum" if spectrum else "length: Amplitude")
+    if khz is None or amplitude is None:
         raise TableError(
             f"{recording.source}: holds neither a thermal spectrum nor an amplitude in m over the frequency (or its "
-            f"shift and the center frequency), but {', '.join(channels)}"
+            f"shift and the center frequency), but {', '.join(recording.channels)}"
         )
     known = {key.removeprefix("free_"): one.value for key, one in recording.known.items()}
-    spectrum = density is not None
-    used = (khz > 0.0) & (size > 0.0) if spectrum else np.ones(len(khz), dtype=bool)
+    used = (khz > 0.0) & (amplitude > 0.0) if spectrum else np.ones(len(khz), dtype=bool)
+    phase = None if spectrum else found.get("angle: Phase")
     return ResonanceSweep(
         frequency_khz=khz[used],
-        amplitude=size[used],
-        phase_deg=None if spectrum or phase is None else phase[used],
+        amplitude=amplitude[used],
+        phase_deg=None if phase is None else phase[used],
         amplitude_unit=DENSITY if spectrum else "nm",
         instrument={key: float(known[key]) for key in _FOUND if key in known},
         averages=float(known["averages"]) if "averages" in known else None,

@@ -6,9 +6,14 @@ free tip, because the height does. Where the farther free bins scatter about a s
 errors (noise that is not independent from row to row), all errors are multiplied by that.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+Rows = Float[np.ndarray, " rows"]
+Bins = Float[np.ndarray, " bins"]
+Places = Int[np.ndarray, " rows"]
 _ROWS = 5
 """Rows in a bin of the usual width, at least; as many are needed for a scatter of their own."""
 _MOST = 200
@@ -20,19 +25,19 @@ _ONE_RAMP = 0.1
 """Share of a branch's rows that the rows of a bin may be spread over, for the bins to be in the order of time."""
 
 
-def ways_of(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> dict[str, Float[np.ndarray, " some"]]:
+def ways_of(offset_nm: Rows, branch: np.ndarray) -> dict[str, Float[np.ndarray, " some"]]:
     """Return the heights of each branch, in the order of the rows."""
     return {name: offset_nm[branch == name] for name in dict.fromkeys(branch.tolist())}
 
 
-def faults_of_order(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> tuple[int, int]:
+def faults_of_order(offset_nm: Rows, branch: np.ndarray) -> tuple[int, int]:
     """Return how many rows repeat a height of their branch, and how many step back against its direction."""
     ways = ways_of(offset_nm, branch).values()
     back = sum(int(np.sum(np.diff(way) * np.sign(way[-1] - way[0]) < 0.0)) for way in ways)
     return sum(len(way) - len(np.unique(way)) for way in ways), back
 
 
-def usual_width(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> float:
+def usual_width(offset_nm: Rows, branch: np.ndarray) -> float:
     """Return the width in nm of bins for a curve whose heights repeat or are not in order.
 
     The width is that of five rows, or of a 200th of them; 0 (only rows of equal height are merged) for few rows.
@@ -42,16 +47,17 @@ def usual_width(offset_nm: Float[np.ndarray, " rows"], branch: np.ndarray) -> fl
 
 
 def binned(
-    offset_nm: Float[np.ndarray, " rows"],
-    readings: dict[str, Float[np.ndarray, " rows"]],
+    offset_nm: Rows,
+    readings: dict[str, Rows],
     branch: np.ndarray,
     free: Bool[np.ndarray, " rows"],
     width_nm: float,
-    stated: dict[str, float],
+    single: dict[str, float],
+    stated: Collection[str],
 ) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a table, a bin of height each, and whether they stand as they were passed.
 
-    A row has the mean height `offset_nm`, `rows` (how many readings), `branch`, and every reading's mean and error.
+    A row has the mean height `offset_nm`, every reading's mean and error, and `retract`, 1 or 0.
 
     Args:
         offset_nm: heights.
@@ -59,8 +65,8 @@ def binned(
         branch: "approach" or "retract" of each row.
         free: rows of the free tip.
         width_nm: of a bin; 0: rows of equal height are merged.
-        stated: standard error of a single reading, by name, where that is given instead of the scatter; with `width_nm`
-            0 it is needed.
+        single: standard error of a single reading, by name.
+        stated: readings whose error that is, and not the scatter; with `width_nm` 0 all.
     """
     columns: dict[str, list[np.ndarray]] = {}
     in_order = True
@@ -76,13 +82,14 @@ def binned(
         whole = np.bincount(place, free[rows]) == counts
         # the nearer half of the free rows may feel the sample already
         whole &= np.cumsum(whole) <= 0.5 * whole.sum()
-        found = {"offset_nm": _means(place, height), "rows": counts, "branch": np.full(len(counts), name)}
+        found = {"offset_nm": _means(place, height), "retract": np.full(len(counts), float(name == "retract"))}
         for key, values in readings.items():
-            means = _means(place, values[rows])
-            single = np.full(len(counts), stated[key]) if key in stated else _scatter(height, values[rows], place)
-            error = single / np.sqrt(counts)
-            excess = 1.0 if key in stated else _excess(means[whole], error[whole], time[whole])
-            found |= {key: means, error_of(key): excess * error}
+            means, error = _means(place, values[rows]), single[key] / np.sqrt(counts)
+            if key not in stated:
+                scatter = _scatter(height, values[rows], place) / np.sqrt(counts)
+                # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
+                error = np.where(scatter > 0.0, _excess(means[whole], scatter[whole], time[whole]) * scatter, error)
+            found |= {key: means, error_of(key): error}
         for key, column in found.items():
             columns.setdefault(key, []).append(column[:: 1 if name == "approach" else -1])
     return {key: np.concatenate(parts) for key, parts in columns.items()}, in_order
@@ -94,14 +101,12 @@ def error_of(name: str) -> str:
     return f"{stem}_error_{unit}"
 
 
-def _means(place: Int[np.ndarray, " rows"], values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " bins"]:
+def _means(place: Places, values: Rows) -> Bins:
     """Return the mean of the values in each place."""
     return np.bincount(place, values) / np.bincount(place)
 
 
-def _scatter(
-    height: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], place: Int[np.ndarray, " rows"]
-) -> Float[np.ndarray, " bins"]:
+def _scatter(height: Rows, values: Rows, place: Places) -> Bins:
     """Return the scatter of single readings about a line over the height, in each bin and its neighbours."""
     # bins of few rows are taken together
     group, held = [0], 0
@@ -123,9 +128,7 @@ def _scatter(
     return np.sqrt(pooled / np.maximum(free, 1.0))[groups]
 
 
-def _excess(
-    values: Float[np.ndarray, " bins"], errors: Float[np.ndarray, " bins"], time: Float[np.ndarray, " bins"]
-) -> float:
+def _excess(values: Bins, errors: Bins, time: Bins) -> float:
     """Return by how much free bins scatter more about a straight line in time than their errors say, 1 at least."""
     known = errors > 0.0
     if known.sum() < _ROWS:

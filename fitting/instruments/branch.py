@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+Rows = Float[np.ndarray, " rows"]
 JUMP = 0.02
 """Change of the free amplitude, as a share of it, that is called a jump."""
 _FEWEST = 5
@@ -72,11 +73,7 @@ class BranchLook(NamedTuple):
     change: float | None = None
 
 
-def look_at(
-    offset_nm: Float[np.ndarray, " rows"],
-    amplitude: Float[np.ndarray, " rows"],
-    lag_deg: Float[np.ndarray, " rows"] | None = None,
-) -> BranchLook:
+def look_at(offset_nm: Rows, amplitude: Rows, lag_deg: Rows | None = None) -> BranchLook:
     """Return the free level, its noise and jumps, contact and slope of one branch.
 
     Args:
@@ -116,7 +113,7 @@ def look_at(
     return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change)
 
 
-def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " rows"] | None) -> int:
+def _plateau_end(values: Rows, lag: Rows | None) -> int:
     """Return how many rows, the farthest first, are of the free tip: until blocks of them leave the farthest ones."""
     rows = len(values)
     size = max(rows // _PARTS, _FEWEST)
@@ -143,7 +140,7 @@ def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " ro
     return until
 
 
-def _change(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"]) -> float | None:
+def _change(offset: Rows, values: Rows) -> float | None:
     """Return by how much the amplitude falls over the farthest quarter of the rows, of it; None where it is flat."""
     rows = max(len(values) // 4, min(len(values), _FEWEST))
     far, line = values[:rows], _line(offset[:rows], values[:rows])
@@ -157,13 +154,13 @@ def _change(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows
     return change if falls else None
 
 
-def _scatter(values: Float[np.ndarray, " rows"]) -> float:
+def _scatter(values: Rows) -> float:
     """Return the standard deviation about a straight line: a drift is none, correlated noise counts."""
     line = _line(np.arange(len(values), dtype=float), values) if len(values) > 3 else None
     return 0.0 if line is None else line[2]
 
 
-def _contact(values: Float[np.ndarray, " rows"], level: float, scatter: float) -> tuple[int, int]:
+def _contact(values: Rows, level: float, scatter: float) -> tuple[int, int]:
     """Return from which row on, up to which, the amplitude is reduced: from the nearest outwards until it is back."""
     deep = values.min() < 0.5 * level
     highest = _SHALLOW * level if deep else level - max(5.0 * min(scatter, 0.02 * level), 0.01 * level)
@@ -174,9 +171,7 @@ def _contact(values: Float[np.ndarray, " rows"], level: float, scatter: float) -
     return (int(outside[-1]) + 1 if outside.size else 0), int(low[-1]) + 1
 
 
-def steepest_part(
-    offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], *, deep: bool = False
-) -> ContactSlope | None:
+def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactSlope | None:
     """Return the steepest settled part of rows in contact, the nearest to the sample if there are several.
 
     A curve that first falls slowly (attraction) and then by 1 nm per nm (a hard sample) tells the scale of its
@@ -215,7 +210,7 @@ def steepest_part(
     return ContactSlope(chosen[0], chosen[1], float(offset[first]), float(offset[last - 1]), last - first)
 
 
-def _straight_from(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], first: int) -> int:
+def _straight_from(offset: Rows, values: Rows, first: int) -> int:
     """Return from which row on the slope is known well enough, as far as the rows up to the last lie on a line."""
     step = max(len(offset) - first, 4) // 4
     while first > 0:
@@ -244,7 +239,7 @@ def _line(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]
     return slope, scatter / float(np.sqrt(width)), scatter
 
 
-def _jump(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " rows"] | None) -> tuple[float, float] | None:
+def _jump(values: Rows, lag: Rows | None) -> tuple[float, float] | None:
     """Return the levels on both sides of the split of the rows whose means differ most, if that is a jump.
 
     A tip that comes into contact goes on losing amplitude, and its lag changes, too.

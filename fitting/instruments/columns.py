@@ -1,24 +1,32 @@
 """Which channels of a file become which columns of a table, where names, units and layout do not tell."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
-from fitting.instruments.recording import UNITS, Recording, Segment, quantity_of, unit_named
+from fitting.instruments.recording import UNITS, Recording, quantity_of, two_ways, unit_named
 from fitting.tables.csv_text import NUMBER, TableError
 
 ROLES = {
-    "offset_nm": (("length",), ("offset.*", "z-axis sensor", "zsnsr", "z", "z rel", "z-axis", "height.*", "lvdt")),
+    "offset_nm": (
+        ("length",),
+        ("offset.*", "calc_ramp.*", "z-axis sensor", "zsnsr", "z", "z rel", "z-axis", "height.*", "lvdt"),
+    ),
     "lockin_amplitude_nm": (
         ("length", "voltage"),
-        ("lockin_amplitude.*", "m1a", r"amp(litude)?(_\w+)?", r"amp(litude)?\b.*"),
+        ("lockin_amplitude.*", "m1a", r"amp(litude)?(_\w+)?", r"(lock-?in[_ ])?amp(?![a-z]*[ _]?2).*"),
     ),
-    "phase_lag_deg": (("angle",), ("phase_lag.*", "m1p", "phase?(_.*)?", r"phase\b.*")),
+    "phase_lag_deg": (
+        ("angle",),
+        ("phase_lag.*", "m1p", "phase?(_.*)?", r"(lock-?in[_ ])?pha(?![a-z]*[ _]?2).*"),
+    ),
     "deflection_nm": (("length", "voltage", "force"), ("defl.*", "normal force")),
 }
-"""What a channel can be: the quantities it may measure, and the names it goes by, likeliest first (no case)."""
+"""What a channel can be: the quantities it may measure, and the names it goes by, likeliest first (no case); channels
+of a second mode, Amplitude2 and Phase2, are none."""
 
 
 @dataclass(frozen=True)
@@ -64,19 +72,49 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
     return found
 
 
-def checked_unit(unit: str, role: str, channel: str, source: str) -> str:
-    """Return the unit of a channel for a column.
+def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSource]) -> ColumnSource | None:
+    """Return the channel that becomes a column, with its unit; None where neither the caller nor its name tells it.
+
+    Args:
+        recording: the file.
+        role: the column, a key of `ROLES`.
+        wanted: channels that the caller names, by column; a number counts them.
 
     Raises:
-        TableError: if the column has none such.
+        TableError: if there is no channel of a name, or its unit is none of the column.
     """
-    if quantity_of(unit) not in ROLES[role][0]:
-        usual = "deg" if role == "phase_lag_deg" else "nm"
+    (quantities, patterns), names, source = ROLES[role], recording.channels, wanted.get(role)
+    if source is None:
+        taken = {_numbered(other.channel, names) for other in wanted.values()}
+        ranked = [n for pattern in patterns for n in names if re.fullmatch(pattern, n, re.IGNORECASE | re.DOTALL)]
+        units = {n: recording.units.get(n, "") for n in ranked if n not in taken}
+        suited = [n for n, unit in units.items() if quantity_of(unit) in quantities]
+        suited += [n for n, unit in units.items() if not unit]
+        if not suited:
+            return None
+        source = ColumnSource(suited[0])
+    channel = _numbered(source.channel, names)
+    if channel not in names:
+        there = f"it has {', '.join(names)}; {columns_to_paste(recording)}"
+        raise TableError(f"{recording.source}: there is no channel `{channel}` for {role}; {there}")
+    unit = source.unit or recording.units.get(channel) or usual_unit(role)
+    if quantity_of(unit) not in quantities:
         raise TableError(
-            f"{source}: the channel {channel} has the unit {unit!r}, which is none of {role}; say "
-            f'`columns="{role}={channel}:{usual}"`'
+            f"{recording.source}: the channel {channel} has the unit {unit!r}, which is none of {role}; say "
+            f'`columns="{role}={channel}:{usual_unit(role)}"`'
         )
-    return unit
+    return ColumnSource(channel, unit, source.factor)
+
+
+def usual_unit(role: str) -> str:
+    """Return the unit of a channel that says none."""
+    return "deg" if role == "phase_lag_deg" else "nm"
+
+
+def _numbered(channel: str, names: list[str]) -> str:
+    """Return the channel that is meant: of that name, else of that number."""
+    counted = channel not in names and channel.isdecimal() and 0 < int(channel) <= len(names)
+    return names[int(channel) - 1] if counted else channel
 
 
 _EXAMPLE = "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
@@ -91,32 +129,42 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Record
     """
     names = recording.channels
     both = {role: one.channel for role, one in wanted.items() if "/" in one.channel and one.channel not in names}
-    pairs = {role: [name.strip() for name in channel.split("/", 1)] for role, channel in both.items()}
-    missing = next((name for pair in pairs.values() for name in pair if name not in names), None)
-    if missing is not None:
-        raise TableError(f"{recording.source}: there is no channel `{missing}`; it has {', '.join(names)}")
-    single = next((role for role in wanted if role not in pairs), None)
+    pairs = {role: [_numbered(name.strip(), names) for name in both[role].split("/", 1)] for role in both}
     if not pairs:
         return recording
+    missing = next((name for pair in pairs.values() for name in pair if name not in names), None)
+    single = next((role for role in wanted if role not in pairs), None)
+    if missing is not None:
+        there = f"it has {', '.join(names)}; {columns_to_paste(recording)}"
+        raise TableError(f"{recording.source}: there is no channel `{missing}`; {there}")
     if single is not None:
         raise TableError(
             f"{recording.source}: {single}={wanted[single].channel} has one channel where other columns have OUT/BACK; "
             f"write two for each, as {_EXAMPLE}"
         )
-    segments = [
-        Segment(segment.curve, branch, {both[role]: segment.channels[pair[way]] for role, pair in pairs.items()})
-        for segment in recording.segments
-        for way, branch in enumerate(("approach", "retract"))
-    ]
+    segments = two_ways(recording.segments, {both[role]: pair for role, pair in pairs.items()})
     units = {both[role]: recording.units.get(pair[0], "") for role, pair in pairs.items()}
     away = tuple(both[role] for role, pair in pairs.items() if pair[0] in recording.away)
-    return replace(recording, segments=tuple(segments), units=units, away=away)
+    return replace(recording, segments=segments, units=units, away=away)
 
 
-def example_of_columns(recording: Recording) -> str:
-    """Return what to write for channels without names: an example of eight columns where that may be meant."""
-    unnamed = recording.channels == [str(k + 1) for k in range(8)]
-    return f'say `columns="{_EXAMPLE if unnamed else "offset_nm=CHANNEL:UNIT"}"`' + " (approach/retract)" * unnamed
+_CURVE = ("offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
+
+
+def columns_to_paste(recording: Recording, roles: Iterable[str] = _CURVE) -> str:
+    """Return what to write for channels whose names do not tell what they are, made from the file's own channels."""
+    names = recording.channels
+    if names == [str(k + 1) for k in range(8)]:
+        return f'say `columns="{_EXAMPLE}"` (approach/retract)'
+    told = {role: channel_of(recording, role, {}) for role in roles}
+    others = iter([name for name in names if name not in {one.channel for one in told.values() if one is not None}])
+    parts = []
+    for role, one in told.items():
+        channel = next(others, "") if one is None else one.channel
+        unit = recording.units.get(channel, "")
+        unit = unit if quantity_of(unit) in ROLES[role][0] else usual_unit(role)
+        parts += [f"{role}={channel}:{unit}"] if channel else []
+    return f'say `columns="{",".join(parts)}"`'
 
 
 _TURN = 0.3

@@ -6,8 +6,7 @@ towards the tip), `lockin_amplitude_nm`, `phase_lag_deg` (behind the drive) and 
 assumptions, and a message about a missing quantity names the option that gives it.
 """
 
-import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -20,13 +19,13 @@ from afm_jax.checks import checked
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import printable
-from fitting.instruments.bins import binned, error_of, faults_of_order, usual_width, ways_of
+from fitting.instruments.bins import binned, faults_of_order, usual_width, ways_of
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import (
     ROLES,
     ColumnSource,
-    checked_unit,
-    example_of_columns,
+    channel_of,
+    columns_to_paste,
     laid_out,
     parse_columns,
     turns_of,
@@ -44,7 +43,8 @@ from fitting.instruments.recording import (
     refuse_other_modes,
 )
 from fitting.parameters import USUAL_ERRORS
-from fitting.tables.csv_text import TableError, setting_line
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import ERROR_OF, AmplitudeTable, csv_of
 
 FORMAT_VERSION = 1
 OPTIONS = {
@@ -62,7 +62,6 @@ OPTIONS = {
 _NEEDED = ("drive_frequency_khz", "free_frequency_khz", "free_amplitude_nm", "nm_per_volt")
 _WANTED = ("quality_factor", "spring_constant_n_per_m")
 """What a table cannot do without, and what it asks for."""
-_NO_AMPLITUDE = "There is no lock-in amplitude"
 
 
 @public_result()
@@ -117,8 +116,7 @@ class MeasuredCurve(JudgedResult):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        own = {name: value for name, value in vars(self).items() if name != "known"}
-        return plain(own | {"valid": self.valid, "known": {key: vars(one) for key, one in self.known.items()}})
+        return plain(vars(self) | {"valid": self.valid})
 
 
 @checked
@@ -160,8 +158,9 @@ def read_curves(
             curve if possible. A factor of the phase in `columns` says that it is a lag then.
         bin_nm: width of the bins of height in the table of a curve, 0 to merge equal heights only; None: rows as they
             are, or where heights repeat or are not in order bins of five rows or a 200th of a branch.
-        numbers: what the file does not say, or says wrongly: the keys of `OPTIONS`, each a number or a pair with its
-            standard error; `nm_per_volt="slope"` takes the sensitivity from the curve's own slope.
+        numbers: what the file does not say, or says wrongly: the keys of `OPTIONS`, each a number, a pair with its
+            standard error or a text such as '44 +- 4'; `nm_per_volt="slope"` takes the sensitivity from the curve's
+            own slope.
 
     Raises:
         TableError: one line: the file is damaged, holds no such curve, or a channel is missing.
@@ -170,26 +169,29 @@ def read_curves(
     if bin_nm is not None and not 0.0 <= bin_nm < np.inf:
         raise ValueError(f"`bin_nm` must be finite and not below 0, but is {bin_nm!r}")
     of_slope = {"nm_per_volt": None} if numbers.get("nm_per_volt") == "slope" else {}
-    given = given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))
+    known = {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
+    known |= given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))
     wanted = parse_columns(columns)
     recording = read_recording(path)
     _refuse_others(recording)
     stated = any(segment.branch for segment in recording.segments)
     recording = laid_out(recording, wanted)
-    known = recording.known | {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
-    known |= given
+    known = recording.known | known
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
         # lock-ins are tuned to the resonance before a curve is taken
         known["drive_frequency_khz"] = replace(known["free_frequency_khz"], origin=ASSUMED_RESONANCE, error=None)
-    numbered = groupby(recording.segments, key=lambda segment: segment.curve)
-    joined = [curve for _, segments in numbered for curve in _joined(recording, list(segments), wanted)]
-    if any(curve.amplitude is not None for curve in joined):
-        _refuse_modes(recording)
+    notes = list(recording.remarks)
+    sources = _sources(recording, wanted, notes)
+    if "lockin_amplitude_nm" in sources:
+        refuse_other_modes(recording.settings, recording.source, recording.channels)
     said = {role for role, source in wanted.items() if source.factor is not None}
     sense = phase_sense or ("lag" if "phase_lag_deg" in said else "")
+    by_curve = groupby(_ways(recording, sources, notes), key=lambda way: way[0])
+    joined = [[way[1:] for way in ways] for _, ways in by_curve]
     curves = []
-    for number, one in enumerate(joined, start=1):
-        curve = replace(one, curve=number, curves=len(joined), known=dict(known))
+    for number, ways in enumerate(joined, start=1):
+        curve = replace(_joined(recording, ways, sources), curve=number, curves=len(joined), known=dict(known))
+        curve = replace(curve, notes=(*notes, *curve.notes))
         if "offset_nm" not in said and _running_away(curve):
             curve = replace(curve, offset_nm=-curve.offset_nm, notes=(*curve.notes, _TURNED))
         if not stated and not any(_as_named(curve)):
@@ -201,92 +203,46 @@ def read_curves(
 _ASSUMED_BASE = 'assumed: shaken at its base by a piezo; `drive="force"` for a photothermal or magnetic drive'
 
 
-_OTHER_CHANNELS = re.compile(
-    r"(amp(litude)?|pha?(se?)?)[ _-]*2\b.*|.*\b(lateral|torsion\w*|friction|pfm|piezo\w*|second (eigen)?mode)\b.*",
-    re.IGNORECASE,
-)
-"""Channels of modes in which amplitude and phase are not those of one flexural mode that taps."""
-
-
 def _refuse_others(recording: Recording) -> None:
-    kinds = set(map(quantity_of, recording.units.values()))
-    if {"spectrum", "voltage spectrum"} & kinds:
-        raise TableError(f"{recording.source}: holds a thermal spectrum, not a curve; `afm-jax calibrate` fits it")
-    if any(name.startswith("Frequency") for name in recording.channels):
-        raise TableError(f"{recording.source}: holds a resonance sweep, not a curve; `afm-jax calibrate` fits it")
+    spectrum = {"spectrum", "voltage spectrum"} & set(map(quantity_of, recording.units.values()))
+    if spectrum or any(name.startswith("Frequency") for name in recording.channels):
+        what = "thermal spectrum" if spectrum else "resonance sweep"
+        raise TableError(f"{recording.source}: holds a {what}, not a curve; `afm-jax calibrate` fits it")
 
 
-def _refuse_modes(recording: Recording) -> None:
-    """Check that a file with amplitudes, where it says in which mode it was recorded, says tapping.
+def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: list[str]) -> dict[str, ColumnSource]:
+    """Return the channels that become columns; notes say what was assumed and what is missing.
 
     Raises:
-        TableError: with the name of the mode, or of the channel that tells it.
+        TableError: if there is no height.
     """
-    refuse_other_modes(recording.settings, recording.source)
-    channel = next((name for name in recording.channels if _OTHER_CHANNELS.fullmatch(name)), None)
-    if channel is not None:
-        raise TableError(
-            f"{recording.source}: holds a channel {channel!r}, which is none of amplitude modulation (tapping) of one "
-            "mode; its amplitude and phase do not give the energy of a tap"
-        )
-
-
-def _joined(recording: Recording, segments: list[Segment], wanted: Mapping[str, ColumnSource]) -> list[MeasuredCurve]:
-    """Return the curves in segments of one number, in the table's quantities.
-
-    Where no branch is stated the heights tell it, and an approach and a retract are a curve.
-    """
-    notes = list(recording.remarks)
-    found = {role: _source(recording, segments[0], role, wanted, notes) for role in ROLES}
-    sources = {role: source for role, source in found.items() if source is not None}
+    sources = {}
+    for role in ROLES:
+        source = channel_of(recording, role, wanted)
+        if source is None:
+            continue
+        channel = source.channel
+        if role == "offset_nm" and role not in wanted and channel in recording.away:
+            source = replace(source, factor=-1.0)
+            notes.append(f"Sign: {channel} grows away from the sample in this format; the offset is its negative.")
+        if not recording.units.get(channel) and not (role in wanted and wanted[role].unit):
+            notes.append(f'Unit: {channel} has none; {source.unit} is assumed; else `columns="{role}={channel}:UNIT"`.')
+        sources[role] = source
+    paste = columns_to_paste(recording)
     if "offset_nm" not in sources:
         channels = ", ".join(recording.channels)
-        raise TableError(
-            f"{recording.source}: no height among the channels {channels}; {example_of_columns(recording)}"
-        )
-    taken = {source.channel for source in sources.values()}
-    others = ", ".join(name for name in segments[0].channels if name not in taken)
-    missing = next((role for role in ("lockin_amplitude_nm", "phase_lag_deg") if role not in sources), "")
-    ask = f'; if one of the channels {others} is: `columns="{missing}=CHANNEL:UNIT"`' if others else ""
-    if missing:
-        notes.append(f"{_NO_PHASE if missing == 'phase_lag_deg' else _NO_AMPLITUDE}{ask}.")
-    ways = [(segment.branch, _converted(recording, segment, sources)) for segment in segments]
-    size, (branch, columns) = len(ways), ways[0]
-    if not branch:
-        offset, size, ways = columns["offset_nm"], 2, []
-        if len(offset) >= _FEWEST and np.median(np.abs(np.diff(offset))) >= _JUMPS * np.ptp(offset):
-            notes.append(_MIXED)
-        for first, last in pairwise([0, *turns_of(offset), len(offset)]):
-            branch = "approach" if offset[last - 1] >= offset[first] else "retract"
-            ways.append((branch, {role: numbers[first:last] for role, numbers in columns.items()}))
-    scales = {"length": "nm", "voltage": "V", "force": "nN"}
-    units = {role: scales.get(quantity_of(source.unit), "") for role, source in sources.items()}
-    curves = []
-    for some in (ways[first : first + size] for first in range(0, len(ways), size)):
-        columns = {role: np.concatenate([parts[role] for _, parts in some]) for role in sources}
-        branches = [np.full(len(parts["offset_nm"]), name) for name, parts in some]
-        amplitude, phase = columns.get("lockin_amplitude_nm"), columns.get("phase_lag_deg")
-        inverted = amplitude is not None and amplitude[np.argmax(np.abs(amplitude))] < 0.0
-        curve = MeasuredCurve(
-            source=recording.source,
-            format=recording.format,
-            curve=len(curves) + 1,
-            curves=len(ways) // size,
-            branch=np.concatenate(branches),
-            offset_nm=columns["offset_nm"],
-            amplitude=-amplitude if amplitude is not None and inverted else amplitude,
-            amplitude_unit=units.get("lockin_amplitude_nm", "nm"),
-            phase_lag_deg=None if phase is None else np.unwrap(phase, period=360.0),
-            deflection=columns.get("deflection_nm"),
-            deflection_unit=units.get("deflection_nm", "nm"),
-            free=np.zeros(len(columns["offset_nm"]), dtype=bool),
-            notes=(*notes, *([_INVERTED] if inverted else [])),
-        )
-        curves.append(curve)
-    return curves
+        raise TableError(f"{recording.source}: no height among the channels {channels}; {paste}")
+    others = ", ".join(n for n in recording.channels if n not in {source.channel for source in sources.values()})
+    missing = next((role for role in _NO if role not in sources), None)
+    if missing is not None:
+        notes.append(f"{_NO[missing]}{f'; if one of the channels {others} is, {paste}' if others else ''}.")
+    return sources
 
 
-_NO_PHASE = "There is no phase, so that the energy of a tap has an upper bound only"
+_NO = {
+    "lockin_amplitude_nm": "There is no lock-in amplitude",
+    "phase_lag_deg": "There is no phase, so that the energy of a tap has an upper bound only",
+}
 _INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
 _FEWEST, _JUMPS = 20, 0.05
 """Rows, and median step of the heights, of their range, from which they are no ramp."""
@@ -294,38 +250,57 @@ _MIXED = (
     "Direction: heights jump to and fro, so that approach and retract cannot be distinguished: all rows are one "
     "branch; else give a column branch."
 )
+_Columns = dict[str, np.ndarray]
 
 
-def _source(
-    recording: Recording, segment: Segment, role: str, wanted: Mapping[str, ColumnSource], notes: list[str]
-) -> ColumnSource | None:
-    """Return the channel that becomes a column, with its unit; notes say what was assumed."""
-    names, (quantities, patterns), source = list(segment.channels), ROLES[role], wanted.get(role)
-    if source is not None and source.channel not in names:
-        raise TableError(
-            f"{recording.source}: there is no channel `{source.channel}` for {role}; it has {', '.join(names)}"
-        )
-    if source is None:
-        taken = {other.channel for other in wanted.values()}
-        ranked = [n for pattern in patterns for n in names if re.fullmatch(pattern, n, re.IGNORECASE | re.DOTALL)]
-        units = {n: recording.units.get(n, "") for n in ranked if n not in taken}
-        suited = [n for n, unit in units.items() if quantity_of(unit) in quantities]
-        suited += [n for n, unit in units.items() if not unit]
-        if not suited:
-            return None
-        away = role == "offset_nm" and suited[0] in recording.away
-        source = ColumnSource(suited[0], "", -1.0 if away else 1.0)
-        if away:
-            notes.append(f"Sign: {suited[0]} grows away from the sample in this format; the offset is its negative.")
-    unit, usual = source.unit or recording.units.get(source.channel, ""), "deg" if role == "phase_lag_deg" else "nm"
-    if not unit:
-        notes.append(f'Unit: {source.channel} has none; {usual} is assumed; else `columns="{role}=NAME:UNIT"`.')
-    return replace(source, unit=checked_unit(unit or usual, role, source.channel, recording.source))
+def _ways(
+    recording: Recording, sources: Mapping[str, ColumnSource], notes: list[str]
+) -> Iterator[tuple[Any, str, _Columns]]:
+    """Give which curve, branch and columns of every ramp; where no branch is stated the heights tell it.
+
+    An approach and a retract, the one after the other, are a curve then.
+    """
+    for segment in recording.segments:
+        columns = _converted(recording, segment, sources)
+        if segment.branch:
+            yield segment.curve, segment.branch, columns
+            continue
+        offset = columns["offset_nm"]
+        if len(offset) >= _FEWEST and np.median(np.abs(np.diff(offset))) >= _JUMPS * np.ptp(offset):
+            notes.append(_MIXED)
+        for number, (first, last) in enumerate(pairwise([0, *turns_of(offset), len(offset)])):
+            branch = "approach" if offset[last - 1] >= offset[first] else "retract"
+            part = {role: numbers[first:last] for role, numbers in columns.items()}
+            yield (segment.curve, number // 2), branch, part
 
 
-def _converted(
-    recording: Recording, segment: Segment, sources: Mapping[str, ColumnSource]
-) -> dict[str, Float[np.ndarray, " rows"]]:
+def _joined(
+    recording: Recording, ways: list[tuple[str, _Columns]], sources: Mapping[str, ColumnSource]
+) -> MeasuredCurve:
+    """Return approach and retract, the one after the other, as a curve."""
+    scales = {"length": "nm", "voltage": "V", "force": "nN"}
+    units = {role: scales.get(quantity_of(source.unit), "") for role, source in sources.items()}
+    columns = {role: np.concatenate([parts[role] for _, parts in ways]) for role in sources}
+    amplitude, phase = columns.get("lockin_amplitude_nm"), columns.get("phase_lag_deg")
+    inverted = amplitude is not None and amplitude[np.argmax(np.abs(amplitude))] < 0.0
+    return MeasuredCurve(
+        source=recording.source,
+        format=recording.format,
+        curve=1,
+        curves=1,
+        branch=np.concatenate([np.full(len(parts["offset_nm"]), name) for name, parts in ways]),
+        offset_nm=columns["offset_nm"],
+        amplitude=-amplitude if amplitude is not None and inverted else amplitude,
+        amplitude_unit=units.get("lockin_amplitude_nm", "nm"),
+        phase_lag_deg=None if phase is None else np.unwrap(phase, period=360.0),
+        deflection=columns.get("deflection_nm"),
+        deflection_unit=units.get("deflection_nm", "nm"),
+        free=np.zeros(len(columns["offset_nm"]), dtype=bool),
+        notes=(_INVERTED,) if inverted else (),
+    )
+
+
+def _converted(recording: Recording, segment: Segment, sources: Mapping[str, ColumnSource]) -> _Columns:
     """Return the columns of a segment in the table's units, without padding at the end.
 
     Raises:
@@ -394,7 +369,7 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
     """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
     if curve.amplitude is None:
         return curve
-    known, looks = dict(curve.known), _looks(curve)
+    known, looks, notes = curve.known, _looks(curve), list(curve.notes)
     slope = _mean_slope(looks) if of_slope else None
     if slope is not None:
         known["nm_per_volt"] = _scale_of_slope(curve, slope, looks)
@@ -405,30 +380,25 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, stated_sense: str) -> Measu
     free = np.zeros(len(curve.offset_nm), dtype=bool)
     for branch, look in looks.items():
         free[np.flatnonzero(curve.branch == branch)[look.free]] = True
-    curve = replace(curve, known=known, free=free, slope=_mean_slope(looks))
-    curve = replace(curve, reasons=tuple(_reasons(curve, looks)))
-    notes = list(curve.notes)
+    curve = replace(curve, free=free, slope=_mean_slope(looks))
+    reasons = tuple(_reasons(curve, looks))
     _add_levels(curve, looks)
     offset = curve.offset_nm - _add_origin(curve, looks)
     phase = _add_phase(curve, looks, stated_sense, notes)
     # in volts the sensitivity comes first
     needless = "free_amplitude_nm" if curve.amplitude_unit == "V" else "nm_per_volt"
     missing = tuple(key for key in (*_NEEDED, *_WANTED) if key not in {*known, needless})
-    notes += _scale_notes(curve)
-    return replace(curve, offset_nm=offset, phase_lag_deg=phase, notes=tuple(notes), missing=missing)
+    said = (*notes, *_scale_notes(curve))
+    return replace(curve, offset_nm=offset, phase_lag_deg=phase, notes=said, missing=missing, reasons=reasons)
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
     offset, amplitude, lag = curve.offset_nm, np.asarray(curve.amplitude), curve.phase_lag_deg
-    rows = {branch: curve.branch == branch for branch in dict.fromkeys(curve.branch.tolist())}
-    return {
-        branch: look_at(offset[here], amplitude[here], None if lag is None else lag[here])
-        for branch, here in rows.items()
-    }
-
-
-_LEAST_ERROR = 1e-9
-"""Of a slope, relative."""
+    looks = {}
+    for branch in dict.fromkeys(curve.branch.tolist()):
+        here = curve.branch == branch
+        looks[branch] = look_at(offset[here], amplitude[here], None if lag is None else lag[here])
+    return looks
 
 
 def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
@@ -437,7 +407,7 @@ def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     if not slopes.size:
         return None
     # rows that lie on a line exactly leave no error at all
-    weights = np.maximum(slopes[:, 1], _LEAST_ERROR * np.abs(slopes[:, 0])) ** -2.0
+    weights = np.maximum(slopes[:, 1], 1e-9 * np.abs(slopes[:, 0])) ** -2.0
     mean = float(np.sum(weights * slopes[:, 0]) / weights.sum())
     chi2 = float(np.sum(weights * (slopes[:, 0] - mean) ** 2))
     return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))
@@ -446,61 +416,53 @@ def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
 def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Mapping[str, BranchLook]) -> Known:
     """Return the scale with which the amplitude falls by 1 nm per nm in contact."""
     scale, unit = 1.0 / abs(slope[0]), curve.amplitude_unit
-    parts = [
-        f"{look.slope.rows} rows of the {branch} from {look.slope.from_nm:.2f} to {look.slope.to_nm:.2f} nm"
-        for branch, look in looks.items()
-        if look.slope is not None
-    ]
+    found = [(branch, look.slope) for branch, look in looks.items() if look.slope is not None]
+    parts = [f"{one.rows} rows of the {branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found]
     how = f"slope of the steepest settled part ({' and '.join(parts)}), assumed to be 1 nm per nm (a hard sample)"
     return Known(scale, f"nm/{unit}", f"measured: {how}; unit {unit}", scale * slope[1] / abs(slope[0]))
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
     """Return why a curve must not be used: free amplitudes that jump, heights that run the wrong way."""
-    unit, away = curve.amplitude_unit, _running_away(curve)
-    jumps = [
-        f"jumps from {look.jump[0]:.4g} to {look.jump[1]:.4g} {unit} within the {branch}"
-        for branch, look in looks.items()
-        if look.jump is not None
-    ]
-    levels = {branch: look.level for branch, look in looks.items()}
-    if np.ptp(list(levels.values())) > JUMP * max(levels.values()):
-        jumps.append("is " + " and ".join(f"{level:.4g} {unit} in the {branch}" for branch, level in levels.items()))
-    reasons = [
-        f"The free amplitude {jump}: the drive or the demodulation changed while the curve was recorded."
-        for jump in jumps
-    ]
+    unit, away, jumps, slopes = curve.amplitude_unit, _running_away(curve), [], []
+    for branch, look in looks.items():
+        if look.jump is not None:
+            jumps.append(f"jumps from {look.jump[0]:.4g} to {look.jump[1]:.4g} {unit} within the {branch}")
+        if look.change is not None and "free_amplitude_nm" not in curve.known:
+            slopes.append(
+                f"There is no flat free part in the {branch}: the amplitude still changes by {look.change:.1%} over "
+                "the farthest quarter of the rows; record farther away, or give `free_amplitude_nm=...`."
+            )
+    levels = [look.level for look in looks.values()]
+    if np.ptp(levels) > JUMP * max(levels):
+        jumps.append("is " + " and ".join(f"{look.level:.4g} {unit} in the {branch}" for branch, look in looks.items()))
+    changed = "the drive or the demodulation changed while the curve was recorded"
+    reasons = [f"The free amplitude {jump}: {changed}." for jump in jumps]
     if away is not None:
         far, near = (f"{amplitude:.4g} {unit}" for amplitude in away)
         reasons.append(
             f"The amplitude is smaller far from the sample ({far}) than near it ({near}): the heights run the other "
             'way; turn them round with `columns="offset_nm=CHANNEL:-1"` (or drop that -1).'
         )
-    reasons += [
-        f"There is no flat free part in the {branch}: the amplitude still changes by {look.change:.1%} over the "
-        "farthest quarter of the rows; record farther away, or give `free_amplitude_nm=...`."
-        for branch, look in looks.items()
-        if look.change is not None and "free_amplitude_nm" not in curve.known
-    ]
-    return reasons
+    return reasons + slopes
 
 
 def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
     """Add the free amplitude and the errors of single rows to what is known, from the free ones."""
-    level = float(np.mean([look.level for look in looks.values()]))
+    known, level = curve.known, float(np.mean([look.level for look in looks.values()]))
     noise = max((look.noise for look in looks.values() if look.noise > 0.0), default=0.0)
-    scatter_of_rows = "measured: scatter of the free rows"
+    measured = "measured: scatter of the free rows"
     if curve.amplitude_unit == "nm":
         if not any(look.jump for look in looks.values()):
             how, error = f"measured: median of {curve.free.sum()} free rows", max(v.level_error for v in looks.values())
-            curve.known.setdefault("free_amplitude_nm", Known(level, "nm", how, float(error)))
-        how = scatter_of_rows if noise else "assumed: 1 % of the free amplitude"
-        curve.known.setdefault("amplitude_error_nm", Known(noise or 0.01 * level, "nm", how))
+            known.setdefault("free_amplitude_nm", Known(level, "nm", how, float(error)))
+        how = measured if noise else "assumed: 1 % of the free amplitude"
+        known.setdefault("amplitude_error_nm", Known(noise or 0.01 * level, "nm", how))
     if curve.phase_lag_deg is not None:
         ways = [curve.phase_lag_deg[curve.free & (curve.branch == branch)] for branch in looks]
         scatter = max(float(np.std(np.diff(way)) / np.sqrt(2.0)) if len(way) > 4 else 0.0 for way in ways)
-        how = scatter_of_rows if scatter > 0.0 else "assumed: 1 degree"
-        curve.known.setdefault("phase_error_deg", Known(scatter or 1.0, "deg", how))
+        how = measured if scatter > 0.0 else "assumed: 1 degree"
+        known.setdefault("phase_error_deg", Known(scatter or 1.0, "deg", how))
 
 
 def _add_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> float:
@@ -602,39 +564,54 @@ def _scale_notes(curve: MeasuredCurve) -> list[str]:
 
 
 def table_text(curve: MeasuredCurve) -> str:
-    """Return a curve as a table of `afm-jax tapping` and `afm-jax fit`.
+    """Return a curve as a table of `afm-jax tapping` and `afm-jax fit`; errors as of `table_of`."""
+    return csv_of(table_of(curve))
+
+
+def table_of(curve: MeasuredCurve) -> AmplitudeTable:
+    """Return a curve as an amplitude table.
 
     Raises:
         TableError: if something is missing, naming the options that give it, or the curve must not be used.
     """
+    where, known = f"{curve.source}, curve {curve.curve}", curve.known
     if curve.amplitude is None:
-        why = next((note for note in curve.notes if note.startswith(_NO_AMPLITUDE)), _NO_AMPLITUDE)
-        raise TableError(f"{curve.source}, curve {curve.curve}: no table of this. {why}")
+        why = next(note for note in curve.notes if note.startswith(_NO["lockin_amplitude_nm"]))
+        raise TableError(f"{where}: no table of this. {why}")
     if curve.reasons:
-        raise TableError(f"{curve.source}, curve {curve.curve}: {curve.reasons[0]}")
+        raise TableError(f"{where}: {curve.reasons[0]}")
     needed = [key for key in curve.missing if key in _NEEDED]
     if needed:
         words = {key: unit.upper() for key, unit in OPTIONS.items()} | {"nm_per_volt": 'NM_PER_V|"slope"'}
         options = " ".join(f"`{key}={words[key]}`" for key in needed)
         raise TableError(f"{curve.source}: the file does not say {', '.join(needed)}; give {options}")
     rows, in_order = _rows(curve)
-    drive: dict[str, Any] = {key: curve.number(key) for key in ("drive_frequency_khz", "free_amplitude_nm")}
-    columns = drive | rows
     # an offset of the detector may take the amplitude of a tip that does not move below zero
     moving = rows["lockin_amplitude_nm"] > 0.0
-    cells = [np.broadcast_to(column, moving.shape)[moving].tolist() for column in columns.values()]
-    lines = [f"# drive = {curve.known['drive'].value}", *_setting_lines(curve)]
-    if in_order:
-        lines.append("# rows = in order of time")
+    rows |= {key: np.full(moving.shape, known[key].value) for key in ("drive_frequency_khz", "free_amplitude_nm")}
     remarks = [f"read from {Path(curve.source).name} ({curve.format}), curve {curve.curve}", *curve.notes]
-    zero = curve.known.get("phase_zero_deg")
-    remarks += [] if zero is None or not zero.error else [zero_of_free_rows(zero.error)]
+    header: dict[str, Any] = {key: known[key].value for key in ("free_frequency_khz", *_WANTED) if key in known}
+    header |= {ERROR_OF[key]: known[key].error for key in header}
+    errors = {key: one.error for key, one in known.items() if one.error}
+    calibration = {key: (0.0, errors[key]) for key in ("offset_origin_nm", "phase_zero_deg") if key in errors}
+    if "nm_per_volt" in errors:
+        calibration["tip_calibration"] = (1.0, errors["nm_per_volt"] / float(known["nm_per_volt"].value))
+    if "phase_zero_deg" in errors:
+        remarks.append(zero_of_free_rows(errors["phase_zero_deg"]))
+    if curve.phase_lag_deg is not None:
+        # the zero was set by the free rows: it says nothing of the sign
+        header["phase_sense"] = "lag" if "phase_sense" in known else "either"
     if not moving.all():
         remarks.append(f"left out: {np.sum(~moving)} rows whose amplitude is not above zero")
-    lines += [f"# {remark}" for remark in remarks]
-    lines.append(",".join(columns))
-    lines += [",".join(map(repr, row)) for row in zip(*cells, strict=True)]
-    return "\n".join(lines) + "\n"
+    return AmplitudeTable(
+        **{name: column[moving] for name, column in rows.items()},
+        **header,
+        drive=str(known["drive"].value),
+        calibration=calibration,
+        rows_in_order_of_time=in_order,
+        source=curve.source,
+        remarks=tuple(remarks),
+    )
 
 
 def zero_of_free_rows(error: float) -> str:
@@ -645,32 +622,10 @@ def zero_of_free_rows(error: float) -> str:
 def _rows(curve: MeasuredCurve) -> tuple[dict[str, np.ndarray], bool]:
     """Return the rows of a curve's table, its bins or the rows as they were read, and if they are in order of time."""
     readings = {"lockin_amplitude_nm": np.asarray(curve.amplitude)}
-    single = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
+    known = {"lockin_amplitude_nm": curve.known["amplitude_error_nm"]}
     if curve.phase_lag_deg is not None:
-        readings["phase_lag_deg"], single["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]
-    width = curve.bin_nm or 0.0
-    stated = {name: float(one.value) for name, one in single.items() if not width or one.origin.startswith("option")}
-    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, width, stated)
-    number, branch = rows.pop("rows"), rows.pop("branch")
-    for name, one in single.items():
-        # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
-        error = rows[error_of(name)]
-        rows[error_of(name)] = np.where(error > 0.0, error, float(one.value) / np.sqrt(number))
-    rows["retract"] = (branch == "retract").astype(int)
+        readings["phase_lag_deg"], known["phase_lag_deg"] = curve.phase_lag_deg, curve.known["phase_error_deg"]
+    width, single = curve.bin_nm or 0.0, {name: float(one.value) for name, one in known.items()}
+    stated = {name for name, one in known.items() if not width or one.origin.startswith("option")}
+    rows, in_order = binned(curve.offset_nm, readings, curve.branch, curve.free, width, single, stated)
     return rows, in_order and (curve.bin_nm is not None or all(_as_named(curve)))
-
-
-def _setting_lines(curve: MeasuredCurve) -> list[str]:
-    """Return the comment lines that a table understands."""
-    known = curve.known
-    lever = [key for key in ("free_frequency_khz", *_WANTED) if key in known]
-    zeros = [key for key in ("offset_origin_nm", "phase_zero_deg") if key in known and known[key].error]
-    lines = [setting_line(key, known[key].value, known[key].error) for key in lever]
-    lines += [setting_line(key, "0", known[key].error) for key in zeros]
-    if curve.phase_lag_deg is not None:
-        # the zero was set by the free rows: it says nothing of the sign
-        lines.append(f"# phase_sense = {'lag' if 'phase_sense' in known else 'either'}")
-    scale = known.get("nm_per_volt")
-    if scale is not None and scale.error and not isinstance(scale.value, str):
-        lines.append(setting_line("tip_calibration", "1", scale.error / scale.value))
-    return lines

@@ -27,6 +27,7 @@ from fitting.instruments.recording import (
     known_from,
     number_in,
     package_for,
+    two_ways,
     unit_named,
 )
 from fitting.tables.csv_text import (
@@ -58,16 +59,27 @@ def read_recording(path: str | Path) -> Recording:
     data = read_bytes(path, "one file")
     if not data.strip():
         raise TableError(f"{name}: the file is empty; copy it again from the instrument")
-    if data.startswith((b"\x93NUMPY", b"GWYP")) or (data.startswith(b"PK") and b".npy" in data[:4096]):
-        what = "arrays of NumPy or data of Gwyddion, no curve as text; export a graph as text"
-        raise TableError(f"{name}: holds {what}; energies of images: afm-jax tapping-map")
+    for marks, what in _NOT_READ.items():
+        if any(mark in data[:16] for mark in marks):
+            raise TableError(f"{name}: {what}; energies of images: afm-jax tapping-map")
     parse = parse_igor if is_igor(data, str(path)) else parse_text
     parse = next((parser for mark, parser in MARKS.items() if data.startswith(mark)), parse)
     with damaged_as_one_line(name):
         recording = parse(data, name)
+    if any(np.ndim(v) != 1 for s in recording.segments for v in s.channels.values()):
+        raise TableError(f"{name}: holds images; their energies: afm-jax tapping-map")
     if not recording.segments or any(not np.size(v) for s in recording.segments for v in s.channels.values()):
         raise cut_off(name, "holds no rows of numbers")
     return recording
+
+
+_NOT_READ = {
+    (b"\x93NUMPY", b"GWYP", b"PK\x03\x04"): "holds arrays of NumPy, or data of Gwyddion or JPK; export a curve as text",
+    (b"\x89HDF",): "is HDF5, as Nanosurf's .nhf; export the curve as .nid or CSV",
+    (b"ARDF",): "is Asylum's .ARDF; export the curve as .ibw, or as text",
+    (b"\\*File list", b"\\*Force file", b"\\*EC File"): "is Bruker's; export the curve as text (NanoScope Analysis)",
+}
+"""What files that are not read begin with, and what to do instead."""
 
 
 def is_igor(head: bytes, path: str = "") -> bool:
@@ -81,8 +93,8 @@ def is_igor(head: bytes, path: str = "") -> bool:
 def parse_text(data: bytes, name: str) -> Recording:
     """Read text: comments or a head above `[DATA]`, a row of names (units in them or below), and rows of numbers.
 
-    Nanonis writes `[DATA]`, and names with "[bwd]" for the way back. neaSNOM's comments are `key: [unit] values`; its
-    columns carry no units.
+    Nanonis writes `[DATA]`, and names with "[bwd]" for the way back; Bruker's exports have _Ex and _Rt in the names of
+    both ways. neaSNOM's comments are `key: [unit] values`; its columns carry no units.
     """
     wrong = "is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, Nanonis .dat, "
     comments, rows = split_lines(text_of(data, name, f"{wrong}CSV); export it as CSV", latin=True))
@@ -108,12 +120,11 @@ def parse_text(data: bytes, name: str) -> Recording:
         for way in dict.fromkeys(ways)
         if (rows_of_it := (runs == run) & (np.array(ways) == way)).any()
     ]
-    back = {title.replace("[bwd]", "").strip(): numbers for title, numbers in columns.items() if "[bwd]" in title}
+    back = {title.replace("[bwd]", "").strip(): title for title in columns if "[bwd]" in title}
     if back:
-        forward = {title: numbers for title, numbers in columns.items() if "[bwd]" not in title}
         # the height is written once where forward and backward stood at the same heights
-        heights = {title: numbers for title, numbers in forward.items() if title.startswith("Z")}
-        segments = [Segment(1, "approach", forward), Segment(1, "retract", heights | back)]
+        pairs = {title: (title, back.get(title, title)) for title in columns if title in back or title.startswith("Z")}
+        segments = two_ways(segments, pairs)
     return Recording(kind, name, tuple(segments), units, known_from(header), away, remarks, header)
 
 
@@ -141,6 +152,7 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
         titles = [str(k + 1) for k in range(len(titles))]
     else:
         titles, body = [printable(title) or f"column {k + 1}" for k, title in enumerate(titles)], body[1:]
+        titles = [re.sub(r"^(.*)_Rt(?=_|$)", r"[bwd] \1", re.sub(r"_Ex(?=_|$)", "", title)) for title in titles]
         if body and not any(map(NUMBER.fullmatch, body[0])):
             below, body = body[0], body[1:]
     if not body:
@@ -245,15 +257,15 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     sizes = [int(keys["Points"]) * int(keys["Lines"]) * (int(keys["SaveBits"]) // 8) for keys in sets]
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
         raise cut_off(name, f"the header announces {sum(sizes)} bytes of data, {len(data) - mark - 2} are there")
-    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": "", "Spectrum Fit": ""}
+    # the vendor's fit of a spectrum is left aside
+    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": ""}
     parts: dict[tuple[int, str], dict[str, Any]] = {}
     units: dict[str, str] = {}
     ends = mark + 2 + np.cumsum(sizes)
     for keys, size, end in zip(sets, sizes, ends.tolist(), strict=True):
         frame = keys.get("Frame", "")
         if frame in branches:
-            ending = " (vendor's fit)" if frame == "Spectrum Fit" else ""
-            axis, channel = printable(keys["Dim0Name"]), printable(keys["Dim2Name"] + ending)
+            axis, channel = printable(keys["Dim0Name"]), printable(keys["Dim2Name"])
             units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
             for line, (at, numbers) in enumerate(_nid_lines(keys, data[end - size : end]), start=1):
                 parts.setdefault((line, branches[frame]), {axis: at})[channel] = numbers
@@ -285,11 +297,8 @@ def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, 
 # ---- Igor
 
 
-_IGOR_UNITS = {"amp": "m", "defl": "m", "zsnsr": "m", "raw": "m", "lvdt": "m", "phase": "deg", "phas": "deg"}
-
-
-def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, str], dict[str, Known]]:
-    """Return the numbers of an Igor binary wave, the names of its channels, its note and what that says.
+def parse_igor(data: bytes, name: str) -> Recording:
+    """Read Asylum's binary waves: a column, or an image, for each channel, notes of `key: value`, SI units.
 
     Raises:
         TableError: if it is damaged, or the package that reads it is missing; the line names the extra.
@@ -304,7 +313,10 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
         warnings.simplefilter("ignore", RuntimeWarning)
         wave = package.load(io.BytesIO(data))["wave"]
         numbers = np.asarray(wave["wData"], dtype=float)
-    labels = _igor_labels(data, wave["bin_header"], min(numbers.ndim - 1, 2))
+    side = numbers.ndim - 1
+    labels = _igor_labels(data, wave["bin_header"], min(side, 2))
+    if side not in {1, 2} or len(labels) != numbers.shape[side]:
+        raise TableError(f"{name}: holds an array of {side + 1} dimensions, no channels of a ramp or an image")
     header = _settings(bytes(wave["note"]), ":")
     known = known_from(header, "note")
     phase, said = (number_in(header.get(f"FreeAir{what}", "")) for what in ("Phase", "Amplitude"))
@@ -314,7 +326,24 @@ def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, 
         # in volts, or in metres where tiny
         factor, how = (1e9, "m") if said[0] < 1e-5 else (float(known["nm_per_volt"].value), "V, times AmpInvOLS")
         known["free_amplitude_nm"] = Known(said[0] * factor, "nm", f"note: FreeAirAmplitude, assumed in {how}")
-    return numbers, labels, header, known
+    units = {label: "deg" if re.match("pha", label, re.IGNORECASE) else "m" for label in labels}
+    # Igor counts columns first, and rows from below
+    columns = {
+        label: (numbers[..., ::-1, k].T if side == 2 else numbers[:, k].copy()) for k, label in enumerate(labels)
+    }
+    # the row of an index is the last of its segment
+    ends = [0, *(int(index) + 1 for index in header.get("Indexes", "").split(",")[1:])]
+    ways = [{"1": "approach", "-1": "retract"}.get(way.strip()) for way in header.get("Direction", "").split(",")[1:]]
+    segments = [
+        Segment(1, way, {label: column[first:last] for label, column in columns.items()})
+        for (first, last), way in zip(pairwise(ends), ways, strict=False)
+        if way is not None
+    ]
+    sides = [number_in(header.get(key, "")) for key in ("SlowScanSize", "FastScanSize")]
+    size = None if None in sides else (sides[0][0], sides[1][0])  # type: ignore[index]
+    whole = (Segment(1, "", columns),) if side == 2 or not segments else tuple(segments)
+    kind = "Igor .ibw images" if side == 2 else "Igor .ibw ramp"
+    return Recording(kind, name, whole, units, known, settings=header, size_m=size)
 
 
 def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]:
@@ -341,27 +370,6 @@ def _igor_points(data: bytes) -> int:
     places = (*range(4, 56, 4), 76, *range(132, 148, 4))
     announced = [int.from_bytes(data[k : k + 4], order, signed=True) for k in places]
     return max(announced) if min(announced) >= 0 else len(data) + 1
-
-
-def parse_igor(data: bytes, name: str) -> Recording:
-    """Read Asylum's ramps in Igor's binary waves: a column for each channel, notes of `key: value`, SI units."""
-    numbers, labels, header, known = igor_wave(data, name)
-    if numbers.ndim != 2:
-        what = "images; their energies: afm-jax tapping-map" if numbers.ndim == 3 else "no ramp of channels"
-        raise TableError(f"{name}: holds an array of {numbers.ndim} dimensions, {what}")
-    units = {label: _IGOR_UNITS.get(label.lower(), "") for label in labels}
-    columns = dict(zip(labels, numbers.T.copy(), strict=True))
-    # the row of an index is the last of its segment
-    ends = [0, *(int(index) + 1 for index in header.get("Indexes", "").split(",")[1:])]
-    ways = [{"1": "approach", "-1": "retract"}.get(way.strip()) for way in header.get("Direction", "").split(",")[1:]]
-    segments = [
-        Segment(1, way, {label: column[first:last] for label, column in columns.items()})
-        for (first, last), way in zip(pairwise(ends), ways, strict=False)
-        if way is not None
-    ]
-    return Recording(
-        "Igor .ibw ramp", name, tuple(segments or [Segment(1, "", columns)]), units, known, settings=header
-    )
 
 
 MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf}

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 
 Numbers = float | Float[np.ndarray, "..."]
 Rows = Float[np.ndarray, " rows"]
@@ -101,11 +101,6 @@ class PhaseReadings(NamedTuple):
         """Rows of the free tip that have a phase."""
         return self.free & np.isfinite(self.phase_deg)
 
-    @property
-    def known_zero(self) -> bool:
-        """Whether the free tip, or a statement, determines the zero of the phase."""
-        return bool(self.seen_free.any()) or self.zero is not None
-
     def zero_deg(self, sign: float) -> Rows:
         """Return what the phase reads where the lag is 0: of each frequency by its free rows, else by all of them."""
         off = self.phase_deg - sign * self.free_lag_deg
@@ -127,7 +122,8 @@ class PhaseReadings(NamedTuple):
         It is what the tap takes and what the air takes at the harmonics, so that it is above zero. Under a base the
         deflection is read, D = Z + gamma A0 = -A0 (1 - gamma) a exp(-i Delta).
         """
-        gamma = self._gamma
+        s = self.frequency_ratio
+        gamma = 1.0 - s**2 + 1j * s / self.quality_factor
         phasor = self.ratio * np.exp(1j * np.deg2rad(behind_deg))
         of_height = np.imag(gamma * (phasor - self.ratio**2))
         if self.drive != "base":
@@ -136,23 +132,10 @@ class PhaseReadings(NamedTuple):
         return np.abs(1.0 - gamma) ** 2 * of_height + np.abs(gamma) ** 2 * of_base
 
     @property
-    def _gamma(self) -> Complex[np.ndarray, " rows"]:
-        s = self.frequency_ratio
-        return 1.0 - s**2 + 1j * s / self.quality_factor
-
-    @property
     def detuning(self) -> float:
         """The largest factor of a sin Delta in the energy, all that depends on the sign: 1 - s^2 under a force."""
-        gamma = self._gamma
-        factor = np.real(gamma)
-        if self.drive == "base":
-            factor = np.abs(1.0 - gamma) ** 2 * factor + np.abs(gamma) ** 2 * np.real(1.0 - gamma)
-        return float(np.abs(factor).max())
-
-    @property
-    def on_resonance(self) -> bool:
-        """Whether the energies of all rows hardly depend on the sign."""
-        return bool(self.detuning <= _ON_RESONANCE / self.quality_factor)
+        quarter = np.full(len(self.ratio), 90.0)
+        return float(np.max(np.abs(self.energy(quarter) - self.energy(-quarter)) / (2.0 * self.ratio)))
 
     def giving_energy_away(self, sign: float) -> int:
         """Return how many rows have energies below zero beyond all errors, the phase taken with a sign."""
@@ -161,13 +144,13 @@ class PhaseReadings(NamedTuple):
         lag_error = np.hypot(self.phase_error_deg, _TOLERANCE_DEG)
         if not self.seen_free.any():
             lag_error = np.hypot(lag_error, _UNKNOWN_DEG if self.zero is None else self.zero[1])
-        moved = (
-            self._replace(ratio=self.ratio + self.ratio_error).energy(behind),
-            self.energy(behind + lag_error),
-            self._replace(frequency_ratio=self.frequency_ratio * (1.0 + self.frequency_error)).energy(behind),
-            self._replace(quality_factor=self.quality_factor * (1.0 + self.quality_error)).energy(behind),
+        changes = (
+            {"ratio": self.ratio + self.ratio_error},
+            {"frequency_ratio": self.frequency_ratio * (1.0 + self.frequency_error)},
+            {"quality_factor": self.quality_factor * (1.0 + self.quality_error)},
         )
-        error = np.linalg.norm([other - start for other in moved], axis=0)
+        moved = [self.energy(behind + lag_error), *(self._replace(**change).energy(behind) for change in changes)]
+        error = np.linalg.norm(np.array(moved) - start, axis=0)
         with np.errstate(invalid="ignore"):
             return int(np.sum((start < -_SURE * error) & (self.ratio > LEAST_RATIO)))
 
@@ -190,7 +173,7 @@ class PhaseReadings(NamedTuple):
         stretch of rows is the attractive one.
         """
         found = set()
-        for way in self.ways if self.known_zero else ():
+        for way in self.ways:
             rows = way[(self.ratio[way] > LEAST_RATIO) & np.isfinite(self.phase_deg[way]) & ~self.free[way]]
             behind = self.behind_deg(1.0)[rows]
             clear = np.abs(behind) > np.maximum(_SURE * self.phase_error_deg[rows], _CLEAR_DEG)
@@ -260,17 +243,21 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
         readings: amplitudes and phases, as read.
         stated: "lag" or "lead"; empty or "either": not known.
     """
-    by_energy = readings.sign_by_energy() if readings.known_zero else None
+    # the free tip, or a statement, determines the zero of the phase
+    known_zero = bool(readings.seen_free.any()) or readings.zero is not None
+    by_energy = readings.sign_by_energy() if known_zero else None
+    # energies of all rows hardly depend on the sign
+    on_resonance = readings.detuning <= _ON_RESONANCE / readings.quality_factor
     decided = {
         "stated": SENSES.get(stated),
         "energy": by_energy or None,
-        "zero": None if readings.on_resonance else readings.sign_by_zero(),
-        "order": readings.sign_by_order() if readings.on_resonance else None,
+        "zero": None if on_resonance else readings.sign_by_zero(),
+        "order": readings.sign_by_order() if on_resonance and known_zero else None,
     }
     origin = next((name for name, sign in decided.items() if sign is not None), "")
     sign = decided.get(origin)
     if sign is None:
-        origin = "assumed" if readings.on_resonance else "unknown"
+        origin = "assumed" if on_resonance else "unknown"
         off = [abs(float(np.median(turned(readings.zero_deg(one))))) for one in (1.0, -1.0)]
         sign = -1.0 if off[1] < _NEAR_DEG < off[0] else 1.0
     zero = float(np.median(readings.zero_deg(sign)))
@@ -309,11 +296,9 @@ def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -
         reads = f"the free tip reads {turned(zero_deg + sign * lag):.1f} deg where its lag is {lag:.1f}"
     notes = []
     if origin in {"assumed", "unknown"}:
-        both = "with the other sign energies are nearly the same, and attractive and repulsive are exchanged; " * (
-            origin == "assumed"
-        )
         taken = f"the phase {'leads' if leads else 'lags'}, which is assumed"
-        notes.append(f"Sign: {reads}: {taken}; {both}say {SENSE_OPTION}.")
+        both = "with the other sign energies are nearly the same, and attractive and repulsive are exchanged; "
+        notes.append(f"Sign: {reads}: {taken}; {both if origin == 'assumed' else ''}say {SENSE_OPTION}.")
     elif leads and origin != "stated":
         notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and its sign was reversed.")
     quarters = round(zero_deg / 90.0)

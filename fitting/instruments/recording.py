@@ -5,7 +5,7 @@ by those who read it further.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.words import printable, value_and_error
-from fitting.tables.csv_text import NUMBER, TableError
+from afm_jax.words import printable
+from fitting.tables.csv_text import NUMBER, TableError, given_value
 
 _SIZES = {
     "length": {"m": 1e9, "mm": 1e6, "um": 1e3, "nm": 1.0, "pm": 1e-3},
     "voltage": {"V": 1.0, "mV": 1e-3},
     "angle": {"deg": 1.0, "rad": 180.0 / np.pi},
     "frequency": {"Hz": 1e-3, "kHz": 1.0, "MHz": 1e3},
-    "force": {"N": 1e9, "nN": 1.0},
+    "force": {"N": 1e9, "nN": 1.0, "pN": 1e-3},
     "stiffness": {"N/m": 1.0},
     "sensitivity": {"m/V": 1e9, "nm/V": 1.0},
     "spectrum": {"m/sqrt(Hz)": 1e9, "nm/sqrt(Hz)": 1.0, "pm/sqrt(Hz)": 1e-3, "fm/sqrt(Hz)": 1e-6},
@@ -70,12 +70,21 @@ class Segment:
     Attributes:
         curve: which curve of the file, from 1.
         branch: "approach", "retract", or empty: determined from the height's direction.
-        channels: numbers by channel name, in the units of `Recording.units`.
+        channels: numbers by channel name, in the units of `Recording.units`; of images arrays of rows and columns.
     """
 
     curve: int
     branch: str
-    channels: dict[str, Float[np.ndarray, " rows"]]
+    channels: dict[str, Float[np.ndarray, "..."]]
+
+
+def two_ways(segments: Iterable[Segment], pairs: Mapping[str, Sequence[str]]) -> tuple[Segment, ...]:
+    """Return an approach and a retract out of every segment, whose channels are each a pair of its channels."""
+    return tuple(
+        Segment(segment.curve, branch, {name: segment.channels[pair[way]] for name, pair in pairs.items()})
+        for segment in segments
+        for way, branch in enumerate(("approach", "retract"))
+    )
 
 
 @dataclass(frozen=True)
@@ -91,6 +100,7 @@ class Recording:
         away: channels that grow with the distance between tip and sample; other heights grow towards the tip.
         remarks: what a reader should know of the format.
         settings: what the header says, as the file spells it.
+        size_m: height and width of images, or None.
     """
 
     format: str
@@ -101,6 +111,7 @@ class Recording:
     away: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     settings: Mapping[str, str] = field(default_factory=dict)
+    size_m: tuple[float, float] | None = None
 
     @property
     def channels(self) -> list[str]:
@@ -160,7 +171,7 @@ def given_numbers(
     """Return what a caller gives of the instrument, by name.
 
     Args:
-        numbers: each a number, a pair with its standard error, or both as a text, '44 +- 4'; None: not given.
+        numbers: each a number, a pair with its standard error or a text such as '44 +- 4'; None: not given.
         units: of those that may be given.
         any_sign: those that need not be above 0.
 
@@ -169,17 +180,12 @@ def given_numbers(
         ValueError: if a value is impossible.
     """
     found = {}
-    for key, value in numbers.items():
+    for key, given in numbers.items():
         if key not in units:
             raise TypeError(f"there is no option `{key}`; it is one of {', '.join(units)}")
-        if value is None:
-            continue
-        pair = value_and_error(value) if isinstance(value, str) else value
-        number, error = pair if isinstance(pair, tuple) else (float(pair), None)
-        sound = np.isfinite(number) and (number > 0.0 or key in any_sign) and (error is None or error > 0.0)
-        if not sound:
-            raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
-        found[key] = Known(float(number), units[key], f"option `{key}=...`", error)
+        if given is not None:
+            number, error = given_value(key, given, any_sign=key in any_sign)
+            found[key] = Known(number, units[key], f"option `{key}=...`", error)
     return found
 
 
@@ -216,22 +222,30 @@ _STRICT_KEYS = {"ImagingMode", "Op. mode"}
 """Asylum's and NanoSurf's, which name amplitude modulation by the words above."""
 
 
-def refuse_other_modes(settings: Mapping[str, str], source: str) -> None:
+_OTHER_CHANNELS = re.compile(
+    r"(amp(litude)?|pha?(se?)?)[ _-]*2\b.*|.*\b(lateral|torsion\w*|friction|pfm|piezo\w*|second (eigen)?mode)\b.*",
+    re.IGNORECASE,
+)
+"""Channels of modes in which amplitude and phase are not those of one flexural mode that taps."""
+
+
+def refuse_other_modes(settings: Mapping[str, str], source: str, channels: Iterable[str] = ()) -> None:
     """Check that a file, where it says in which mode it was recorded, says amplitude modulation (tapping).
 
     Raises:
-        TableError: with the mode's name.
+        TableError: with the name of the mode, or of the channel that tells it.
     """
+    found = [f"holds a channel {name!r}, which is none of" for name in channels if _OTHER_CHANNELS.fullmatch(name)]
     for key, value in settings.items():
         name = re.split(r"::|[/:]", key)[-1].strip()
         others = _AMPLITUDE_MODES.sub("", value)
         strict = name in _STRICT_KEYS and others == value
         bimodal = name == "DualACMode" and value.strip() not in {"", "0"}
         if bimodal or strict or ((_MODE_KEYS.fullmatch(name) or name in _STRICT_KEYS) and _OTHER_MODES.search(others)):
-            raise TableError(
-                f"{source}: was recorded in the mode {printable(value)!r} ({printable(key)}), not in amplitude "
-                "modulation (tapping); its amplitude and phase do not give the energy of a tap"
-            )
+            found.insert(0, f"was recorded in the mode {printable(value)!r} ({printable(key)}), not in")
+    if found:
+        why = "amplitude modulation (tapping) of one mode; its amplitude and phase do not give the energy of a tap"
+        raise TableError(f"{source}: {found[0]} {why}")
 
 
 @contextmanager

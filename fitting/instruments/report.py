@@ -47,14 +47,10 @@ def _row(curve: MeasuredCurve) -> list[str]:
     if free is None and curve.amplitude is not None and curve.free.any():
         free = float(np.median(curve.amplitude[curve.free]))
     branches = [f"{np.sum(curve.branch == name)} {name}" for name in dict.fromkeys(curve.branch.tolist())]
-    return [
-        str(curve.curve),
-        " + ".join(branches),
-        f"{curve.offset_nm.min():.1f} to {curve.offset_nm.max():.1f}",
-        "-" if free is None or curve.amplitude is None else f"{free:.5g} {unit}",
-        "-" if curve.slope is None else f"{curve.slope[0]:.3g} {unit}/nm",
-        "" if curve.valid else "refused",
-    ]
+    heights = f"{curve.offset_nm.min():.1f} to {curve.offset_nm.max():.1f}"
+    level = "-" if free is None or curve.amplitude is None else f"{free:.5g} {unit}"
+    slope = "-" if curve.slope is None else f"{curve.slope[0]:.3g} {unit}/nm"
+    return [str(curve.curve), " + ".join(branches), heights, level, slope, "" if curve.valid else "refused"]
 
 
 def write_tables(curves: list[MeasuredCurve], path: Path) -> list[Path]:

@@ -1,6 +1,6 @@
 """Direct inversion: amplitude and phase of each row give the speeds of its impact and the collision delay, no law."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,10 @@ from fitting.predict.orbit import Local, Row
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
 
+Rows = Float[np.ndarray, " rows"]
+Impacts = Float[np.ndarray, "rows 3"]
+Covariances = Float[np.ndarray, "rows 3 3"]
+Shared = Float[np.ndarray, "rows 3 k"]
 _OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _SLOW = 2.5
@@ -73,10 +77,10 @@ class Inversion(JudgedResult):
         warnings: what a reader should know besides.
     """
 
-    approach_speed_nm_per_us: Float[np.ndarray, " rows"]
-    rebound_speed_nm_per_us: Float[np.ndarray, " rows"]
-    collision_delay_us: Float[np.ndarray, " rows"]
-    covariance: Float[np.ndarray, "rows 3 3"]
+    approach_speed_nm_per_us: Rows
+    rebound_speed_nm_per_us: Rows
+    collision_delay_us: Rows
+    covariance: Covariances
     shared: Float[np.ndarray, "rows 3 shared"]
     shared_names: tuple[str, ...]
     note: tuple[str, ...]
@@ -87,7 +91,7 @@ class Inversion(JudgedResult):
     warnings: tuple[str, ...] = ()
 
     @property
-    def errors(self) -> Float[np.ndarray, "rows 3"]:
+    def errors(self) -> Impacts:
         """Standard errors of approach speed, rebound speed and delay, what rows share included."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2) + np.sum(self.shared**2, axis=2))
 
@@ -137,7 +141,7 @@ class Inversion(JudgedResult):
 
 @checked
 @in_float64
-def invert(table: TableLike) -> Inversion:
+def invert(table: TableLike, *, noise: float | None = None, quality_factor: Any = None) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and lines through the losses.
 
     A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
@@ -146,7 +150,9 @@ def invert(table: TableLike) -> Inversion:
     over (1, u_in), a viscous loss, and over (1, u_in^2), a restitution.
 
     Args:
-        table: from `read_table`, with phases; its free frequency is exactly known if it has no error.
+        table: from `read_table`, or its file, with phases; its free frequency is exactly known if it has no error.
+        noise: of a file's amplitudes without an error, relative.
+        quality_factor: in place of the table's: a number, a pair with its error, '40 +- 2', or 'none': no air damping.
 
     Returns:
         Rows with errors, lines and a verdict; see `Inversion`.
@@ -154,7 +160,7 @@ def invert(table: TableLike) -> Inversion:
     Raises:
         TableError: if the table has no phase, or does not say its quality factor.
     """
-    table = as_table(table)
+    table = as_table(table, noise=noise, quality_factor=quality_factor)
     if table.tapping:
         raise TableError(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "
@@ -194,7 +200,8 @@ def invert(table: TableLike) -> Inversion:
         note[i] = f"amplitudes and phase contradict each other (chi2 {chi2[i]:.3g} of one degree of freedom)"
     u, w, delay = impact.T
     unsure = table.quality_factor is not None and table.quality_factor_error is None
-    result = Inversion(
+    reason = _why_not_valid(u, lines, int(fast.sum()))
+    return Inversion(
         approach_speed_nm_per_us=u,
         rebound_speed_nm_per_us=w,
         collision_delay_us=delay,
@@ -205,29 +212,26 @@ def invert(table: TableLike) -> Inversion:
         in_lines=np.isin(np.arange(table.rows), rows[fast]),
         lines=lines,
         table=table,
+        reasons=() if reason is None else (reason,),
         warnings=("Q comes without an error: its uncertainty is not in the errors here",) if unsure else (),
     )
-    reason = _why_not_valid(result)
-    return replace(result, reasons=() if reason is None else (reason,))
 
 
-def _why_not_valid(e: Inversion) -> str | None:
-    if not np.isfinite(e.approach_speed_nm_per_us).any():
+def _why_not_valid(speed: Rows, lines: dict[str, Line], rows: int) -> str | None:
+    """Return why approach speeds, and the lines through so many rows, are no measurement; None where they are."""
+    if not np.isfinite(speed).any():
         return "no row could be inverted: check the phases' sign and zero (t = 0 when the platform is highest)"
-    lines = e.lines.values()
     if not lines:
-        return f"{e.in_lines.sum()} rows do not determine a line of two coefficients: measure at more drives"
-    if max(one.p_value for one in lines) < IMPROBABLE:
+        return f"{rows} rows do not determine a line of two coefficients: measure at more drives"
+    if max(one.p_value for one in lines.values()) < IMPROBABLE:
         return "neither line explains the rows: check the errors, Q, and the calibration of tip and drive"
-    if all(abs(one.epsilon) < 2 * one.epsilon_error and abs(one.slope) < 2 * one.slope_error for one in lines):
+    if all(abs(one.epsilon) < 2 * one.epsilon_error and abs(one.slope) < 2 * one.slope_error for one in lines.values()):
         return "the rows determine no coefficient of either line to two standard errors: measure more finely"
     return None
 
 
 def _lines(
-    impact: Float[np.ndarray, "rows 3"],
-    covariance: Float[np.ndarray, "rows 3 3"],
-    shared: Float[np.ndarray, "rows 3 k"],
+    impact: Impacts, covariance: Covariances, shared: Shared
 ) -> tuple[dict[str, Line], Bool[np.ndarray, " rows"]]:
     """Return the lines through the losses, and which rows they go through: those that are not too slow."""
     fast, lines = np.ones(len(impact), dtype=bool), {}
@@ -240,12 +244,7 @@ def _lines(
     return lines, fast
 
 
-def line(
-    impact: Float[np.ndarray, "rows 3"],
-    covariance: Float[np.ndarray, "rows 3 3"],
-    shared: Float[np.ndarray, "rows 3 k"],
-    power: int,
-) -> Line:
+def line(impact: Impacts, covariance: Covariances, shared: Shared, power: int) -> Line:
     """Return the line u_in^2 - u_out^2 = epsilon + slope u_in^n of correlated rows.
 
     The residual of a row varies by (2 u_in - n slope u_in^(n - 1), -2 u_out) times the errors of its speeds, which its

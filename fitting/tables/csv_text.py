@@ -8,19 +8,22 @@ read by the same functions.
 import csv
 import difflib
 import json
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.saved import why_no_fit
-from afm_jax.whole_files import read_whole
+from afm_jax.whole_files import LARGEST_BYTES, read_whole
 from afm_jax.words import printable
 
+# a cell may be as long as a file
+csv.field_size_limit(LARGEST_BYTES)
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
@@ -41,6 +44,8 @@ SETTING_NAMES = frozenset(
 )
 """What a comment sets in one file or another: where it sets nothing it is refused, never left among the remarks."""
 
+Rows = Float[np.ndarray, " rows"]
+Lines = Int[np.ndarray, " rows"]
 NumberedLines = list[tuple[int, str]]
 """Lines of a file, each with its number."""
 Columns = dict[str, Shaped[np.ndarray, " rows"]]
@@ -51,56 +56,44 @@ class TableError(ValueError):
     """Raised where a file or table cannot be used; the message is one line: what, where, how to mend it."""
 
 
-@dataclass
-class Faults:
-    """Faults of a table: the first one in the file is reported, and the others are counted.
+@dataclass(frozen=True)
+class Source:
+    """What numbers are read from, and how a message names a place in it.
 
     Attributes:
-        source: the table's name, as it begins every message.
-        place: what a row's number is called, "line" for a file and "row" for a table in memory.
-        found: lines and messages.
+        name: of the file or table, as it begins every message.
+        row: what a row's number is called, "line" for a file and "row" for a table in memory.
     """
 
-    source: str
-    place: str = "line"
-    found: list[tuple[int, str]] = field(default_factory=list, init=False)
+    name: str
+    row: str = "line"
 
-    def add(self, message: str, *, line: int = 0, column: str | None = None) -> None:
-        """Note a fault.
+    def fault(self, message: str, *, line: int = 0, column: str | None = None) -> TableError:
+        """Return the error of a fault.
 
         Args:
             message: what is wrong and how to mend it, without the place.
-            line: number of the line (or row) it is in; 0 stands for the table as a whole and comes first.
+            line: number of the line (or row) it is in; 0 stands for the table as a whole.
             column: name of the column it is in.
         """
-        place = f", {self.place} {line}" if line else ""
+        place = f", {self.row} {line}" if line else ""
         place += "" if column is None else f", column {column}"
-        self.found.append((line, f"{printable(self.source)}{place}: {message}"))
+        return TableError(f"{printable(self.name)}{place}: {message}")
 
-    def add_rows(
-        self, bad: Bool[np.ndarray, " rows"], message: str, lines: Int[np.ndarray, " rows"], column: str | None = None
-    ) -> None:
-        """Note a fault of some rows.
+    def refuse(self, bad: Bool[np.ndarray, " rows"], message: str, lines: Lines, column: str | None = None) -> None:
+        """Check that no row is bad.
 
         Args:
-            bad: which rows.
-            message: as for `add`.
+            bad: which rows are.
+            message: as for `fault`.
             lines: number of the line of each row.
-            column: as for `add`.
-        """
-        for line in lines[bad].tolist():
-            self.add(message, line=line, column=column)
-
-    def raise_any(self) -> None:
-        """Raise the first fault, if there is one.
+            column: as for `fault`.
 
         Raises:
-            TableError: with the first fault and the number of the others.
+            TableError: of the first row that is.
         """
-        if self.found:
-            _, message = min(self.found, key=lambda fault: fault[0])
-            more = len(self.found) - 1
-            raise TableError(message + (f" (and {more} more fault{'s' if more > 1 else ''})" if more else ""))
+        if bad.any():
+            raise self.fault(message, line=int(lines[np.argmax(bad)]), column=column)
 
 
 LARGEST = 1e9
@@ -120,11 +113,9 @@ class Column:
 
     Attributes:
         name: its name in the file.
-        kind: what its numbers must be: "number" (any finite one), "not negative", "positive", "whole" (1, 2, 3, ...) or
-            "flag" (0, 1).
+        kind: what its numbers must be; see `Form.check_numbers`.
         meaning: what its numbers become; empty: the name. Columns of one meaning are aliases; a file has one.
         needed: what it gives, in a word, if every file needs a column that gives it; else empty.
-        required: whether every row needs it.
         error: the name of the column that holds its standard errors, for a measured column.
         amplitude: whether it is a measured amplitude: each row needs one, and a relative noise applies to it.
         convert: makes the unit of the meaning of its numbers; None: they have it.
@@ -134,10 +125,9 @@ class Column:
     kind: Literal["number", "not negative", "positive", "whole", "flag"] = "positive"
     meaning: str = ""
     needed: str = ""
-    required: bool = False
     error: str | None = None
     amplitude: bool = False
-    convert: Callable[[Float[np.ndarray, " rows"]], Float[np.ndarray, " rows"]] | None = None
+    convert: Callable[[Rows], Rows] | None = None
 
     @property
     def becomes(self) -> str:
@@ -154,7 +144,6 @@ class Form:
         row: what a row is measured at: a drive, a point, a sample.
         open: whether columns of other names are left alone, not refused.
         blanks: whether cells may be blank (NaN); else every cell is needed.
-        separator: what stands between cells; empty: commas, tabs, semicolons or spaces, as the row of names has them.
         largest: size of any number.
         strange: columns that other files have, and what to do about them.
     """
@@ -163,48 +152,33 @@ class Form:
     row: str
     open: bool = False
     blanks: bool = False
-    separator: str = ","
     largest: float = FARTHEST
     strange: Mapping[str, str] = field(default_factory=dict)
-
-    def column(self, name: str) -> Column | None:
-        """Return the column of a name, None if there is none."""
-        return next((column for column in self.columns if column.name == name), None)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the table's columns."""
         return tuple(column.name for column in self.columns)
 
-    def check_numbers(
-        self, name: str, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
-    ) -> None:
-        """Note the impossible numbers of a column.
+    def check_numbers(self, name: str, values: Rows, lines: Lines, source: Source) -> None:
+        """Check the numbers of a column: a "number" is finite, a "whole" one 1, 2, 3, ..., a "flag" 0 or 1.
 
         Args:
             name: of the column, or what it becomes.
             values: its numbers, NaN where nothing was measured.
             lines: where each stands.
-            faults: where the faults are noted.
+            source: for messages.
         """
-        column = next(one for one in self.columns if name in {one.name, one.becomes})
-        lowest, highest = {
-            "number": (-self.largest, self.largest),
-            "not negative": (1.0 / FARTHEST, self.largest),
-            "positive": (1.0 / FARTHEST, self.largest),
-            # a whole number only has to survive the way through 64-bit floats
-            "whole": (1.0, 2.0**53 - 1.0),
-            "flag": (0.0, 1.0),
-        }[column.kind]
-        good = (values >= lowest) & (values <= highest)
+        kind = next(one.kind for one in self.columns if name in {one.name, one.becomes})
+        lowest = {"number": -self.largest, "positive": 1.0 / FARTHEST, "whole": 1.0}.get(kind, 0.0)
+        # a whole number only has to survive the way through 64-bit floats
+        highest = {"whole": 2.0**53 - 1.0, "flag": 1.0}.get(kind, self.largest)
         words = {"whole": "be a positive whole number (1, 2, 3, ...)", "flag": "be 0 or 1"}
-        if column.kind in words:
-            good &= values == np.floor(values)
-        good |= (column.kind == "not negative") & (values == 0.0)
-        must = words.get(column.kind, f"lie between {lowest:g} and {highest:g}")
-        for row in np.flatnonzero(~(good | (np.isnan(values) & self.blanks))):
-            number = repr(float(values[row])).removesuffix(".0")
-            faults.add(f"must {must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
+        must = words.get(kind, f"lie between {lowest:g} and {highest:g}")
+        good = (values >= lowest) & (values <= highest) & ((kind not in words) | (values == np.floor(values)))
+        bad = ~(good | (np.isnan(values) & self.blanks))
+        number = repr(float(values[np.argmax(bad)])).removesuffix(".0")
+        source.refuse(bad, f"must {must}, but is {number}; correct it or remove the row", lines, name)
 
 
 @dataclass(frozen=True)
@@ -315,39 +289,29 @@ def text_of(data: bytes, path: str | Path, wrong: str, *, latin: bool = False) -
     return text
 
 
-class TextTable(NamedTuple):
-    """What a file with comments and columns says.
-
-    Attributes:
-        columns: the numbers, by what they become, in its unit.
-        names: of the columns that were read.
-        lines: the line of each row.
-        settings: value and error of those that comments make.
-    """
-
-    columns: Columns
-    names: tuple[str, ...]
-    lines: Int[np.ndarray, " rows"]
-    settings: dict[str, tuple[float, float | None]]
-
-
-def read_columns(text: str, form: Form, settings: Settings, faults: Faults) -> TextTable:
-    """Read a text of comments, a row of column names, and rows of numbers, whose form is known.
+def read_columns(
+    path: str | Path, form: Form, settings: Settings
+) -> tuple[dict[str, Column], Columns, Lines, dict[str, tuple[Any, float | None]]]:
+    """Read a file of comments, a row of column names, and rows of numbers, whose form is known.
 
     Args:
-        text: all of it.
+        path: the file.
         form: the columns that it may have.
         settings: those that comments may make.
-        faults: where faults are noted; with any, the result is not to be used.
+
+    Returns:
+        The columns that were read, and their numbers in the unit of what they become, both by that; the line of each
+        row; value and error of the settings.
 
     Raises:
-        TableError: as `read_comments` and `read_rows`.
+        TableError: with the first fault of the file.
     """
-    found, _, rows = read_comments(text, settings, faults)
-    columns, lines = read_rows(rows, form, faults)
-    used = [column for column in form.columns if column.name in columns]
-    numbers = {one.becomes: one.convert(columns[one.name]) if one.convert else columns[one.name] for one in used}
-    return TextTable(numbers, tuple(column.name for column in used), lines, found)
+    source = Source(str(path))
+    found, _, rows = read_comments(read_text(path), settings, source)
+    numbers, lines = read_rows(rows, form, source)
+    used = {column.becomes: column for column in form.columns if column.name in numbers}
+    columns = {key: one.convert(numbers[one.name]) if one.convert else numbers[one.name] for key, one in used.items()}
+    return used, columns, lines, found
 
 
 def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
@@ -375,6 +339,41 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
     return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
 
 
+def given_value(name: str, given: Any, *, any_sign: bool = False) -> tuple[float, float | None]:
+    """Return a value and its standard error, None without one, that a caller gives.
+
+    >>> given_value("k", "44 +- 4"), given_value("k", 44), given_value("k", (44.0, None))
+    ((44.0, 4.0), (44.0, None), (44.0, None))
+
+    Args:
+        name: of the argument, for messages.
+        given: a number, a pair, or a text such as '44 +- 4'.
+        any_sign: whether it need not be above 0.
+
+    Raises:
+        ValueError: if it is none, or is impossible.
+    """
+    if isinstance(given, str):
+        given = _numbers_around(given, f"`{name}`", "write 40 or '40 +- 2'")
+    value, error = given if isinstance(given, tuple) else (given, None)
+    if not (np.isfinite(value) and (value > 0.0 or any_sign) and (error is None or 0.0 < error < np.inf)):
+        raise ValueError(f"`{name}` must be finite and above 0, but is {given!r}")
+    return float(value), None if error is None else float(error)
+
+
+def _numbers_around(text: str, name: str, mend: str) -> tuple[float, float | None]:
+    """Return the number of a text, and the one behind its +-, None without it.
+
+    Raises:
+        ValueError: with the name, what stands where a number must, and how to mend it.
+    """
+    cells = [cell.strip() for cell in _PLUS_MINUS.split(text, maxsplit=1)]
+    for cell in cells:
+        if not NUMBER.fullmatch(cell):
+            raise ValueError(f"{name} has {quoted(cell)} where a number must stand; {mend}")
+    return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
+
+
 def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
     """Return the value and its error of a comment that makes a setting; of a word the word.
 
@@ -396,30 +395,24 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
         raise ValueError(f"{key} must be {' or '.join(setting.choices)}, but is {quoted(value)}")
     if setting.none and value == "none":
         return None, None
-    cells = [cell.strip() for cell in _PLUS_MINUS.split(value)]
-    for cell in cells:
-        if not NUMBER.fullmatch(cell):
-            mend = f"write '{setting.line}', with a decimal point and without the unit"
-            raise ValueError(f"{key} has {quoted(cell)} where a number must stand; {mend}")
-    if len(cells) not in {"never": (1,), "maybe": (1, 2), "always": (2,)}[setting.error]:
-        wrong = "needs its standard error" if len(cells) < 2 else "takes no such error"
+    number, error = _numbers_around(value, key, f"write '{setting.line}', with a decimal point and without the unit")
+    if setting.error == ("always" if error is None else "never"):
+        wrong = "needs its standard error" if error is None else "takes no such error"
         raise ValueError(f"{key} {wrong}; write '{setting.line}'")
-    number, error = float(cells[0]), float(cells[1]) if len(cells) > 1 else None
-    fault = fault_in_number(setting, number, error)
-    if fault is not None:
-        raise ValueError(f"{key} {fault}")
+    if wrong := fault_in_number(setting, number, error):
+        raise ValueError(f"{key} {wrong}")
     return number, error
 
 
 def read_comments(
-    text: str, settings: Settings, faults: Faults
+    text: str, settings: Settings, source: Source
 ) -> tuple[dict[str, tuple[Any, float | None]], tuple[str, ...], NumberedLines]:
     """Return value and error of the settings that comments make, other comments, and rows.
 
     Args:
         text: of the whole file.
         settings: those there are.
-        faults: where a misspelt key, a value that is no number and a repeated key are noted.
+        source: for messages of a misspelt key, a value that is no number and a repeated key.
 
     Raises:
         TableError: if something is wrong, or there are no rows: the column names and what stands below.
@@ -433,19 +426,18 @@ def read_comments(
             match = _KEY_AND_VALUE.fullmatch(comment)
             name = "" if match is None else plain_name(match["key"])
             if name in SETTING_NAMES:
-                faults.add(f"{name} sets nothing in such a file; remove the line", line=line)
+                raise source.fault(f"{name} sets nothing in such a file; remove the line", line=line)
             remarks.append(comment)
         elif setting.key in found:
-            faults.add(f"{setting.key} was given already; remove one of the two", line=line)
+            raise source.fault(f"{setting.key} was given already; remove one of the two", line=line)
         else:
             try:
                 found[setting.key] = _value_of(setting, comment)
             except ValueError as error:
-                faults.add(str(error), line=line)
+                raise source.fault(str(error), line=line) from None
     if not rows:
         what = "only comments" if comments else "nothing"
-        faults.add(f"the file holds {what}; add a row of column names and rows of numbers")
-    faults.raise_any()
+        raise source.fault(f"the file holds {what}; add a row of column names and rows of numbers")
     return found, tuple(remarks), rows
 
 
@@ -466,63 +458,45 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
 def cells_of(text: str, separator: str) -> list[str]:
     """Return the cells of one line, without the spaces and quotation marks around them."""
     # instruments end their lines with a tab, and put several spaces between columns
-    text = text.rstrip(" ").removesuffix("\t") if separator == "\t" else text
-    text = " ".join(text.split()) if separator == " " else text
-    # The csv module is needed for quotation marks only, and costs more than the rest of the reading.
-    quotes = '"' in text
-    cells = next(csv.reader([text], delimiter=separator, skipinitialspace=True)) if quotes else text.split(separator)
-    return [cell.strip() for cell in cells]
+    text = text.rstrip(" ").removesuffix("\t" if separator == "\t" else "")
+    return [cell.strip() for cell in next(csv.reader([text], delimiter=separator, skipinitialspace=True))]
 
 
-def read_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Columns, Int[np.ndarray, " rows"]]:
+def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns, Lines]:
     """Return the columns that the form has as numbers (NaN where a cell is blank), and the line of each row.
+
+    Commas, tabs, semicolons or spaces stand between cells, as the row of names has them.
 
     Args:
         rows: lines with their numbers, the column names first.
         form: what the file is to be.
-        faults: where the faults are noted.
+        source: for messages.
 
     Raises:
         TableError: at once where the column names are wrong: the cells below cannot be judged then.
     """
-    line, text = rows[0]
-    looks = next((sign for sign in ",\t; " if sign in text.strip()), ",")
-    separator = form.separator or looks
-    if looks != separator:
-        faults.add("the columns are not separated by commas; separate them by commas, decimals by points", line=line)
-        faults.raise_any()
+    head, text = rows[0]
+    separator = next((sign for sign in ",\t; " if sign in text.strip()), ",")
     names = cells_of(text, separator)
-    check_names(names, form, faults, line=line)
+    check_names(names, form, source, line=head)
     if not rows[1:]:
-        faults.add(f"there are column names but no rows below them; add a row for each {form.row}", line=line)
-    faults.raise_any()
-    table = _table_of(rows[1:], len(names), separator, faults)
-    columns = {}
-    for position, name in enumerate(names):
-        if form.column(name) is not None:
-            columns[name] = numbers = np.full(len(table), np.nan)
-            for row, (line, cells) in enumerate(table):
-                text = cells[position]
-                if NUMBER.fullmatch(text):
-                    numbers[row] = float(text)
-                elif text or not form.blanks:
-                    faults.add(_unreadable(text, form.row), line=line, column=name)
-    return columns, np.array([line for line, _ in table], dtype=np.int64)
-
-
-def _table_of(rows: NumberedLines, width: int, separator: str, faults: Faults) -> list[tuple[int, list[str]]]:
-    """Return the cells of rows, numbered, after noting and leaving out those of another number of cells."""
-    table = []
-    for line, text in rows:
+        raise source.fault(f"there are column names but no rows below them; add a row for each {form.row}", line=head)
+    columns: dict[str, list[float]] = {name: [] for name in names if name in form.names}
+    lines = []
+    for line, text in rows[1:]:
         cells = cells_of(text, separator)
         if text.count('"') % 2:
-            faults.add("a quotation mark is not closed; close or remove it", line=line)
-        elif len(cells) != width:
-            hint = "fill the row up" if len(cells) < width else "a decimal comma must be a point"
-            faults.add(f"there are {len(cells)} cells for {width} columns; {hint}", line=line)
-        else:
-            table.append((line, cells))
-    return table
+            raise source.fault("a quotation mark is not closed; close or remove it", line=line)
+        if len(cells) != len(names):
+            hint = "fill the row up" if len(cells) < len(names) else "a decimal comma must be a point"
+            raise source.fault(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
+        lines.append(line)
+        for name, cell in zip(names, cells, strict=True):
+            if name in columns:
+                columns[name].append(float(cell) if NUMBER.fullmatch(cell) else math.nan)
+                if math.isnan(columns[name][-1]) and (cell or not form.blanks):
+                    raise source.fault(_unreadable(cell, form.row), line=line, column=name)
+    return {name: np.array(column) for name, column in columns.items()}, np.array(lines, dtype=np.int64)
 
 
 def _unreadable(text: str, row: str) -> str:
@@ -534,49 +508,36 @@ def _unreadable(text: str, row: str) -> str:
     return f"{quoted(text)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
 
 
-def check_names(names: list[str], form: Form, faults: Faults, *, line: int = 0) -> None:
-    """Note every fault of column names.
+def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) -> None:
+    """Check the names of columns.
 
     Args:
         names: of the columns, from left to right.
         form: what the table is to be.
-        faults: where the faults are noted.
+        source: for messages.
         line: where the names stand; 0: in memory.
     """
     if any(NUMBER.fullmatch(name) for name in names):
-        faults.add("the first row holds numbers; put the row of column names above it", line=line)
-        return
-    present: set[str] = set()
-    unknown = []
-    for name in names:
-        column = form.column(name)
-        if column is None:
-            unknown.append(name)
-        elif column.becomes in present:
-            faults.add("says again what another column says; remove one", line=line, column=name)
-        else:
-            present.add(column.becomes)
-    _check_unknown(unknown[:_SUGGESTIONS], form, present, line, faults)
+        raise source.fault("the first row holds numbers; put the row of column names above it", line=line)
+    becomes = {column.name: column.becomes for column in form.columns}
+    present = [becomes[name] for name in names if name in becomes]
+    for name in {becomes[name]: name for name in names if present.count(becomes.get(name, "")) > 1}.values():
+        raise source.fault("says again what another column says; remove one", line=line, column=name)
+    for name in [name for name in names if name not in becomes][:_SUGGESTIONS]:
+        meant = nearest_name(name, becomes)
+        if name in form.strange:
+            raise source.fault(form.strange[name], line=line, column=name)
+        if not form.open or (meant is not None and becomes[meant] not in present):
+            known = f"remove or rename it, the columns are {', '.join(becomes)}"
+            mend = known if meant is None else f"did you mean {meant}?"
+            raise source.fault(f"unknown column {quoted(name)}; {mend}", line=line)
     # a column that is missing may be one that is misspelt
-    for what in dict.fromkeys(column.needed for column in form.columns) if not faults.found else ():
+    for what in dict.fromkeys(column.needed for column in form.columns):
         columns = [column for column in form.columns if column.needed == what]
         if what and not any(column.becomes in present for column in columns):
-            faults.add(f"there is no {what} column; add {' or '.join(column.name for column in columns)}", line=line)
-
-
-def _check_unknown(unknown: list[str], form: Form, present: set[str], line: int, faults: Faults) -> None:
-    """Note names that no column has, and what each was meant to be."""
-    for name in unknown:
-        meant = form.column(nearest_name(name, form.names) or "")
-        if name in form.strange:
-            faults.add(form.strange[name], line=line, column=name)
-        elif form.open and (meant is None or meant.becomes in present):
-            continue
-        elif meant is None:
-            known = ", ".join(form.names)
-            faults.add(f"unknown column {quoted(name)}; remove or rename it, the columns are {known}", line=line)
-        else:
-            faults.add(f"unknown column {quoted(name)}; did you mean {meant.name}?", line=line)
+            raise source.fault(
+                f"there is no {what} column; add {' or '.join(column.name for column in columns)}", line=line
+            )
 
 
 def plain_name(text: str) -> str:
@@ -598,9 +559,11 @@ def nearest_name(text: str, known: Iterable[str]) -> str | None:
     return next(iter(difflib.get_close_matches(plain_name(text), list(known), n=1, cutoff=_SIMILAR)), None)
 
 
-def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, faults: Faults) -> Float[np.ndarray, "..."]:
+def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, source: Source) -> Float[np.ndarray, "..."]:
     """Return a copy of a column of a table in memory, after noting another length than that of the table."""
     column = np.array(values, dtype=np.float64)
     if column.shape != (rows,) or rows == 0:
-        faults.add(f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name)
+        raise source.fault(
+            f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name
+        )
     return column

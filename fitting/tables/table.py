@@ -55,13 +55,14 @@ from fitting.tables.csv_text import (
     LARGEST,
     Column,
     Columns,
-    Faults,
     FileSetting,
     Form,
+    Source,
     TableError,
     check_names,
     column_of,
     fault_in_number,
+    given_value,
     printable,
     quoted,
     read_comments,
@@ -71,6 +72,7 @@ from fitting.tables.csv_text import (
     setting_line,
 )
 
+Rows = Float[np.ndarray, " rows"]
 LEAST_REPEATS = 4
 """Readings beyond the first of each drive from which on their scatter gives errors."""
 ERRORS_OF_REPEATS = "Errors from repeated readings: "
@@ -109,11 +111,11 @@ _CANTILEVER = ("free_frequency_khz", "quality_factor", "mass_ng", "spring_consta
 
 
 _COLUMNS = (
-    Column("order", needed="order", required=True, kind="whole"),
-    Column("drive_frequency_khz", needed="drive frequency", required=True),
-    Column("drive_amplitude_nm", needed="drive amplitude", required=True),
-    Column("free_amplitude_nm", needed="free amplitude", required=True),
-    Column("offset_nm", needed="offset", required=True, kind="number"),
+    Column("order", needed="order", kind="whole"),
+    Column("drive_frequency_khz", needed="drive frequency"),
+    Column("drive_amplitude_nm", needed="drive amplitude"),
+    Column("free_amplitude_nm", needed="free amplitude"),
+    Column("offset_nm", needed="offset", kind="number"),
     Column("peak_amplitude_nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
     Column("peak_amplitude_error_nm"),
     Column("lockin_amplitude_nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
@@ -127,25 +129,21 @@ _COLUMNS = (
 )
 
 
-def _form(others: tuple[str, ...], strange: str, optional: str = "") -> Form:
-    """Return the form of tables that have all columns but those of the other form.
-
-    Args:
-        others: the columns of the other form.
-        strange: what to say of them.
-        optional: a column that may be left out.
-    """
-    columns = [replace(one, needed="") if one.name == optional else one for one in _COLUMNS if one.name not in others]
+def _form_without(*others: str, strange: str, optional: str = "") -> Form:
+    """Return the form of tables that have all columns but those of the other form, of which it says what to do."""
+    columns = [column for column in _COLUMNS if column.name not in others]
+    columns = [replace(column, needed="") if column.name == optional else column for column in columns]
     return Form(tuple(columns), "drive", blanks=True, largest=LARGEST, strange=dict.fromkeys(others, strange))
 
 
-TABLE = _form(
-    ("free_amplitude_nm", "phase_lag_deg", "phase_lag_error_deg", "retract"),
-    "belongs to a cantilever that is driven itself; add the line '# drive = force' or '# drive = base' above the names",
+TABLE = _form_without(
+    *("free_amplitude_nm", "phase_lag_deg", "phase_lag_error_deg", "retract"),
+    strange="belongs to a cantilever that is driven itself; add the line '# drive = force' or '# drive = base' above "
+    "the names",
 )
-TAPPING = _form(
-    ("drive_amplitude_nm", "peak_amplitude_nm", "peak_amplitude_error_nm", "phase_deg", "phase_error_deg"),
-    "belongs to a sample that is driven; where the cantilever is driven the columns are free_amplitude_nm, "
+TAPPING = _form_without(
+    *("drive_amplitude_nm", "peak_amplitude_nm", "peak_amplitude_error_nm", "phase_deg", "phase_error_deg"),
+    strange="belongs to a sample that is driven; where the cantilever is driven the columns are free_amplitude_nm, "
     "lockin_amplitude_nm and phase_lag_deg instead",
     optional="order",
 )
@@ -161,7 +159,7 @@ def columns_of(table: "AmplitudeTable") -> dict[str, Any]:
 
 def required(columns: Collection[str]) -> tuple[Column, ...]:
     """Return the columns of a table in which every row needs a number."""
-    return tuple(column for column in _COLUMNS if column.required and column.name in columns)
+    return tuple(column for column in _COLUMNS if column.needed and not column.amplitude and column.name in columns)
 
 
 def drive_numbers(columns: Columns) -> Int[np.ndarray, " rows"]:
@@ -172,7 +170,7 @@ def drive_numbers(columns: Columns) -> Int[np.ndarray, " rows"]:
 
 
 def scatter_about_means(
-    column: Column, columns: Columns, error: Float[np.ndarray, " rows"] | None
+    column: Column, columns: Columns, error: Rows | None
 ) -> tuple[Bool[np.ndarray, " rows"], int, float]:
     """Return which rows repeat others, degrees of freedom and chi2 of a measured column about each drive's mean.
 
@@ -215,8 +213,7 @@ def _fill_errors_of_repeats(columns: Columns) -> list[str]:
         A remark for each column that errors were added for.
     """
     lacking = [column for column in MEASURED if column.name in columns and str(column.error) not in columns]
-    readable = all(np.isfinite(columns[one.name]).all() for one in required(columns))
-    if not lacking or not columns[lacking[0].name].size or not readable:
+    if not lacking or not all(np.isfinite(columns[one.name]).all() for one in required(columns)):
         return []
     from scipy.stats import t as student_t  # noqa: PLC0415 - fits of other tables need no SciPy
 
@@ -238,42 +235,40 @@ def _fill_errors_of_repeats(columns: Columns) -> list[str]:
     return remarks
 
 
-def _check_rows(columns: Columns, form: Form, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
+def _check_rows(columns: Columns, form: Form, lines: Int[np.ndarray, " rows"], source: Source) -> None:
     """Check the numbers of a table.
 
     Args:
         columns: the columns by name, NaN where nothing was measured.
         form: what the table is to be.
         lines: the number of each row's line, for the messages.
-        faults: where the faults are noted.
+        source: for messages.
 
     Raises:
         TableError: with the first fault: of impossible numbers, else of what must or must not stand together.
     """
     for name in columns:
-        form.check_numbers(name, columns[name], lines, faults)
-    faults.raise_any()
+        form.check_numbers(name, columns[name], lines, source)
     blank = {name: np.isnan(values) for name, values in columns.items()}
     for column in required(columns):
-        faults.add_rows(blank[column.name], "is blank; every row needs it", lines, column.name)
+        source.refuse(blank[column.name], "is blank; every row needs it", lines, column.name)
     if form is TAPPING:
         message = "must be 1 where the cantilever is driven: amplitude and lag are read at the drive's frequency"
-        faults.add_rows(columns["order"] > 1.0, f"{message}; remove the row", lines, "order")
+        source.refuse(columns["order"] > 1.0, f"{message}; remove the row", lines, "order")
     present = [column for column in MEASURED if column.name in columns]
     for column in present:
         value, error = blank[column.name], blank[str(column.error)]
         mend = f"fill {column.error} in" + _OR_NOISE * column.amplitude
-        faults.add_rows(error & ~value, f"the value has no error; {mend}", lines, column.name)
-        faults.add_rows(value & ~error, "the error has no value; fill it in or clear this cell", lines, column.error)
+        source.refuse(error & ~value, f"the value has no error; {mend}", lines, column.name)
+        source.refuse(value & ~error, "the error has no value; fill it in or clear this cell", lines, column.error)
     amplitudes = [column.name for column in present if column.amplitude]
     empty, unseen = np.all([blank[name] for name in amplitudes], axis=0), np.zeros(len(lines), bool)
     message = f"the row has no amplitude; fill {' or '.join(amplitudes)} in or remove the row"
     if "no_orbit" in columns:
         unseen = columns["no_orbit"] == 1.0
         message += ", or set no_orbit to 1 if the tip settled on no orbit there"
-    faults.add_rows(empty & ~unseen, message, lines)
-    faults.add_rows(~empty & unseen, "the row has an amplitude; clear it or set no_orbit to 0", lines, "no_orbit")
-    faults.raise_any()
+    source.refuse(empty & ~unseen, message, lines)
+    source.refuse(~empty & unseen, "the row has an amplitude; clear it or set no_orbit to 0", lines, "no_orbit")
 
 
 _OR_NOISE = " or give the relative noise (`noise=0.01`)"
@@ -325,24 +320,24 @@ class AmplitudeTable(Result):
         TableError: if a value is impossible, an error is missing or the lengths differ.
     """
 
-    drive_frequency_khz: Float[np.ndarray, " rows"]
-    offset_nm: Float[np.ndarray, " rows"]
+    drive_frequency_khz: Rows
+    offset_nm: Rows
     free_frequency_khz: float
     free_frequency_error_khz: float | None = None
     drive: str = "sample"
     order: Real[np.ndarray, " orders"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    drive_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    free_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    peak_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    peak_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
-    lockin_amplitude_nm: Float[np.ndarray, " rows"] | None = None
-    lockin_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
-    phase_deg: Float[np.ndarray, " rows"] | None = None
-    phase_error_deg: Float[np.ndarray, " rows"] | None = None
-    phase_lag_deg: Float[np.ndarray, " rows"] | None = None
-    phase_lag_error_deg: Float[np.ndarray, " rows"] | None = None
-    retract: Float[np.ndarray, " rows"] | None = None
-    no_orbit: Float[np.ndarray, " rows"] | None = None
+    drive_amplitude_nm: Rows | None = None
+    free_amplitude_nm: Rows | None = None
+    peak_amplitude_nm: Rows | None = None
+    peak_amplitude_error_nm: Rows | None = None
+    lockin_amplitude_nm: Rows | None = None
+    lockin_amplitude_error_nm: Rows | None = None
+    phase_deg: Rows | None = None
+    phase_error_deg: Rows | None = None
+    phase_lag_deg: Rows | None = None
+    phase_lag_error_deg: Rows | None = None
+    retract: Rows | None = None
+    no_orbit: Rows | None = None
     quality_factor: float | None = float("nan")
     quality_factor_error: float | None = None
     mass_ng: float | None = None
@@ -359,23 +354,26 @@ class AmplitudeTable(Result):
         # Lines of another number are those of the table that this one was made from (`dataclasses.replace`).
         rows = np.size(self.drive_frequency_khz)
         own = len(self.lines) == rows
-        faults = Faults(self.source, place="line" if own else "row")
+        source = Source(self.source, "line" if own else "row")
         for name, choices in (("drive", DRIVES), ("phase_sense", ("", *PHASE_SENSES))):
             if getattr(self, name) not in choices:
-                faults.add(f"{name} must be one of {', '.join(filter(None, choices))}, but is {getattr(self, name)!r}")
-        faults.raise_any()
+                raise source.fault(
+                    f"{name} must be one of {', '.join(filter(None, choices))}, but is {getattr(self, name)!r}"
+                )
         columns = columns_of(self)
         if self.tapping and np.size(self.order) == 0:
             columns["order"] = np.ones(rows)
         lines = np.array(self.lines if own else np.arange(1, rows + 1), dtype=np.int64)
-        check_names(list(columns), self.form, faults)
-        columns = {name: column_of(name, values, rows, faults) for name, values in columns.items()}
+        check_names(list(columns), self.form, source)
+        columns = {name: column_of(name, values, rows, source) for name, values in columns.items()}
         for column in MEASURED:
             if (column.name in columns) != (column.error in columns):
-                faults.add(f"{column.name} and {column.error} come together; give both or none")
-        _check_header(self, faults)
-        faults.raise_any()
-        _check_rows(columns, self.form, lines, faults)
+                noise = f"{_OR_NOISE * column.amplitude}, or repeat readings: {LEAST_REPEATS} repeats tell them"
+                mend = f"has no errors; add the column {column.error}{noise}"
+                lacks = mend if column.name in columns else f"comes with {column.name}; give both or none"
+                raise source.fault(lacks, column=column.name if column.name in columns else column.error)
+        _check_header(self, source)
+        _check_rows(columns, self.form, lines, source)
         if self.mass_ng is None and self.spring_constant_n_per_m is not None:
             mass = effective_mass_ng(self.spring_constant_n_per_m, self.free_frequency_khz)
             object.__setattr__(self, "mass_ng", float(mass))
@@ -400,13 +398,8 @@ class AmplitudeTable(Result):
         known: dict[str, Any] = {"source": "data frame"}
         known |= {name: value for name, value in frame.attrs.items() if name in own} | header
         names = [name for name in frame.columns if name != "lines"]
-        faults = Faults(str(known["source"]), place="row")
-        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), faults)
-        if "free_frequency_khz" not in known:
-            how = "as free_frequency_khz=... to AmplitudeTable.from_dataframe"
-            faults.add(f"free_frequency_khz is missing; give it in `frame.attrs`, or {how}")
-        faults.raise_any()
-        return _completed({name: np.asarray(frame[name], np.float64) for name in names}, known, noise, faults)
+        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), Source(str(known["source"]), "row"))
+        return _completed({name: np.asarray(frame[name], np.float64) for name in names}, known, noise)
 
     @property
     def rows(self) -> int:
@@ -439,36 +432,38 @@ class AmplitudeTable(Result):
         return self.drive != "sample"
 
     @property
-    def excitation_nm(self) -> Float[np.ndarray, " rows"]:
+    def excitation_nm(self) -> Rows:
         """Amplitude in nm of the sample, or of the free tip where the cantilever is driven."""
         found = self.free_amplitude_nm if self.tapping else self.drive_amplitude_nm
         assert found is not None  # checked when it was made  # noqa: S101
         return found
 
     @property
-    def phase_and_error_deg(self) -> tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, " rows"] | None]:
+    def phase_and_error_deg(self) -> tuple[Rows | None, Rows | None]:
         """Phase of the orbit, or lag of the driven tip, and its standard error; None without them."""
         if self.tapping:
             return self.phase_lag_deg, self.phase_lag_error_deg
         return self.phase_deg, self.phase_error_deg
 
 
-def _check_header(table: AmplitudeTable, faults: Faults) -> None:
+def _check_header(table: AmplitudeTable, source: Source) -> None:
     for name in _CANTILEVER:
         value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
         if value is None or (name == "quality_factor" and np.isnan(value)):
             if error is not None:
-                faults.add(f"{ERROR_OF[name]} stands without {name}; give both or none")
+                raise source.fault(f"{ERROR_OF[name]} stands without {name}; give both or none")
         elif fault := fault_in_number(SETTINGS[name], value, error):
-            faults.add(f"{name} {fault}")
-    if table.spring_constant_n_per_m is not None and table.mass_ng is not None and not faults.found:
+            raise source.fault(f"{name} {fault}")
+    if table.spring_constant_n_per_m is not None and table.mass_ng is not None:
         wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
         if wrong is not None:
-            faults.add(wrong)
+            raise source.fault(wrong)
     for remark in table.remarks:
         plain = remark and remark == remark.strip() and not set(remark) & set("\r\n\0")
         if not plain or setting_in(remark, SETTINGS) is not None:
-            faults.add(f"the remark {quoted(remark)} would not be read back as one; make it one line of free text")
+            raise source.fault(
+                f"the remark {quoted(remark)} would not be read back as one; make it one line of free text"
+            )
 
 
 def check_quality_factor(table: AmplitudeTable) -> None:
@@ -496,7 +491,7 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
             an error of their own; those with one keep it.
 
     Raises:
-        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+        TableError: one line that names the first fault, its place, and how to mend it.
     """
     return parse_table(read_text(path), str(path), noise)
 
@@ -505,17 +500,26 @@ TableLike = AmplitudeTable | str | os.PathLike[str]
 """An amplitude table, or the path of its file."""
 
 
-def as_table(given: TableLike) -> AmplitudeTable:
+def as_table(given: TableLike, *, noise: float | None = None, quality_factor: Any = None) -> AmplitudeTable:
     """Return a table that was given, or is read from its file.
+
+    Args:
+        given: the table or the path.
+        noise: of a file, as for `read_table`.
+        quality_factor: in place of the table's: a number, a pair with its error, '40 +- 2', or 'none'.
 
     Raises:
         TypeError: if it is something else.
         TableError: as `read_table`.
     """
-    if isinstance(given, AmplitudeTable):
+    if not isinstance(given, AmplitudeTable):
+        check_kind("table", given, TableLike)
+        given = read_table(Path(os.fspath(given)), noise)
+    if quality_factor is None:
         return given
-    check_kind("table", given, TableLike)
-    return read_table(Path(os.fspath(given)))
+    none = quality_factor == "none"
+    value, error = (None, None) if none else given_value("quality_factor", quality_factor)
+    return replace(given, quality_factor=value, quality_factor_error=error)
 
 
 def parse_table(text: str, source: str, noise: float | None = None) -> AmplitudeTable:
@@ -529,54 +533,40 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     Raises:
         TableError: as `read_table`.
     """
-    faults = Faults(source)
+    file = Source(source)
     if noise is not None and not 0.0 < noise < 1.0:
-        faults.add(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
-    settings, remarks, rows = read_comments(text, SETTINGS, faults)
+        raise file.fault(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+    settings, remarks, rows = read_comments(text, SETTINGS, file)
     if "free_frequency_khz" not in settings:
         example = SETTINGS["free_frequency_khz"].line
-        faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
-    header: dict[str, Any] = {
-        "rows_in_order_of_time": "rows" in settings,
-        "calibration": {key: settings[key] for key in CALIBRATION if key in settings},
-    }
-    for name in ("drive", "phase_sense", *_CANTILEVER):
-        if name in settings:
-            header[name], error = settings[name]
-            header |= {ERROR_OF[name]: error} if name in ERROR_OF else {}
-    columns, lines = read_rows(rows, FORMS[header.get("drive", "sample")], faults)
+        raise file.fault(f"the free frequency is missing; add a line such as '{example}' above the column names")
+    known = [name for name in ("drive", "phase_sense", *_CANTILEVER) if name in settings]
+    header: dict[str, Any] = {name: settings[name][0] for name in known}
+    header |= {ERROR_OF[name]: settings[name][1] for name in known if name in ERROR_OF}
+    columns, lines = read_rows(rows, FORMS[header.get("drive", "sample")], file)
+    calibration = {key: settings[key] for key in CALIBRATION if key in settings}
+    header |= {"calibration": calibration, "rows_in_order_of_time": "rows" in settings}
     header |= {"source": source, "lines": lines, "remarks": remarks}
-    return _completed(columns, header, noise, faults, head=rows[0][0])
+    return _completed(columns, header, noise)
 
 
-def _completed(
-    columns: Columns, header: dict[str, Any], noise: float | None, faults: Faults, head: int = 0
-) -> AmplitudeTable:
+def _completed(columns: Columns, header: dict[str, Any], noise: float | None) -> AmplitudeTable:
     """Return a table of columns, with the errors that noise and repeated readings give.
 
     Args:
         columns: by name, NaN where nothing was measured; changed in place.
         header: the other attributes of the table.
         noise: relative noise of amplitudes without an error.
-        faults: where faults are noted.
-        head: line of the column names.
 
     Raises:
         TableError: as `read_table`.
     """
-    faults.raise_any()
-    for column in MEASURED if noise is not None else ():
-        if column.amplitude and column.name in columns:
+    for column in MEASURED:
+        if noise is not None and column.amplitude and column.name in columns:
             values, error = columns[column.name], str(column.error)
             errors = columns.get(error, np.full(len(values), np.nan))
-            columns[error] = np.where(np.isnan(errors), (noise or 0.0) * values, errors)
+            columns[error] = np.where(np.isnan(errors), noise * values, errors)
     repeats = _fill_errors_of_repeats(columns)
-    for column in MEASURED:
-        if column.name in columns and column.error not in columns:
-            hint = f"add the column {column.error}" + _OR_NOISE * column.amplitude
-            hint += f", or repeat readings: {LEAST_REPEATS} repeats tell them"
-            faults.add(f"has no errors; {hint}", line=head, column=column.name)
-    faults.raise_any()
     attributes: dict[str, Any] = {**header, **columns, "remarks": (*header.get("remarks", ()), *repeats)}
     return AmplitudeTable(**attributes)
 
@@ -601,22 +591,19 @@ def write_table(table: TableLike, path: str | Path) -> None:
 
 def csv_of(table: AmplitudeTable) -> str:
     """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
-    lines = [f"# drive = {table.drive}"] if table.tapping else []
-    for name in _CANTILEVER:
-        value, error = getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)
-        if name == "quality_factor" and value is None:
-            lines.append("# quality_factor = none")
-        elif value is not None and not np.isnan(value):
-            lines.append(setting_line(name, float(value), error and float(error)))
-    known = {name: table.calibration[name] for name in CALIBRATION if name in table.calibration}
-    lines += [setting_line(name, float(value), float(error)) for name, (value, error) in known.items()]
-    lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
-    lines += [f"# phase_sense = {table.phase_sense}"] if table.phase_sense else []
+    words = {"drive": table.drive if table.tapping else "", "phase_sense": table.phase_sense}
+    words["rows"] = SETTINGS["rows"].example if table.rows_in_order_of_time else ""
+    numbers = {name: (getattr(table, name), getattr(table, ERROR_OF.get(name, ""), None)) for name in _CANTILEVER}
+    numbers |= {name: table.calibration[name] for name in CALIBRATION if name in table.calibration}
+    lines = [setting_line(key, word, None) for key, word in words.items() if word]
+    for key, (value, error) in numbers.items():
+        if value is not None and not np.isnan(value):
+            lines.append(setting_line(key, float(value), error and float(error)))
+    lines += ["# quality_factor = none"] if table.quality_factor is None else []
     lines += [f"# {remark}" for remark in table.remarks]
-    names = [name for name in table.form.names if getattr(table, name) is not None]
+    columns = {name: getattr(table, name) for name in table.form.names if getattr(table, name) is not None}
     if table.tapping and np.all(table.order == 1):
-        names.remove("order")
-    columns = {name: getattr(table, name) for name in names}
+        del columns["order"]
     lines.append(",".join(columns))
     # tolist gives Python numbers, whose repr is the shortest text that reads back as the same number.
     cells = [["" if value != value else repr(value) for value in column.tolist()] for column in columns.values()]  # noqa: PLR0124

@@ -118,7 +118,7 @@ class TappingMap(JudgedResult):
 
 @checked
 def tapping_map(
-    images: AmplitudeAndPhase | str | Path | tuple[np.ndarray, np.ndarray],
+    images: AmplitudeAndPhase | str | Path | tuple[Any, Any],
     *,
     columns: str = "",
     drive: Literal["base", "force"] = "base",
@@ -130,13 +130,14 @@ def tapping_map(
     """Return energy and virial of a tap in every pixel of an image of amplitude and phase.
 
     Args:
-        images: a file for `read_images`, what that returned, or the arrays of amplitude in nm and phase in degrees.
+        images: a file for `read_images`, a pair of files, what that returned, or the arrays of amplitude in nm and
+            phase in degrees.
         columns: which channel is which, as for `read_images`, where `images` does not come from there.
         drive: what shakes the cantilever.
         phase_sense: whether the phase grows as the tip lags more, or falls; None: the energies decide where they can.
         amplitude_error_nm: standard error of every pixel's amplitude; else from the roughness along its lines.
         phase_error_deg: of every pixel's phase; else likewise.
-        given: instead of the file's, each a number or a pair with its standard error: free_frequency_khz,
+        given: instead of the file's, each a number, a pair with its standard error or '44 +- 4': free_frequency_khz,
             quality_factor, spring_constant_n_per_m (left out: energies over it, in nm^2), free_amplitude_nm and
             free_phase_deg (what the instrument reads with the tip free), drive_frequency_khz (left out: on resonance),
             nm_per_volt, tip_calibration.

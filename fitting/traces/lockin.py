@@ -7,6 +7,7 @@ asked for, too: the other lines of a motion of that order then cancel. T is cut 
 """
 
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,10 @@ from afm_jax.checks import checked
 from afm_jax.columns import printed_table, rows_of
 from afm_jax.results import JudgedResult, ResultTuple, public_result
 from afm_jax.units import within_turn
-from afm_jax.words import bullets
-from fitting.tables.csv_text import Column, Faults, FileSetting, Form, TableError, read_columns, read_text
+from afm_jax.words import bullets, printable
+from fitting.tables.csv_text import Column, FileSetting, Form, Source, TableError, read_columns
 
+Samples = Float[np.ndarray, " samples"]
 HIGHEST_ORDER = 8
 """Subharmonics that are read: the paper's proposal; higher ones are hardly ever seen."""
 SHARE = 0.02
@@ -44,8 +46,8 @@ class Trace(ResultTuple):
         drive_frequency_khz: of the platform, or None where the file does not say it.
     """
 
-    time_us: Float[np.ndarray, " samples"]
-    deflection_nm: Float[np.ndarray, " samples"]
+    time_us: Samples
+    deflection_nm: Samples
     drive_frequency_khz: float | None
 
 
@@ -116,17 +118,18 @@ class LockinResult(JudgedResult):
 
 @checked
 def lockin(
-    time_us: Float[np.ndarray, " samples"],
-    deflection_nm: Float[np.ndarray, " samples"],
-    drive_frequency_khz: float,
-    order: int,
+    time_us: Samples | str | os.PathLike[str],
+    deflection_nm: Samples | None = None,
+    drive_frequency_khz: float | None = None,
+    order: int = 1,
 ) -> LockinResult:
     """Read amplitude and phase of a deflection at the drive's frequency over an order, and at the orders beside it.
 
     Args:
-        time_us: of the samples, in us, rising in nearly equal steps; 0 when the platform is highest.
+        time_us: of the samples, in us, rising in nearly equal steps; 0 when the platform is highest. Or a file for
+            `read_trace`, which has the deflection, too.
         deflection_nm: height of the tip, in nm; the zero does not matter.
-        drive_frequency_khz: of the platform.
+        drive_frequency_khz: of the platform; of a file its own, if it is not given.
         order: N, drive periods in a period of the response, 1 to 8.
 
     Returns:
@@ -136,13 +139,23 @@ def lockin(
         TableError: if the trace is too short or has gaps.
         ValueError: if the order or the frequency is impossible.
     """
+    source = ""
+    if isinstance(time_us, str | os.PathLike):
+        source = f"{printable(os.fspath(time_us))}: "
+        time_us, deflection_nm, stated = read_trace(Path(time_us))
+        drive_frequency_khz = stated if drive_frequency_khz is None else drive_frequency_khz
+    if drive_frequency_khz is None:
+        mend = "give `drive_frequency_khz=...` or '# drive_frequency_khz = 180'"
+        raise TableError(f"{source}the drive frequency is missing; {mend}")
     if not 1 <= order <= HIGHEST_ORDER:
         raise ValueError(f"`order` must be 1 to {HIGHEST_ORDER}, but is {order}")
     if not 0.0 < drive_frequency_khz < 1e9:
         raise ValueError(f"`drive_frequency_khz` must be positive, but is {drive_frequency_khz!r}")
     period = 1e3 / drive_frequency_khz
     time, height = (np.asarray(column, dtype=np.float64) for column in (time_us, deflection_nm))
-    _check(time, height, period, order)
+    wrong = _fault(time, height, period, order)
+    if wrong:
+        raise TableError(f"{source}{wrong}")
     orders = np.array(sorted({*range(1, HIGHEST_ORDER + 1), 2 * order}))
     asked = int(np.searchsorted(orders, order))
     blocks = [_blocks(time, height, period, int(n), order) for n in orders]
@@ -176,14 +189,12 @@ def lockin(
     return replace(found, reasons=reasons, warnings=tuple(warnings))
 
 
-def _whole(time: Float[np.ndarray, " samples"], period_us: float) -> int:
+def _whole(time: Samples, period_us: float) -> int:
     """Return how many whole periods a trace holds."""
     return int((time[-1] - time[0]) / period_us + 1e-9)
 
 
-def _blocks(
-    time: Float[np.ndarray, " samples"], height: Float[np.ndarray, " samples"], period: float, n: int, order: int
-) -> Complex[np.ndarray, " blocks"]:
+def _blocks(time: Samples, height: Samples, period: float, n: int, order: int) -> Complex[np.ndarray, " blocks"]:
     """Return 2/T times the integral of z exp(-i omega t/n) over each of at most twelve blocks; none if too short.
 
     Blocks hold equally many whole periods of both orders, the last ones of the trace.
@@ -217,7 +228,7 @@ def _line(blocks: Complex[np.ndarray, " blocks"]) -> tuple[complex, float, float
     return mean, along, min(across / max(abs(mean), 1e-300), math.pi)
 
 
-def _sampling_error(time: Float[np.ndarray, " samples"], period: float) -> float:
+def _sampling_error(time: Samples, period: float) -> float:
     """Return by which share an amplitude may be wrong as few phases of the period are sampled.
 
     Sampled at M phases, the harmonics M - 1 and M + 1 look like the first; the k-th of a bounce is 3/(4 k^2) of it.
@@ -227,28 +238,25 @@ def _sampling_error(time: Float[np.ndarray, " samples"], period: float) -> float
     return 0.75 * (1.0 / (m - 1.0) ** 2 + 1.0 / (m + 1.0) ** 2)
 
 
-def _check(
-    time: Float[np.ndarray, " samples"], height: Float[np.ndarray, " samples"], period: float, order: int
-) -> None:
-    """Refuse times that do not rise in nearly equal steps, or that are too few or too short."""
+def _fault(time: np.ndarray, height: np.ndarray, period: float, order: int) -> str:
+    """Return what is wrong with times that do not rise in nearly equal steps, or are too few or too short."""
     if time.shape != height.shape or time.ndim != 1 or len(time) < 2 or not np.isfinite(time + height).all():
-        raise TableError("the trace must be two or more finite numbers of time and as many of the deflection")
+        return "the trace must be two or more finite numbers of time and as many of the deflection"
     steps = np.diff(time)
     typical, worst = float(np.median(steps)), int(np.argmax(np.abs(steps - np.median(steps))))
     if steps.min() <= 0.0 or steps[worst] > 1.5 * typical:
-        raise TableError(
+        return (
             f"sample {worst + 2}, column time_us: the step is {steps[worst]:.6g} us, the usual one {typical:.6g} us; "
             "times must rise evenly: cut the trace where samples are missing"
         )
     if _LEAST_SAMPLES * typical > period:
-        raise TableError(
-            f"there are {period / typical:.3g} samples in a drive period; sample {_LEAST_SAMPLES:g} or more"
-        )
+        return f"there are {period / typical:.3g} samples in a drive period; sample {_LEAST_SAMPLES:g} or more"
     if _whole(time, order * period) < _LEAST_PERIODS:
-        raise TableError(
+        return (
             f"the trace spans {(time[-1] - time[0]) / period:.3g} drive periods, too short for {_LEAST_PERIODS} "
             f"periods of order {order}; record at least {_LEAST_PERIODS * order * period:.4g} us"
         )
+    return ""
 
 
 def _why_not_periodic(found: LockinResult) -> str | None:
@@ -288,7 +296,6 @@ TRACE = Form(
     ),
     "sample",
     open=True,
-    separator="",
 )
 SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180")}
 
@@ -303,14 +310,10 @@ def read_trace(path: str | Path) -> Trace:
         path: the file.
 
     Raises:
-        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+        TableError: one line that names the first fault, its place, and how to mend it.
     """
-    faults = Faults(str(path))
-    table = read_columns(read_text(path), TRACE, SETTINGS, faults)
-    faults.raise_any()
-    frequency, _ = table.settings.get("drive_frequency_khz", (None, None))
-    columns = table.columns
+    _, columns, lines, settings = read_columns(path, TRACE, SETTINGS)
     for name, numbers in columns.items():
-        TRACE.check_numbers(name, numbers, table.lines, faults)
-    faults.raise_any()
+        TRACE.check_numbers(name, numbers, lines, Source(str(path)))
+    frequency, _ = settings.get("drive_frequency_khz", (None, None))
     return Trace(columns["time_us"], columns["deflection_nm"], frequency)
