@@ -377,7 +377,7 @@ def _judged(e: Calibration) -> Calibration:
     doubt = next((one.reason for one in springs if one.reason is not None), None)
     if doubt is not None and len(springs) == 1:
         how = "`length_um=...` and `width_um=...` give k by Sader's method"
-        reasons.append(f"The spring constant is not calibrated: {doubt}; {how}.")
+        reasons.append(f"The spring constant is not calibrated: {doubt}; {how}. Frequency and Q do not depend on it.")
     notes = {
         f"{khz} is beyond any cantilever: if these are in Hz, name their column frequency_hz.": natural.value > 2e4,
         "The phase rises through the resonance: its sign was reversed.": e.phase_reversed,

@@ -609,7 +609,7 @@ def table_text(curve: MeasuredCurve) -> str:
     """
     if curve.amplitude is None:
         why = next((note for note in curve.notes if note.startswith(_NO_AMPLITUDE)), _NO_AMPLITUDE)
-        raise TableError(f"{curve.source}, curve {curve.curve}: no table of this. {why}")
+        raise TableError(f"{curve.source}, curve {curve.curve}: it gives no table. {why}")
     if curve.reasons:
         raise TableError(f"{curve.source}, curve {curve.curve}: {curve.reasons[0]}")
     needed = [key for key in curve.missing if key in _NEEDED]
