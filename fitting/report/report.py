@@ -65,7 +65,7 @@ def fit_report(result: FitResult, comparison: Comparison | None = None, posterio
             ReportSection("Parameters", [Table("Fitted parameters", head, cells, words=head[-1:])], "Parameters"),
             ReportSection("Goodness of fit", [Text("\n".join(goodness), "lines")]),
             *_table_sections(result),
-            ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes"),
+            *([ReportSection("Notes", [Bullets(result.warnings, "Notes:")], "Notes")] if result.warnings else []),
             *([] if comparison is None else [_compared(comparison)]),
             *([] if posterior is None else [_sampled(posterior)]),
         ],
