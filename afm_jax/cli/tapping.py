@@ -41,8 +41,8 @@ def energy_of_taps(  # noqa: PLR0913
     hysteresis, and impact speeds if they can be determined; then the law from the rows with fast impacts, or why there
     is none and what to record instead. With --out the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and
     that of the law. Several files, or several curves of a file, are assumed to be of one cantilever: frequency and Q
-    are fitted to all of them, and the scatter from curve to curve stands beside the errors (with --out together.html, .txt,
-    .json, .png, and a folder for each curve). Exit code 3 if the energy of a tap is not determined.
+    are fitted to all of them, and the scatter from curve to curve stands beside the errors (with --out together.html,
+    .txt, .json, .png, and a folder for each curve). Exit code 3 if the energy of a tap is not determined.
 
     Args:
         session: for progress and files.
