@@ -98,7 +98,7 @@ DELAY = (
     Parameter(
         name="delay_lead_nm",
         unit="nm",
-        meaning="lead of a slow way out",
+        meaning="lead of a slow retract",
         lowest=-300.0,
         highest=300.0,
         width=5.0,
@@ -123,7 +123,7 @@ NUISANCES = (
     Parameter(
         name="offset_origin_nm",
         unit="nm",
-        meaning="what the table's offsets lack",
+        meaning="to be added to the table's offsets",
     ),
     Parameter(
         name="tip_calibration",

@@ -35,8 +35,10 @@ PICTURES = {
     "tapping": "tapping fitting/examples/tapping_resonance.csv --out report",
     "sweep": "sweep sweep.toml --out swept --plot",
     "collide": "collide --speeds 6:10:1,11:14:0.25,15:60:1 --out collide",
+    "oscillator_bifurcation": "bifurcation oscillator.toml --parameter force.reduced_frequency=0.35:0.55:300 --both"
+    " --ordinate impact_speed --out diagram",
 }
-"""The command that writes each picture; scene and sweep are those of the pages."""
+"""The command that writes each picture, which has its last word as its name; files are those of the pages."""
 
 
 def main() -> None:
@@ -44,12 +46,13 @@ def main() -> None:
     with TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "fitting").symlink_to(ROOT / "fitting")
-        for name, page in (("scene.toml", "first_steps.md"), ("sweep.toml", "sweeps.md")):
+        pages = {"scene": "first_steps.md", "sweep": "sweeps.md", "oscillator": "oscillator.md"}
+        for name, page in pages.items():
             block = re.search(
                 r"^```toml\n(.*?)^```", (PAGES / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
             )
             assert block is not None
-            (folder / name).write_text(block.group(1), encoding="utf-8")
+            (folder / f"{name}.toml").write_text(block.group(1), encoding="utf-8")
         for picture in sys.argv[1:] or [*PICTURES, "figure3"]:
             if picture == "figure3":
                 subprocess.run([sys.executable, ROOT / "notebooks" / "figure3.py"], check=True)
@@ -58,7 +61,7 @@ def main() -> None:
             print("afm-jax", *arguments)
             with contextlib.chdir(folder), kept_figures() as figures:
                 run_command(arguments, standalone_mode=False)
-            made = folder / arguments[arguments.index("--out") + 1] / f"{picture}.png"
+            made = folder / arguments[arguments.index("--out") + 1] / f"{picture.rpartition('_')[2]}.png"
             figure = figures.get(made.read_bytes())
             if figure is None:
                 shutil.copy(made, PAGES / "pictures" / made.name)

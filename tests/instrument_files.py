@@ -55,6 +55,21 @@ def asylum_ramp(*, order: str = "<") -> bytes:
     return igor_wave(columns, note, order=order)
 
 
+BRUKER = (
+    "offset_nm=Calc_Ramp_Ex_nm/Calc_Ramp_Rt_nm:nm,lockin_amplitude_nm=Amplitude_Ex_mV/Amplitude_Rt_mV:mV,"
+    "phase_lag_deg=Phase_Ex_Deg/Phase_Rt_Deg:deg"
+)
+"""The columns of `bruker_ramp`, as `notebooks/pages/tapping.md` names them."""
+
+
+def bruker_ramp() -> str:
+    """Return `tapping_rows` as NanoScope Analysis exports a ramp: extend and retract side by side, heights downward."""
+    rows = {"Ex": tapping_rows(), "Rt": tapping_rows(retract=True)}
+    columns = {f"Calc_Ramp_{way}_nm": -offset for way, (offset, _, _) in rows.items()}
+    columns |= {f"Amplitude_{way}_mV": 1e3 * amplitude / 50.0 for way, (_, amplitude, _) in rows.items()}
+    return separated(columns | {f"Phase_{way}_Deg": lag for way, (_, _, lag) in rows.items()}, "\t")
+
+
 def nanonis_ramp() -> str:
     """Return a Nanonis Z ramp of `tapping_rows`: heights that grow away from the sample, forward and backward."""
     offset, amplitude, lag = tapping_rows()

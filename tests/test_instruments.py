@@ -20,7 +20,7 @@ from fitting.instruments.formats import read_recording
 from fitting.tables.table import parse_table
 from fitting.tapping_curves.measured import is_table
 from fitting.tapping_curves.tapping import tapping
-from tests.instrument_files import asylum_ramp, nanonis_ramp, separated, tapping_rows
+from tests.instrument_files import BRUKER, asylum_ramp, bruker_ramp, nanonis_ramp, separated, tapping_rows
 from tests.strict_reading import strictly
 
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
@@ -147,6 +147,7 @@ def without_names(separator: str) -> str:
 
 RAMP = {"drive": "force"}
 NUMBERS = {"columns": "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:deg"}
+SIDE_BY_SIDE = {"columns": BRUKER, "nm_per_volt": 50.0}
 
 
 @pytest.mark.parametrize(
@@ -156,6 +157,7 @@ NUMBERS = {"columns": "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:d
         (partial(asylum_ramp, order="<"), RAMP, {"rtol": 2e-7}, 0.01),
         (partial(asylum_ramp, order=">"), RAMP, {"rtol": 2e-7}, 0.01),
         (nanonis_ramp, {}, {"rtol": 1e-9}, 1e-6),
+        (bruker_ramp, SIDE_BY_SIDE, {"rtol": 0.0, "atol": 1e-4}, 1e-4),
         (partial(with_units_in_names, "\t", "."), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         (partial(with_units_in_names, ";", ","), {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
         (with_words, {}, {"rtol": 0.0, "atol": 1e-6}, 1e-4),
@@ -167,7 +169,7 @@ def test_every_format_holds_the_same_curve(tmp_path: Path, write, options: dict,
     offset, amplitude, lag = tapping_rows()
     curve = read_curve(saved(tmp_path, write()), **options)
     assert int(np.sum(curve.branch == "approach")) == 120
-    assert len(curve.branch) == (240 if options is RAMP or write in (nanonis_ramp, with_words) else 120)
+    assert len(curve.branch) == (240 if options is RAMP or write in (nanonis_ramp, bruker_ramp, with_words) else 120)
     np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, **precision)
     np.testing.assert_allclose(given(curve.phase_lag_deg)[:120], lag, atol=degrees)
     np.testing.assert_allclose(np.diff(curve.offset_nm[:120]), np.diff(offset), atol=1e-2)

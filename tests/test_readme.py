@@ -115,6 +115,7 @@ LEFT_OUT = {
     "calibrate fitting/examples/real": "tests/test_thermal.py fits such spectra",
     "fit monday.csv": "three tables are fitted by tests/test_several_tables.py",
     "fit my_amplitudes.csv --model law --posterior": "samples for a minute: tests/test_posterior.py",
+    "tapping RAMP.txt": "an export of a program that is not at hand: tests/test_instruments.py reads one like it",
     "basins": "compiles for twenty seconds: tests/test_dynamics.py",
     "bifurcation": "compiles for twenty seconds: tests/test_dynamics.py",
     "lyapunov": "compiles for twenty seconds: tests/test_lyapunov.py",

@@ -15,9 +15,9 @@ class CalibrationOptions:
 
     Attributes:
         averages: spectra that a thermal spectrum is the mean of.
-        length_um: length of a rectangular lever, '225 +- 2' with its error: Sader's method.
+        length_um: length of a rectangular cantilever, '225 +- 2' with its error: Sader's method.
         width_um: its width.
-        temperature_k: of lever and air [default: the file's, 296 +- 3].
+        temperature_k: of cantilever and air [default: the file's, 296 +- 3].
         scale_error: relative error of the deflection's scale (its sensitivity); that of k is twice as large.
     """
 
@@ -39,8 +39,8 @@ def calibration(
 
     SWEEP is Nanonis text, or columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any unit) and, where
     known, phase_deg, amplitude_error_nm (or amplitude_error). A thermal spectrum (NanoSurf .nid, or
-    asd_nm_per_sqrt_hz or psd_nm2_per_hz) gives the spring constant, too, by equipartition; with the lever's size also
-    by Sader's method. frequency_khz is the undamped natural frequency, not that of the maximum. With --out
+    asd_nm_per_sqrt_hz or psd_nm2_per_hz) gives the spring constant, too, by equipartition; with the cantilever's size
+    also by Sader's method. frequency_khz is the undamped natural frequency, not that of the maximum. With --out
     calibration.json, .png and calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the
     edge, not explained by the model, or a scale of the deflection that another spring constant contradicts.
 

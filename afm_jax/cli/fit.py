@@ -65,7 +65,7 @@ def fit(  # noqa: PLR0913
             and adhesion (r, epsilon, viscous_loss); each with the collision delay, which amplitudes near resonance need
             (+delay); contact: physical parameters through the resolved contact, of tapping curves 3 to 10 % above
             resonance.
-        noise: relative error of amplitudes without one, such as 1%.
+        noise: relative error of amplitudes for which the table states none, such as 1%.
         quality_factor: instead of the table's; '40 +- 2', or none: no air damping.
         scale_errors: treat the errors as relative: scale them, by 3 at most, until chi2/dof is 1.
         robust: leave out outliers, at most one row in ten.

@@ -28,7 +28,7 @@ def inversion(
     Args:
         session: for progress.
         table: the file.
-        noise: relative error of amplitudes without one, such as 1%.
+        noise: relative error of amplitudes for which the table states none, such as 1%.
         quality_factor: instead of the table's; '40 +- 2', or none: no air damping.
         example: invert the bundled table instead of a file.
     """

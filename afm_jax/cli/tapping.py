@@ -38,14 +38,14 @@ def energy_of_taps(  # noqa: PLR0913
     file, as for `afm-jax read`. The output gives the energy along the attractive and the repulsive branch, thresholds,
     hysteresis, and impact speeds if they can be determined; then the law from the rows with fast impacts, or why there
     is none and what to record instead. With --out the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and
-    that of the law. Several files, or several curves of a file, are assumed to be of one lever: frequency and Q are
-    fitted to all of them, and the scatter from curve to curve stands beside the errors (with --out together.html, .txt,
-    .json, .png, and a folder for each curve). Exit code 3 if the energy of a tap is not determined.
+    that of the law. Several files, or several curves of a file, are assumed to be of one cantilever: frequency and Q
+    are fitted to all of them, and the scatter from curve to curve stands beside the errors (with --out together.html,
+    .txt, .json, .png, and a folder for each curve). Exit code 3 if the energy of a tap is not determined.
 
     Args:
         session: for progress and files.
         curve_files: files.
-        noise: relative error of amplitudes without one, such as 1%.
+        noise: relative error of amplitudes for which the table states none, such as 1%.
         curve: only this curve of an instrument's file.
         model: model of the law, as for `afm-jax fit`.
         example: analyse the bundled raw file, simulated with the defects of real ones.

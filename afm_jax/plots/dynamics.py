@@ -222,7 +222,7 @@ _SURE = 0.95
 """Share of drawn laws with a verdict from which on it counts as sure."""
 _ENDED = {
     MotionKind.STUCK: ("the platform holds the tip", None),
-    MotionKind.FREE: ("the tip has flown away", "//"),
+    MotionKind.FREE: ("the tip does not meet the sample", "//"),
     MotionKind.UNRESOLVED: ("not followed to the end", "xx"),
 }
 """What is said of motions without impacts to draw, and their ground."""

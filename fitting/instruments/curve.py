@@ -577,7 +577,7 @@ def table_of(curve: MeasuredCurve) -> AmplitudeTable:
     where, known = f"{curve.source}, curve {curve.curve}", curve.known
     if curve.amplitude is None:
         why = next(note for note in curve.notes if note.startswith(_NO["lockin_amplitude_nm"]))
-        raise TableError(f"{where}: no table of this. {why}")
+        raise TableError(f"{where}: it gives no table. {why}")
     if curve.reasons:
         raise TableError(f"{where}: {curve.reasons[0]}")
     needed = [key for key in curve.missing if key in _NEEDED]

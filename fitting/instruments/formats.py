@@ -96,8 +96,8 @@ def parse_text(data: bytes, name: str) -> Recording:
     Nanonis writes `[DATA]`, and names with "[bwd]" for the way back; Bruker's exports have _Ex and _Rt in the names of
     both ways. neaSNOM's comments are `key: [unit] values`; its columns carry no units.
     """
-    wrong = "is neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, Nanonis .dat, "
-    comments, rows = split_lines(text_of(data, name, f"{wrong}CSV); export it as CSV", latin=True))
+    wrong = "neither text nor a known format (neaSNOM, WSxM, Igor .ibw, NanoSurf .nid, Nanonis .dat, "
+    comments, rows = split_lines(text_of(data, name, f"{wrong}CSV); export it as text with columns", latin=True))
     start = next((number for number, line in rows if line.strip() == "[DATA]"), 0)
     head = [line for number, line in rows if number < start] or [comment for _, comment in comments]
     pairs = [re.split(r"\s*[=:\t]\s*", line, maxsplit=1) for line in head]

@@ -33,7 +33,9 @@ def curves_summary(curves: list[MeasuredCurve]) -> str:
     ]
     asked = [f"{key}: `{key}=...`" for key in dict.fromkeys(k for c in curves if c.valid for k in c.missing)]
     lines += bullets("The file does not say:", asked)
-    lines += bullets("Notes:", list(dict.fromkeys(note for curve in curves for note in curve.notes)))
+    common = set.intersection(*(set(curve.notes) for curve in curves))
+    notes = ((note if note in common else f"curve {each.curve}: {note}") for each in curves for note in each.notes)
+    lines += bullets("Notes:", list(dict.fromkeys(notes)))
     lines += bullets("Refused:", [f"curve {curve.curve}: {reason}" for curve in curves for reason in curve.reasons])
     return "\n".join(lines)
 

@@ -20,7 +20,7 @@ def inversion_figure(result: Inversion) -> Figure:
         label = f"{law}, $\\chi^2$ {line.chi2:.1f}/{line.degrees_of_freedom}"
         losses.plot(at, line.epsilon + line.slope * at ** POWERS[law], color=colour, label=label)
     delays.errorbar(u, 1e3 * result.collision_delay_us, 1e3 * result.errors[:, 2], fmt="o", ms=3.5, lw=0.8, color=DARK)
-    label_axes(losses, x="approach speed (nm/us)", y="$u_{in}^2 - u_{out}^2$ (nm$^2$/us$^2$)")
-    label_axes(delays, x="approach speed (nm/us)", y="collision delay (ns)")
+    label_axes(losses, x="approach speed (nm/µs)", y="$u_{in}^2 - u_{out}^2$ (nm$^2$/µs$^2$)")
+    label_axes(delays, x="approach speed (nm/µs)", y="collision delay (ns)")
     losses.legend()
     return figure

@@ -220,7 +220,7 @@ WARNINGS: Rules[Any] = [
     ),
     Rule(
         lambda e: [len(e.set_aside)] if e.set_aside else [],
-        "{case} of {e.curve.rows} rows are excluded; the column `note` of the table of rows says why",
+        "excluded: {case} of {e.curve.rows} rows; the column `note` of the table of rows says why",
     ),
 ]
 """What a reader should also know."""
