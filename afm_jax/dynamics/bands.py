@@ -19,9 +19,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
 from afm_jax.dynamics.bifurcations import BifurcationDiagram, bifurcation_diagram
 from afm_jax.dynamics.continuation import Continuation
-from afm_jax.dynamics.curves import BLOCK, equations_at, loop_at
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.dynamics.impact_loop import LoopFamily, closing_gaps, highest_point
+from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
+from afm_jax.dynamics.impact_orbits import BLOCK, LawLoops
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.solve.lanes import compiled_quickly, in_blocks
@@ -91,7 +91,7 @@ def amplitude_errors(
     return np.sqrt(np.einsum("ni,ij,nj->n", slope, uncertain.covariance, slope))
 
 
-def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, test: int | None) -> LoopFamily:
+def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, test: int | None) -> LawLoops:
     """Return the loops of a continuation with the uncertain parameters behind the followed one."""
     family, zero, unit = continuation.family, jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
     low, width = jnp.concatenate([family.low[:1], zero]), jnp.concatenate([family.width[:1], unit])
@@ -110,14 +110,14 @@ def _slopes_of_special_point(
 
 
 @compiled_quickly()
-def _slopes_by_uncertain(family: LoopFamily, point: Array) -> Float[Array, "n uncertain"]:
-    slopes = jax.jacfwd(lambda unknowns: equations_at(unknowns, family))(point)
+def _slopes_by_uncertain(family: LawLoops, point: Array) -> Float[Array, "n uncertain"]:
+    slopes = jax.jacfwd(family.equations)(point)
     solved = slopes.shape[0]
     return -jnp.linalg.solve(slopes[:, :solved], slopes[:, solved:])
 
 
 @compiled_quickly()
-def _amplitude_slopes(family: LoopFamily, points: Array) -> Float[Array, "points uncertain"]:
+def _amplitude_slopes(family: LawLoops, points: Array) -> Float[Array, "points uncertain"]:
     """Return the derivatives of the peak amplitude of closed loops by the uncertain parameters."""
 
     def slopes_at(point):
@@ -125,7 +125,7 @@ def _amplitude_slopes(family: LoopFamily, points: Array) -> Float[Array, "points
         followed, uncertain = point[count : count + 1], point[count + 1 :]
 
         def gaps_and_peak(unknowns, values):
-            loop = loop_at(jnp.concatenate([followed, values]), family)
+            _, loop = family.at(jnp.concatenate([unknowns, followed, values]))
             return closing_gaps(unknowns, loop), highest_point(unknowns, loop, family.samples)
 
         slopes = jax.jacfwd(gaps_and_peak, argnums=(0, 1))(point[:count], uncertain)

@@ -73,9 +73,9 @@ def orbit_verdicts(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
-    seen = sample_driven(scenes)
     if isinstance(scenes.interaction, Contact):
-        return OrbitVerdicts(**single_contact_orbits(seen, range(first_order, last_order + 1), report=report))
+        return OrbitVerdicts(**single_contact_orbits(scenes, range(first_order, last_order + 1), report=report))
+    seen = sample_driven(scenes)
     orders = jnp.arange(first_order, last_order + 1, dtype=float)
     names = ("peak_amplitude_nm", "largest_multiplier")
     if isinstance(scenes.interaction, TabulatedLaw):

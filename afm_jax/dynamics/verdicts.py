@@ -68,6 +68,13 @@ _KIND_OF = {
 }
 
 
+def kinds_of(outcome: Int[np.ndarray, " lanes"]) -> Int[np.ndarray, " lanes"]:
+    """Return the kinds of motions that ended with an `Outcome` each; irregular while they go on."""
+    kinds = np.full(max(Outcome) + 1, MotionKind.UNRESOLVED)
+    kinds[list(_KIND_OF)] = list(_KIND_OF.values())
+    return kinds[outcome]
+
+
 def settled_below(scenes: Scene) -> float:
     """Return the estimated distance from an orbit below which a motion is on it."""
     return _SETTLED_CONTACT if isinstance(scenes.interaction, Contact) else _SETTLED
@@ -86,9 +93,7 @@ def verdicts_of(
         period_us: of the drive.
         tolerance: of the remaining distance from an orbit (`find_repetitions`).
     """
-    kinds = np.full(max(Outcome) + 1, MotionKind.UNRESOLVED)
-    kinds[list(_KIND_OF)] = list(_KIND_OF.values())
-    kind = kinds[outcome]
+    kind = kinds_of(outcome)
     turns = record.turns(period_us)
     # resolved contacts, for which the tolerance is wide, repeat to no more than their accuracy
     rounding = max(ROUNDING, 1e-2 * tolerance)
