@@ -42,9 +42,9 @@ class UncertainParameters(NamedTuple):
 
     def without(self, path: str) -> "UncertainParameters":
         """Return the parameters without the one of a path, which is varied and has no error of its own."""
-        others = np.array([other != path for other in self.paths])
-        paths = tuple(other for other in self.paths if other != path)
-        return UncertainParameters(paths, self.values[others], self.covariance[np.ix_(others, others)])
+        kept = [number for number, other in enumerate(self.paths) if other != path]
+        paths = tuple(self.paths[number] for number in kept)
+        return UncertainParameters(paths, self.values[kept], self.covariance[np.ix_(kept, kept)])
 
     def possible_draws(self, number: int) -> Float[np.ndarray, "draws parameters"]:
         """Return draws from the normal distribution that are physical: r in (0, 1], nothing else below 0.
@@ -62,6 +62,12 @@ class UncertainParameters(NamedTuple):
         if good.sum() < number:
             raise ValueError("the law's errors are so wide that hardly any draw is a law: there are no bands")
         return drawn[good][:number]
+
+    def scenes(self, scene: Scene, number: int) -> Iterator[Scene]:
+        """Give a scene with drawn parameters, so many times."""
+        family = scene_family(scene, *self.paths)
+        for values in self.possible_draws(number):
+            yield family(*values)
 
 
 def special_errors(continuation: Continuation, uncertain: UncertainParameters) -> Float[np.ndarray, " special"]:
@@ -187,7 +193,7 @@ def verdict_probability(
         impacts: at each value.
     """
     names, same = np.array(sweep.verdicts.names()), np.zeros(len(sweep.values))
-    for drawn in _drawn(scene, uncertain.without(parameter), draws):
+    for drawn in uncertain.without(parameter).scenes(scene, draws):
         other = bifurcation_diagram(drawn, parameter, sweep.values, start=start, upward=sweep.upward, impacts=impacts)
         same += names == np.array(other.verdicts.names())
     return same / draws
@@ -209,14 +215,8 @@ def drawn_shares(
     rows, columns = (min(count, _STARTS) for count in basins.attractor.shape)
     ends = max(float(speed[0] - half), 0.0), float(speed[-1] + half)
     shares = np.zeros((draws, len(basins.attractors)))
-    for number, drawn in enumerate(_drawn(scene, uncertain, draws)):
+    for number, drawn in enumerate(uncertain.scenes(scene, draws)):
         other = basins_of_attraction(drawn, columns=columns, rows=rows, speeds_nm_per_us=ends)
         there = {attractor.name: share for attractor, share in zip(other.attractors, other.share, strict=True)}
         shares[number] = [there.get(attractor.name, 0.0) for attractor in basins.attractors]
     return np.quantile(shares, _BETWEEN, axis=0).T
-
-
-def _drawn(scene: Scene, uncertain: UncertainParameters, draws: int) -> Iterator[Scene]:
-    family = scene_family(scene, *uncertain.paths)
-    for values in uncertain.possible_draws(draws):
-        yield family(*values)

@@ -18,10 +18,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.columns import columns_of, rows_of
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of
-from afm_jax.dynamics.many_tips import Record, Tips, advance, follow
+from afm_jax.dynamics.many_tips import Tips, advance
 from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
-from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, kinds_of, settled_below, verdicts_of
+from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind, kinds_of, motions_of
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.units import within_turn
@@ -34,8 +33,6 @@ _SAME = 1e-3
 _ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
 """Numbers of impacts after which starts that have arrived drop out."""
 _PART = 8 * LANES
-_ACCURACY = 1e-6
-"""Of resolved contacts."""
 _LEFT = 20_000
 """Largest number of starts that are distinguished one by one in the end."""
 
@@ -209,7 +206,8 @@ def basins_of_attraction(
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
     else:
-        finder.look_around(high, low)
+        across, up = evenly_spread(_SAMPLE).T
+        finder.told_apart(finder.tips(2.0 * np.pi * across, low + (high - low) * up))
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
     order = [number for number in np.argsort(-count, kind="stable") if count[number]]
@@ -270,15 +268,10 @@ class _Finder:
 
     def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
         """Return the attractors of motions after a long time; new ones are added to those known."""
-
-        def work(some: Tips) -> tuple[Tips, Record]:
-            return follow(self.scenes(len(some.time_us)), some, skip=_LONG, record=RECORDED, accuracy=_ACCURACY)
-
-        end, record = in_blocks(work, tips, report=report)
-        period = np.full(len(end.time_us), 2.0 * np.pi / self.omega)
-        verdicts = verdicts_of(record, end.outcome, period, tolerance=settled_below(self.scene))
-        label = np.empty(len(period), int)
-        for lane in range(len(period)):
+        count = len(tips.time_us)
+        _, record, verdicts = motions_of(self.scenes(count), tips, _LONG, accuracy=1e-6, report=report)
+        label = np.empty(count, int)
+        for lane in range(count):
             m = int(verdicts.impacts[lane])
             phase = within_turn(self.omega * record.departure_us[lane, -m:], 2.0 * np.pi) if m else np.zeros(0)
             velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
@@ -308,23 +301,6 @@ class _Finder:
         name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
         self.attractors.append(Attractor(name, *kind, phase, velocity, approach))
         return len(self.attractors) - 1
-
-    def look_around(self, high: float, low: float) -> None:
-        """Find attractors with a sample of starts, and what of them is chaotic."""
-        across, up = evenly_spread(_SAMPLE).T
-        tips = self.tips(2.0 * np.pi * across, low + (high - low) * up)
-        label = self.told_apart(tips)
-        for number, attractor in enumerate(self.attractors):
-            if attractor.kind == MotionKind.IRREGULAR:
-                chosen = np.flatnonzero(label == number)[:16]
-                some = jax.tree.map(lambda part, chosen=chosen: part[chosen], tips)
-                exponents = exponents_of(
-                    self.scenes(len(chosen)), some, impacts=1000, transient=_LONG, accuracy=_ACCURACY
-                )
-                larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
-                finite = np.isfinite(larger)
-                if finite.any() and np.median(larger[finite]) > CHAOTIC_ERRORS * np.median(error[finite]):
-                    self.attractors[number] = attractor._replace(name="chaotic")
 
     def arrived(self, tips: Tips, report: Report | None) -> Int[np.ndarray, " lanes"]:
         """Return the attractor of every start, as soon as it has arrived."""

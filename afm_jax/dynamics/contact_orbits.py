@@ -20,7 +20,7 @@ from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.dynamics.impact_loop import GRAZING, LoopFamily, LoopReading, driven_part, lowest_gap
+from afm_jax.dynamics.impact_loop import GRAZING, LoopFamily, LoopReading, driven_part, highest_of_flights, lowest_gap
 from afm_jax.dynamics.impact_orbits import (
     ManyImpactOrbits,
     check_loop,
@@ -31,7 +31,7 @@ from afm_jax.dynamics.impact_orbits import (
 )
 from afm_jax.dynamics.many_tips import CONTACTS_AT_ONCE, next_departures, tips_after_contacts
 from afm_jax.dynamics.starts import evenly_spread, laws_of, leaving_tips, sample_driven
-from afm_jax.impact.orbits import FlightEnds, SingleImpactOrbits, highest_of_flight, single_impact_orbits
+from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.motion.record import ContactKind
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import default_start, gap_of_departure
@@ -55,6 +55,8 @@ _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _DIFFERENCE = 1e-5
 """Of unknowns without dimension, for derivatives of test functions."""
+_RISING = 8
+"""Rounds of Newton's method for where a flight comes to the end of contact."""
 _LONGEST_CONTACT = 0.5
 """Time that a contact may take beyond where it was expected to end, in flights of the loop."""
 
@@ -232,33 +234,27 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, 
     # `phase_rad` is within [0, 2 pi), but the impacts follow one another: a phase that falls is one turn later
     turns = np.cumsum(np.diff(phases, axis=1) < 0.0, axis=1)
     starts = phases + 2.0 * np.pi * np.pad(turns, ((0, 0), (1, 0)))
-    departures, speeds = _where_contact_ends(scene, starts, rebounds)
-    guesses = np.concatenate([departures, speeds], axis=1)
-    return guesses[np.isfinite(guesses).all(axis=1) & (speeds > 0.0).all(axis=1)]
+    guesses = _where_contact_ends(scene, starts, rebounds)
+    return guesses[np.isfinite(guesses).all(axis=1) & (guesses[:, impacts:] > 0.0).all(axis=1)]
 
 
 def _where_contact_ends(
     scene: Scene, phases: Float[np.ndarray, "orbits m"], rebounds: Float[np.ndarray, "orbits m"]
-) -> tuple[Float[np.ndarray, "orbits m"], Float[np.ndarray, "orbits m"]]:
-    """Return phases and speeds against the surface at which flights from the surface first are as high; NaN if never.
+) -> Float[np.ndarray, "orbits n"]:
+    """Return phases and speeds against the surface at which flights from the surface come to where contact ends.
 
-    Straight paths are not enough: slow tips take a good part of a drive period.
+    By Newton's method, from straight paths: slow tips take a good part of a drive period.
     """
     surface, _ = surface_of(scene)
-    omega = float(drive_of(scene).angular_frequency)
-    begin, after = phases[..., None] / omega, np.linspace(0.0, 2.0 * np.pi / omega, _SAMPLES)
+    omega, gap = float(drive_of(scene).angular_frequency), float(gap_of_departure(scene))
+    begin, rise = phases / omega, gap / rebounds
     height, rate = surface.position_and_velocity(begin)
-    position, velocity = scene.cantilever.propagator(after)(height, rate + rebounds[..., None])
-    surface_height, surface_rate = surface.position_and_velocity(begin + after)
-    above = np.asarray(position - surface_height) - float(gap_of_departure(scene))
-    crossing = np.argmax(above > 0.0, axis=-1)[..., None]
-    before = np.take_along_axis(above, np.maximum(crossing - 1, 0), axis=-1)[..., 0]
-    behind = np.take_along_axis(above, crossing, axis=-1)[..., 0]
-    # linear between two samples
-    fraction = np.where(behind > 0.0, behind / np.maximum(behind - before, 1e-300), np.nan)
-    rise_us = (crossing[..., 0] - fraction) * after[1]
-    speed = np.take_along_axis(np.asarray(velocity - surface_rate), crossing, axis=-1)[..., 0]
-    return phases + omega * rise_us, speed
+    for _ in range(_RISING):
+        position, velocity = scene.cantilever.propagator(rise)(height, rate + rebounds)
+        level, level_rate = surface.position_and_velocity(begin + rise)
+        speed = velocity - level_rate
+        rise = rise - (position - level - gap) / speed
+    return np.concatenate([phases + omega * rise, speed], axis=1)
 
 
 def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
@@ -273,13 +269,12 @@ def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> lis
     leaving, period = leaving_tips(scenes), float(platform.period_us)
     across, up = evenly_spread(_STARTS).T
     usual = seen.start(default_start(scene))
-    time = np.append(period * across, float(usual.time_us))
     faster = float(leaving.velocity_nm_per_us[0] - platform.velocity(leaving.time_us[0])) * (0.5 + 3.0 * up)
-    velocity = np.asarray(platform.velocity(time)) + np.append(faster, 0.0)
-    velocity[-1] = float(usual.velocity_nm_per_us)
-    gap = np.array(leaving.gap_nm)
-    gap[-1] = float(usual.position_nm - platform.position(usual.time_us))
-    tips = leaving._replace(time_us=time, gap_nm=gap, velocity_nm_per_us=velocity)
+    tips = leaving._replace(
+        time_us=np.append(period * across, usual.time_us),
+        gap_nm=np.append(leaving.gap_nm[1:], usual.position_nm - platform.position(usual.time_us)),
+        velocity_nm_per_us=np.append(platform.velocity(period * across) + faster, usual.velocity_nm_per_us),
+    )
     _, record = tips_after_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=accuracy)
     turns = record.departure_periods + record.departure_us / period + float(seen.frame.phase_rad) / (2.0 * np.pi)
     rebound = record.velocity_after_nm_per_us - np.asarray(platform.velocity(record.departure_us))
@@ -471,7 +466,5 @@ def _heights(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array) -
     level, rate = surface.position_and_velocity(begin_us)
     height, velocity, lasts = level + gap_of_departure(scene), rate + rebound, arrival_us - begin_us
     flights = begin_us, height, velocity, jnp.zeros_like(begin_us), lasts
-    lowest = lowest_gap(scene.cantilever, surface, flights, _SAMPLES)
-    ends = FlightEnds(begin_us, lasts, height, velocity, *scene.cantilever.propagator(lasts)(height, velocity))
-    highest = jax.vmap(lambda flight: highest_of_flight(scene.cantilever, flight, response))(ends)
-    return jnp.max(highest), lowest - scene.interaction.bridge_forms_nm
+    lowest = lowest_gap(scene.cantilever, surface, flights, _SAMPLES) - scene.interaction.bridge_forms_nm
+    return highest_of_flights(scene.cantilever, response, flights, _SAMPLES), lowest

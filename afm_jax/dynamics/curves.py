@@ -7,14 +7,13 @@ test function of the family changes its sign between two points the root is loca
 On curves in two parameters the test function is solved for together with the closing conditions.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.dynamics.impact_loop import CAPTURE, FOLD, LoopFamily
+from afm_jax.dynamics.impact_loop import CAPTURE, FOLD, LoopFamily, rolled_states
 from afm_jax.solve.arclength import point_in_plane
 from afm_jax.solve.derivatives import bracketed_root
 from afm_jax.solve.newton import Newton
@@ -157,24 +156,19 @@ def _unlike_a_shorter_loop(first: CurvePoint, family: LoopFamily) -> Callable[[C
     None where a loop of so many impacts and periods cannot. A curve that comes to a loop of fewer impacts goes through
     it, back along its own loops begun with another impact: the sign changes there.
     """
-    count = (len(first.point) - len(family.paths)) // 2
-    divisor = math.gcd(count, int(family.order))
-    shifts = [count // parts for parts in range(2, divisor + 1) if divisor % parts == 0]
+    parameters = len(family.paths)
+    count = (len(first.point) - parameters) // 2
+    shifts = [shift for shift in range(1, count) if count % shift == 0 and int(family.order) % (count // shift) == 0]
     if not shifts:
         return None
 
     def differences(point: CurvePoint) -> np.ndarray:
-        state = _state(point.point, count)
-        return np.stack([np.roll(state, shift, axis=1) - state for shift in shifts]).reshape(len(shifts), -1)
+        rolled = rolled_states(point.point[:-parameters])
+        return (rolled[shifts] - rolled[0]).reshape(len(shifts), -1)
 
     towards = differences(first)
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     return lambda point: float(np.min(np.sum(differences(point) * towards, axis=1)))
-
-
-def _state(point: np.ndarray, count: int) -> Float[np.ndarray, "3 m"]:
-    """Return the impacts of a loop, whole turns of the phases left out: cosine, sine, coordinate."""
-    return np.stack([np.cos(point[:count]), np.sin(point[:count]), point[count : 2 * count]])
 
 
 def _reversed(point: CurvePoint) -> CurvePoint:
@@ -216,17 +210,13 @@ def lies_on(point: np.ndarray, curve: FollowedCurve, family: LoopFamily) -> bool
         rise = high[-1] - low[-1]
         guess = low + ((point[-1] - low[-1]) / rise if rise else 0.0) * (high - low)
         guess[-1] = point[-1]
-        on_curve = solved_point(guess, np.eye(len(guess))[-1], family)
-        if on_curve is not None and _same_loop(on_curve.point, point, parameters):
+        found = solved_point(guess, np.eye(len(guess))[-1], family)
+        if found is None or np.abs(found.point - point)[-parameters:].max() > _SAME:
+            continue
+        rolled, state = rolled_states(found.point[:-parameters]), rolled_states(point[:-parameters])[0]
+        if np.abs(rolled - state).max(axis=(1, 2), initial=0.0).min() < _SAME:
             return True
     return False
-
-
-def _same_loop(point: np.ndarray, other: np.ndarray, parameters: int) -> bool:
-    count = (len(point) - parameters) // 2
-    state, other_state = _state(point, count), _state(other, count)
-    apart = min(np.abs(np.roll(state, turn, axis=1) - other_state).max(initial=0.0) for turn in range(max(count, 1)))
-    return bool(apart < _SAME and np.abs(point - other)[-parameters:].max() < _SAME)
 
 
 def tested_by(test: int, family: LoopFamily) -> Callable[[CurvePoint], float]:

@@ -12,9 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
@@ -37,8 +36,6 @@ _MOST_IMPACTS = 1_200_000
 """Impacts recorded together: of long motions a block holds fewer."""
 _BEYOND = 1e-3
 """Time after a departure, in free periods, at which this contact is over and the next one has not begun."""
-_PUSH = 1e-3
-"""Of the speed off the platform, by which a tip leaves an unstable orbit."""
 _GROWS = 1e-9
 """Larger exponent per impact above which an orbit is unstable; below it is rounding."""
 _ARRIVED = 1e-8
@@ -55,7 +52,6 @@ class Lyapunov(ResultTuple):
         exponents_per_us: exponents per time, in 1/us; minus infinity and NaN where those per impact are.
         exponents_per_impact_error: standard errors from the means of twenty parts; of an orbit how far it may be off.
         exponents_per_us_error: standard errors of the exponents in 1/us, likewise.
-        mean_log_determinant: mean of ln |det| of the map's Jacobian.
         impacts: how many the means are over.
         rested: how many of them ended in a rest.
         verdicts: what the motions have come to.
@@ -68,7 +64,6 @@ class Lyapunov(ResultTuple):
     exponents_per_us: Float[np.ndarray, "lanes 2"]
     exponents_per_impact_error: Float[np.ndarray, "lanes 2"]
     exponents_per_us_error: Float[np.ndarray, "lanes 2"]
-    mean_log_determinant: Float[np.ndarray, " lanes"]
     impacts: Int[np.ndarray, " lanes"]
     rested: Int[np.ndarray, " lanes"]
     verdicts: Verdicts
@@ -154,7 +149,7 @@ class Lyapunov(ResultTuple):
 
 _TOLD = (
     *("exponents_per_us", "exponents_per_impact", "exponents_per_us_error", "exponents_per_impact_error"),
-    *("mean_log_determinant", "impacts", "rested"),
+    *("impacts", "rested"),
 )
 """Attributes of `Lyapunov` that are keys of its JSON object."""
 CHAOTIC_ERRORS = 3.0
@@ -163,11 +158,12 @@ CHAOTIC_ERRORS = 3.0
 
 def exponent_verdicts(exponents: Lyapunov) -> list[str]:
     """Return in words what the exponents of each of many motions say."""
-    words, unstable = [], on_unstable_orbit(exponents)
+    words = []
     for lane, name in enumerate(exponents.verdicts.names()):
         kind = exponents.verdicts.kind[lane]
         larger, error = exponents.exponents_per_impact[lane, 0], exponents.exponents_per_impact_error[lane, 0]
-        if unstable[lane]:
+        if kind == MotionKind.ORBIT and larger > max(_GROWS, error):
+            # rounding holds the motion there: no neighbour comes to it
             words.append(f"undecided: the motion stays on a {name} orbit that is unstable; try another [start]")
         elif kind == MotionKind.ORBIT:
             forgets = ", the tip rests on the platform and forgets its start" if np.isneginf(larger) else ""
@@ -191,12 +187,6 @@ _WITHOUT_EXPONENTS = {
     MotionKind.FREE: "free: the tip no longer meets the platform",
     MotionKind.UNRESOLVED: f"unresolved: the motion comes {WHY_UNRESOLVED}",
 }
-
-
-def on_unstable_orbit(exponents: Lyapunov) -> Bool[np.ndarray, " lanes"]:
-    """Say which of many motions repeat on an orbit with a multiplier outside the unit circle."""
-    larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
-    return (exponents.verdicts.kind == MotionKind.ORBIT) & (larger > np.maximum(_GROWS, error))
 
 
 @checked
@@ -232,31 +222,16 @@ def lyapunov_spectrum(
     single = scene.platform.frequency_khz.ndim == 0
     scenes, tips = batch_and_tips(seen.scenes, None if start is None else seen.start(start))
 
-    lengths = {"impacts": impacts, "transient": transient, "accuracy": accuracy}
-    exponents = exponents_of(scenes, tips, **lengths, report=report)
-    unstable = on_unstable_orbit(exponents)
-    if unstable.any():
-        # rounding may hold a tip on such an orbit for ever: no neighbour comes to it
-        velocity = np.asarray(tips.velocity_nm_per_us)
-        speed = velocity - np.asarray(jax.vmap(Platform.velocity)(scenes.platform, jnp.asarray(tips.time_us)))
-        pushed = tips._replace(velocity_nm_per_us=velocity + np.where(unstable, _PUSH * np.abs(speed), 0.0))
-        exponents = exponents_of(scenes, pushed, **lengths)
-    return jax.tree.map(lambda part: part[0], exponents) if single else exponents
-
-
-def exponents_of(
-    scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float, report: Report | None = None
-) -> Lyapunov:
-    """Return the exponents of motions in a batch of scenes; arguments as for `lyapunov_spectrum`."""
-
     def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
         return _exponents_of_block(*lanes, impacts=impacts, transient=transient, accuracy=accuracy)
 
     if isinstance(scenes.interaction, Contact):
-        return work((scenes, tips))
-    block = max(1, min(LANES, _MOST_IMPACTS // impacts))
-    widths = [width for width in WIDTHS if width <= block]
-    return in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
+        exponents = work((scenes, tips))
+    else:
+        block = max(1, min(LANES, _MOST_IMPACTS // impacts))
+        widths = [width for width in WIDTHS if width <= block]
+        exponents = in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
+    return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 
 def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:
@@ -306,13 +281,11 @@ def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: i
 
     per_impact = mean_and_error(made, np.ones(len(period)))
     per_us = mean_and_error(time_us, verdicts.periods * period / np.maximum(verdicts.impacts, 1) + ~orbit)
-    mean_determinant = determinant.sum(axis=0) / np.where(measured, made.sum(axis=0), 1.0)
     return Lyapunov(
         exponents_per_impact=per_impact[0],
         exponents_per_us=per_us[0],
         exponents_per_impact_error=per_impact[1],
         exponents_per_us_error=per_us[1],
-        mean_log_determinant=known(np.where(orbit, of_orbits.sum(axis=1), mean_determinant), -np.inf),
         impacts=made.sum(axis=0),
         rested=rested,
         verdicts=verdicts,

@@ -152,15 +152,18 @@ def nearest_approach(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: in
         loop: what it closes.
         samples: heights computed in every flight.
     """
+    return lowest_gap(loop.cantilever, loop.surface, _flights(unknowns, loop), samples)
+
+
+def _flights(unknowns: Float[Array, " n"], loop: ImpactLoop) -> tuple[Float[Array, " m"], ...]:
+    """Return the flights of a loop as `lowest_gap` takes them; of a tip that meets nothing its rest in the frame."""
     if unknowns.shape[0] == 0:
         zero = jnp.zeros((1,))
-        flights = zero, zero, zero, zero, _RESTING_PERIODS * loop.period_us[None]
-    else:
-        impacts = impacts_at(unknowns, loop)
-        # a flight counts from max(t_in, t_out) on
-        first = jnp.maximum(-impacts.speeds.delay, 0.0)
-        flights = impacts.leaving_us, impacts.height, impacts.velocity, first, impacts.duration_us
-    return lowest_gap(loop.cantilever, loop.surface, flights, samples)
+        return zero, zero, zero, zero, _RESTING_PERIODS * loop.period_us[None]
+    impacts = impacts_at(unknowns, loop)
+    # a flight counts from max(t_in, t_out) on
+    first = jnp.maximum(-impacts.speeds.delay, 0.0)
+    return impacts.leaving_us, impacts.height, impacts.velocity, first, impacts.duration_us
 
 
 def lowest_gap(
@@ -228,15 +231,23 @@ def flies(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Bool[Array, ""]:
 
 def highest_point(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> Array:
     """Return the largest height of the tip above its rest position, in nm."""
-    response = loop.response
-    if unknowns.shape[0] == 0:
-        zero = jnp.zeros(())
-        free = FlightEnds(zero, loop.period_us, zero, zero, zero, zero)
-        return highest_of_flight(loop.cantilever, free, response, samples)
-    impacts = impacts_at(unknowns, loop)
-    end, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
-    flights = FlightEnds(impacts.leaving_us, impacts.duration_us, impacts.height, impacts.velocity, end, speed)
-    return largest(jax.vmap(lambda flight: highest_of_flight(loop.cantilever, flight, response, samples))(flights))
+    return highest_of_flights(loop.cantilever, loop.response, _flights(unknowns, loop), samples)
+
+
+def highest_of_flights(
+    cantilever: Cantilever, response: Surface | None, flights: tuple[Float[Array, " m"], ...], samples: int
+) -> Float[Array, ""]:
+    """Return the largest height of flights in nm in the lab; arguments as of `lowest_gap` and `highest_of_flight`."""
+    begin_us, height, velocity, _, lasts_us = flights
+    ends = FlightEnds(begin_us, lasts_us, height, velocity, *cantilever.propagator(lasts_us)(height, velocity))
+    return largest(jax.vmap(lambda flight: highest_of_flight(cantilever, flight, response, samples))(ends))
+
+
+def rolled_states(loop: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m 3 m"]:
+    """Return the impacts of a loop in turn, begun with each of them: cosine and sine of the phase, speed."""
+    phases, speeds = np.split(loop, 2)
+    state = np.stack([np.cos(phases), np.sin(phases), speeds])
+    return np.stack([np.roll(state, -shift, axis=1) for shift in range(max(len(phases), 1))])
 
 
 class LoopReading(eqx.Module):

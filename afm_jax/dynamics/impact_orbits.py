@@ -26,6 +26,7 @@ from afm_jax.dynamics.impact_loop import (
     impacts_at,
     nearest_approach,
     reading_of,
+    rolled_states,
     trace_and_determinant_of,
 )
 from afm_jax.dynamics.starts import evenly_spread
@@ -343,20 +344,18 @@ def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[A
 
 def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
     """Return each loop once, its hardest impact first; without those that repeat a shorter one."""
-    count = loops.shape[1] // 2
-    distinct, result = np.zeros((0, 3, count)), []
+    count, result, known = loops.shape[1] // 2, [], np.zeros((0, 3, loops.shape[1] // 2))
     for unknowns in loops:
-        phases, sizes = unknowns[:count], unknowns[count:]
+        phases, speeds = unknowns[:count], unknowns[count:]
         if np.any(np.diff(phases) <= 0.0) or phases[-1] - phases[0] >= 2.0 * np.pi * order:
             continue
-        first = int(np.argmax(np.round(sizes / sizes.max(), 7)))
+        first = int(np.argmax(np.round(speeds / speeds.max(), 7)))
         turned = np.concatenate([phases[first:], phases[:first] + 2.0 * np.pi * order])
         turned -= 2.0 * np.pi * np.floor(turned[0] / (2.0 * np.pi))
-        states = np.stack([np.cos(turned), np.sin(turned), np.roll(sizes, -first) / sizes.max()])
-        rolled = [np.roll(states, -shift, axis=1) for shift in range(count)]
-        repeats = any(np.abs(states - rolled[shift]).max() < _SAME for shift in range(1, count) if count % shift == 0)
-        if repeats or any((np.abs(distinct - each).max(axis=(1, 2)) < _SAME).any() for each in rolled):
-            continue
-        distinct = np.concatenate([distinct, states[None]])
-        result.append(np.concatenate([turned, np.roll(sizes, -first)]))
+        speeds = np.roll(speeds, -first)
+        rolled = rolled_states(np.append(turned, speeds / speeds.max()))
+        shorter = [shift for shift in range(1, count) if count % shift == 0]
+        if not any((np.abs(others - rolled[0]).max(axis=(1, 2)) < _SAME).any() for others in (rolled[shorter], known)):
+            known = np.concatenate([known, rolled])
+            result.append(np.append(turned, speeds))
     return np.array(result).reshape(-1, 2 * count)

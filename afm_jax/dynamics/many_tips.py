@@ -151,30 +151,45 @@ def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> tuple[Tips, 
     stuck = (captured & law.adheres) | held
     goes_on = landed & ~stuck
     outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
-    passed = jnp.floor(jnp.where(goes_on, time, 0.0) / surface.period_us)
-    end = Tips(
-        time_us=jnp.where(goes_on, time - passed * surface.period_us, tips.time_us),
-        periods=tips.periods + passed,
-        gap_nm=jnp.where(goes_on, gap, 0.0),
-        velocity_nm_per_us=jnp.where(goes_on, velocity, tips.velocity_nm_per_us),
+    arrival, time, velocity = (jnp.where(goes_on, part, jnp.nan) for part in (impact.arrival_time_us, time, velocity))
+    approach = surface.velocity(arrival) - impact.velocity_before_nm_per_us
+    record = _record(tips.periods, surface.period_us, arrival, approach, time, velocity)
+    return _departed(tips, record, goes_on, outcome, gap), record._replace(rested=goes_on & rested)
+
+
+def _record(periods: Array, period_us: Array, arrival: Any, approach: Any, departure: Any, velocity: Any) -> Record:
+    """Return the record of impacts, none of which rested.
+
+    Args:
+        periods: whole drive periods before the beginning from which times count.
+        period_us: of the drive.
+        arrival: times in us, NaN where there is no impact.
+        approach: speeds in nm/us, of the platform and the tip.
+        departure: times in us, NaN where there is no impact.
+        velocity: in nm/us, in the lab, at the departure.
+    """
+    arrivals, departures = jnp.floor(arrival / period_us), jnp.floor(departure / period_us)
+    return Record(
+        arrival_us=arrival - arrivals * period_us,
+        approach_nm_per_us=approach,
+        departure_us=departure - departures * period_us,
+        velocity_after_nm_per_us=velocity,
+        arrival_periods=periods + arrivals,
+        departure_periods=periods + departures,
+        rested=jnp.zeros(jnp.shape(arrival), bool),
+    )
+
+
+def _departed(tips: Tips, last: Record, goes_on: Array, outcome: Array, gap_nm: Array) -> Tips:
+    """Return tips that go on from their last impacts with an outcome; those that had ended before stay as they are."""
+    going = tips.outcome == Outcome.IMPACT
+    return Tips(
+        time_us=jnp.where(goes_on, last.departure_us, tips.time_us),
+        periods=jnp.where(goes_on, last.departure_periods, tips.periods),
+        gap_nm=jnp.where(goes_on, gap_nm, tips.gap_nm),
+        velocity_nm_per_us=jnp.where(goes_on, last.velocity_after_nm_per_us, tips.velocity_nm_per_us),
         outcome=jnp.where(going, outcome, tips.outcome).astype(tips.outcome.dtype),
     )
-    arrival = jnp.where(goes_on, impact.arrival_time_us, 0.0)
-    passed = jnp.floor(arrival / surface.period_us)
-
-    def if_it_goes_on(value: Array) -> Array:
-        return jnp.where(goes_on, value, jnp.nan)
-
-    record = Record(
-        arrival_us=if_it_goes_on(arrival - passed * surface.period_us),
-        approach_nm_per_us=if_it_goes_on(surface.velocity(arrival) - impact.velocity_before_nm_per_us),
-        departure_us=if_it_goes_on(end.time_us),
-        velocity_after_nm_per_us=if_it_goes_on(end.velocity_nm_per_us),
-        arrival_periods=if_it_goes_on(tips.periods + passed),
-        departure_periods=if_it_goes_on(end.periods),
-        rested=goes_on & rested,
-    )
-    return end, record
 
 
 def _flight_of(scene: Scene, tip: Tips) -> Flight:
@@ -262,28 +277,14 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
         [Outcome.IMPACT, Outcome.CAPTURED, Outcome.NO_FURTHER_IMPACT],
         Outcome.STEP_LIMIT,
     )
-    goes_on = going & full
-    passed, passed_at_arrival = np.floor(departure / period[:, None]), np.floor(arrival / period[:, None])
-    velocity = np.where(leaves, contacts.departure_velocity_nm_per_us, np.nan)
-
-    time_in_period = departure - passed * period[:, None]
-    end = Tips(
-        time_us=np.where(goes_on, time_in_period[:, -1], tips.time_us),
-        periods=tips.periods + np.where(goes_on, passed[:, -1], 0.0),
-        gap_nm=np.where(goes_on, np.asarray(gap_of_departure(scenes)), tips.gap_nm),
-        velocity_nm_per_us=np.where(goes_on, velocity[:, -1], tips.velocity_nm_per_us),
-        outcome=np.where(going, outcome, tips.outcome).astype(np.int32),
+    approach, velocity = (
+        np.where(leaves, part, np.nan)
+        for part in (contacts.approach_speed_nm_per_us, contacts.departure_velocity_nm_per_us)
     )
-    rows = Record(
-        arrival_us=arrival - passed_at_arrival * period[:, None],
-        approach_nm_per_us=np.where(leaves, contacts.approach_speed_nm_per_us, np.nan),
-        departure_us=time_in_period,
-        velocity_after_nm_per_us=velocity,
-        arrival_periods=tips.periods[:, None] + passed_at_arrival,
-        departure_periods=tips.periods[:, None] + passed,
-        rested=np.zeros_like(leaves),
-    )
-    return end, rows
+    record = _record(tips.periods[:, None], period[:, None], arrival, approach, departure, velocity)
+    last = jax.tree.map(lambda part: part[:, -1], record)
+    end = _departed(tips, last, going & full, outcome, gap_of_departure(scenes))
+    return jax.tree.map(np.asarray, (end, record))
 
 
 @eqx.filter_jit

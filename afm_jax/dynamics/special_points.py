@@ -101,17 +101,11 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
         number: of the branch.
         family: of its loops.
     """
-    roots = [*_roots_on(curve, family), *at_lost_ends(curve)]
-    if not roots:
-        return []
-    roots.sort(key=lambda root: root.position)
-    readings = family.readings(np.stack([point for root in roots for point in root.seen]))
     low, width = float(family.low[0]), float(family.width[0])
-    special, first = [], 0
-    for root in roots:
-        reading = jax.tree.map(lambda column, first=first: column[first], readings)
-        admissible = bool(readings.admissible[first : first + len(root.seen)].any())
-        first += len(root.seen)
+    special = []
+    for root in sorted([*_roots_on(curve, family), *at_lost_ends(curve)], key=lambda root: root.position):
+        readings = family.readings(np.stack(root.seen))
+        reading, admissible = jax.tree.map(lambda column: column[0], readings), bool(readings.admissible.any())
         kind = _kind_of(root.test, root.point, family)
         if root.test == CAPTURE and kind == KINDS[GRAZING] and not admissible:
             # the tip rests while the sample goes through it: no motion comes to that
