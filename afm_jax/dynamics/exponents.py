@@ -77,10 +77,8 @@ class Lyapunov(ResultTuple):
         motions = self._motions()
         if not np.isnan(motions.exponents_per_impact[:, 0]).all():
             return None
-        verdicts = exponent_verdicts(motions)
-        most = "at most " if len(verdicts) > 1 else ""
-        words = "; ".join(dict.fromkeys(verdicts))
-        return f"{words}; there were {most}{int(motions.impacts.max())} impacts to average over"
+        words = "; ".join(dict.fromkeys(exponent_verdicts(motions)))
+        return f"{words}; there were at most {int(motions.impacts.max())} impacts to average over"
 
     @property
     def impact_speeds_nm_per_us(self) -> Float[np.ndarray, "*lanes last"]:
