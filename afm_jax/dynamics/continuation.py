@@ -177,12 +177,9 @@ class Continuation(ResultTuple):
                 "branch": "branch:d",
                 "admissible": "admissible",
             }
-            rows = self._special_rows()
-            if any("interval95" in row for row in rows):
-                cells["95 % interval"] = lambda row: (
-                    "{:.5g} to {:.5g}".format(*row["interval95"]) if "interval95" in row else ""
-                )
-            parts.append(printed_table("Special points", cells, rows))
+            if self.special_errors is not None:
+                cells["95 % interval"] = lambda row: "{:.5g} to {:.5g}".format(*row["interval95"])
+            parts.append(printed_table("Special points", cells, self._special_rows()))
         for curve in self.curves:
             ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
             parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")

@@ -57,12 +57,8 @@ class SampleDriven(NamedTuple):
         time, wave = jnp.asarray(time_us), self.frame.response
         if wave is None:
             return jnp.zeros_like(time), jnp.zeros_like(time)
-        cosine, sine, omega = (
-            part.reshape(*part.shape, *[1] * (time.ndim - part.ndim))
-            for part in (wave.cosine, wave.sine, wave.angular_frequency)
-        )
-        turned = jnp.cos(omega * time), jnp.sin(omega * time)
-        return cosine * turned[0] + sine * turned[1], omega * (sine * turned[0] - cosine * turned[1])
+        columns = jax.tree.map(lambda part: part.reshape(*part.shape, *[1] * (time.ndim - part.ndim)), wave)
+        return columns.value_and_rate(time)
 
 
 def sample_driven(scenes: Scene) -> SampleDriven:
