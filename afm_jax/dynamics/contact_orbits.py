@@ -453,7 +453,7 @@ def _reading_of(flown: FlownLoop) -> LoopReading:
         "admissible": True,
         "missing": np.abs(flown.gaps * np.repeat([1.0, 1.0 / rebound.max()], len(phase))).max(),
     }
-    return LoopReading(**values)
+    return LoopReading(**{name: jnp.asarray(value) for name, value in values.items()})
 
 
 @compiled_quickly()

@@ -12,7 +12,7 @@ import abc
 import math
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -243,7 +243,7 @@ def highest_of_flights(
     return largest(jax.vmap(lambda flight: highest_of_flight(cantilever, flight, response, samples))(ends))
 
 
-def rolled_states(loop: Float[np.ndarray, " n"]) -> Float[np.ndarray, "m 3 m"]:
+def rolled_states(loop: Float[np.ndarray, " n"]) -> Float[np.ndarray, "shifts 3 m"]:
     """Return the impacts of a loop in turn, begun with each of them: cosine and sine of the phase, speed."""
     phases, speeds = np.split(loop, 2)
     state = np.stack([np.cos(phases), np.sin(phases), speeds])
@@ -335,7 +335,7 @@ class LoopFamily(eqx.Module):
     """Number of the test function that is 0 besides; None: none is."""
 
     @classmethod
-    def of(cls, scene: Scene, order: int, ranges: Sequence[ParameterRange] = (), **settings: Any) -> Self:
+    def of(cls, scene: Scene, order: int, ranges: Sequence[ParameterRange] = (), **settings: Any) -> Any:
         """Return the loops of one scene in N drive periods, over the ranges of some parameters; the unit is 1 nm/us.
 
         Raises:

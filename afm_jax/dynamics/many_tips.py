@@ -157,7 +157,7 @@ def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> tuple[Tips, 
     return _departed(tips, record, goes_on, outcome, gap), record._replace(rested=goes_on & rested)
 
 
-def _record(periods: Array, period_us: Array, arrival: Any, approach: Any, departure: Any, velocity: Any) -> Record:
+def _record(periods: Any, period_us: Any, arrival: Any, approach: Any, departure: Any, velocity: Any) -> Record:
     """Return the record of impacts, none of which rested.
 
     Args:
@@ -180,7 +180,7 @@ def _record(periods: Array, period_us: Array, arrival: Any, approach: Any, depar
     )
 
 
-def _departed(tips: Tips, last: Record, goes_on: Array, outcome: Array, gap_nm: Array) -> Tips:
+def _departed(tips: Tips, last: Record, goes_on: Any, outcome: Any, gap_nm: Any) -> Tips:
     """Return tips that go on from their last impacts with an outcome; those that had ended before stay as they are."""
     going = tips.outcome == Outcome.IMPACT
     return Tips(
