@@ -8,7 +8,7 @@ again for parameters drawn from the normal distribution with covariance C.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,7 +99,8 @@ def amplitude_errors(
 
 def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, test: int | None) -> LawLoops:
     """Return the loops of a continuation with the uncertain parameters behind the followed one."""
-    family, zero, unit = continuation.family, jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
+    family: Any = continuation.family
+    zero, unit = jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
     low, width = jnp.concatenate([family.low[:1], zero]), jnp.concatenate([family.width[:1], unit])
     return replace(family, low=low, width=width, paths=(continuation.range.path, *uncertain.paths), test=test)
 

@@ -273,7 +273,8 @@ def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: R
     length = -(-count // _STRETCHES)
     numbers = starts = np.arange(0, count, length)
     few = {} if isinstance(scenes.interaction, Contact) else {"block": _FEW, "widths": (_FEW,)}
-    rows = motions_of(*_rows_of((scenes, fresh), starts), impacts, accuracy=accuracy, **few)
+    at, begin = _rows_of((scenes, fresh), starts)
+    rows = motions_of(at, begin, impacts, accuracy=accuracy, **few)
     # no motion is of the kind -1
     ramped = jax.tree.map(lambda part: np.full((count, *part.shape[1:]), -1, part.dtype), rows)
     for step in range(1, length + _LONGEST_AGAIN):
@@ -345,7 +346,7 @@ def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray) -> Float[np.
         part[:, some][:, :-1, None] for part in (record.departure_us, record.velocity_after_nm_per_us)
     )
 
-    def height_of(scene: Scene, departure: Array, velocity: Array, flown: Array) -> Array:
+    def height_of(scene: Scene, departure: Any, velocity: Any, flown: Any) -> Array:
         start = scene.platform.position(departure) + gap_of_departure(scene)
         return scene.cantilever.propagator(flown)(start, velocity)[0]
 

@@ -247,7 +247,7 @@ def _where_contact_ends(
     """
     surface, _ = surface_of(scene)
     omega, gap = float(drive_of(scene).angular_frequency), float(gap_of_departure(scene))
-    begin, rise = phases / omega, gap / rebounds
+    begin, rise, speed = phases / omega, gap / rebounds, rebounds
     height, rate = surface.position_and_velocity(begin)
     for _ in range(_RISING):
         position, velocity = scene.cantilever.propagator(rise)(height, rate + rebounds)
@@ -429,7 +429,7 @@ def _readings_of(flown: Sequence[FlownLoop], impacts: int) -> LoopReading:
     """Return what there is to know of closed loops of m contacts, NumPy arrays with a leading axis of loops."""
     if not flown:
         each, whole = jnp.zeros((0, impacts)), jnp.zeros(0)
-        return LoopReading(*[each] * 6, *[whole] * 3, whole > 0.0, whole)
+        return LoopReading(*[*[each] * 6, *[whole] * 3, whole > 0.0, whole])
     return jax.tree.map(lambda *numbers: np.stack([np.asarray(each) for each in numbers]), *map(_reading_of, flown))
 
 

@@ -233,7 +233,7 @@ def recorded(scenes: Scene, tips: Tips, skip: int | Int[Array, ""] = 0, *, impac
 
     counts = jnp.ones(impacts, int).at[0].add(skip)
     no_number, no = jnp.full(tips.time_us.shape, jnp.nan), jnp.zeros(tips.time_us.shape, bool)
-    (tips, _), rows = lax.scan(next_row, (tips, Record(*[no_number] * 6, no)), counts)
+    (tips, _), rows = lax.scan(next_row, (tips, Record(*[*[no_number] * 6, no])), counts)
     return tips, rows
 
 
@@ -250,7 +250,7 @@ def tips_after_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, ac
     """
     tips = jax.tree.map(np.asarray, tips)
     no_number = np.full((len(tips.time_us), record), np.nan)
-    kept = Record(*[no_number] * 6, np.zeros_like(no_number, bool))
+    kept = Record(*[*[no_number] * 6, np.zeros_like(no_number, bool)])
     for _ in range(-(-skip // _ROWS) + -(-record // _ROWS)):
         tips, rows = _stretch(scenes, tips, accuracy)
         kept = Record(*(np.concatenate(both, axis=1)[:, _ROWS:] for both in zip(kept, rows, strict=True)))
