@@ -171,7 +171,7 @@ class LawLoops(LoopFamily):
         """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
         return float(self.at(jnp.asarray(point))[1].impact.lowest) == 0.0
 
-    def at(self, point: Float[Array, " n"]) -> tuple[Float[Array, " n"], ImpactLoop]:
+    def at(self, point: Float[Array, " n"]) -> tuple[Float[Array, " unknowns"], ImpactLoop]:
         """Return the unknowns at a point of a curve, and what they close there."""
         count = point.shape[0] - len(self.paths)
         scene = self.scene_at(self.low + self.width * point[count:])
