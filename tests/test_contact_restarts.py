@@ -20,7 +20,7 @@ from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.continuation import continue_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.dynamics.many_tips import departure_jacobians, tips_after_contacts
+from afm_jax.dynamics.many_tips import next_departures, tips_after_contacts
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.motion.contact_motion import has_just_left
 from afm_jax.motion.follow import follow_long, state_after
@@ -272,10 +272,13 @@ def test_the_map_of_departures_contracts_by_what_the_air_takes(name):
     rows = motion.contacts
     first, second = (state_after(motion, row) for row in (1, 2))
     batch = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
-    columns = (jnp.asarray(part)[None] for part in (first.time_us, first.velocity_nm_per_us, second.time_us))
-    slopes = departure_jacobians(batch, *columns, accuracy=1e-9)[0]
-    # time and velocity on a surface of constant gap: the area element carries the speed of the gap
-    speeds = np.asarray(rows.rebound_speed_nm_per_us)[1:3]
+    omega, speeds = float(scene.platform.angular_frequency), np.asarray(rows.rebound_speed_nm_per_us)[1:3]
+    departure, until = (
+        jnp.array([[omega * float(first.time_us), speeds[0]]]),
+        omega * jnp.array([second.time_us + 0.01]),
+    )
+    slopes = next_departures(batch, departure, until, accuracy=1e-9)[1][0]
+    # phase and rebound speed on a surface of constant gap: the area element carries the speed of the gap
     passed = float(second.time_us - first.time_us)
     assert np.linalg.det(slopes) == pytest.approx(np.exp(-OMEGA * passed / QUALITY) * speeds[0] / speeds[1], rel=1e-5)
 

@@ -29,7 +29,7 @@ from afm_jax import (
     single_impact_orbits,
 )
 from afm_jax.cli.main import main
-from afm_jax.dynamics import curves
+from afm_jax.dynamics import curves, impact_orbits
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.dynamics.special_points import at_lost_ends
@@ -404,9 +404,9 @@ def test_a_curve_that_is_lost_next_to_a_grazing_has_a_special_point_there(before
         tests = np.array([1.0, 1.0, 1.0, near, 0.4])
         return curves.CurvePoint(np.array([1.0, 0.5, place]), np.array([0.0, 0.0, 1.0]), tests, 0.0)
 
-    leg = curves.CurveLeg(at(0.2, before), at(0.3, last), np.zeros(3), np.zeros(3))
+    leg = curves.CurveLeg(at(0.2, before), at(0.3, last), (np.zeros(3), np.zeros(3)), np.zeros(3))
     with warnings.catch_warnings(action="error"):
-        roots = at_lost_ends(curves.FollowedCurve(leg.begin, [], [leg], ("range", "lost")))
+        roots = at_lost_ends(curves.FollowedCurve([leg], ("range", "lost")))
     assert [root.test for root in roots] == ([] if kind is None else [kind])
     for root in roots:
         place = 0.3 if np.isinf(before) else np.interp(0.0, [-before, -last], [0.2, 0.3]) + 0.1 * last / (before - last)
@@ -419,13 +419,13 @@ def feeding(monkeypatch: pytest.MonkeyPatch):
 
     The test with it is the last of the file: what JAX has compiled for the others is forgotten before and after.
     """
-    true = curves.trace_and_determinant_of
+    true = impact_orbits.trace_and_determinant_of
 
     def more(*arguments):
         trace, determinant = true(*arguments)
         return trace, 1.02 * determinant
 
-    monkeypatch.setattr(curves, "trace_and_determinant_of", more)
+    monkeypatch.setattr(impact_orbits, "trace_and_determinant_of", more)
     jax.clear_caches()
     yield
     jax.clear_caches()

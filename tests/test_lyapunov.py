@@ -61,7 +61,7 @@ def test_exponents_of_orbits_are_the_logarithms_of_their_multipliers(found):
         period = float(law_scene(reduced).platform.period_us)
         np.testing.assert_allclose(found.exponents_per_us[lane], wanted / period, rtol=0, atol=1e-8)
         # undamped, without adhesion: the determinant is r^2
-        assert found.mean_log_determinant[lane] == pytest.approx(2.0 * np.log(0.8), abs=1e-10)
+        assert found.exponents_per_impact[lane].sum() == pytest.approx(2.0 * np.log(0.8), abs=1e-10)
 
 
 @pytest.mark.slow
@@ -80,7 +80,6 @@ def test_the_larger_exponent_is_the_growth_of_neighbouring_motions(found):
     assert len(grown) > lanes // 4
     spread = np.std(grown) / np.sqrt(len(grown))
     assert abs(larger - np.mean(grown)) < 4.0 * np.hypot(error, spread) + 0.02
-    assert larger + smaller == pytest.approx(found.mean_log_determinant[-1], abs=1e-10)
     # the speeds' ratios of many flights cancel but for the ends: 2 ln r is left
     assert larger + smaller == pytest.approx(2.0 * np.log(0.8), abs=5e-3)
 
@@ -104,7 +103,7 @@ def test_a_tip_that_rests_is_followed_like_a_simulation_and_forgets_its_start():
 
 
 @pytest.mark.slow
-def test_no_motion_stays_on_an_unstable_orbit():
+def test_a_motion_that_stays_on_an_unstable_orbit_is_undecided():
     """A lever of 159 kHz over a resting sample, driven by a force: its (1,1) orbit has the multipliers -2.24, -0.26."""
     drive = np.linspace(437.0, 437.3, 80)
     lever, law = afm.Cantilever(159.155, 25.0), afm.ImpactLaw(0.8)
@@ -119,7 +118,9 @@ def test_no_motion_stays_on_an_unstable_orbit():
     # of starts on the orbit itself about every seventh comes back to the very same numbers
     start = State(phase / (2e-3 * np.pi * drive), np.zeros_like(phase), velocity)
     from_orbits = lyapunov_spectrum(scenes, start, **LONG)
-    assert "(1,1)" not in from_orbits.verdicts.names()
+    stay = [name == "(1,1)" for name in from_orbits.verdicts.names()]
+    assert any(stay)
+    assert ["unstable" in words for words in exponent_verdicts(from_orbits)] == stay
     found = lyapunov_spectrum(scene, impacts=2000, transient=500)
     assert (found.verdicts.impacts, found.verdicts.periods) == (30, 24)
     # 30 impacts in 24 periods: the determinant of the map is r^2 exp(-Omega T/Q)
@@ -154,7 +155,6 @@ def test_the_contact_is_chaotic_at_high_frequency():
     start, found = starts[int(np.argmax(certain))], spectra[int(np.argmax(certain))]
     larger, error = found.exponents_per_impact[0], found.exponents_per_impact_error[0]
     assert larger > 5.0 * error
-    assert found.exponents_per_impact.sum() == pytest.approx(found.mean_log_determinant, abs=1e-10)
     # pairs of close tips, simulated: how far they part from the third contact to the tenth
     lanes, few = 10, 24
     scenes, tips = batch_and_tips(scene, start)

@@ -23,10 +23,10 @@ def basins(
     """Find the motion on which each start of a scene ends.
 
     A start is a drive phase and a speed at which the tip leaves the platform, at most four times the platform's top
-    speed unless --speeds says otherwise. Attractors are named (m,N), m impacts in N drive periods, chaotic (the larger
-    Lyapunov exponent is positive), irregular, stuck or free. The output gives the fraction of the starts that end on
-    each, with the errors of as many random starts. With --law fractions have a band from drawn laws. With --out
-    basins.csv (a row a start), attractors.csv and a picture. Exit code 3 if starts could not be followed.
+    speed unless --speeds says otherwise. Attractors are named (m,N), m impacts in N drive periods, irregular, stuck or
+    free. The output gives the fraction of the starts that end on each, with the errors of as many random starts. With
+    --law fractions have a band from drawn laws. With --out basins.csv (a row a start), attractors.csv and a picture.
+    Exit code 3 if starts could not be followed.
 
     Args:
         session: for progress.

@@ -28,9 +28,9 @@ def lyapunov(
     platform forgets its start: its exponents are minus infinity, null in JSON. The motion begins at the file's [start];
     without one where `simulate` begins: on a single-impact orbit of the order nearest to resonance, or just beside it
     if it is unstable, else leaving the sample upward. With --parameter or --law it begins on a stable orbit or leaves
-    the sample upward. An orbit is reported only if it is stable. With --law the larger exponent has a band, whose
-    motions do not use [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 if every motion
-    ends before enough impacts.
+    the sample upward. A motion that stays on an unstable orbit is undecided. With --law the larger exponent has a band,
+    whose motions do not use [start]. With --out lyapunov.csv, and with --parameter a picture. Exit code 3 if every
+    motion ends before enough impacts.
 
     Args:
         session: for progress.

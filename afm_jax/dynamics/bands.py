@@ -8,7 +8,7 @@ again for parameters drawn from the normal distribution with covariance C.
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +19,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
 from afm_jax.dynamics.bifurcations import BifurcationDiagram, bifurcation_diagram
 from afm_jax.dynamics.continuation import Continuation
-from afm_jax.dynamics.curves import BLOCK, equations_at, loop_at
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.dynamics.impact_loop import LoopFamily, closing_gaps, highest_point
+from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
+from afm_jax.dynamics.impact_orbits import BLOCK, LawLoops
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.solve.lanes import in_blocks
@@ -42,9 +42,9 @@ class UncertainParameters(NamedTuple):
 
     def without(self, path: str) -> "UncertainParameters":
         """Return the parameters without the one of a path, which is varied and has no error of its own."""
-        others = np.array([other != path for other in self.paths])
-        paths = tuple(other for other in self.paths if other != path)
-        return UncertainParameters(paths, self.values[others], self.covariance[np.ix_(others, others)])
+        kept = [number for number, other in enumerate(self.paths) if other != path]
+        paths = tuple(self.paths[number] for number in kept)
+        return UncertainParameters(paths, self.values[kept], self.covariance[np.ix_(kept, kept)])
 
     def possible_draws(self, number: int) -> Float[np.ndarray, "draws parameters"]:
         """Return draws from the normal distribution that are physical: r in (0, 1], nothing else below 0.
@@ -62,6 +62,12 @@ class UncertainParameters(NamedTuple):
         if good.sum() < number:
             raise ValueError("the law's errors are so wide that hardly any draw is a law: there are no bands")
         return drawn[good][:number]
+
+    def scenes(self, scene: Scene, number: int) -> Iterator[Scene]:
+        """Give a scene with drawn parameters, so many times."""
+        family = scene_family(scene, *self.paths)
+        for values in self.possible_draws(number):
+            yield family(*values)
 
 
 def special_errors(continuation: Continuation, uncertain: UncertainParameters) -> Float[np.ndarray, " special"]:
@@ -91,9 +97,10 @@ def amplitude_errors(
     return np.sqrt(np.einsum("ni,ij,nj->n", slope, uncertain.covariance, slope))
 
 
-def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, test: int | None) -> LoopFamily:
+def _with_uncertain(continuation: Continuation, uncertain: UncertainParameters, test: int | None) -> LawLoops:
     """Return the loops of a continuation with the uncertain parameters behind the followed one."""
-    family, zero, unit = continuation.family, jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
+    family: Any = continuation.family
+    zero, unit = jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
     low, width = jnp.concatenate([family.low[:1], zero]), jnp.concatenate([family.width[:1], unit])
     return replace(family, low=low, width=width, paths=(continuation.range.path, *uncertain.paths), test=test)
 
@@ -110,14 +117,14 @@ def _slopes_of_special_point(
 
 
 @jax.jit
-def _slopes_by_uncertain(family: LoopFamily, point: Array) -> Float[Array, "n uncertain"]:
-    slopes = jax.jacfwd(lambda unknowns: equations_at(unknowns, family))(point)
+def _slopes_by_uncertain(family: LawLoops, point: Array) -> Float[Array, "n uncertain"]:
+    slopes = jax.jacfwd(family.equations)(point)
     solved = slopes.shape[0]
     return -jnp.linalg.solve(slopes[:, :solved], slopes[:, solved:])
 
 
 @jax.jit
-def _amplitude_slopes(family: LoopFamily, points: Array) -> Float[Array, "points uncertain"]:
+def _amplitude_slopes(family: LawLoops, points: Array) -> Float[Array, "points uncertain"]:
     """Return the derivatives of the peak amplitude of closed loops by the uncertain parameters."""
 
     def slopes_at(point):
@@ -125,7 +132,7 @@ def _amplitude_slopes(family: LoopFamily, points: Array) -> Float[Array, "points
         followed, uncertain = point[count : count + 1], point[count + 1 :]
 
         def gaps_and_peak(unknowns, values):
-            loop = loop_at(jnp.concatenate([followed, values]), family)
+            _, loop = family.at(jnp.concatenate([unknowns, followed, values]))
             return closing_gaps(unknowns, loop), highest_point(unknowns, loop, family.samples)
 
         slopes = jax.jacfwd(gaps_and_peak, argnums=(0, 1))(point[:count], uncertain)
@@ -187,7 +194,7 @@ def verdict_probability(
         impacts: at each value.
     """
     names, same = np.array(sweep.verdicts.names()), np.zeros(len(sweep.values))
-    for drawn in _drawn(scene, uncertain.without(parameter), draws):
+    for drawn in uncertain.without(parameter).scenes(scene, draws):
         other = bifurcation_diagram(drawn, parameter, sweep.values, start=start, upward=sweep.upward, impacts=impacts)
         same += names == np.array(other.verdicts.names())
     return same / draws
@@ -209,14 +216,8 @@ def drawn_shares(
     rows, columns = (min(count, _STARTS) for count in basins.attractor.shape)
     ends = max(float(speed[0] - half), 0.0), float(speed[-1] + half)
     shares = np.zeros((draws, len(basins.attractors)))
-    for number, drawn in enumerate(_drawn(scene, uncertain, draws)):
+    for number, drawn in enumerate(uncertain.scenes(scene, draws)):
         other = basins_of_attraction(drawn, columns=columns, rows=rows, speeds_nm_per_us=ends)
         there = {attractor.name: share for attractor, share in zip(other.attractors, other.share, strict=True)}
         shares[number] = [there.get(attractor.name, 0.0) for attractor in basins.attractors]
     return np.quantile(shares, _BETWEEN, axis=0).T
-
-
-def _drawn(scene: Scene, uncertain: UncertainParameters, draws: int) -> Iterator[Scene]:
-    family = scene_family(scene, *uncertain.paths)
-    for values in uncertain.possible_draws(draws):
-        yield family(*values)

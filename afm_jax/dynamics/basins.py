@@ -11,34 +11,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
-from afm_jax.columns import rows_of
+from afm_jax.columns import columns_of, rows_of
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of
-from afm_jax.dynamics.many_tips import Record, Tips, advance, follow
+from afm_jax.dynamics.many_tips import Tips, advance
 from afm_jax.dynamics.starts import evenly_spread, leaving_tips, sample_driven, tips_at
-from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, settled_below, verdicts_of
-from afm_jax.outcomes import Outcome
+from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind, kinds_of, motions_of
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.units import within_turn
 
-_SAMPLE = 2048
+_SAMPLE = 512
 _LONG = 1000
 """Impacts after which the motions of a sample are distinguished."""
 _SAME = 1e-3
-"""Distance below which points are those of one orbit."""
-_POINTS = 64
-"""Points of orbits at which starts drop out."""
+"""Distance, of the velocity if that is larger, below which points are those of one orbit."""
 _ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
 """Numbers of impacts after which starts that have arrived drop out."""
 _PART = 8 * LANES
-_ACCURACY = 1e-6
-"""Of resolved contacts."""
 _LEFT = 20_000
 """Largest number of starts that are distinguished one by one in the end."""
 
@@ -94,14 +88,13 @@ class Basins(ResultTuple):
     @property
     def reason(self) -> str | None:
         """Why the shares are not valid: some starts could not be followed; None where all were."""
-        unresolved = sum(
-            share
-            for attractor, share in zip(self.attractors, self.share, strict=True)
-            if attractor.kind == MotionKind.UNRESOLVED
+        lost = np.array([attractor.kind == MotionKind.UNRESOLVED for attractor in self.attractors])
+        unresolved = 100.0 * self.share[lost].sum()
+        return (
+            f"{unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}"
+            if unresolved
+            else None
         )
-        if not unresolved:
-            return None
-        return f"{100.0 * unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}"
 
     @property
     def impact_speeds_nm_per_us(self) -> Float[np.ndarray, " impacts"]:
@@ -110,20 +103,21 @@ class Basins(ResultTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax basins`."""
-        attractors = []
-        for number, attractor in enumerate(self.attractors):
-            told = {
+        attractors = [
+            {
                 "name": attractor.name,
                 "impacts": attractor.impacts,
                 "periods": attractor.periods,
-                "share": self.share[number],
-                "share_error": self.share_error[number],
+                "share": share,
+                "share_error": error,
                 "phase_rad": attractor.phase_rad,
                 "velocity_after_nm_per_us": attractor.velocity_nm_per_us,
             }
-            if self.share_interval95 is not None:
-                told["share_interval95"] = self.share_interval95[number].tolist()
-            attractors.append(told)
+            for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)
+        ]
+        if self.share_interval95 is not None:
+            for attractor, ends in zip(attractors, self.share_interval95.tolist(), strict=True):
+                attractor["share_interval95"] = ends
         return {"starts": self.attractor.size, "attractors": attractors}
 
     def printed(self) -> list[str]:
@@ -131,16 +125,13 @@ class Basins(ResultTuple):
         speeds = self.rebound_speed_nm_per_us
         box = f"{len(self.phase_rad)} drive phases of a period x {len(speeds)} rebound speeds"
         starts = f"Starts: {box} from {speeds[0]:.4g} to {speeds[-1]:.4g} nm/us (`speeds_nm_per_us=...` chooses others)"
-        lines = [
-            f"{attractor.name}: {100.0 * share:.4g} +- {100.0 * error:.2g} % of the starts"
-            for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)
-        ]
-        if self.share_interval95 is not None:
-            ends = 100.0 * self.share_interval95
-            lines = [
-                f"{line}; {low:.4g} to {high:.4g} % in 95 % of the draws"
-                for line, (low, high) in zip(lines, ends, strict=True)
-            ]
+        lines = []
+        for number, attractor in enumerate(self.attractors):
+            share, error = 100.0 * self.share[number], 100.0 * self.share_error[number]
+            lines.append(f"{attractor.name}: {share:.4g} +- {error:.2g} % of the starts")
+            if self.share_interval95 is not None:
+                low, high = 100.0 * self.share_interval95[number]
+                lines[-1] += f"; {low:.4g} to {high:.4g} % in 95 % of the draws"
         if any(attractor.kind == MotionKind.IRREGULAR for attractor in self.attractors):
             lines.append(
                 f"irregular: nothing repeated within {_LONG} impacts; with a high quality factor the motion may still "
@@ -157,21 +148,21 @@ class Basins(ResultTuple):
             "rebound_speed_nm_per_us": speed.ravel(),
             "attractor": names[self.attractor.ravel()],
         }
-        # an attractor without an impact has a row, too
-        nothing = np.array([np.nan])
-        impacts = [max(attractor.phase_rad.size, 1) for attractor in self.attractors]
-        points = {
-            "attractor": np.repeat(names, impacts),
-            "share": np.repeat(self.share, impacts),
-            "share_error": np.repeat(self.share_error, impacts),
-            "phase_rad": np.concatenate(
-                [each.phase_rad if each.phase_rad.size else nothing for each in self.attractors]
-            ),
-            "velocity_after_nm_per_us": np.concatenate(
-                [each.velocity_nm_per_us if each.phase_rad.size else nothing for each in self.attractors]
-            ),
-        }
-        return {"basins.csv": starts, "attractors.csv": points}
+        points = [
+            {
+                "attractor": attractor.name,
+                "share": share,
+                "share_error": error,
+                "phase_rad": phase,
+                "velocity_after_nm_per_us": velocity,
+            }
+            for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)
+            # an attractor without an impact has a row, too
+            for phase, velocity in zip(
+                attractor.phase_rad.tolist() or [None], attractor.velocity_nm_per_us.tolist() or [None], strict=True
+            )
+        ]
+        return {"basins.csv": starts, "attractors.csv": columns_of(points)}
 
 
 @checked
@@ -215,7 +206,8 @@ def basins_of_attraction(
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
     else:
-        finder.look_around(high, low)
+        across, up = evenly_spread(_SAMPLE).T
+        finder.told_apart(finder.tips(2.0 * np.pi * across, low + (high - low) * up))
         label = finder.arrived(starts, report)
     count = np.bincount(label, minlength=len(finder.attractors))
     order = [number for number in np.argsort(-count, kind="stable") if count[number]]
@@ -266,28 +258,20 @@ class _Finder:
         tips = tips_at(scenes, time, np.asarray(_velocity(self.scene.platform, time)) + speed)
         return jax.tree.map(np.asarray, tips)
 
-    def _later(self, tips: Tips, impacts: int, report: Report | None = None) -> tuple[Tips, Record]:
-        """Return tips some impacts later, and the record of the last ones."""
-
-        def work(some: Tips) -> tuple[Tips, Record]:
-            return follow(self.scenes(len(some.time_us)), some, skip=impacts, record=RECORDED, accuracy=_ACCURACY)
-
-        return in_blocks(work, tips, report=report)
-
-    def _distance(
+    def _is_at(
         self, orbit: Attractor, phase: Float[np.ndarray, " points"], velocity: Float[np.ndarray, " points"]
-    ) -> Float[np.ndarray, " points"]:
-        """Return how far points are from the nearest of an orbit's."""
-        turn = (orbit.phase_rad - phase[:, None] + np.pi) % (2.0 * np.pi) - np.pi
-        return np.hypot(turn, (orbit.velocity_nm_per_us - velocity[:, None]) / self.top).min(axis=-1)
+    ) -> Bool[np.ndarray, " points"]:
+        """Say which points are those of an orbit."""
+        turn = (phase[:, None] - orbit.phase_rad + np.pi) % (2.0 * np.pi) - np.pi
+        apart = np.hypot(turn, (velocity[:, None] - orbit.velocity_nm_per_us) / self.top).min(axis=1, initial=np.inf)
+        return apart < _SAME * np.maximum(1.0, np.abs(velocity) / self.top)
 
     def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
         """Return the attractors of motions after a long time; new ones are added to those known."""
-        end, record = self._later(tips, _LONG, report)
-        period = np.full(len(end.time_us), 2.0 * np.pi / self.omega)
-        verdicts = verdicts_of(record, end.outcome, period, tolerance=settled_below(self.scene))
-        label = np.empty(len(period), int)
-        for lane in range(len(period)):
+        count = len(tips.time_us)
+        _, record, verdicts = motions_of(self.scenes(count), tips, _LONG, accuracy=1e-6, report=report)
+        label = np.empty(count, int)
+        for lane in range(count):
             m = int(verdicts.impacts[lane])
             phase = within_turn(self.omega * record.departure_us[lane, -m:], 2.0 * np.pi) if m else np.zeros(0)
             velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
@@ -312,52 +296,27 @@ class _Finder:
                 continue
             if not kind[1]:
                 return number
-            size = max(1.0, np.abs(velocity[-1]) / self.top)
-            if self._distance(attractor, phase[-1:], velocity[-1:])[0] < _SAME * size:
+            if self._is_at(attractor, phase[-1:], velocity[-1:])[0]:
                 return number
         name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
         self.attractors.append(Attractor(name, *kind, phase, velocity, approach))
         return len(self.attractors) - 1
-
-    def look_around(self, high: float, low: float) -> None:
-        """Find attractors with a sample of starts, and what of them is chaotic."""
-        across, up = evenly_spread(_SAMPLE).T
-        tips = self.tips(2.0 * np.pi * across, low + (high - low) * up)
-        label = self.told_apart(tips)
-        for number, attractor in enumerate(self.attractors):
-            if attractor.kind == MotionKind.IRREGULAR:
-                chosen = np.flatnonzero(label == number)[:16]
-                some = jax.tree.map(lambda part, chosen=chosen: part[chosen], tips)
-                exponents = exponents_of(
-                    self.scenes(len(chosen)), some, impacts=1000, transient=_LONG, accuracy=_ACCURACY
-                )
-                larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
-                finite = np.isfinite(larger)
-                if finite.any() and np.median(larger[finite]) > CHAOTIC_ERRORS * np.median(error[finite]):
-                    self.attractors[number] = attractor._replace(name="chaotic")
 
     def arrived(self, tips: Tips, report: Report | None) -> Int[np.ndarray, " lanes"]:
         """Return the attractor of every start, as soon as it has arrived."""
         count = len(tips.time_us)
         label, remaining = np.full(count, -1), np.arange(count)
         for impacts in _ROUNDS:
-            points, owner = self._points()
 
-            def work(some: Tips, impacts: int = impacts, points: np.ndarray = points) -> tuple[Tips, Array]:
-                return _towards(self.scene, some, points, impacts=impacts)
+            def work(some: Tips, impacts: int = impacts) -> Tips:
+                return _later(self.scene, some, impacts=impacts)
 
-            tips, nearest = in_blocks(work, tips, block=_PART)
-            arrival = owner[nearest]
-            for outcome, kind in (
-                (Outcome.CAPTURED, MotionKind.STUCK),
-                (Outcome.NO_FURTHER_IMPACT, MotionKind.FREE),
-            ):
-                ended = tips.outcome == outcome
-                if ended.any():
-                    arrival[ended] = self._number_of((int(kind), 0, 0))
-            lost = (tips.outcome != Outcome.IMPACT) & (arrival < 0)
-            if lost.any():
-                arrival[lost] = self._number_of((int(MotionKind.UNRESOLVED), 0, 0))
+            tips = in_blocks(work, tips, block=_PART)
+            arrival, kinds = np.full(remaining.size, -1), kinds_of(tips.outcome)
+            for number, orbit in enumerate(self.attractors):
+                arrival[self._is_at(orbit, self.omega * tips.time_us, tips.velocity_nm_per_us)] = number
+            for kind in np.unique(kinds[kinds != MotionKind.IRREGULAR]).tolist():
+                arrival[kinds == kind] = self._number_of((kind, 0, 0))
             label[remaining] = arrival
             going = arrival < 0
             remaining, tips = remaining[going], jax.tree.map(lambda part, going=going: part[going], tips)
@@ -371,40 +330,14 @@ class _Finder:
             label[remaining] = self._number_of((int(MotionKind.IRREGULAR), 0, 0))
         return label
 
-    def _points(self) -> tuple[Float[np.ndarray, "points 2"], Int[np.ndarray, " points"]]:
-        """Return points of the known orbits, phase in rad and velocity over beta omega, filled up with NaN to 64.
-
-        And the number of the attractor that each belongs to; of the last one, which is never a point, -1.
-        """
-        points, owner, used = np.full((_POINTS + 1, 2), np.nan), np.full(_POINTS + 1, -1), 0
-        for number, orbit in enumerate(self.attractors):
-            if orbit.impacts and used + orbit.impacts <= _POINTS:
-                some = slice(used, used + orbit.impacts)
-                points[some] = np.stack([orbit.phase_rad, orbit.velocity_nm_per_us / self.top], axis=1)
-                owner[some] = number
-                used += orbit.impacts
-        return points, owner
-
 
 @jax.jit
-def _towards(
-    scene: Scene,
-    tips: Tips,
-    points: Float[np.ndarray | Array, "points 2"],
-    *,
-    impacts: int | Int[Array, ""],
-) -> tuple[Tips, Int[Array, " lanes"]]:
-    """Return tips some impacts later, and the number of the point that each is at; -1: none."""
-    omega, top = scene.platform.angular_frequency, scene.platform.top_speed_nm_per_us
+def _later(scene: Scene, tips: Tips, *, impacts: int | Int[Array, ""]) -> Tips:
+    """Return tips some impacts later."""
 
-    def piece(tips: Tips) -> tuple[Tips, Array]:
+    def piece(tips: Tips) -> Tips:
         scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tips.time_us.shape, *leaf.shape)), scene)
-        end = lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now)[0], tips)
-        turn = omega * end.time_us[:, None] - points[:, 0]
-        turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
-        square = turn**2 + (end.velocity_nm_per_us[:, None] / top - points[:, 1]) ** 2
-        near = (square < _SAME**2) & (end.outcome == Outcome.IMPACT)[:, None]
-        return end, jnp.where(near.any(axis=1), jnp.argmax(near, axis=1), -1)
+        return lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now)[0], tips)
 
     lanes = tips.time_us.shape[0]
     pieces = jax.tree.map(lambda part: part.reshape(-1, min(LANES, lanes)), tips)

@@ -1,15 +1,13 @@
 """Bifurcation diagrams: the motions on which a tip settles while a parameter is ramped up, and down.
 
 A ramp carries the drive phase and the rebound speed of the tip from value to value, so that hysteresis shows; it is a
-long sequence. Many lanes compute it at once, each a stretch of neighbouring values. First all stretches are ramped side
-by side, each from its own start. Then every stretch is ramped again from the end of the one before it, as far as that
-makes a difference, until no stretch has a new end. Where the motion is regular, the result is that of one tip ramped
-along all values. A tip that the platform holds, or that flies away, begins anew at the next value, at the given start
-or where there is motion (`bouncing_tips`).
+long sequence. Many lanes compute it at once, each a stretch of neighbouring values that it ramps from its own start.
+Every lane goes on into the stretches behind it, as long as its motion differs from the one that is there already. Where
+the motion is regular, the result is that of one tip ramped along all values. A tip that the platform holds, or that
+flies away, begins anew at the next value, at the given start or where there is motion (`bouncing_tips`).
 """
 
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -20,20 +18,20 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import Record, Tips, follow
+from afm_jax.dynamics.many_tips import Record, Tips
 from afm_jax.dynamics.starts import SampleDriven, batch_and_tips, sample_driven
-from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, settled_below, verdicts_of
+from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Motions, Verdicts, motions_of
 from afm_jax.motion.start import gap_of_departure, start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
-from afm_jax.solve.lanes import LANES, Report, in_blocks
+from afm_jax.solve.lanes import LANES, Report
 from afm_jax.units import within_turn
 
 _STRETCHES = LANES
 """Stretches at most that are ramped side by side: one block of tips."""
 _LONGEST_AGAIN = 320
-"""Values at most over which a stretch goes on."""
+"""Values at most over which a lane goes on beyond its stretch."""
 _FEW = 16
 """Lanes of a block of laws."""
 _SAME = 1e-4
@@ -95,38 +93,42 @@ class BifurcationDiagram(ResultTuple):
             "phase_rad": [row[np.isfinite(row)] for row in self.phase_rad],
             "platform_height_nm": [row[np.isfinite(row)] for row in self.height_nm],
         }
-        return told if self.verdict_probability is None else told | {"verdict_probability": self.verdict_probability}
+        return told | self._probability
+
+    @property
+    def _probability(self) -> dict[str, np.ndarray]:
+        probability = self.verdict_probability
+        return {} if probability is None else {"verdict_probability": probability}
 
     def printed(self) -> list[str]:
         """Return a line with the commonest kinds of motion, and at how many values each is."""
         counts = Counter(self.verdicts.names()).most_common()
-        words = ", ".join(f"{name} at {count}" for name, count in counts[:_LISTED])
+        words = [f"{name} at {count}" for name, count in counts[:_LISTED]]
         others = sum(count for _, count in counts[_LISTED:])
-        return [f"ramped {self.direction}: {words}" + (f", others at {others}" if others else "")]
+        return [f"ramped {self.direction}: " + ", ".join([*words, *([f"others at {others}"] if others else [])])]
 
-    def columns(self, parameter: str) -> Iterator[dict[str, np.ndarray]]:
-        """Give the columns of three tables: a row a value, an impact, and a height when the drive's phase is 0."""
-        values = {
-            "direction": np.full(len(self.values), self.direction),
-            parameter: self.values,
-            "verdict": np.array(self.verdicts.names()),
-            "restarted": self.restarted,
-        }
-        probability = self.verdict_probability
-        yield values if probability is None else values | {"verdict_probability": probability}
+    def tables(self, parameter: str = "value") -> dict[str, dict[str, np.ndarray]]:
+        """Return the columns of three files: a row a value, an impact, and a height when the drive's phase is 0."""
+        verdicts = {"verdict": np.array(self.verdicts.names()), "restarted": self.restarted}
         impacts = {
             "phase_rad": self.phase_rad,
             "approach_speed_nm_per_us": self.approach_nm_per_us,
             "velocity_after_nm_per_us": self.velocity_after_nm_per_us,
             "platform_height_nm": self.height_nm,
         }
-        for arrays in (impacts, {"height_nm": self.strobe_height_nm}):
-            there = np.isfinite(next(iter(arrays.values())))
-            yield {
+        files = {
+            "bifurcation.csv": (verdicts | self._probability, np.ones(len(self.values), bool)),
+            "impacts.csv": (impacts, np.isfinite(self.phase_rad)),
+            "strobe.csv": ({"height_nm": self.strobe_height_nm}, np.isfinite(self.strobe_height_nm)),
+        }
+        return {
+            file: {
                 "direction": np.full(there.sum(), self.direction),
-                parameter: np.repeat(self.values, there.sum(axis=1)),
+                parameter: np.repeat(self.values, there.reshape(len(self.values), -1).sum(axis=1)),
                 **{name: array[there] for name, array in arrays.items()},
             }
+            for file, (arrays, there) in files.items()
+        }
 
 
 class Ramps(NamedTuple):
@@ -171,11 +173,10 @@ class Ramps(NamedTuple):
 
     def tables(self) -> dict[str, dict[str, np.ndarray]]:
         """Return the columns of three files, the directions one below the other."""
-        files = ("bifurcation.csv", "impacts.csv", "strobe.csv")
-        parts = zip(*(sweep.columns(self.parameter) for sweep in self.sweeps), strict=True)
+        each = [sweep.tables(self.parameter) for sweep in self.sweeps]
         return {
-            file: {name: np.concatenate([part[name] for part in both]) for name in both[0]}
-            for file, both in zip(files, parts, strict=True)
+            file: {name: np.concatenate([tables[file][name] for tables in each]) for name in columns}
+            for file, columns in each[0].items()
         }
 
 
@@ -218,26 +219,27 @@ def bifurcation_diagram(  # noqa: PLR0913
     if impacts < RECORDED:
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
     begin = None if start is None else seen.start(start_of(scenes, start))
-    _, fresh = batch_and_tips(seen.scenes, begin)
-    seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
-    ramped, complete = _ramped(seen.scenes, fresh, impacts, accuracy, report)
+    fresh = jax.tree.map(np.asarray, batch_and_tips(seen.scenes, begin)[1])
+    ramped, complete = _ramped(jax.tree.map(np.asarray, seen.scenes), fresh, impacts, accuracy, report)
     restarted = np.append(False, ramped.end.outcome[:-1] != Outcome.IMPACT)
     order = slice(None) if upward else slice(None, None, -1)
     seen, platform, ramped, restarted = _rows_of((seen, scenes.platform, ramped, restarted), order)
-    seen, platform = jax.tree.map(jnp.asarray, (seen, platform))
     record, verdicts = ramped.record, ramped.verdicts
-    period = np.asarray(seen.scenes.platform.period_us)
-    # of an orbit its last impacts, each point once
-    shown = (verdicts.impacts[:, None] == 0) | (np.arange(RECORDED, 0, -1) <= verdicts.impacts[:, None])
+    shown = _shown(verdicts)
 
-    def known(part: np.ndarray) -> np.ndarray:
+    def known(part: Any) -> np.ndarray:
         return np.where(shown, part, np.nan)
 
     # in the lab the platform is another one than the frame's
-    amplitude, offset, ahead = (
-        np.asarray(part)[:, None] for part in (platform.amplitude_nm, platform.offset_nm, seen.frame.phase_rad)
+    amplitude, offset, ahead, omega = (
+        np.asarray(part)[:, None]
+        for part in (
+            platform.amplitude_nm,
+            platform.offset_nm,
+            seen.frame.phase_rad,
+            seen.scenes.platform.angular_frequency,
+        )
     )
-    omega, response = 2.0 * np.pi / period[:, None], np.asarray(seen.response(record.departure_us)[1])
     return BifurcationDiagram(
         values=ordered,
         upward=upward,
@@ -245,22 +247,19 @@ def bifurcation_diagram(  # noqa: PLR0913
         restarted=restarted,
         phase_rad=known(within_turn(omega * record.departure_us + ahead, 2.0 * np.pi)),
         approach_nm_per_us=known(record.approach_nm_per_us),
-        velocity_after_nm_per_us=known(record.velocity_after_nm_per_us + response),
+        velocity_after_nm_per_us=known(record.velocity_after_nm_per_us + seen.response(record.departure_us)[1]),
         height_nm=known(offset + amplitude * np.cos(omega * record.arrival_us + ahead)),
-        strobe_height_nm=_strobes(seen, record, shown, period),
+        strobe_height_nm=_strobes(seen, record, shown),
         complete=complete,
     )
 
 
-class _Ramped(NamedTuple):
-    """What motions come to at values in the order of the ramp, arrays with a leading axis of values."""
-
-    end: Tips
-    record: Record
-    verdicts: Verdicts
+def _shown(verdicts: Verdicts) -> Bool[np.ndarray, "values impacts"]:
+    """Return which of the recorded impacts are shown: of an orbit the last ones, each point once, else all."""
+    return (verdicts.impacts[:, None] == 0) | (np.arange(RECORDED, 0, -1) <= verdicts.impacts[:, None])
 
 
-def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: Report | None) -> tuple[_Ramped, bool]:
+def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: Report | None) -> tuple[Motions, bool]:
     """Return what tips come to at all values, and whether no stretch was left to go on.
 
     Args:
@@ -272,44 +271,25 @@ def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: R
     """
     count = len(fresh.time_us)
     length = -(-count // _STRETCHES)
-    starts = np.arange(0, count, length)
-    rows = _motions(_rows_of(scenes, starts), _rows_of(fresh, starts), impacts, accuracy)
-    ramped = jax.tree.map(lambda part: np.empty((count, *part.shape[1:]), part.dtype), rows)
-    _write(ramped, starts, rows)
-
-    def motions(numbers: np.ndarray) -> _Ramped:
-        before = _rows_of((scenes, ramped.end), numbers - 1)
-        at, begin = _rows_of((scenes, fresh), numbers)
-        return _motions(at, carried(before[0], at, begin, before[1]), impacts, accuracy)
-
-    for place in range(1, length):
-        if report is not None:
-            report(min(place * len(starts), count), count)
-        numbers = starts[starts + place < count] + place
-        _write(ramped, numbers, motions(numbers))
-    numbers = starts[1:]
-    for _ in range(_LONGEST_AGAIN):
+    numbers = starts = np.arange(0, count, length)
+    few = {} if isinstance(scenes.interaction, Contact) else {"block": _FEW, "widths": (_FEW,)}
+    at, begin = _rows_of((scenes, fresh), starts)
+    rows = motions_of(at, begin, impacts, accuracy=accuracy, **few)
+    # no motion is of the kind -1
+    ramped = jax.tree.map(lambda part: np.full((count, *part.shape[1:]), -1, part.dtype), rows)
+    for step in range(1, length + _LONGEST_AGAIN):
+        new = ~_same(rows, _rows_of(ramped, numbers))
+        for part, values in zip(jax.tree.leaves(ramped), jax.tree.leaves(rows), strict=True):
+            part[numbers[new]] = values[new]
+        numbers = numbers[new & (numbers + 1 < count)] + 1
         if not numbers.size:
-            break
-        rows = motions(numbers)
-        differs = ~_same(rows, _rows_of(ramped, numbers))
-        _write(ramped, numbers[differs], _rows_of(rows, differs))
-        numbers = numbers[differs & (numbers + 1 < count)] + 1
-    return ramped, not numbers.size
-
-
-def _motions(scenes: Scene, tips: Tips, impacts: int, accuracy: float) -> _Ramped:
-    """Return what tips come to, one at each value."""
-
-    def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
-        return follow(*lanes, skip=impacts - RECORDED, record=RECORDED, accuracy=accuracy)
-
-    if isinstance(scenes.interaction, Contact):
-        end, record = in_blocks(work, (scenes, tips))
-    else:
-        end, record = in_blocks(work, (scenes, tips), block=_FEW, widths=(_FEW,))
-    period = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
-    return _Ramped(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
+            return ramped, True
+        if report is not None:
+            report(min(step * len(starts), count), count)
+        before, end = _rows_of((scenes, ramped.end), numbers - 1)
+        at, begin = _rows_of((scenes, fresh), numbers)
+        rows = motions_of(at, carried(before, at, begin, end), impacts, accuracy=accuracy, **few)
+    return ramped, False
 
 
 @jax.jit
@@ -338,56 +318,39 @@ def _rows_of(tree: Any, rows: Any) -> Any:
     return jax.tree.map(lambda part: part[rows], tree)
 
 
-def _write(tree: Any, rows: np.ndarray, values: Any) -> None:
-    for part, new in zip(jax.tree.leaves(tree), jax.tree.leaves(values), strict=True):
-        part[rows] = new
-
-
-def _same(one: _Ramped, other: _Ramped) -> Bool[np.ndarray, " lanes"]:
+def _same(one: Motions, other: Motions) -> Bool[np.ndarray, " lanes"]:
     """Say which motions are the same: of one kind, and orbits through the same points."""
     a, b = one.verdicts, other.verdicts
     same = (a.kind == b.kind) & (a.impacts == b.impacts) & (a.periods == b.periods)
-    for lane in np.flatnonzero(same & (a.kind == MotionKind.ORBIT)):
-        m = a.impacts[lane]
-        points = [np.sort(each.record.approach_nm_per_us[lane, -m:]) for each in (one, other)]
-        same[lane] = np.max(np.abs(points[0] - points[1])) <= _SAME * max(np.max(points[1]), 1e-12)
-    return same
+    speeds, others = (
+        np.sort(np.where(_shown(each.verdicts), each.record.approach_nm_per_us, 0.0), axis=1) for each in (one, other)
+    )
+    near = np.abs(speeds - others).max(axis=1) <= _SAME * np.maximum(others[:, -1], 1e-12)
+    return same & (near | (a.kind != MotionKind.ORBIT))
 
 
 _STROBE_IMPACTS, _STROBES = 48, 8
 """Last impacts in whose flights the tip's height is taken, and heights at most in a flight."""
 
 
-def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.ndarray) -> np.ndarray:
+def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray) -> Float[np.ndarray, "values heights"]:
     """Return the tip's heights whenever the drive's phase is 0: with a moving platform, whenever it is highest."""
-    scenes, some = seen.scenes, slice(-_STROBE_IMPACTS - 1, None)
+    period, some = np.asarray(seen.scenes.platform.period_us), slice(-_STROBE_IMPACTS - 1, None)
     # in periods of the scene's own clock
     ahead = np.asarray(seen.frame.phase_rad)[:, None] / (2.0 * np.pi)
-    begin = record.turns(period)[:, some] + ahead
-    end = record.arrival_periods + record.arrival_us / period[:, None] + ahead
-    begin, end, used = begin[:, :-1], end[:, some][:, 1:], shown[:, some][:, 1:]
-    gap = np.asarray(gap_of_departure(scenes))
+    begin = record.turns(period)[:, some][:, :-1] + ahead
+    end = (record.arrival_periods + record.arrival_us / period[:, None])[:, some][:, 1:] + ahead
     strobe = np.ceil(begin)[..., None] + np.arange(_STROBES)
-    flown = (strobe - begin[..., None]) * period[:, None, None]
+    flown = np.nan_to_num((strobe - begin[..., None]) * period[:, None, None])
     departure, velocity = (
         part[:, some][:, :-1, None] for part in (record.departure_us, record.velocity_after_nm_per_us)
     )
-    height = np.asarray(
-        _flight_height(scenes, gap, departure, velocity, np.where(np.isfinite(flown), flown, 0.0))
-    ) + np.asarray(seen.response(-(ahead * period[:, None])[..., None])[0])
-    inside = used[..., None] & (strobe < end[..., None])
+
+    def height_of(scene: Scene, departure: Any, velocity: Any, flown: Any) -> Array:
+        start = scene.platform.position(departure) + gap_of_departure(scene)
+        return scene.cantilever.propagator(flown)(start, velocity)[0]
+
+    height = jax.vmap(height_of)(seen.scenes, departure, velocity, flown)
+    height = np.asarray(height + seen.response(-ahead * period[:, None])[0][..., None])
+    inside = shown[:, some][:, 1:, None] & (strobe < end[..., None])
     return np.where(inside, height, np.nan).reshape(len(period), -1)
-
-
-@jax.jit
-def _flight_height(
-    scenes: Scene,
-    gap_nm: Float[Array, " values"],
-    departure_us: Float[Array, "values impacts 1"],
-    velocity_nm_per_us: Float[Array, "values impacts 1"],
-    flown_us: Float[Array, "values impacts times"],
-) -> Float[Array, "values impacts times"]:
-    """Return the height in nm of tips that departed at a gap over the platform, some time of their flights later."""
-    column, gap = jax.tree.map(lambda leaf: leaf[:, None, None], (scenes, gap_nm))
-    start = column.platform.position(departure_us) + gap
-    return column.cantilever.propagator(flown_us)(start, velocity_nm_per_us)[0]

@@ -25,7 +25,7 @@ from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
 from afm_jax.dynamics.starts import SampleDriven, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem, find_roots
-from afm_jax.impact.law import TabulatedLaw, impact_law_of
+from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parse_range, scene_family
@@ -42,7 +42,7 @@ class OrbitVerdicts(NamedTuple):
     ``peak_amplitude_nm``: of the stable one (the highest, if there are several); NaN where there is none.
     ``largest_multiplier``: how stable that one is: the size of the larger multiplier of the linearised map.
     ``unresolved``, of contacts only: the closest law has an orbit, but none was found.
-    ``approach_speed_nm_per_us``, of laws that are tables only: of the stable one's impact.
+    ``approach_speed_nm_per_us``, of laws only: of the stable one's impact.
     """
 
     stable: Bool[np.ndarray, "orders scenes"]
@@ -73,18 +73,16 @@ def orbit_verdicts(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
-    seen = sample_driven(scenes)
     if isinstance(scenes.interaction, Contact):
-        return OrbitVerdicts(**single_contact_orbits(seen, range(first_order, last_order + 1), report=report))
+        return OrbitVerdicts(**single_contact_orbits(scenes, range(first_order, last_order + 1), report=report))
+    seen = sample_driven(scenes)
     orders = jnp.arange(first_order, last_order + 1, dtype=float)
-    names = ("peak_amplitude_nm", "largest_multiplier")
-    if isinstance(scenes.interaction, TabulatedLaw):
-        names = (*names, "approach_speed_nm_per_us")
+    names = ("peak_amplitude_nm", "largest_multiplier", "approach_speed_nm_per_us")
 
     def work(part: SampleDriven) -> OrbitVerdicts:
         orbits = highest_orbits(part.scenes, part.frame, orders, names=names)
-        numbers = {name: orbits[name] for name in names}
-        return OrbitVerdicts(orbits["stable_orbits"] > 0, orbits["admissible_orbits"] > 0, **numbers)
+        stable, admissible = (orbits[name] > 0 for name in ("stable_orbits", "admissible_orbits"))
+        return OrbitVerdicts(stable, admissible, **{name: orbits[name] for name in names})
 
     return jax.tree.map(np.transpose, in_blocks(work, seen, block=_LANES, report=report))
 
@@ -133,10 +131,9 @@ def highest_orbits(
                 place, jnp.ones((), bool), jnp.zeros((), bool), own_frame, problem_of(scene, own_frame, order)
             )
             half, determinant = 0.5 * jnp.abs(orbit.trace), orbit.determinant
-            inside = half**2 - determinant
+            apart = half**2 - determinant
             # a pair on a circle has the root of the determinant for its size
-            pair = jnp.sqrt(jnp.abs(determinant))
-            size = jnp.where(inside > 0.0, half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0)), pair)
+            size = jnp.where(apart > 0.0, half + jnp.sqrt(jnp.abs(apart)), jnp.sqrt(jnp.abs(determinant)))
             wanted = [size if name == "largest_multiplier" else getattr(orbit, name) for name in names]
             numbers = jnp.stack([orbit.peak_amplitude_nm, *wanted])
             return orbit.admissible, orbit.admissible & orbit.stable, numbers
@@ -217,13 +214,6 @@ class StabilityChart(Result):
         frequency, amplitude = np.meshgrid(self.x_values, self.y_values)
         return frequency.ravel(), amplitude.ravel()
 
-    def tongue(self, order: int) -> Bool[np.ndarray, "rows columns"]:
-        """Return where an orbit of this order is stable with a flight shorter than the tip's free period (n > N/2).
-
-        Longer flights, past the platform without a touch, are possible too: islands apart from the tongue.
-        """
-        return self.stable[order - 1] & (self.x_values > 0.5 * order)
-
     def table(self) -> list[dict[str, object]]:
         """Return the rows of chart.csv, one a point."""
         return rows_of(self.tables()["chart.csv"])
@@ -246,20 +236,17 @@ class StabilityChart(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax chart`."""
-        verdicts = self.verdicts
-        several = verdicts.stable.sum(axis=0) > 1
-        told: dict[str, Any] = {
-            **{
-                axis: {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
-                for axis, given in (("x", self.x), ("y", self.y))
-                if given is not None
-            },
+        verdicts, told = self.verdicts, {}
+        for axis, given in (("x", self.x), ("y", self.y)):
+            if given is not None:
+                told[axis] = {"parameter": given.path, "low": given.low, "high": given.high, "number": given.number}
+        told |= {
             "orders": list(range(1, self.orders + 1)),
-            "points": int(several.size),
+            "points": verdicts.stable.shape[1],
             "admissible_share": verdicts.admissible.mean(axis=1),
             "stable_share": verdicts.stable.mean(axis=1),
             "any_stable_share": self.stable_share,
-            "several_stable_share": float(several.mean()),
+            "several_stable_share": float((verdicts.stable.sum(axis=0) > 1).mean()),
         }
         if verdicts.unresolved is not None:
             told["unresolved_share"] = verdicts.unresolved.mean(axis=1)
@@ -270,15 +257,13 @@ class StabilityChart(Result):
     def printed(self) -> list[str]:
         """Return what `afm-jax chart` prints, a line an order."""
         told = self.to_dict()
-        shares = zip(told["orders"], told["stable_share"], told["admissible_share"], strict=True)
-        return [
-            *(
-                f"order {order}: stable at {100.0 * stable:.4g} % of the points, "
-                f"admissible at {100.0 * admissible:.4g} %"
-                for order, stable, admissible in shares
-            ),
-            f"several orders are stable at {100.0 * told['several_stable_share']:.4g} % of the points",
+        lines = [
+            f"order {order}: stable at {100.0 * stable:.4g} % of the points, admissible at {100.0 * admissible:.4g} %"
+            for order, stable, admissible in zip(
+                told["orders"], told["stable_share"], told["admissible_share"], strict=True
+            )
         ]
+        return [*lines, f"several orders are stable at {100.0 * told['several_stable_share']:.4g} % of the points"]
 
     def tables(self) -> dict[str, dict[str, Any]]:
         """Return the columns of chart.csv, a row a point."""
@@ -350,13 +335,10 @@ def stable_probability(
         paths: of the chart's parameters.
         draws: how many.
     """
-    uncertain = uncertain.without(paths[0]).without(paths[1])
-    family, columns = scene_family(scene, *paths, *uncertain.paths), chart.points()
-    total = np.zeros(chart.verdicts.stable.shape)
-    for drawn in uncertain.possible_draws(draws):
-        scenes = batch_of_scenes(family, *columns, *(np.full(len(columns[0]), value) for value in drawn))
-        total += orbit_verdicts(scenes, last_order=chart.orders).stable
-    return total / draws
+    drawn = uncertain.without(paths[0]).without(paths[1]).scenes(scene, draws)
+    values = {"x_values": chart.x_values, "y_values": chart.y_values, "last_order": chart.orders}
+    charts = (stability_chart(scene_family(each, *paths), **values) for each in drawn)
+    return sum((each.verdicts.stable for each in charts), np.zeros(chart.verdicts.stable.shape)) / draws
 
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:

@@ -14,29 +14,14 @@ import numpy as np
 from jaxtyping import Float
 from rich.table import Table
 
-from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene, drive_of
+from afm_jax.apparatus.scene import RANGE_OF_ONE, Scene
 from afm_jax.checks import checked, require_float64
 from afm_jax.columns import Cell, columns_of, printed_table, rows_of
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.contact_orbits import ContactFlights, ContactLoops, contact_loops
-from afm_jax.dynamics.curves import (
-    CAPTURE,
-    CurveLeg,
-    FollowedCurve,
-    LawLoops,
-    followed_both_ways,
-    lies_on,
-    root_on,
-    tested_by,
-)
-from afm_jax.dynamics.impact_loop import LoopFamily, driven_part, samples_for
-from afm_jax.dynamics.impact_orbits import (
-    IMPACT_COLUMNS,
-    MOST_IMPACTS,
-    impact_rows,
-    many_impact_orbits,
-    orbit_facts,
-)
+from afm_jax.dynamics.contact_orbits import ContactLoops
+from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
+from afm_jax.dynamics.impact_loop import CAPTURE, LoopFamily, driven_part
+from afm_jax.dynamics.impact_orbits import IMPACT_COLUMNS, MOST_IMPACTS, LawLoops, impact_rows, orbit_facts
 from afm_jax.dynamics.special_points import (
     OrbitBranch,
     SpecialCurve,
@@ -45,7 +30,6 @@ from afm_jax.dynamics.special_points import (
     special_points_of,
 )
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
@@ -193,12 +177,9 @@ class Continuation(ResultTuple):
                 "branch": "branch:d",
                 "admissible": "admissible",
             }
-            rows = self._special_rows()
-            if any("interval95" in row for row in rows):
-                cells["95 % interval"] = lambda row: (
-                    "{:.5g} to {:.5g}".format(*row["interval95"]) if "interval95" in row else ""
-                )
-            parts.append(printed_table("Special points", cells, rows))
+            if self.special_errors is not None:
+                cells["95 % interval"] = lambda row: "{:.5g} to {:.5g}".format(*row["interval95"])
+            parts.append(printed_table("Special points", cells, self._special_rows()))
         for curve in self.curves:
             ends = [f"({curve.parameter[place]:.5g}, {curve.second[place]:.5g})" for place in (0, -1)]
             parts.append(f"  curve of {curve.kind.replace('_', ' ')} from {ends[0]} to {ends[1]}")
@@ -267,13 +248,14 @@ def continue_orbits(
         value = parameter_values(scene)[second.path]
         if not second.low <= value <= second.high:
             raise ValueError(f"{second}: the range must hold the scene's own value, {value:g}, where the curves begin")
-    family = _family(scene, order, ranges[:1])
-    starts, rejected = _orbits_in_range(scene, family, impacts, given)
+    kind = ContactLoops if isinstance(scene.interaction, Contact) else LawLoops
+    family = kind.of(scene, order, ranges[:1])
+    starts, rejected = _orbits_in_range(family, impacts, given)
     speed_unit = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
     family = replace(family, speed_unit=jnp.asarray(speed_unit))
     followed: list[FollowedCurve] = []
     for fraction, loop in starts:
-        start = np.concatenate([loop[:impacts], loop[impacts:] / speed_unit, [fraction]])
+        start = np.append(loop / family.units(impacts), fraction)
         if not any(lies_on(start, curve, family) for curve in followed):
             curve = followed_both_ways(start, family)
             if curve is not None:
@@ -284,7 +266,7 @@ def continue_orbits(
     )
     curves = ()
     if second is not None:
-        both = replace(_family(scene, order, ranges), speed_unit=family.speed_unit)
+        both = replace(kind.of(scene, order, ranges), speed_unit=family.speed_unit)
         curves = special_curves(special, both, second, parameter_values(scene)[second.path])
     return Continuation(order, impacts, given, second, branches, special, curves, rejected, family)
 
@@ -312,73 +294,40 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
                 raise ValueError(f"{given}: {problem}{hint}") from None
 
 
-def _family(scene: Scene, order: int, ranges: Sequence[ParameterRange]) -> LawLoops | ContactLoops:
-    """Return the loops of a scene over the ranges of some parameters; the unit of speeds is 1 nm/us."""
-    low, high = (jnp.asarray([getattr(given, end) for given in ranges]) for end in ("low", "high"))
-    paths, driven = tuple(given.path for given in ranges), driven_part(scene)
-    numbers = scene, jnp.asarray(float(order)), jnp.ones(()), low, high - low, paths, driven
-    if isinstance(scene.interaction, Contact):
-        return ContactLoops(*numbers, flights=ContactFlights(scene, order, paths))
-    return LawLoops(*numbers, samples_for(scene, order, driven))
-
-
 def _orbits_in_range(
-    scene: Scene, family: LoopFamily, impacts: int, given: ParameterRange
+    family: LoopFamily, impacts: int, given: ParameterRange
 ) -> tuple[list[tuple[float, np.ndarray]], int]:
     """Return orbits at some values in the range, and how many were left out as not admissible.
 
-    Each as the fraction of the range at which it is, and phases in rad with coordinates in nm/us (of a contact with
-    rebound speeds).
+    Each as the fraction of the range at which it is, and its loop in rad and nm/us.
     """
-    value = parameter_values(scene)[given.path]
-    order, contact = int(family.order), isinstance(family, ContactLoops)
-    tried = np.linspace(0.0, 1.0, (_VALUES_TRIED if impacts == 1 and not contact else _FEWER_TRIED) + 2)[1:-1]
+    value = parameter_values(family.scene)[given.path]
+    few = impacts > 1 or isinstance(family, ContactLoops)
+    tried = np.linspace(0.0, 1.0, (_FEWER_TRIED if few else _VALUES_TRIED) + 2)[1:-1]
     # the middle first
-    fractions = list(tried[np.argsort(np.abs(tried - 0.5), kind="stable")])
+    fractions = tried[np.argsort(np.abs(tried - 0.5), kind="stable")].tolist()
     if given.low <= value <= given.high:
         fractions = [(value - given.low) / (given.high - given.low), *fractions]
     if impacts == 0:
-        return [(float(fractions[0]), np.zeros(0))], 0
-    scene_at, orbits, rejected = scene_family(scene, given.path), [], 0
-    one_cosine = all(part is None or part.second is None for part in (scene.platform, scene.base, scene.force))
+        return [(fractions[0], np.zeros(0))], 0
+    orbits, rejected = [], 0
     for fraction in fractions:
-        value = given.low + (given.high - given.low) * fraction
-        if isinstance(family, ContactLoops):
-            loops = contact_loops(family.flights, np.array([value]), impacts)
-        elif impacts == 1 and one_cosine:
-            loops, passing = _single_impact_loops(scene_at(value), order)
-            rejected += passing
-        else:
-            loops = many_impact_orbits(scene_at(value), order, impacts).loops
-        orbits += [(float(fraction), loop) for loop in loops]
+        loops, passing = family.found(np.array([given.low + (given.high - given.low) * fraction]), impacts)
+        orbits += [(fraction, loop) for loop in loops]
+        rejected += passing
     return orbits, rejected
-
-
-def _single_impact_loops(scene: Scene, order: int) -> tuple[Float[np.ndarray, "orbits 2"], int]:
-    """Return arrival phases in rad and coordinates in nm/us of the admissible orbits, and how many are not."""
-    orbits = single_impact_orbits(scene, order)
-    exists = np.asarray(orbits.exists)
-    admissible = exists & np.asarray(orbits.admissible)
-    omega = drive_of(scene).angular_frequency
-    phases = np.asarray(orbits.phase_rad) - omega * np.asarray(orbits.delay_us)
-    coordinates = np.asarray(impact_law_of(scene).coordinate(orbits.approach_speed_nm_per_us))
-    return np.stack([phases, coordinates], axis=1)[admissible], int(np.sum(exists & ~admissible))
 
 
 def _branch(curve: FollowedCurve, family: LoopFamily) -> OrbitBranch:
     """Return the orbits along a curve; where an impact loses its speed the last point is just before."""
     points, ends = curve.points, list(curve.ends)
-    for place, legs in ((0, curve.behind), (-1, curve.ahead)):
+    for place in (0, -1):
         if ends[place] == "capture":
-            points[place] = _before_capture(legs[-1], family)
+            leg = curve.legs[place]
+            root = root_on(leg, tested_by(CAPTURE, family), family)
+            last = None if root is None else leg.at(root[0] + _BEFORE_CAPTURE * (1 + place - root[0]), family)
+            points[place] = (leg.end if place == 0 else leg.begin).point if last is None else last.point
             if family.captures_nothing(points[place]):
                 ends[place] = "no_speed"
     value = float(family.low[0]) + float(family.width[0]) * points[:, -1]
     return OrbitBranch(value, points[:, :-1], family.readings(points), (ends[0], ends[1]))
-
-
-def _before_capture(leg: CurveLeg, family: LoopFamily) -> Float[np.ndarray, " n"]:
-    """Return the last point of a leg before capture, to a millionth of the way."""
-    root = root_on(leg, tested_by(CAPTURE, family), family)
-    point = None if root is None else leg.at((1.0 - _BEFORE_CAPTURE) * root[0], family)
-    return leg.begin.point if point is None else point.point

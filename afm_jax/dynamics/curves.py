@@ -1,52 +1,25 @@
-"""Curves of closed loops in one or two parameters, followed by pseudo-arclength round folds, and their test functions.
+"""Curves of closed loops in one or two parameters, followed by pseudo-arclength round folds.
 
-A point of a curve is the unknowns of a loop (`impact_loop`, or departures of simulated contacts) followed by the
-parameters as fractions of their ranges. A step along the tangent is a guess, and Newton's method closes the loop again
-in the plane across the tangent. Where the nature of the orbit changes one of five test functions is 0:
-
-    fold             the tangent's component along the parameter, on curves in two parameters 1 - T + D
-    period_doubling  1 + T + D, a multiplier -1
-    torus            D - 1 with |T| < 2, a pair of multipliers on the unit circle
-    grazing          the lowest point of a flight above the surface; or an impact without adhesion whose speed vanishes
-    capture          the distance of the slowest impact from capture
+A point of a curve is the unknowns of a loop (`LoopFamily`) followed by the parameters as fractions of their ranges. A
+step along the tangent is a guess, and Newton's method closes the loop again in the plane across the tangent. Where a
+test function of the family changes its sign between two points the root is located by a bracketed search.
 
 On curves in two parameters the test function is solved for together with the closing conditions.
 """
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from afm_jax.dynamics.impact_loop import (
-    ImpactLoop,
-    LoopFamily,
-    LoopReading,
-    closing_gaps,
-    impacts_at,
-    loop_of,
-    nearest_approach,
-    reading_of,
-    trace_and_determinant_of,
-)
-from afm_jax.scenefile.parameter_paths import with_numbers
-from afm_jax.solve.arclength import EquationsAt, PointInPlane, point_in_plane
-from afm_jax.solve.derivatives import largest
-from afm_jax.solve.lanes import compiled_quickly, in_blocks
+from afm_jax.dynamics.impact_loop import CAPTURE, FOLD, LoopFamily, rolled_states
+from afm_jax.solve.arclength import point_in_plane
 from afm_jax.solve.newton import Newton
 
-KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
-FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
 _CLOSING = Newton(rounds=12, step_tolerance=1e-11)
 """Steps towards a point: phases in rad, speeds of the fastest impact, parameters of their ranges."""
-BLOCK = 64
-"""Points of a curve read together: one program."""
-FIRST_STEP = 0.01
-LONGEST_STEP = 0.05
+_FIRST_STEP, _LONGEST_STEP = 0.01, 0.05
 """Steps along a curve: phases in rad, speeds of the fastest impact, parameters of their ranges."""
 _SHORTEST_STEP = 1e-7
 _MOST_POINTS = 3000
@@ -67,58 +40,6 @@ _UNLIKE = 1e-3
 _SAME = 1e-5
 
 
-def loop_at(fractions: Float[Array, " parameters"], family: LoopFamily) -> ImpactLoop:
-    """Return the loop of a law scene where the parameters are at fractions of their ranges."""
-    values = dict(zip(family.paths, family.low + family.width * fractions, strict=True))
-    return loop_of(with_numbers(family.scene, values), family.order, family.driven, family.speed_unit)
-
-
-def split_point(point: Array, family: LoopFamily) -> tuple[Array, Array]:
-    """Return the unknowns of a point, and the parameters as fractions of their ranges."""
-    count = point.shape[0] - len(family.paths)
-    return point[:count], point[count:]
-
-
-def _tests(unknowns: Array, loop: ImpactLoop, family: LoopFamily) -> list[Array]:
-    """Return the test functions in the order of `KINDS`, without dimension."""
-    trace, determinant = trace_and_determinant_of(unknowns, loop)
-    near = nearest_approach(unknowns, loop, family.samples)
-    if family.test == CAPTURE:
-        near = jnp.minimum(near, _rise_when_captured(unknowns, loop))
-    speeds = unknowns[unknowns.shape[0] // 2 :]
-    slowest = -largest(-speeds) if speeds.size else jnp.inf
-    return [
-        1.0 - trace + determinant,
-        1.0 + trace + determinant,
-        determinant - 1.0,
-        near * loop.cantilever.angular_frequency / loop.speed_unit,
-        slowest - loop.impact.lowest / loop.speed_unit,
-    ]
-
-
-def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
-    """Return how the gap opens after the slowest impact, which leaves without speed: z'' - z_p'' over Omega^2, in nm.
-
-    Where it is negative the tip passes through the surface, in a dip too shallow and short to be seen among samples.
-    """
-    impacts = impacts_at(unknowns, loop)
-    slowest = jnp.argmin(unknowns[unknowns.shape[0] // 2 :])
-    leaving, height, velocity = impacts.leaving_us[slowest], impacts.height[slowest], impacts.velocity[slowest]
-    omega, decay = loop.cantilever.angular_frequency, loop.cantilever.decay_rate
-    return -height - (2.0 * decay * velocity + jax.grad(loop.surface.velocity)(leaving)) / omega**2
-
-
-def equations_at(point: Float[Array, " n"], family: LoopFamily) -> Float[Array, " rows"]:
-    """Return the closing conditions at a point of a curve, and behind them the test function that is to be 0."""
-    unknowns, fractions = split_point(point, family)
-    loop = loop_at(fractions, family)
-    gaps = closing_gaps(unknowns, loop)
-    if family.test is None:
-        return gaps
-    test = _tests(unknowns, loop, family)[family.test]
-    return jnp.append(gaps, test)
-
-
 class CurvePoint(NamedTuple):
     """A point of a curve of closed loops, NumPy arrays."""
 
@@ -131,61 +52,10 @@ class CurvePoint(NamedTuple):
     """Longest delay of an impact, in drive periods."""
 
 
-@compiled_quickly()
-def _linearised(family: LoopFamily, point: Array) -> tuple[Array, Array]:
-    def twice(point):
-        value = equations_at(point, family)
-        return value, value
-
-    slopes, value = jax.jacfwd(twice, has_aux=True)(point)
-    return value, slopes
-
-
-@jax.jit
-def _tests_and_delay(family: LoopFamily, point: Array) -> tuple[Array, Array]:
-    unknowns, fractions = split_point(point, family)
-    loop = loop_at(fractions, family)
-    delay = jnp.zeros(())
-    if loop.impact.delayed:
-        delays = impacts_at(unknowns, loop).speeds.delay
-        delay = jnp.max(jnp.abs(delays)) * loop.angular_frequency / (2.0 * jnp.pi)
-    return jnp.stack(_tests(unknowns, loop, family)), delay
-
-
 def solved_point(guess: np.ndarray, normal: np.ndarray, family: LoopFamily) -> CurvePoint | None:
     """Return the point of a curve in the plane through a guess across a normal; None where no loop closes there."""
     point = point_in_plane(family.linearised, guess, normal, _CLOSING)
     return None if point is None else CurvePoint(point.x, point.tangent, *family.tests(point))
-
-
-@compiled_quickly()
-def _read(family: LoopFamily, points: Array) -> LoopReading:
-    def reading_at(point):
-        unknowns, fractions = split_point(point, family)
-        return reading_of(unknowns, loop_at(fractions, family), family.samples)
-
-    return jax.vmap(reading_at)(points)
-
-
-class LawLoops(LoopFamily):
-    """Loops of a scene with a law, all of whose flights are closed forms."""
-
-    def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt:
-        """Return the closing conditions and the wanted test function at a point of a curve."""
-        return EquationsAt(*(np.asarray(part) for part in _linearised(self, jnp.asarray(point))))
-
-    def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
-        """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods."""
-        tests, delay = _tests_and_delay(self, jnp.asarray(solved.x))
-        return np.asarray(tests), float(delay)
-
-    def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
-        """Return the readings of the orbits at points of a curve, NumPy arrays."""
-        return in_blocks(lambda block: _read(self, block), points, block=BLOCK, widths=())
-
-    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:
-        """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
-        return float(loop_at(split_point(jnp.asarray(point), self)[1], self).impact.lowest) == 0.0
 
 
 class CurveLeg(NamedTuple):
@@ -193,43 +63,33 @@ class CurveLeg(NamedTuple):
 
     begin: CurvePoint
     end: CurvePoint
-    guess: np.ndarray
-    """From which the next point was solved for."""
+    guesses: tuple[np.ndarray, np.ndarray]
+    """From which the points at either end were solved for."""
     normal: np.ndarray
-    """Of the plane in which it was."""
+    """Of the plane in which they were."""
 
     def at(self, fraction: float, family: LoopFamily) -> CurvePoint | None:
         """Return the curve's point in the plane at a fraction of the step."""
-        guess = self.begin.point + fraction * (self.guess - self.begin.point)
-        point = solved_point(guess, self.normal, family)
+        first, last = self.guesses
+        point = solved_point(first + fraction * (last - first), self.normal, family)
         return point if point is None or point.tangent @ self.begin.tangent > 0.0 else _reversed(point)
 
 
 class FollowedCurve(NamedTuple):
-    """A curve as it was followed from one of its points both ways."""
+    """A curve as it was followed from one of its points both ways: its steps from one end to the other."""
 
-    first: CurvePoint
-    behind: list[CurveLeg]
-    ahead: list[CurveLeg]
+    legs: list[CurveLeg]
     ends: tuple[str, str]
 
     @property
     def steps(self) -> list[CurvePoint]:
         """The points from one end to the other."""
-        return [*(leg.end for leg in reversed(self.behind)), self.first, *(leg.end for leg in self.ahead)]
+        return [self.legs[0].begin, *(leg.end for leg in self.legs)]
 
     @property
     def points(self) -> Float[np.ndarray, "points n"]:
         """The coordinates of the points from one end to the other."""
         return np.stack([step.point for step in self.steps])
-
-    def places(self) -> Iterator[tuple[CurveLeg, Callable[[float], float]]]:
-        """Give the legs, each with the function from a fraction of it to a position along the points."""
-        count = len(self.behind)
-        for index, leg in enumerate(self.behind):
-            yield leg, lambda fraction, index=index: count - index - fraction
-        for index, leg in enumerate(self.ahead):
-            yield leg, lambda fraction, index=index: count + index + fraction
 
 
 def followed_both_ways(start: np.ndarray, family: LoopFamily) -> FollowedCurve | None:
@@ -239,38 +99,41 @@ def followed_both_ways(start: np.ndarray, family: LoopFamily) -> FollowedCurve |
     first = next((point for point in solved if point is not None and np.abs(point.point - start).max() < _NEAR), None)
     if first is None:
         return None
-    ahead, why_ahead = _follow(first, first.tangent, family)
-    if why_ahead == "closed":
-        return FollowedCurve(first, [], ahead, ("closed", "closed"))
-    behind, why_behind = _follow(first, -first.tangent, family)
-    return FollowedCurve(first, behind, ahead, (why_behind, why_ahead)) if ahead or behind else None
+    ahead, why_ahead = _follow(first, family)
+    behind, why_behind = ([], "closed") if why_ahead == "closed" else _follow(_reversed(first), family)
+    back = [
+        CurveLeg(_reversed(leg.end), _reversed(leg.begin), (leg.guesses[1], leg.guesses[0]), leg.normal)
+        for leg in reversed(behind)
+    ]
+    return FollowedCurve([*back, *ahead], (why_behind, why_ahead)) if ahead or behind else None
 
 
-def _follow(first: CurvePoint, tangent: np.ndarray, family: LoopFamily) -> tuple[list[CurveLeg], str]:
-    """Return the legs of a curve from a point in a direction, and why they end."""
-    parameters = len(family.paths)
-    here, legs, length = first._replace(tangent=tangent), [], FIRST_STEP
-    begin, unlike_shorter = here, _unlike_a_shorter_loop(first, family)
+def _follow(begin: CurvePoint, family: LoopFamily) -> tuple[list[CurveLeg], str]:
+    """Return the legs of a curve from a point along its tangent, and why they end."""
+    here, legs, length = begin, [], _FIRST_STEP
+    unlike_shorter = _unlike_a_shorter_loop(begin, family)
     while len(legs) < _MOST_POINTS:
         guess = here.point + length * here.tangent
         ahead = solved_point(guess, here.tangent, family)
-        if ahead is None or not _is_next(ahead, guess, length, here):
+        if ahead is None or not (
+            np.linalg.norm(ahead.point - guess) < _OFF * length and here.tangent @ ahead.tangent > _STRAIGHT
+        ):
             length *= 0.5
             if length < _SHORTEST_STEP:
                 return legs, "lost"
             continue
-        fractions = ahead.point[-parameters:]
+        fractions = ahead.point[-len(family.paths) :]
         if np.any(fractions < 0.0) or np.any(fractions > 1.0):
             last = _at_the_border(here, ahead, family)
             return (legs if last is None else [*legs, last]), "range"
-        legs.append(CurveLeg(here, ahead, guess, here.tangent))
+        legs.append(CurveLeg(here, ahead, (here.point, guess), here.tangent))
         over = _why_over(ahead, unlike_shorter, family)
         if over is not None:
             return (legs if over == "capture" else legs[:-1]), over
-        if len(legs) > 10 and _closes(ahead, begin, length, parameters):
+        if len(legs) > 10 and _closes(ahead, begin, length, family):
             return legs, "closed"
         if here.tangent @ ahead.tangent > _LONGER:
-            length = min(1.5 * length, LONGEST_STEP)
+            length = min(1.5 * length, _LONGEST_STEP)
         here = ahead
     return legs, "too long"
 
@@ -292,37 +155,28 @@ def _unlike_a_shorter_loop(first: CurvePoint, family: LoopFamily) -> Callable[[C
     None where a loop of so many impacts and periods cannot. A curve that comes to a loop of fewer impacts goes through
     it, back along its own loops begun with another impact: the sign changes there.
     """
-    count = (len(first.point) - len(family.paths)) // 2
-    divisor = math.gcd(count, int(family.order))
-    shifts = [count // parts for parts in range(2, divisor + 1) if divisor % parts == 0]
+    parameters = len(family.paths)
+    count = (len(first.point) - parameters) // 2
+    shifts = [shift for shift in range(1, count) if count % shift == 0 and int(family.order) % (count // shift) == 0]
     if not shifts:
         return None
 
     def differences(point: CurvePoint) -> np.ndarray:
-        state = _state(point.point, count)
-        return np.stack([np.roll(state, shift, axis=1) - state for shift in shifts]).reshape(len(shifts), -1)
+        rolled = rolled_states(point.point[:-parameters])
+        return (rolled[shifts] - rolled[0]).reshape(len(shifts), -1)
 
     towards = differences(first)
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     return lambda point: float(np.min(np.sum(differences(point) * towards, axis=1)))
 
 
-def _state(point: np.ndarray, count: int) -> Float[np.ndarray, "3 m"]:
-    """Return the impacts of a loop, whole turns of the phases left out: cosine, sine, coordinate."""
-    return np.stack([np.cos(point[:count]), np.sin(point[:count]), point[count : 2 * count]])
-
-
 def _reversed(point: CurvePoint) -> CurvePoint:
     return point._replace(tangent=-point.tangent)
 
 
-def _is_next(ahead: CurvePoint, guess: np.ndarray, length: float, here: CurvePoint) -> bool:
-    return bool(np.linalg.norm(ahead.point - guess) < _OFF * length and here.tangent @ ahead.tangent > _STRAIGHT)
-
-
-def _closes(here: CurvePoint, first: CurvePoint, length: float, parameters: int) -> bool:
+def _closes(here: CurvePoint, first: CurvePoint, length: float, family: LoopFamily) -> bool:
     """Say whether a curve has come back to its beginning; whole turns of the phases count as none."""
-    count = (len(first.point) - parameters) // 2
+    count = (len(first.point) - len(family.paths)) // 2
     apart = here.point - first.point
     apart[:count] = (apart[:count] + np.pi) % (2.0 * np.pi) - np.pi
     return bool(np.linalg.norm(apart) < length and here.tangent @ first.tangent > _STRAIGHT)
@@ -341,9 +195,9 @@ def _at_the_border(here: CurvePoint, beyond: CurvePoint, family: LoopFamily) -> 
     guess[place] = border[which]
     normal = np.eye(len(guess))[place]
     end = solved_point(guess, normal, family)
-    if end is None or np.linalg.norm(end.point - guess) > LONGEST_STEP:
+    if end is None or np.linalg.norm(end.point - guess) > _LONGEST_STEP:
         return None
-    return CurveLeg(here, end if end.tangent @ here.tangent >= 0.0 else _reversed(end), guess, normal)
+    return CurveLeg(here, end if end.tangent @ here.tangent >= 0.0 else _reversed(end), (here.point, guess), normal)
 
 
 def lies_on(point: np.ndarray, curve: FollowedCurve, family: LoopFamily) -> bool:
@@ -355,17 +209,13 @@ def lies_on(point: np.ndarray, curve: FollowedCurve, family: LoopFamily) -> bool
         rise = high[-1] - low[-1]
         guess = low + ((point[-1] - low[-1]) / rise if rise else 0.0) * (high - low)
         guess[-1] = point[-1]
-        on_curve = solved_point(guess, np.eye(len(guess))[-1], family)
-        if on_curve is not None and _same_loop(on_curve.point, point, parameters):
+        found = solved_point(guess, np.eye(len(guess))[-1], family)
+        if found is None or np.abs(found.point - point)[-parameters:].max() > _SAME:
+            continue
+        rolled, state = rolled_states(found.point[:-parameters]), rolled_states(point[:-parameters])[0]
+        if np.abs(rolled - state).max(axis=(1, 2), initial=0.0).min() < _SAME:
             return True
     return False
-
-
-def _same_loop(point: np.ndarray, other: np.ndarray, parameters: int) -> bool:
-    count = (len(point) - parameters) // 2
-    state, other_state = _state(point, count), _state(other, count)
-    apart = min(np.abs(np.roll(state, turn, axis=1) - other_state).max(initial=0.0) for turn in range(max(count, 1)))
-    return bool(apart < _SAME and np.abs(point - other)[-parameters:].max() < _SAME)
 
 
 def tested_by(test: int, family: LoopFamily) -> Callable[[CurvePoint], float]:
@@ -388,9 +238,9 @@ def root_on(leg: CurveLeg, test: Callable[[CurvePoint], float], family: LoopFami
         point = leg.at(fraction, family)
         return np.nan if point is None else test(point)
 
-    from scipy.optimize import brentq  # noqa: PLC0415  # half a second, seldom needed
-
     try:
+        from scipy.optimize import brentq  # noqa: PLC0415  # half a second, seldom needed
+
         fraction = float(np.asarray(brentq(tested_at, 0.0, 1.0, xtol=1e-15)))
     except ValueError:
         # the guesses on the way led elsewhere

@@ -4,7 +4,7 @@ Of the map's two exponents the larger is the growth of a tangent vector, the ort
 two dimensions, and their sum the mean of ln |det|. Once a motion repeats, after m impacts, they are ln |multipliers|/m
 of the Jacobian over one repetition. A tip that comes to rest on the platform and is let go by it, or stays for good,
 forgets its start: the map has rank one at the capture and rank zero after the release, and both exponents are minus
-infinity. Near grazing the Jacobian grows without bound; such impacts are counted.
+infinity. Near grazing the Jacobian grows without bound, and errors with it.
 """
 
 from typing import Any
@@ -12,14 +12,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.impact_orbits import multipliers_of
-from afm_jax.dynamics.many_tips import Record, Tips, departure_jacobians, follow
+from afm_jax.dynamics.many_tips import CONTACTS_AT_ONCE, Record, Tips, follow, next_departures
 from afm_jax.dynamics.starts import batch_and_tips, sample_driven
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
@@ -35,10 +34,8 @@ _PARTS = 20
 """Parts of a motion whose means tell the errors."""
 _MOST_IMPACTS = 1_200_000
 """Impacts recorded together: of long motions a block holds fewer."""
-_CONTACTS_AT_ONCE = 256
-"""Contacts whose Jacobians are computed together."""
-_PUSH = 1e-3
-"""Of the speed off the platform, by which a tip leaves an unstable orbit."""
+_BEYOND = 1e-3
+"""Time after a departure, in free periods, at which this contact is over and the next one has not begun."""
 _GROWS = 1e-9
 """Larger exponent per impact above which an orbit is unstable; below it is rounding."""
 _ARRIVED = 1e-8
@@ -55,9 +52,7 @@ class Lyapunov(ResultTuple):
         exponents_per_us: exponents per time, in 1/us; minus infinity and NaN where those per impact are.
         exponents_per_impact_error: standard errors from the means of twenty parts; of an orbit how far it may be off.
         exponents_per_us_error: standard errors of the exponents in 1/us, likewise.
-        mean_log_determinant: mean of ln |det| of the map's Jacobian.
         impacts: how many the means are over.
-        near_grazing: how many of them are near grazing.
         rested: how many of them ended in a rest.
         verdicts: what the motions have come to.
         approach_speed_nm_per_us: of the last impacts of each motion.
@@ -69,9 +64,7 @@ class Lyapunov(ResultTuple):
     exponents_per_us: Float[np.ndarray, "lanes 2"]
     exponents_per_impact_error: Float[np.ndarray, "lanes 2"]
     exponents_per_us_error: Float[np.ndarray, "lanes 2"]
-    mean_log_determinant: Float[np.ndarray, " lanes"]
     impacts: Int[np.ndarray, " lanes"]
-    near_grazing: Int[np.ndarray, " lanes"]
     rested: Int[np.ndarray, " lanes"]
     verdicts: Verdicts
     approach_speed_nm_per_us: Float[np.ndarray, "lanes last"]
@@ -84,10 +77,8 @@ class Lyapunov(ResultTuple):
         motions = self._motions()
         if not np.isnan(motions.exponents_per_impact[:, 0]).all():
             return None
-        verdicts = exponent_verdicts(motions)
-        most = "at most " if len(verdicts) > 1 else ""
-        words = "; ".join(dict.fromkeys(verdicts))
-        return f"{words}; there were {most}{int(motions.impacts.max())} impacts to average over"
+        words = "; ".join(dict.fromkeys(exponent_verdicts(motions)))
+        return f"{words}; there were at most {int(motions.impacts.max())} impacts to average over"
 
     @property
     def impact_speeds_nm_per_us(self) -> Float[np.ndarray, "*lanes last"]:
@@ -129,9 +120,6 @@ class Lyapunov(ResultTuple):
             f"                       per us: {pair(self.exponents_per_us, self.exponents_per_us_error)}",
             f"{int(self.impacts)} impacts; {exponent_verdicts(self._motions())[0]}",
         ]
-        if self.near_grazing:
-            many = int(self.near_grazing)
-            lines.append(f"{many} impacts are near grazing, where the map's slopes grow without bound")
         if self.larger_interval95 is not None:
             low, high = self.larger_interval95
             lines.append(f"the larger per impact: {low:.6g} to {high:.6g} in 95 % of the draws")
@@ -148,7 +136,6 @@ class Lyapunov(ResultTuple):
             "exponent_per_us": motions.exponents_per_us[:, 0],
             "second_exponent_per_us": motions.exponents_per_us[:, 1],
             "impacts": motions.impacts,
-            "near_grazing": motions.near_grazing,
             "rested": motions.rested,
             "verdict": exponent_verdicts(motions),
         }
@@ -160,7 +147,7 @@ class Lyapunov(ResultTuple):
 
 _TOLD = (
     *("exponents_per_us", "exponents_per_impact", "exponents_per_us_error", "exponents_per_impact_error"),
-    *("mean_log_determinant", "impacts", "near_grazing", "rested"),
+    *("impacts", "rested"),
 )
 """Attributes of `Lyapunov` that are keys of its JSON object."""
 CHAOTIC_ERRORS = 3.0
@@ -169,37 +156,35 @@ CHAOTIC_ERRORS = 3.0
 
 def exponent_verdicts(exponents: Lyapunov) -> list[str]:
     """Return in words what the exponents of each of many motions say."""
-    words, unstable = [], on_unstable_orbit(exponents)
+    words = []
     for lane, name in enumerate(exponents.verdicts.names()):
         kind = exponents.verdicts.kind[lane]
         larger, error = exponents.exponents_per_impact[lane, 0], exponents.exponents_per_impact_error[lane, 0]
-        if unstable[lane]:
+        if kind == MotionKind.ORBIT and larger > max(_GROWS, error):
+            # rounding holds the motion there: no neighbour comes to it
             words.append(f"undecided: the motion stays on a {name} orbit that is unstable; try another [start]")
         elif kind == MotionKind.ORBIT:
             forgets = ", the tip rests on the platform and forgets its start" if np.isneginf(larger) else ""
             words.append(f"regular: the motion has come to a {name} orbit{forgets}")
-        elif kind == MotionKind.STUCK:
-            words.append("stuck: the platform holds the tip")
-        elif kind == MotionKind.IRREGULAR and np.isneginf(larger):
+        elif kind != MotionKind.IRREGULAR:
+            words.append(_WITHOUT_EXPONENTS[kind])
+        elif np.isneginf(larger):
             words.append("the tip rests on the platform and forgets its start")
-        elif kind == MotionKind.IRREGULAR and larger > CHAOTIC_ERRORS * error:
+        elif larger > CHAOTIC_ERRORS * error:
             words.append("chaotic: the larger exponent is positive")
-        elif kind == MotionKind.IRREGULAR:
+        else:
             words.append(
                 "undecided: nothing repeats, and the larger exponent is not clearly positive; the motion may still be "
                 "settling (`transient=...` gives it more)"
             )
-        elif kind == MotionKind.FREE:
-            words.append("free: the tip no longer meets the platform")
-        else:
-            words.append(f"unresolved: the motion comes {WHY_UNRESOLVED}")
     return words
 
 
-def on_unstable_orbit(exponents: Lyapunov) -> Bool[np.ndarray, " lanes"]:
-    """Say which of many motions repeat on an orbit with a multiplier outside the unit circle."""
-    larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
-    return (exponents.verdicts.kind == MotionKind.ORBIT) & (larger > np.maximum(_GROWS, error))
+_WITHOUT_EXPONENTS = {
+    MotionKind.STUCK: "stuck: the platform holds the tip",
+    MotionKind.FREE: "free: the tip no longer meets the platform",
+    MotionKind.UNRESOLVED: f"unresolved: the motion comes {WHY_UNRESOLVED}",
+}
 
 
 @checked
@@ -235,31 +220,16 @@ def lyapunov_spectrum(
     single = scene.platform.frequency_khz.ndim == 0
     scenes, tips = batch_and_tips(seen.scenes, None if start is None else seen.start(start))
 
-    lengths = {"impacts": impacts, "transient": transient, "accuracy": accuracy}
-    exponents = exponents_of(scenes, tips, **lengths, report=report)
-    unstable = on_unstable_orbit(exponents)
-    if unstable.any():
-        # rounding may hold a tip on such an orbit for ever: no neighbour comes to it
-        velocity = np.asarray(tips.velocity_nm_per_us)
-        speed = velocity - np.asarray(jax.vmap(Platform.velocity)(scenes.platform, jnp.asarray(tips.time_us)))
-        pushed = tips._replace(velocity_nm_per_us=velocity + np.where(unstable, _PUSH * np.abs(speed), 0.0))
-        exponents = exponents_of(scenes, pushed, **lengths)
-    return jax.tree.map(lambda part: part[0], exponents) if single else exponents
-
-
-def exponents_of(
-    scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float, report: Report | None = None
-) -> Lyapunov:
-    """Return the exponents of motions in a batch of scenes; arguments as for `lyapunov_spectrum`."""
-
     def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
         return _exponents_of_block(*lanes, impacts=impacts, transient=transient, accuracy=accuracy)
 
     if isinstance(scenes.interaction, Contact):
-        return work((scenes, tips))
-    block = max(1, min(LANES, _MOST_IMPACTS // impacts))
-    widths = [width for width in WIDTHS if width <= block]
-    return in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
+        exponents = work((scenes, tips))
+    else:
+        block = max(1, min(LANES, _MOST_IMPACTS // impacts))
+        widths = [width for width in WIDTHS if width <= block]
+        exponents = in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
+    return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 
 def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:
@@ -285,34 +255,54 @@ def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: i
     made, time_us = parts(np.isfinite(passed)), parts(np.nan_to_num(passed))
     rested = parts(record.rested[:, 1:]).sum(axis=0)
     forgotten = (verdicts.kind == MotionKind.STUCK) | (rested > 0)
-    measured = (made > 0).all(axis=0) & ~forgotten & np.isin(verdicts.kind, (MotionKind.ORBIT, MotionKind.IRREGULAR))
+    orbit = verdicts.kind == MotionKind.ORBIT
+    measured = (made > 0).all(axis=0) & ~forgotten & (orbit | (verdicts.kind == MotionKind.IRREGULAR))
+    orbit &= measured
     logs = np.stack([growth, determinant - growth], axis=-1)
+    of_orbits = _exponents_of_orbits(verdicts, jacobians, determinants)
 
-    def mean_and_error(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def known(value: np.ndarray, forgets: float) -> np.ndarray:
+        return np.where(measured, value.T, np.where(forgotten, forgets, np.nan)).T
+
+    def mean_and_error(weight: np.ndarray, of_orbit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return exponents and errors per unit of a weight, which orbits have so much of for each impact."""
         total = np.where(measured, weight.sum(axis=0), 1.0)[:, None]
         mean = logs.sum(axis=0) / total
         off = logs - mean * weight[..., None]
         error = np.sqrt((off**2).sum(axis=0) * _PARTS / (_PARTS - 1)) / total
         larger = np.argsort(-mean, axis=1)
         mean, error = (np.take_along_axis(part, larger, axis=1) for part in (mean, error))
-        mean = np.where(measured[:, None], mean, np.where(forgotten[:, None], -np.inf, np.nan))
-        return mean, np.where(measured[:, None], error, np.where(forgotten[:, None], 0.0, np.nan))
+        of_orbit = of_orbit[:, None]
+        mean = np.where(orbit[:, None], of_orbits / of_orbit, mean)
+        error = np.where(orbit[:, None], verdicts.remaining[:, None] / of_orbit, error)
+        return known(mean, -np.inf), known(error, 0.0)
 
-    per_impact, per_us = mean_and_error(made), mean_and_error(time_us)
-    mean_determinant = determinant.sum(axis=0) / np.where(measured, made.sum(axis=0), 1.0)
-    means = Lyapunov(
+    per_impact = mean_and_error(made, np.ones(len(period)))
+    per_us = mean_and_error(time_us, verdicts.periods * period / np.maximum(verdicts.impacts, 1) + ~orbit)
+    return Lyapunov(
         exponents_per_impact=per_impact[0],
         exponents_per_us=per_us[0],
         exponents_per_impact_error=per_impact[1],
         exponents_per_us_error=per_us[1],
-        mean_log_determinant=np.where(measured, mean_determinant, np.where(forgotten, -np.inf, np.nan)),
         impacts=made.sum(axis=0),
-        near_grazing=parts(record.near_grazing[:, 1:]).sum(axis=0),
         rested=rested,
         verdicts=verdicts,
         approach_speed_nm_per_us=last.approach_nm_per_us,
     )
-    return _of_orbits(means, jacobians, determinants, period)
+
+
+def _exponents_of_orbits(
+    verdicts: Verdicts, jacobians: Float[np.ndarray, "lanes steps 2 2"], determinants: Float[np.ndarray, "lanes steps"]
+) -> Float[np.ndarray, "lanes 2"]:
+    """Return ln |multipliers|/m of the motions that have come to an orbit, from the last Jacobians; 0 of the others."""
+    m = verdicts.impacts
+    product, determinant = np.broadcast_to(np.eye(2), (len(m), 2, 2)), np.ones(len(m))
+    for back in range(int(m.max(initial=0)), 0, -1):
+        counts = m >= back
+        product = np.where(counts[:, None, None], jacobians[:, -back] @ product, product)
+        determinant = determinant * np.where(counts, determinants[:, -back], 1.0)
+    larger = np.log(np.abs(multipliers_of(np.trace(product, axis1=1, axis2=2), determinant)[:, 0]))
+    return np.stack([larger, np.log(np.abs(determinant)) - larger], axis=1) / np.maximum(m, 1)[:, None]
 
 
 def _linearised(
@@ -320,8 +310,8 @@ def _linearised(
 ) -> tuple[Float[np.ndarray, "lanes steps 2 2"], Float[np.ndarray, "lanes steps"], Float[np.ndarray, "lanes steps"]]:
     """Return the map's Jacobians between recorded impacts, their determinants, and the times in us in between.
 
-    The coordinates are drive phase and velocity over beta omega. Where there is no impact, or the tip rested before its
-    departure, the Jacobian is 1.
+    The coordinates are drive phase and velocity (of contacts the rebound speed) over beta omega. Where there is no
+    impact, or the tip rested before its departure, the Jacobian is 1.
     """
     departure, velocity = record.departure_us[:, :-1], record.velocity_after_nm_per_us[:, :-1]
     before = record.departure_periods[:, :-1]
@@ -338,22 +328,40 @@ def _linearised(
         np.where(there, part, 0.0) for part in (departure, velocity, passed, flown, record.approach_nm_per_us[:, 1:])
     ]
     if isinstance(scenes.interaction, Contact):
-        steps = there.shape[1]
-        of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps, axis=0), scenes)
-
-        def work(lanes: tuple[Scene, Array, Array, Array]) -> Array:
-            return departure_jacobians(*lanes, accuracy=accuracy)
-
-        flat = (of_all, *(part.ravel() for part in rows[:3]))
-        jacobians = in_blocks(work, flat, block=_CONTACTS_AT_ONCE).reshape(*there.shape, 2, 2)
-        determinants = np.linalg.det(jacobians)
+        jacobians = _contact_jacobians(scenes, *rows[:3], accuracy=accuracy)
+        determinants, unit = np.linalg.det(jacobians), np.asarray(scenes.platform.top_speed_nm_per_us)
     else:
         jacobians, determinants = map(np.asarray, _impact_jacobians(scenes, *rows[:2], *rows[3:]))
-    unit = np.asarray(scenes.platform.angular_frequency * scenes.platform.top_speed_nm_per_us)
+        unit = np.asarray(scenes.platform.angular_frequency * scenes.platform.top_speed_nm_per_us)
     scale = np.stack([np.ones_like(unit), unit, 1.0 / unit, np.ones_like(unit)], axis=1).reshape(-1, 1, 2, 2)
     counts = there & ~record.rested[:, 1:]
     jacobians = np.where(counts[..., None, None], jacobians * scale, np.eye(2))
     return jacobians, np.where(counts & (determinants != 0.0), determinants, 1.0), passed - departure
+
+
+def _contact_jacobians(
+    scenes: Scene,
+    departure_us: Float[np.ndarray, "lanes steps"],
+    velocity_nm_per_us: Float[np.ndarray, "lanes steps"],
+    next_departure_us: Float[np.ndarray, "lanes steps"],
+    *,
+    accuracy: float,
+) -> Float[np.ndarray, "lanes steps 2 2"]:
+    """Return the derivatives of next departures, d(phase, rebound speed) over d(phase, rebound speed) of these."""
+    column = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], scenes)
+    omega, until = (
+        column.platform.angular_frequency,
+        next_departure_us + _BEYOND * 1e3 / column.cantilever.frequency_khz,
+    )
+    rebound = velocity_nm_per_us - column.platform.velocity(departure_us)
+    departures = jnp.stack([omega * departure_us, rebound], axis=-1).reshape(-1, 2)
+    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), departure_us.shape[1], axis=0), scenes)
+
+    def work(lanes: tuple[Scene, Array, Array]) -> Array:
+        return next_departures(*lanes, accuracy=accuracy)[1]
+
+    slopes = in_blocks(work, (of_all, departures, (omega * until).ravel()), block=CONTACTS_AT_ONCE)
+    return slopes.reshape(*departure_us.shape, 2, 2)
 
 
 @jax.jit
@@ -393,47 +401,3 @@ def _growth_of(jacobians: Float[np.ndarray, "lanes steps 2 2"]) -> Float[np.ndar
         length = np.where(length > 0.0, length, 1.0)
         vector, growth[:, number] = image / length[:, None], np.log(length)
     return growth
-
-
-def _of_orbits(
-    means: Lyapunov,
-    jacobians: Float[np.ndarray, "lanes steps 2 2"],
-    determinants: Float[np.ndarray, "lanes steps"],
-    period_us: Float[np.ndarray, " lanes"],
-) -> Lyapunov:
-    """Return exponents with the multipliers' logarithms in place of means where the motion has come to an orbit.
-
-    Args:
-        means: exponents as means over all impacts.
-        jacobians: of the last impacts.
-        determinants: of these Jacobians.
-        period_us: of the drive.
-    """
-    verdicts = means.verdicts
-    lanes = np.flatnonzero((verdicts.impacts > 0) & np.isfinite(means.exponents_per_impact[:, 0]))
-    if not lanes.size:
-        return means
-    m = verdicts.impacts[lanes]
-    product, determinant = np.broadcast_to(np.eye(2), (lanes.size, 2, 2)), np.ones(lanes.size)
-    for back in range(int(m.max()), 0, -1):
-        counts = m >= back
-        product = np.where(counts[:, None, None], jacobians[lanes, -back] @ product, product)
-        determinant = determinant * np.where(counts, determinants[lanes, -back], 1.0)
-    trace, logarithm = np.trace(product, axis1=1, axis2=2), np.log(np.abs(determinant))
-    larger = np.log(np.abs(multipliers_of(trace, determinant)[:, 0]))
-    logs = np.stack([larger, logarithm - larger], axis=1) / m[:, None]
-    per_us = m / (verdicts.periods[lanes] * period_us[lanes])
-    error = np.repeat(verdicts.remaining[lanes][:, None], 2, axis=1)
-
-    def replaced(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-        old = old.copy()
-        old[lanes] = new
-        return old
-
-    return means._replace(
-        exponents_per_impact=replaced(means.exponents_per_impact, logs),
-        exponents_per_us=replaced(means.exponents_per_us, logs * per_us[:, None]),
-        exponents_per_impact_error=replaced(means.exponents_per_impact_error, error),
-        exponents_per_us_error=replaced(means.exponents_per_us_error, error * per_us[:, None]),
-        mean_log_determinant=replaced(means.mean_log_determinant, logarithm / m),
-    )

@@ -10,8 +10,9 @@ The linearised map of the whole loop is the product of its flights' and impacts'
 
 import abc
 import math
+from collections.abc import Sequence
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,22 +24,26 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.apparatus.surface import Surface
 from afm_jax.impact.first_impact import Flight
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import speeds_of_lasting_impact
-from afm_jax.impact.law import Law, Speeds, impact_law_of
+from afm_jax.impact.law import Law, Speeds
 from afm_jax.impact.orbits import FlightEnds, ends_at_its_own_impact, highest_of_flight
+from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
 from afm_jax.solve.arclength import EquationsAt, PointInPlane
 from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import power_of_two
-from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
+from afm_jax.units import within_turn
 
-SAMPLES_PER_TURN = 32
+_SAMPLES_PER_TURN = 32
 """Heights computed of a flight for every period of the faster of drive and tip."""
 _MOST_SAMPLES = 4096
 _RESTING_PERIODS = 1.25
 """Response periods searched of a tip that meets nothing: more than one, so that its nearest approach is inside."""
+KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
+FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
+"""Kinds of special points, by the numbers of the test functions that are 0 there (`LoopFamily.tests`)."""
 
 
 class ImpactLoop(NamedTuple):
@@ -86,28 +91,6 @@ def driven_part(scene: Scene) -> str:
     parts = {"base": scene.base, "force": scene.force}
     moving = [name for name, part in parts.items() if part is not None and any(float(t.amplitude) for t in part.tones)]
     return "platform" if float(scene.platform.amplitude_nm) or not moving else moving[0]
-
-
-def loop_of(scene: Scene, order: Float[Array, ""], driven: str, speed_unit: Array | None = None) -> ImpactLoop:
-    """Return what (m, N) orbits of a scene close.
-
-    Args:
-        scene: its interaction is a law; its numbers may be traced.
-        order: N.
-        driven: the part that sets the period (`driven_part`).
-        speed_unit: unit of the unknown coordinates in nm/us; None: the surface's top speed.
-    """
-    omega = RAD_PER_US_PER_KHZ * getattr(scene, driven).frequency_khz
-    surface, response = surface_of(scene)
-    unit = surface.top_speed_nm_per_us if speed_unit is None else speed_unit
-    law, period = impact_law_of(scene), 2.0 * jnp.pi * order / omega
-    return ImpactLoop(scene.cantilever, surface, response, law, period, omega, unit)
-
-
-def samples_for(scene: Scene, order: int, driven: str) -> int:
-    """Return how many heights are computed of every flight of an orbit of an order: a power of 2."""
-    ratio = float(scene.cantilever.frequency_khz) / float(getattr(scene, driven).frequency_khz)
-    return min(_MOST_SAMPLES, power_of_two(math.ceil(SAMPLES_PER_TURN * order * max(1.0, ratio)), 64))
 
 
 def impacts_at(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Impacts:
@@ -169,15 +152,18 @@ def nearest_approach(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: in
         loop: what it closes.
         samples: heights computed in every flight.
     """
+    return lowest_gap(loop.cantilever, loop.surface, _flights(unknowns, loop), samples)
+
+
+def _flights(unknowns: Float[Array, " n"], loop: ImpactLoop) -> tuple[Float[Array, " m"], ...]:
+    """Return the flights of a loop as `lowest_gap` takes them; of a tip that meets nothing its rest in the frame."""
     if unknowns.shape[0] == 0:
         zero = jnp.zeros((1,))
-        flights = zero, zero, zero, zero, _RESTING_PERIODS * loop.period_us[None]
-    else:
-        impacts = impacts_at(unknowns, loop)
-        # a flight counts from max(t_in, t_out) on
-        first = jnp.maximum(-impacts.speeds.delay, 0.0)
-        flights = impacts.leaving_us, impacts.height, impacts.velocity, first, impacts.duration_us
-    return lowest_gap(loop.cantilever, loop.surface, flights, samples)
+        return zero, zero, zero, zero, _RESTING_PERIODS * loop.period_us[None]
+    impacts = impacts_at(unknowns, loop)
+    # a flight counts from max(t_in, t_out) on
+    first = jnp.maximum(-impacts.speeds.delay, 0.0)
+    return impacts.leaving_us, impacts.height, impacts.velocity, first, impacts.duration_us
 
 
 def lowest_gap(
@@ -245,15 +231,23 @@ def flies(unknowns: Float[Array, " n"], loop: ImpactLoop) -> Bool[Array, ""]:
 
 def highest_point(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> Array:
     """Return the largest height of the tip above its rest position, in nm."""
-    response = loop.response
-    if unknowns.shape[0] == 0:
-        zero = jnp.zeros(())
-        free = FlightEnds(zero, loop.period_us, zero, zero, zero, zero)
-        return highest_of_flight(loop.cantilever, free, response, samples)
-    impacts = impacts_at(unknowns, loop)
-    end, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
-    flights = FlightEnds(impacts.leaving_us, impacts.duration_us, impacts.height, impacts.velocity, end, speed)
-    return largest(jax.vmap(lambda flight: highest_of_flight(loop.cantilever, flight, response, samples))(flights))
+    return highest_of_flights(loop.cantilever, loop.response, _flights(unknowns, loop), samples)
+
+
+def highest_of_flights(
+    cantilever: Cantilever, response: Surface | None, flights: tuple[Float[Array, " m"], ...], samples: int
+) -> Float[Array, ""]:
+    """Return the largest height of flights in nm in the lab; arguments as of `lowest_gap` and `highest_of_flight`."""
+    begin_us, height, velocity, _, lasts_us = flights
+    ends = FlightEnds(begin_us, lasts_us, height, velocity, *cantilever.propagator(lasts_us)(height, velocity))
+    return largest(jax.vmap(lambda flight: highest_of_flight(cantilever, flight, response, samples))(ends))
+
+
+def rolled_states(loop: Float[np.ndarray, " n"]) -> Float[np.ndarray, "shifts 3 m"]:
+    """Return the impacts of a loop in turn, begun with each of them: cosine and sine of the phase, speed."""
+    phases, speeds = np.split(loop, 2)
+    state = np.stack([np.cos(phases), np.sin(phases), speeds])
+    return np.stack([np.roll(state, -shift, axis=1) for shift in range(max(len(phases), 1))])
 
 
 class LoopReading(eqx.Module):
@@ -318,7 +312,8 @@ def reading_of(unknowns: Float[Array, " n"], loop: ImpactLoop, samples: int) -> 
 class LoopFamily(eqx.Module):
     """Closed loops of a scene whose parameters move: what is solved along a curve of them, and in which units.
 
-    Loops of laws and of simulated contacts differ in its four methods. What is static makes a program of its own.
+    Loops of laws (`LawLoops`) and of simulated contacts (`ContactLoops`) differ in its five methods. What is static
+    makes a program of its own.
     """
 
     scene: Scene
@@ -334,10 +329,33 @@ class LoopFamily(eqx.Module):
     """Of the parameters that move."""
     driven: str = eqx.field(static=True)
     """The part of the scene that sets the period (`driven_part`)."""
-    samples: int = eqx.field(static=True, default=0)
-    """Heights at which every flight is evaluated for its lowest point."""
+    samples: int = eqx.field(static=True)
+    """Heights at which every flight is evaluated for its lowest point: a power of 2."""
     test: int | None = eqx.field(static=True, default=None)
     """Number of the test function that is 0 besides; None: none is."""
+
+    @classmethod
+    def of(cls, scene: Scene, order: int, ranges: Sequence[ParameterRange] = (), **settings: Any) -> Any:
+        """Return the loops of one scene in N drive periods, over the ranges of some parameters; the unit is 1 nm/us.
+
+        Raises:
+            ValueError: if no motion can repeat under the scene's drive.
+        """
+        low, high = (jnp.asarray([getattr(given, end) for given in ranges], float) for end in ("low", "high"))
+        paths, driven = tuple(given.path for given in ranges), driven_part(scene)
+        ratio = float(scene.cantilever.frequency_khz) / float(getattr(scene, driven).frequency_khz)
+        heights = power_of_two(math.ceil(_SAMPLES_PER_TURN * order * max(1.0, ratio)), 64)
+        numbers = scene, jnp.asarray(float(order)), jnp.ones(()), low, high - low, paths, driven
+        return cls(*numbers, min(_MOST_SAMPLES, heights), **settings)
+
+    @abc.abstractmethod
+    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> tuple[Float[np.ndarray, "loops n"], int]:
+        """Return the loops of m impacts that a search finds, in rad and nm/us, and how many closed but do not fly.
+
+        Args:
+            values: of the parameters.
+            impacts: m.
+        """
 
     @abc.abstractmethod
     def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt | None:
@@ -349,7 +367,16 @@ class LoopFamily(eqx.Module):
 
     @abc.abstractmethod
     def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
-        """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods."""
+        """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods.
+
+        Without dimension, in the order of `KINDS`:
+
+            fold             1 - T + D; on curves in one parameter the tangent's component along it counts instead
+            period_doubling  1 + T + D, a multiplier -1
+            torus            D - 1 with |T| < 2, a pair of multipliers on the unit circle
+            grazing          the lowest point of a flight above the surface
+            capture          the distance of the slowest impact from capture; without adhesion its speed
+        """
 
     @abc.abstractmethod
     def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
@@ -358,6 +385,10 @@ class LoopFamily(eqx.Module):
     @abc.abstractmethod
     def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:
         """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
+
+    def scene_at(self, values: Any) -> Scene:
+        """Return the scene where the parameters have some values, which may be traced."""
+        return with_numbers(self.scene, dict(zip(self.paths, values, strict=True)))
 
     def units(self, impacts: int) -> Float[np.ndarray, " n"]:
         """Return the units of a loop's unknowns: m phases in rad, m speeds or coordinates in nm/us."""

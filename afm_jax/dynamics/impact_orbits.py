@@ -1,9 +1,10 @@
-"""Orbits of m impacts in N drive periods: found from many starts, sorted, polished.
+"""Loops of impacts of a law, and orbits of m impacts in N drive periods: found from many starts, sorted, polished.
 
 Starts are flown through the map; every window of m of their impacts that takes about N periods is a first guess, and
 Newton's method closes the whole loop (`impact_loop`). What is left are loops that the map flies, each once.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,26 +14,36 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.dynamics.impact_loop import (
+    CAPTURE,
     ImpactLoop,
+    LoopFamily,
     LoopReading,
     closing_gaps,
-    driven_part,
-    loop_of,
+    impacts_at,
+    nearest_approach,
     reading_of,
-    samples_for,
+    rolled_states,
+    trace_and_determinant_of,
 )
 from afm_jax.dynamics.starts import evenly_spread
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import Departure, follow_impacts
+from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
-from afm_jax.solve.lanes import compiled_quickly, power_of_two
+from afm_jax.solve.arclength import EquationsAt, PointInPlane
+from afm_jax.solve.derivatives import largest
+from afm_jax.solve.lanes import in_blocks
 from afm_jax.solve.newton import Newton, newton
+from afm_jax.units import RAD_PER_US_PER_KHZ
 
+BLOCK = 64
+"""Loops read together: one program."""
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
 """m: the linear system that closes a loop has twice as many unknowns."""
@@ -123,6 +134,108 @@ def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray,
     return np.asarray(np.abs(multipliers[..., 0]) < 1.0)
 
 
+class LawLoops(LoopFamily):
+    """Loops of a scene with a law, all of whose flights are closed forms."""
+
+    def found(self, values: Float[np.ndarray, " parameters"], impacts: int) -> tuple[Float[np.ndarray, "loops n"], int]:
+        """Return loops of m impacts in rad and nm/us, and how many closed but do not fly; see `LoopFamily`."""
+        scene, order = self.scene_at(values), int(self.order)
+        several = any(
+            part is not None and part.second is not None for part in (scene.platform, scene.base, scene.force)
+        )
+        if impacts > 1 or several:
+            return many_impact_orbits(scene, order, impacts).loops, 0
+        # all of them, close to capture too, where no start of a search stays
+        orbits = single_impact_orbits(scene, order)
+        admissible = np.asarray(orbits.exists & orbits.admissible)
+        phases = np.asarray(orbits.phase_rad) - drive_of(scene).angular_frequency * np.asarray(orbits.delay_us)
+        coordinates = np.asarray(impact_law_of(scene).coordinate(orbits.approach_speed_nm_per_us))
+        return np.stack([phases, coordinates], axis=1)[admissible], int(np.sum(orbits.exists) - admissible.sum())
+
+    def linearised(self, point: Float[np.ndarray, " n"]) -> EquationsAt:
+        """Return the closing conditions and the wanted test function at a point of a curve."""
+        return EquationsAt(*(np.asarray(part) for part in _linearised(self, jnp.asarray(point))))
+
+    def tests(self, solved: PointInPlane) -> tuple[Float[np.ndarray, " kinds"], float]:
+        """Return the test functions at a point of a curve, and the longest delay of an impact in drive periods."""
+        tests, delay = _tests_and_delay(self, jnp.asarray(solved.x))
+        return np.asarray(tests), float(delay)
+
+    def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
+        """Return the readings of the orbits at points of a curve, NumPy arrays."""
+        some = points if len(points) else np.ones((1, points.shape[1]))
+        read = in_blocks(lambda block: _read(self, block), some, block=BLOCK, widths=())
+        return jax.tree.map(lambda leaf: leaf[: len(points)], read)
+
+    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:
+        """Say whether impacts at a point of a curve are of a law without adhesion, which any speed leaves."""
+        return float(self.at(jnp.asarray(point))[1].impact.lowest) == 0.0
+
+    def at(self, point: Float[Array, " n"]) -> tuple[Float[Array, " unknowns"], ImpactLoop]:
+        """Return the unknowns at a point of a curve, and what they close there."""
+        count = point.shape[0] - len(self.paths)
+        scene = self.scene_at(self.low + self.width * point[count:])
+        omega = RAD_PER_US_PER_KHZ * getattr(scene, self.driven).frequency_khz
+        law, period = impact_law_of(scene), 2.0 * jnp.pi * self.order / omega
+        return point[:count], ImpactLoop(scene.cantilever, *surface_of(scene), law, period, omega, self.speed_unit)
+
+    def equations(self, point: Float[Array, " n"]) -> Float[Array, " rows"]:
+        """Return the closing conditions at a point of a curve, and behind them the test function that is to be 0."""
+        unknowns, loop = self.at(point)
+        gaps = closing_gaps(unknowns, loop)
+        return gaps if self.test is None else jnp.append(gaps, self.test_functions(unknowns, loop)[self.test])
+
+    def test_functions(self, unknowns: Array, loop: ImpactLoop) -> list[Array]:
+        """Return the test functions in the order of `KINDS`, without dimension."""
+        trace, determinant = trace_and_determinant_of(unknowns, loop)
+        near = nearest_approach(unknowns, loop, self.samples)
+        if self.test == CAPTURE:
+            near = jnp.minimum(near, _rise_when_captured(unknowns, loop))
+        speeds = unknowns[unknowns.shape[0] // 2 :]
+        slowest = -largest(-speeds) if speeds.size else jnp.inf
+        return [
+            1.0 - trace + determinant,
+            1.0 + trace + determinant,
+            determinant - 1.0,
+            near * loop.cantilever.angular_frequency / loop.speed_unit,
+            slowest - loop.impact.lowest / loop.speed_unit,
+        ]
+
+
+def _rise_when_captured(unknowns: Array, loop: ImpactLoop) -> Array:
+    """Return how the gap opens after the slowest impact, which leaves without speed: z'' - z_p'' over Omega^2, in nm.
+
+    Where it is negative the tip passes through the surface, in a dip too shallow and short to be seen among samples.
+    """
+    impacts = impacts_at(unknowns, loop)
+    slowest = jnp.argmin(unknowns[unknowns.shape[0] // 2 :])
+    leaving, height, velocity = impacts.leaving_us[slowest], impacts.height[slowest], impacts.velocity[slowest]
+    omega, decay = loop.cantilever.angular_frequency, loop.cantilever.decay_rate
+    return -height - (2.0 * decay * velocity + jax.grad(loop.surface.velocity)(leaving)) / omega**2
+
+
+@jax.jit
+def _linearised(family: LawLoops, point: Array) -> tuple[Array, Array]:
+    def twice(point):
+        value = family.equations(point)
+        return value, value
+
+    slopes, value = jax.jacfwd(twice, has_aux=True)(point)
+    return value, slopes
+
+
+@jax.jit
+def _tests_and_delay(family: LawLoops, point: Array) -> tuple[Array, Array]:
+    unknowns, loop = family.at(point)
+    delays = jnp.abs(impacts_at(unknowns, loop).speeds.delay) * loop.angular_frequency / (2.0 * jnp.pi)
+    return jnp.stack(family.test_functions(unknowns, loop)), jnp.max(delays, initial=0.0)
+
+
+@jax.jit
+def _read(family: LawLoops, points: Array) -> LoopReading:
+    return jax.vmap(lambda point: reading_of(*family.at(point), family.samples))(points)
+
+
 @checked
 def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
     """Return the orbits of m impacts in N drive periods that a search from many starts finds.
@@ -145,22 +258,23 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     """
     require_float64(scene)
     impact_law_of(scene)
-    driven = driven_part(scene)
     check_loop(order, impacts)
     check_count("starts", starts)
-    number = jnp.asarray(float(order))
-    unknowns, speed_unit, closed = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
+    top_speed = surface_of(scene)[0].top_speed_nm_per_us
+    family = replace(LawLoops.of(scene, order), speed_unit=top_speed)
+    unknowns, closed = _search(family, jnp.asarray((0.5 + evenly_spread(starts)) % 1.0), impacts=int(impacts))
     loops = loops_told_apart(np.asarray(unknowns)[np.asarray(closed)], order)
-    padded = np.concatenate([loops, np.zeros((power_of_two(len(loops), 16) - len(loops), 2 * impacts))])
-    reading = _read_loops(scene, number, jnp.asarray(padded), driven=driven, samples=samples_for(scene, order, driven))
-    reading = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(loops)], reading)
-    keep = reading.admissible & (reading.missing < _CLOSED)
-    rank = np.argsort(-reading.peak_amplitude_nm, kind="stable")
-    chosen = rank[keep[rank]]
-    reading = jax.tree.map(lambda leaf: leaf[chosen], reading)
-    absolute = loops[chosen] * np.repeat([1.0, float(speed_unit)], impacts)
-    multipliers = multipliers_of(reading.trace, reading.determinant)
-    return ManyImpactOrbits(absolute, reading, multipliers, is_stable(multipliers))
+    reading = family.readings(loops)
+    fly = reading.admissible & (reading.missing < _CLOSED)
+    return orbits_of(loops[fly] * family.units(impacts), jax.tree.map(lambda leaf: leaf[fly], reading))
+
+
+def orbits_of(loops: Float[np.ndarray, "loops n"], reading: LoopReading) -> ManyImpactOrbits:
+    """Return loops and their readings by falling peak amplitude."""
+    rank = np.argsort(-np.asarray(reading.peak_amplitude_nm), kind="stable")
+    reading = jax.tree.map(lambda leaf: leaf[rank], reading)
+    multipliers = multipliers_of(np.asarray(reading.trace), np.asarray(reading.determinant))
+    return ManyImpactOrbits(loops[rank], reading, multipliers, is_stable(multipliers))
 
 
 def check_loop(order: int, impacts: int) -> None:
@@ -174,30 +288,22 @@ def check_loop(order: int, impacts: int) -> None:
             raise ValueError(f"`{name}` must be a positive integer up to {most}, but is {value}")
 
 
-@compiled_quickly(static_argnames=("driven", "samples"))
-def _read_loops(
-    scene: Scene, order: Float[Array, ""], loops: Float[Array, "loops n"], *, driven: str, samples: int
-) -> LoopReading:
-    """Return what there is to know of loops of one scene (`reading_of`)."""
-    loop = loop_of(scene, order, driven)
-    return jax.vmap(lambda unknowns: reading_of(unknowns, loop, samples))(loops)
+@partial(jax.jit, static_argnames=("impacts",))
+def _search(family: LawLoops, starts: Float[Array, "starts 2"], *, impacts: int) -> tuple[Array, Array]:
+    """Return the unknowns of loops, and which of them close.
 
-
-def _starts(number: int) -> Float[Array, "starts 2"]:
-    """Return phases and logarithms of speeds, both as fractions of their range, that fill the square evenly."""
-    return jnp.asarray((0.5 + evenly_spread(number)) % 1.0)
-
-
-@partial(jax.jit, static_argnames=("impacts", "driven"))
-def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: str):
-    """Return the unknowns of loops, the unit of their coordinates in nm/us, and which of them close."""
-    loop = loop_of(scene, order, driven)
-    seen = eqx.tree_at(lambda parts: parts.platform, scene, loop.surface)
+    Args:
+        family: without parameters.
+        starts: phases and logarithms of speeds, both as fractions of their ranges.
+        impacts: m.
+    """
+    _, loop = family.at(jnp.zeros(0))
+    seen = eqx.tree_at(lambda parts: parts.platform, family.scene, loop.surface)
     phases, speeds = _walks(seen, loop, starts, _WINDOWS[-1] + impacts + 1)
     guesses, misfit = [], []
     for begin in _WINDOWS:
         phase, speed = phases[:, begin : begin + impacts + 1], speeds[:, begin : begin + impacts + 1]
-        turns = (phase[:, -1] - phase[:, 0]) / (2.0 * jnp.pi) - order
+        turns = (phase[:, -1] - phase[:, 0]) / (2.0 * jnp.pi) - family.order
         change = (speed[:, -1] - speed[:, 0]) / (speed[:, -1] + speed[:, 0])
         misfit.append(jnp.abs(turns) + jnp.abs(change))
         coordinates = loop.impact.coordinate(speed[:, :-1])
@@ -206,11 +312,17 @@ def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: 
     near = jnp.argsort(jnp.where(jnp.isfinite(misfit), misfit, jnp.inf))[: starts.shape[0]]
     usable = jnp.isfinite(misfit[near])
     guesses = jnp.where(usable[:, None], guesses[near], 1.0)
-    loops = jax.vmap(lambda guess: _closed_loop(guess, loop))(guesses)
+    capture = loop.impact.lowest / loop.speed_unit
+
+    def damped(unknowns: Array, step: Array) -> Array:
+        nearer = -_SHARE * (unknowns[impacts:] - capture)
+        return jnp.concatenate([jnp.clip(step[:impacts], -_TURN, _TURN), jnp.maximum(step[impacts:], nearer)])
+
+    loops = jax.vmap(lambda guess: newton(closing_gaps, guess, loop, _CLOSING._replace(damping=damped)).x)(guesses)
     missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, loop))))(loops)
     # a free motion that touches the surface is no orbit of impacts
-    leaves = jnp.min(loops[:, impacts:], axis=1) > loop.impact.lowest / loop.speed_unit + _GRAZES
-    return loops, loop.speed_unit, usable & (missing < _CLOSED) & leaves
+    leaves = jnp.min(loops[:, impacts:], axis=1) > capture + _GRAZES
+    return loops, usable & (missing < _CLOSED) & leaves
 
 
 def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[Array, Array]:
@@ -230,33 +342,20 @@ def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[A
     return jax.vmap(walk)(starts)
 
 
-def _closed_loop(guess: Float[Array, " n"], loop: ImpactLoop) -> Float[Array, " n"]:
-    """Return the unknowns that Newton's method finds from a guess; whether the loop closes is for the caller to see."""
-    count = guess.shape[0] // 2
-
-    def damped(unknowns: Array, step: Array) -> Array:
-        nearer = -_SHARE * (unknowns[count:] - loop.impact.lowest / loop.speed_unit)
-        return jnp.concatenate([jnp.clip(step[:count], -_TURN, _TURN), jnp.maximum(step[count:], nearer)])
-
-    return newton(closing_gaps, guess, loop, _CLOSING._replace(damping=damped)).x
-
-
 def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
     """Return each loop once, its hardest impact first; without those that repeat a shorter one."""
-    count = loops.shape[1] // 2
-    distinct, result = np.zeros((0, 3, count)), []
+    count, result, known = loops.shape[1] // 2, [], np.zeros((0, 3, loops.shape[1] // 2))
     for unknowns in loops:
-        phases, sizes = unknowns[:count], unknowns[count:]
+        phases, speeds = unknowns[:count], unknowns[count:]
         if np.any(np.diff(phases) <= 0.0) or phases[-1] - phases[0] >= 2.0 * np.pi * order:
             continue
-        first = int(np.argmax(np.round(sizes / sizes.max(), 7)))
+        first = int(np.argmax(np.round(speeds / speeds.max(), 7)))
         turned = np.concatenate([phases[first:], phases[:first] + 2.0 * np.pi * order])
         turned -= 2.0 * np.pi * np.floor(turned[0] / (2.0 * np.pi))
-        states = np.stack([np.cos(turned), np.sin(turned), np.roll(sizes, -first) / sizes.max()])
-        rolled = [np.roll(states, -shift, axis=1) for shift in range(count)]
-        repeats = any(np.abs(states - rolled[shift]).max() < _SAME for shift in range(1, count) if count % shift == 0)
-        if repeats or any((np.abs(distinct - each).max(axis=(1, 2)) < _SAME).any() for each in rolled):
-            continue
-        distinct = np.concatenate([distinct, states[None]])
-        result.append(np.concatenate([turned, np.roll(sizes, -first)]))
+        speeds = np.roll(speeds, -first)
+        rolled = rolled_states(np.append(turned, speeds / speeds.max()))
+        shorter = [shift for shift in range(1, count) if count % shift == 0]
+        if not any((np.abs(others - rolled[0]).max(axis=(1, 2)) < _SAME).any() for others in (rolled[shorter], known)):
+            known = np.concatenate([known, rolled])
+            result.append(np.append(turned, speeds))
     return np.array(result).reshape(-1, 2 * count)

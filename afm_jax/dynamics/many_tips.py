@@ -10,7 +10,7 @@ and long searches for an impact are computed in the steps in which a tip of the 
 
 Contacts are simulated, a stretch of many at a time. A tip departs where the bridge breaks, at one gap always, so that
 its next contact depends on time and velocity alone: a map of two variables like that of impacts, whose Jacobian is the
-forward derivative of the simulation (`departure_jacobians`).
+forward derivative of the simulation (`next_departures`).
 """
 
 from functools import partial
@@ -35,7 +35,9 @@ from afm_jax.motion.settle import HELD_PERIODS
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import gap_of_departure
 from afm_jax.outcomes import Outcome
+from afm_jax.scenefile.parameter_paths import with_numbers
 from afm_jax.solve.lanes import again_for
+from afm_jax.units import RAD_PER_US_PER_KHZ
 
 MAX_STEPS = 2000
 """Steps of the search for one impact."""
@@ -50,10 +52,10 @@ _ROWS = 40
 """Contacts of one stretch, which is one call of `simulate`."""
 _PERIODS_EACH = 6.0
 """Duration of a stretch per contact, in periods of the drive or of the free tip, whichever is longer."""
+CONTACTS_AT_ONCE = 128
+"""Contacts followed together, each with its derivatives."""
 _AWAY = 30.0
 """Time without a contact after which the tip counts as having left the sample, in these longer periods."""
-_BEYOND = 1e-3
-"""Time after a departure, in free periods, at which this contact is over and the next one has not begun."""
 
 
 class Tips(NamedTuple):
@@ -86,7 +88,6 @@ class Record(NamedTuple):
     """Whole drive periods before the arrival."""
     departure_periods: Float[Any, "lanes impacts"]
     """Whole drive periods before the departure."""
-    near_grazing: Bool[Any, "lanes impacts"]
     rested: Bool[Any, "lanes impacts"]
 
     def turns(self, period_us: Float[np.ndarray, " lanes"]) -> Float[np.ndarray, "lanes impacts"]:
@@ -150,31 +151,45 @@ def after_impacts(scenes: Scene, tips: Tips, impact: NextImpact) -> tuple[Tips, 
     stuck = (captured & law.adheres) | held
     goes_on = landed & ~stuck
     outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
-    passed = jnp.floor(jnp.where(goes_on, time, 0.0) / surface.period_us)
-    end = Tips(
-        time_us=jnp.where(goes_on, time - passed * surface.period_us, tips.time_us),
-        periods=tips.periods + passed,
-        gap_nm=jnp.where(goes_on, gap, 0.0),
-        velocity_nm_per_us=jnp.where(goes_on, velocity, tips.velocity_nm_per_us),
+    arrival, time, velocity = (jnp.where(goes_on, part, jnp.nan) for part in (impact.arrival_time_us, time, velocity))
+    approach = surface.velocity(arrival) - impact.velocity_before_nm_per_us
+    record = _record(tips.periods, surface.period_us, arrival, approach, time, velocity)
+    return _departed(tips, record, goes_on, outcome, gap), record._replace(rested=goes_on & rested)
+
+
+def _record(periods: Any, period_us: Any, arrival: Any, approach: Any, departure: Any, velocity: Any) -> Record:
+    """Return the record of impacts, none of which rested.
+
+    Args:
+        periods: whole drive periods before the beginning from which times count.
+        period_us: of the drive.
+        arrival: times in us, NaN where there is no impact.
+        approach: speeds in nm/us, of the platform and the tip.
+        departure: times in us, NaN where there is no impact.
+        velocity: in nm/us, in the lab, at the departure.
+    """
+    arrivals, departures = jnp.floor(arrival / period_us), jnp.floor(departure / period_us)
+    return Record(
+        arrival_us=arrival - arrivals * period_us,
+        approach_nm_per_us=approach,
+        departure_us=departure - departures * period_us,
+        velocity_after_nm_per_us=velocity,
+        arrival_periods=periods + arrivals,
+        departure_periods=periods + departures,
+        rested=jnp.zeros(jnp.shape(arrival), bool),
+    )
+
+
+def _departed(tips: Tips, last: Record, goes_on: Any, outcome: Any, gap_nm: Any) -> Tips:
+    """Return tips that go on from their last impacts with an outcome; those that had ended before stay as they are."""
+    going = tips.outcome == Outcome.IMPACT
+    return Tips(
+        time_us=jnp.where(goes_on, last.departure_us, tips.time_us),
+        periods=jnp.where(goes_on, last.departure_periods, tips.periods),
+        gap_nm=jnp.where(goes_on, gap_nm, tips.gap_nm),
+        velocity_nm_per_us=jnp.where(goes_on, last.velocity_after_nm_per_us, tips.velocity_nm_per_us),
         outcome=jnp.where(going, outcome, tips.outcome).astype(tips.outcome.dtype),
     )
-    arrival = jnp.where(goes_on, impact.arrival_time_us, 0.0)
-    passed = jnp.floor(arrival / surface.period_us)
-
-    def if_it_goes_on(value: Array) -> Array:
-        return jnp.where(goes_on, value, jnp.nan)
-
-    record = Record(
-        arrival_us=if_it_goes_on(arrival - passed * surface.period_us),
-        approach_nm_per_us=if_it_goes_on(surface.velocity(arrival) - impact.velocity_before_nm_per_us),
-        departure_us=if_it_goes_on(end.time_us),
-        velocity_after_nm_per_us=if_it_goes_on(end.velocity_nm_per_us),
-        arrival_periods=if_it_goes_on(tips.periods + passed),
-        departure_periods=if_it_goes_on(end.periods),
-        near_grazing=goes_on & impact.near_grazing,
-        rested=goes_on & rested,
-    )
-    return end, record
 
 
 def _flight_of(scene: Scene, tip: Tips) -> Flight:
@@ -218,7 +233,7 @@ def recorded(scenes: Scene, tips: Tips, skip: int | Int[Array, ""] = 0, *, impac
 
     counts = jnp.ones(impacts, int).at[0].add(skip)
     no_number, no = jnp.full(tips.time_us.shape, jnp.nan), jnp.zeros(tips.time_us.shape, bool)
-    (tips, _), rows = lax.scan(next_row, (tips, Record(*[no_number] * 6, *[no] * 2)), counts)
+    (tips, _), rows = lax.scan(next_row, (tips, Record(*[*[no_number] * 6, no])), counts)
     return tips, rows
 
 
@@ -235,7 +250,7 @@ def tips_after_contacts(scenes: Scene, tips: Tips, *, skip: int, record: int, ac
     """
     tips = jax.tree.map(np.asarray, tips)
     no_number = np.full((len(tips.time_us), record), np.nan)
-    kept = Record(*[no_number] * 6, *[np.zeros_like(no_number, bool)] * 2)
+    kept = Record(*[*[no_number] * 6, np.zeros_like(no_number, bool)])
     for _ in range(-(-skip // _ROWS) + -(-record // _ROWS)):
         tips, rows = _stretch(scenes, tips, accuracy)
         kept = Record(*(np.concatenate(both, axis=1)[:, _ROWS:] for both in zip(kept, rows, strict=True)))
@@ -262,29 +277,14 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
         [Outcome.IMPACT, Outcome.CAPTURED, Outcome.NO_FURTHER_IMPACT],
         Outcome.STEP_LIMIT,
     )
-    goes_on = going & full
-    passed, passed_at_arrival = np.floor(departure / period[:, None]), np.floor(arrival / period[:, None])
-    velocity = np.where(leaves, contacts.departure_velocity_nm_per_us, np.nan)
-
-    time_in_period = departure - passed * period[:, None]
-    end = Tips(
-        time_us=np.where(goes_on, time_in_period[:, -1], tips.time_us),
-        periods=tips.periods + np.where(goes_on, passed[:, -1], 0.0),
-        gap_nm=np.where(goes_on, np.asarray(gap_of_departure(scenes)), tips.gap_nm),
-        velocity_nm_per_us=np.where(goes_on, velocity[:, -1], tips.velocity_nm_per_us),
-        outcome=np.where(going, outcome, tips.outcome).astype(np.int32),
+    approach, velocity = (
+        np.where(leaves, part, np.nan)
+        for part in (contacts.approach_speed_nm_per_us, contacts.departure_velocity_nm_per_us)
     )
-    rows = Record(
-        arrival_us=arrival - passed_at_arrival * period[:, None],
-        approach_nm_per_us=np.where(leaves, contacts.approach_speed_nm_per_us, np.nan),
-        departure_us=time_in_period,
-        velocity_after_nm_per_us=velocity,
-        arrival_periods=tips.periods[:, None] + passed_at_arrival,
-        departure_periods=tips.periods[:, None] + passed,
-        near_grazing=np.zeros_like(leaves),
-        rested=np.zeros_like(leaves),
-    )
-    return end, rows
+    record = _record(tips.periods[:, None], period[:, None], arrival, approach, departure, velocity)
+    last = jax.tree.map(lambda part: part[:, -1], record)
+    end = _departed(tips, last, going & full, outcome, gap_of_departure(scenes))
+    return jax.tree.map(np.asarray, (end, record))
 
 
 @eqx.filter_jit
@@ -299,45 +299,47 @@ def _followed(scenes: Scene, tips: Tips, duration_us: Float[Any, " lanes"], *, a
     return jax.vmap(followed)(scenes, tips, duration_us)
 
 
-def next_contact(
-    scene: Scene, departure_us: Array, velocity_nm_per_us: Array, until_us: Array, accuracy: float
-) -> Contacts:
-    """Return the first contact after a departure, followed until a time; one scene, a velocity in the lab."""
-    height = scene.platform.position(departure_us) + gap_of_departure(scene)
-    start = State(departure_us, height, velocity_nm_per_us)
-    rows = simulate(scene, start, until_us - departure_us, max_contacts=1, accuracy=accuracy).contacts
-    return jax.tree.map(lambda part: part[0], rows._replace(detail=None))
-
-
-@partial(jax.jit, static_argnames=("accuracy",))
-def departure_jacobians(
+@partial(jax.jit, static_argnames=("paths", "driven", "accuracy"))
+def next_departures(
     scenes: Scene,
-    departure_us: Float[Array, " lanes"],
-    velocity_nm_per_us: Float[Array, " lanes"],
-    next_departure_us: Float[Array, " lanes"],
+    departures: Float[Array, "lanes unknowns"],
+    until_rad: Float[Array, " lanes"],
     *,
+    paths: tuple[str, ...] = (),
+    driven: str = "platform",
     accuracy: float,
-) -> Float[Array, "lanes 2 2"]:
-    """Return the derivatives of next departures, d(time, velocity) over d(time, velocity) of these.
+) -> tuple[Float[Array, "lanes 2"], Float[Array, "lanes 2 unknowns"], Contacts, Scene]:
+    """Return drive phase in rad and rebound speed in nm/us of the departures after some, and their derivatives.
 
     Args:
         scenes: a batch of scenes with a contact.
-        departure_us: when the tips depart.
-        velocity_nm_per_us: in the lab, then.
-        next_departure_us: when their next contacts end.
+        departures: phase and rebound speed of each, followed by the values of some parameters.
+        until_rad: phases until which the tips are followed.
+        paths: of the parameters.
+        driven: the part of the scene that sets the period.
         accuracy: of `simulate`.
+
+    Returns:
+        The next departures, their derivatives by what is given, the contacts in between, and the scenes with the
+        values.
     """
 
-    def jacobian(scene: Scene, time: Array, velocity: Array, later: Array) -> Array:
-        until = later + _BEYOND / scene.cantilever.frequency_khz * 1e3
+    def of_one(scene: Scene, departure: Array, until: Array) -> tuple[Array, Array, Contacts, Scene]:
+        def departs(unknowns: Array) -> tuple[Array, tuple[Array, Contacts, Scene]]:
+            there = with_numbers(scene, dict(zip(paths, unknowns[2:], strict=True)))
+            omega = RAD_PER_US_PER_KHZ * getattr(there, driven).frequency_khz
+            time = unknowns[0] / omega
+            height, rate = there.platform.position_and_velocity(time)
+            start = State(time, height + gap_of_departure(there), rate + unknowns[1])
+            rows = simulate(there, start, until / omega - time, max_contacts=1, accuracy=accuracy).contacts
+            contact = jax.tree.map(lambda part: part[0], rows._replace(detail=None))
+            following = jnp.stack([omega * contact.departure_time_us, contact.rebound_speed_nm_per_us])
+            return following, (following, contact, there)
 
-        def next_departure(state: Array) -> Array:
-            contact = next_contact(scene, state[0], state[1], until, accuracy)
-            return jnp.stack([contact.departure_time_us, contact.departure_velocity_nm_per_us])
+        slopes, (following, contact, there) = jax.jacfwd(departs, has_aux=True)(departure)
+        return following, slopes, contact, there
 
-        return jax.jacfwd(next_departure)(jnp.stack([time, velocity]))
-
-    return jax.vmap(jacobian)(scenes, departure_us, velocity_nm_per_us, next_departure_us)
+    return jax.vmap(of_one)(scenes, departures, until_rad)
 
 
 def _slower_period_us(scenes: Scene) -> Float[np.ndarray, " lanes"]:

@@ -4,7 +4,6 @@ An orbit of one impact is a row of `SingleImpactOrbits`; an orbit of several imp
 one's numbers besides (`orbit_facts`).
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -112,22 +111,14 @@ class OrbitTable(NamedTuple):
         return parts
 
     def _printed_impacts(self, orbits: list[dict[str, Any]], impacts: int) -> Table:
-        """Return the orbits as a table, a line an impact, an orbit's numbers in its first."""
-
-        def of_orbit(cell: Callable[[dict[str, Any]], str]) -> Cell:
-            return lambda row: cell(row["orbit"]) if row["first"] else ""
-
-        rows = [
-            {**impact, "orbit": orbit | {"number": number}, "first": place == 0}
-            for number, orbit in enumerate(orbits)
-            for place, impact in enumerate(orbit["impacts"])
-        ]
+        """Return the orbits as a table, a line an impact."""
+        rows = [{**orbit, **impact, "orbit": k} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
         cells: dict[str, Cell] = {
-            "orbit": of_orbit(lambda orbit: str(orbit["number"])),
+            "orbit": "orbit:d",
             **_IMPACT_CELLS,
-            "peak\nnm": of_orbit(lambda orbit: f"{orbit['peak_amplitude_nm']:.6g}"),
-            "multipliers": of_orbit(lambda orbit: ", ".join(map(_multiplier, orbit["multipliers"]))),
-            "stable": of_orbit(lambda orbit: "yes" if orbit["stable"] else "no"),
+            "peak\nnm": "peak_amplitude_nm",
+            "multipliers": lambda row: ", ".join(map(_multiplier, row["multipliers"])),
+            "stable": "stable",
         }
         title = f"Orbits with {counted(impacts, 'impact')} in {counted(self.order, 'drive period')}"
         return printed_table(title, cells, rows)

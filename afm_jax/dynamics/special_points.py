@@ -14,12 +14,6 @@ from jaxtyping import Float
 
 from afm_jax.dynamics.curves import (
     AT_A_ROOT,
-    CAPTURE,
-    DOUBLING,
-    FOLD,
-    GRAZING,
-    KINDS,
-    TORUS,
     CurveLeg,
     CurvePoint,
     FollowedCurve,
@@ -28,7 +22,7 @@ from afm_jax.dynamics.curves import (
     root_on,
     tested_by,
 )
-from afm_jax.dynamics.impact_loop import LoopFamily, LoopReading
+from afm_jax.dynamics.impact_loop import CAPTURE, DOUBLING, FOLD, GRAZING, KINDS, TORUS, LoopFamily, LoopReading
 from afm_jax.scenefile.parameter_paths import ParameterRange
 
 _ASIDE = 1e-5
@@ -107,17 +101,11 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
         number: of the branch.
         family: of its loops.
     """
-    roots = [*_roots_on(curve, family), *at_lost_ends(curve)]
-    if not roots:
-        return []
-    roots.sort(key=lambda root: root.position)
-    readings = family.readings(np.stack([point for root in roots for point in root.seen]))
     low, width = float(family.low[0]), float(family.width[0])
-    special, first = [], 0
-    for root in roots:
-        reading = jax.tree.map(lambda column, first=first: column[first], readings)
-        admissible = bool(readings.admissible[first : first + len(root.seen)].any())
-        first += len(root.seen)
+    special = []
+    for root in sorted([*_roots_on(curve, family), *at_lost_ends(curve)], key=lambda root: root.position):
+        readings = family.readings(np.stack(root.seen))
+        reading, admissible = jax.tree.map(lambda column: column[0], readings), bool(readings.admissible.any())
         kind = _kind_of(root.test, root.point, family)
         if root.test == CAPTURE and kind == KINDS[GRAZING] and not admissible:
             # the tip rests while the sample goes through it: no motion comes to that
@@ -136,7 +124,7 @@ def special_points_of(curve: FollowedCurve, number: int, family: LoopFamily) -> 
 def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
     """Return the roots of all test functions between the points of a branch."""
     roots = []
-    for leg, position_of in curve.places():
+    for number, leg in enumerate(curve.legs):
         for test in range(len(KINDS)):
             root = root_on(leg, tested_by(test, family), family)
             if root is None:
@@ -145,7 +133,7 @@ def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
             # multipliers that are a complex pair, given D = 1: |T| < 2
             if test == TORUS and not abs(float(point.tests[DOUBLING] - point.tests[FOLD])) < 4.0:
                 continue
-            position = position_of(fraction)
+            position = number + fraction
             if test == CAPTURE:
                 # there the branch ends: its last point is beside it
                 position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
@@ -168,12 +156,12 @@ def at_lost_ends(curve: FollowedCurve) -> list[_Root]:
     curve's own last point.
     """
     roots = []
-    for legs, end, position in ((curve.behind, 0, 0.0), (curve.ahead, 1, float(len(curve.steps) - 1))):
-        if curve.ends[end] != "lost" or not legs:
+    for end, steps in enumerate((curve.steps[::-1], curve.steps)):
+        if curve.ends[end] != "lost":
             continue
-        last = legs[-1].end
-        apart = (leg.begin for leg in reversed(legs) if np.linalg.norm(leg.begin.point - last.point) > _LONG_ENOUGH)
-        before = next(apart, legs[0].begin)
+        last, position = steps[-1], float(end * len(curve.legs))
+        far = (step for step in reversed(steps) if np.linalg.norm(step.point - last.point) > _LONG_ENOUGH)
+        before = next(far, steps[0])
         for test in (GRAZING, CAPTURE):
             left, earlier = float(last.tests[test]), float(before.tests[test])
             # infinite where no flight has a lowest point
@@ -221,7 +209,7 @@ def _special_curve(kind: str, curve: FollowedCurve, family: LoopFamily) -> Speci
     # an impact without speed, or of a captured tip, has no linearised map
     others = [GRAZING] if family.test == CAPTURE else [test for test in range(len(KINDS)) if test != family.test]
     meetings = []
-    for leg, _ in curve.places():
+    for leg in curve.legs:
         for test in others:
             root = root_on(leg, tested_by(test, family), family)
             if root is not None:

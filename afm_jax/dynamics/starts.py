@@ -25,7 +25,7 @@ from afm_jax.motion.law_motion import or_rest
 from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start, gap_of_departure
 from afm_jax.outcomes import Outcome
-from afm_jax.solve.lanes import compiled_quickly, in_blocks
+from afm_jax.solve.lanes import in_blocks
 
 _TOUCHING = 1e-13
 """Gap over the heights it is the difference of, below which it is rounding."""
@@ -57,12 +57,8 @@ class SampleDriven(NamedTuple):
         time, wave = jnp.asarray(time_us), self.frame.response
         if wave is None:
             return jnp.zeros_like(time), jnp.zeros_like(time)
-        cosine, sine, omega = (
-            part.reshape(*part.shape, *[1] * (time.ndim - part.ndim))
-            for part in (wave.cosine, wave.sine, wave.angular_frequency)
-        )
-        turned = jnp.cos(omega * time), jnp.sin(omega * time)
-        return cosine * turned[0] + sine * turned[1], omega * (sine * turned[0] - cosine * turned[1])
+        columns = jax.tree.map(lambda part: part.reshape(*part.shape, *[1] * (time.ndim - part.ndim)), wave)
+        return columns.value_and_rate(time)
 
 
 def sample_driven(scenes: Scene) -> SampleDriven:
@@ -175,7 +171,7 @@ def bouncing_tips(scenes: Scene) -> Tips:
     return jax.tree.map(lambda on_orbit, elsewhere: np.where(there & has_law, on_orbit, elsewhere), tips, usual)
 
 
-@compiled_quickly()
+@jax.jit
 def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Bool[Array, " lanes"], Tips]:
     """Return which scenes with laws have a stable orbit, and tips on them that have risen to a gap in nm."""
 

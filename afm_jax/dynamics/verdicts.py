@@ -1,16 +1,20 @@
-"""How motions end: on an (m, N) orbit, on no repetition, stuck, away from the sample. Vectorised, in plain NumPy."""
+"""How motions end: on an (m, N) orbit, on no repetition, stuck, away from the sample."""
 
 import enum
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.many_tips import Record
+from afm_jax.dynamics.many_tips import Record, Tips, follow
 from afm_jax.motion.settle import LONGEST, ROUNDING, find_repetitions
 from afm_jax.outcomes import Outcome
+from afm_jax.solve.lanes import LANES, WIDTHS, Report, in_blocks
 
 
 class MotionKind(enum.IntEnum):
@@ -68,9 +72,51 @@ _KIND_OF = {
 }
 
 
-def settled_below(scenes: Scene) -> float:
-    """Return the estimated distance from an orbit below which a motion is on it."""
-    return _SETTLED_CONTACT if isinstance(scenes.interaction, Contact) else _SETTLED
+def kinds_of(outcome: Int[np.ndarray, " lanes"]) -> Int[np.ndarray, " lanes"]:
+    """Return the kinds of motions that ended with an `Outcome` each; irregular while they go on."""
+    kinds = np.full(max(Outcome) + 1, MotionKind.UNRESOLVED)
+    kinds[list(_KIND_OF)] = list(_KIND_OF.values())
+    return kinds[outcome]
+
+
+class Motions(NamedTuple):
+    """What tips have come to, arrays of one lane a tip."""
+
+    end: Tips
+    record: Record
+    """Of the last impacts."""
+    verdicts: Verdicts
+
+
+def motions_of(
+    scenes: Scene,
+    tips: Tips,
+    impacts: int,
+    *,
+    accuracy: float,
+    block: int = LANES,
+    widths: Sequence[int] = WIDTHS,
+    report: Report | None = None,
+) -> Motions:
+    """Return what tips come to after some impacts.
+
+    Args:
+        scenes: of the tips, a batch.
+        tips: at the beginning of a flight each.
+        impacts: how many, those recorded included.
+        accuracy: of resolved contacts.
+        block: as of `in_blocks`, and so the rest.
+        widths: of smaller blocks.
+        report: called with how many of how many tips are done.
+    """
+
+    def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
+        return follow(*lanes, skip=impacts - RECORDED, record=RECORDED, accuracy=accuracy)
+
+    end, record = in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
+    tolerance = _SETTLED_CONTACT if isinstance(scenes.interaction, Contact) else _SETTLED
+    period = np.asarray(jax.tree.map(jnp.asarray, scenes.platform).period_us)
+    return Motions(end, record, verdicts_of(record, end.outcome, period, tolerance=tolerance))
 
 
 def verdicts_of(
@@ -86,9 +132,7 @@ def verdicts_of(
         period_us: of the drive.
         tolerance: of the remaining distance from an orbit (`find_repetitions`).
     """
-    kinds = np.full(max(Outcome) + 1, MotionKind.UNRESOLVED)
-    kinds[list(_KIND_OF)] = list(_KIND_OF.values())
-    kind = kinds[outcome]
+    kind = kinds_of(outcome)
     turns = record.turns(period_us)
     # resolved contacts, for which the tolerance is wide, repeat to no more than their accuracy
     rounding = max(ROUNDING, 1e-2 * tolerance)

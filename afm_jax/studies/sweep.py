@@ -318,7 +318,7 @@ def _orbits(
 def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row: dict[str, float]) -> dict[str, Any]:
     """Return what is recorded of the single-impact orbits of one resolved contact."""
     try:
-        one = sample_driven(scene_batch(scene, {name: np.array([value]) for name, value in row.items()}))
+        one = scene_batch(scene, {name: np.array([value]) for name, value in row.items()})
         found = single_contact_orbits(one, orders, accuracy=accuracy)
     except ValueError as error:
         nothing, no = np.full(len(orders), math.nan), np.zeros(len(orders), bool)

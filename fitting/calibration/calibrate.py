@@ -183,11 +183,9 @@ def calibrate(
     doubt = next((one.reason for one in springs.values() if one.reason is not None), None)
     if doubt is not None:
         how = "`length_um=...` and `width_um=...` give k by Sader's method"
-        reasons += (
-            [f"The spring constant is not calibrated: {doubt}; {how}. Frequency and Q do not depend on it."]
-            if len(springs) == 1
-            else []
-        )
+        if len(springs) == 1:
+            said = f"The spring constant is not calibrated: {doubt}; {how}."
+            reasons.append(f"{said} Frequency and Q do not depend on it.")
         warnings.append(f"The spring constants contradict each other: {doubt}.")
     said = {"reasons": tuple(reasons), "warnings": tuple(warnings)}
     return replace(found, spring_constant_n_per_m=springs, **said)
