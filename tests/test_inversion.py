@@ -195,7 +195,7 @@ def test_rows_that_give_nothing_are_named():
 
 
 def test_one_program_serves_tables_of_any_length():
-    programs: tuple[Any, ...] = (_evaluated.outside(),)
+    programs: tuple[Any, ...] = (vars(_evaluated)["outside"](),)
     table, _ = law_table(ImpactLaw(0.95, 60.0), 40.0, LAW_ROWS)
     assert invert(table).valid
     before = [program._cache_size() for program in programs]

@@ -111,7 +111,7 @@ def follow_law(  # noqa: PLR0913
     course = FollowedTip.begun(departure, no_row, begun, rows=max_contacts)
     # one more, which finds no room
     search = Search(_FLIGHT_STEPS, jnp.asarray(tolerance, until.dtype), until, from_above=True)
-    course = follow_rounds(partial(_one_flight, seen, search), course, rounds=max_contacts + 1, reverse=reverse)
+    course = follow_rounds(partial(_one_flight, seen, until, search), course, rounds=max_contacts + 1, reverse=reverse)
     row, no_gap = LawRow(*course.rows.T), jnp.zeros(max_contacts)
     arrival, departure = State(row.arrival_us, no_gap, -row.approach), State(row.departure_us, no_gap, row.rebound)
     lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
@@ -125,9 +125,9 @@ def follow_law(  # noqa: PLR0913
     )
 
 
-def _one_flight(seen: Scene, search: Search, course: FollowedTip) -> FollowedTip:
+def _one_flight(seen: Scene, until: Array, search: Search, course: FollowedTip) -> FollowedTip:
     """Return a tip after a flight, its impact and the rest that follows, with its row; as it was where it has ended."""
-    departure, flies, until = course.tip, ~course.done, search.until_us
+    departure, flies = course.tip, ~course.done
     impact = impact_after(seen, departure, search, flies=flies)
     impact = where(course.contacts == 0, or_rest(seen, departure, impact), impact)
     ended = impact.outcome

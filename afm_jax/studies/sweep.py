@@ -402,7 +402,7 @@ def _simulation(
 ) -> Recorder:
     """Record what an experiment reads of scenes in time, followed until they settle or for some drive periods."""
     family = scene_family(scene, *paths)
-    nothing = {observable.name: math.nan for observable in OBSERVABLES} | {"settled": False, "stuck": False}
+    nothing = dict.fromkeys(OBSERVABLES, math.nan) | {"settled": False, "stuck": False}
     nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0) | {"outcome": _REFUSED, MESSAGE: ""}
     nothing |= {EXTRAPOLATED: False} if isinstance(scene.interaction, TabulatedLaw) else {}
 
