@@ -108,7 +108,10 @@ def _projected(
     losses, late = ([name for name in own if name in kind] for kind in (_LOSSES, DELAY_TERMS))
     values = dict(fixed) | closest_loss(losses, u, rebound, weight[0], fixed)
     vanishing = {name for name in losses if values[name] == _LOSSES[name]}
-    w = np.maximum(rebound_by_formula(values, u), 0.1 * rebound)
+    w = rebound_by_formula(values, u)
+    # where the formula captures it says nothing more
+    weight = np.where(w > 0.0, weight, 0.0)
+    w = np.maximum(w, 0.1 * rebound)
     by_loss = {"r": values.get("r", 1.0) * u**2 / w, "epsilon": -0.5 / w, "viscous_loss": -0.5 * u / w}
     moving = [name for name in losses if name not in vanishing]
     slope = np.reshape([by_loss[name] for name in moving], (-1, u.size)).T

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 from afm_jax.units import TWO_SIDED_95
 
 
@@ -105,8 +106,8 @@ def closest_loss(
 ) -> dict[str, float]:
     """Return the parameters of the formula closest to a law, as u_out is to be close; no loss is negative.
 
-    Least squares in u_out by Gauss-Newton steps from the law itself: about speeds w, u_out of the formula is
-    (u_out^2 + w^2)/(2 w) to first order, which is linear in the terms of the loss.
+    Least squares in u_out, from those in u_out^2, which is linear in the terms of the loss. Where the formula captures
+    the rebound speed is 0, however far beyond its capture speed that lies.
 
     Args:
         family: of r, viscous_loss and epsilon those that are looked for.
@@ -119,22 +120,25 @@ def closest_loss(
         return {}
     columns = np.stack([speeds ** _POWERS[name] for name in family], axis=1)
     lossless = square_by_formula({name: value for name, value in known.items() if name not in family}, speeds)
-    w, terms = rebound, np.zeros(len(family))
-    for _ in range(_ROUNDS):
-        steep = 0.5 * weight / w
-        scale = np.linalg.norm(steep[:, None] * columns, axis=0)
-        target = lossless + w**2 - 2.0 * w * rebound
-        ends = np.stack([np.zeros(scale.size), np.full(scale.size, np.inf)], axis=1)
-        terms = bounded(-steep * target, steep[:, None] * columns / scale, ends) / scale
-        w = np.sqrt(np.maximum(lossless - columns @ terms, (_SLOWEST * rebound) ** 2))
+
+    def evaluate(terms: Float[np.ndarray, " k"]) -> Sum:
+        square = lossless - columns @ terms
+        leaves = square > 0.0
+        w = np.sqrt(np.where(leaves, square, 1.0))
+        residual = weight * (np.where(leaves, w, 0.0) - rebound)
+        return Sum(float(residual @ residual), residual, np.where(leaves, -0.5 * weight / w, 0.0)[:, None] * columns)
+
+    steep = 0.5 * weight / rebound
+    slope = steep[:, None] * columns
+    scale, ends = np.linalg.norm(slope, axis=0), np.tile([0.0, np.inf], (len(family), 1))
+    start = bounded(steep * (rebound**2 - lossless), slope / scale, ends) / scale
+    terms = levenberg_marquardt(evaluate, start, settled=_SETTLED, most=_STEPS, lowest=0.0).place
     found = zip(family, terms.tolist(), strict=True)
     return {name: max(1.0 - term, 0.0) ** 0.5 if name == "r" else term for name, term in found}
 
 
-_ROUNDS = 8
-"""Steps to the closest formula: squared rebound speeds are nearly linear in what is fitted."""
-_SLOWEST = 0.1
-"""Rebound speed of a formula over that of the law that it is compared with at which it is held: it may capture."""
+_SETTLED, _STEPS = 1e-10, 50
+"""Fall of the sum of squares at which the closest formula is found, and steps at most."""
 
 
 def root_of(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
