@@ -132,13 +132,13 @@ def closest_loss(
     slope = steep[:, None] * columns
     scale, ends = np.linalg.norm(slope, axis=0), np.tile([0.0, np.inf], (len(family), 1))
     start = bounded(steep * (rebound**2 - lossless), slope / scale, ends) / scale
-    terms = levenberg_marquardt(evaluate, start, settled=_SETTLED, most=_STEPS, lowest=0.0).place
+    terms = levenberg_marquardt(evaluate, start, settled=0.0, most=_STEPS, lowest=0.0).place
     found = zip(family, terms.tolist(), strict=True)
     return {name: max(1.0 - term, 0.0) ** 0.5 if name == "r" else term for name, term in found}
 
 
-_SETTLED, _STEPS = 1e-10, 50
-"""Fall of the sum of squares at which the closest formula is found, and steps at most."""
+_STEPS = 50
+"""Steps to the closest formula at most, which goes to the last digit."""
 
 
 def root_of(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
