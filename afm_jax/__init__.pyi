@@ -10,8 +10,8 @@ from afm_jax.contact.collide import Collision as Collision
 from afm_jax.contact.collide import capture_speed as capture_speed
 from afm_jax.contact.collide import collide as collide
 from afm_jax.contact.contact import Contact as Contact
+from afm_jax.contact.junction import ContactPhase as ContactPhase
 from afm_jax.contact.junction import Junction as Junction
-from afm_jax.contact.junction import Phase as Phase
 from afm_jax.contact.junction import find_junction as find_junction
 from afm_jax.contact.law_of_contact import make_law as make_law
 from afm_jax.contact.time_course import time_course as time_course

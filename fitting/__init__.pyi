@@ -1,13 +1,13 @@
 from afm_jax.contact.law_of_contact import ContactDelay as ContactDelay
 from afm_jax.contact.law_of_contact import ContactLaw as ContactLaw
-from afm_jax.contact.law_of_contact import fit_delay as fit_delay
-from afm_jax.contact.law_of_contact import fit_law as fit_law
+from afm_jax.contact.law_of_contact import delay_of_contact as delay_of_contact
+from afm_jax.contact.law_of_contact import law_of_contact as law_of_contact
 from afm_jax.saved import load as load
 from fitting.calibration.calibrate import Calibration as Calibration
 from fitting.calibration.calibrate import calibrate as calibrate
 from fitting.calibration.stiffness import sader as sader
-from fitting.calibration.sweep import ResonanceSweep as ResonanceSweep
-from fitting.calibration.sweep import read_sweep as read_sweep
+from fitting.calibration.sweep import Resonance as Resonance
+from fitting.calibration.sweep import read_resonance as read_resonance
 from fitting.experiments.candidates import drive_grid as drive_grid
 from fitting.experiments.design import Design as Design
 from fitting.experiments.design import design as design

@@ -31,7 +31,7 @@ from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.law_files import load_law
 from afm_jax.scenefile.scenefile import read_scene, read_toml
 from afm_jax.studies.sweep import axes_of
-from fitting.calibration.sweep import read_sweep
+from fitting.calibration.sweep import read_resonance
 from fitting.experiments.prior import read_prior
 from fitting.instruments.curve import read_curves
 from fitting.tables.table import read_table
@@ -182,8 +182,8 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "contact": read_scene,
     "sweep": lambda path: axes_of(read_toml(str(path)).get("axes", ())),
     "trace": lambda path: _lockin(read_trace(path)),
-    "spectrum": read_sweep,
-    "psd": read_sweep,
+    "spectrum": read_resonance,
+    "psd": read_resonance,
     "curve": read_curves,
     "nanonis": read_curves,
     "law": lambda path: (read_prior(path), load_law(path)),

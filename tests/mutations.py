@@ -197,7 +197,9 @@ MUTATIONS = {
     "a transient that settles while it is large": Mutation(
         "if {not  => }transient <= tolerance", f"{OBSERVED}test_a_vibration_that_dies_away_settles_when_it_has"
     ),
-    "a junction that breaks past the bridge": Mutation("driven.breaks_nm, Phase.{BRIDGE => DRY}, Phase.DRY)", STEPS),
+    "a junction that breaks past the bridge": Mutation(
+        "driven.breaks_nm, ContactPhase.{BRIDGE => DRY}, ContactPhase.DRY)", STEPS
+    ),
     "push of the platform without its acceleration": Mutation(
         "return {self.surface.acceleration(time_us) -  => -}self.cantilever",
         "tests/hard_cases/test_rests.py::test_a_tip_captured_without_adhesion_is_let_go_too",

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fitting.calibration.sweep import ResonanceSweep
+from fitting.calibration.sweep import Resonance
 
 FREQUENCY_KHZ, QUALITY_FACTOR = 90.0, 400.0
 
@@ -31,7 +31,7 @@ def synthetic_sweep(
     centre: float = 0.0,
     quality_factor: float = QUALITY_FACTOR,
     seed: int = 1,
-) -> ResonanceSweep:
+) -> Resonance:
     """Return a sweep around the resonance.
 
     Args:
@@ -56,7 +56,7 @@ def synthetic_sweep(
     error = noise * amplitude_nm
     spread = error * (random.standard_normal(points) + 1j * random.standard_normal(points))
     measured = amplitude_nm * clean + spread
-    return ResonanceSweep(
+    return Resonance(
         frequency_khz=frequency,
         amplitude=np.abs(measured),
         phase_deg=np.rad2deg(np.angle(measured)) if phase else None,

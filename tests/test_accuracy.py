@@ -10,7 +10,7 @@ import pytest
 
 from afm_jax import Cantilever, ForceDrive, ImpactLaw, Platform, Scene
 from afm_jax.contact.driven import driven_by
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.motion.record import State
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import load_scene, save_scene
@@ -96,7 +96,7 @@ def test_rivals_follow_straight_and_turning_contacts(course, rival: str):
         jnp.asarray([getattr(each, name) for each in (straight, turning)])
         for name in ("arrival_time_us", "approach_speed_nm_per_us")
     )
-    tips = accuracy.tips_at(Phase.BRIDGE, driven.forms_nm, -rates, arrivals)
+    tips = accuracy.tips_at(ContactPhase.BRIDGE, driven.forms_nm, -rates, arrivals)
     if rival == "SciPy":
         programs = accuracy.ScipyPrograms(motion)
         alone = [jax.tree.map(lambda part, tip=tip: np.asarray(part)[tip], tips) for tip in (0, 1)]

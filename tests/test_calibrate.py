@@ -10,9 +10,9 @@ from scipy.optimize import least_squares
 from scipy.signal import lfilter
 from scipy.stats import chi2 as chi2_distribution
 
-from fitting import calibrate, read_sweep
+from fitting import calibrate, read_resonance
 from fitting.calibration.calibrate import CalibratedValue
-from fitting.calibration.sweep import ResonanceSweep
+from fitting.calibration.sweep import Resonance
 from fitting.tables.csv_text import TableError
 from tests.resonance_sweeps import FREQUENCY_KHZ, QUALITY_FACTOR, synthetic_sweep
 
@@ -63,7 +63,7 @@ def test_noise_in_quadrature_is_a_floor():
     assert result.quality_factor.value == pytest.approx(QUALITY_FACTOR, rel=1e-8)
 
 
-def scipy_residual(sweep: ResonanceSweep):
+def scipy_residual(sweep: Resonance):
     """Return the residual function of (f0 - 90)/half-width, log Q and the linear parameters, and where to start.
 
     Written out again for a straight line behind the response.
@@ -152,7 +152,7 @@ def test_order_of_the_points_and_sign_and_turns_of_the_phase_do_not_matter(rever
     phase = reverse * sweep.phase_deg + 360.0 * (np.arange(120) % 3) + 77.0
     order = np.random.default_rng(5).permutation(120)
     columns = {name: getattr(sweep, name)[order] for name in ("frequency_khz", "amplitude", "amplitude_error")}
-    result = calibrate(ResonanceSweep(**columns, phase_deg=phase[order]))
+    result = calibrate(Resonance(**columns, phase_deg=phase[order]))
     plain = calibrate(sweep)
     assert result.phase_reversed == (reverse < 0.0)
     assert result.quality_factor.value == pytest.approx(plain.quality_factor.value, rel=1e-9)
@@ -186,10 +186,10 @@ def test_noise_or_nothing_is_no_resonance():
         "amplitude": 1.0 + 0.02 * random.standard_normal(80),
         "phase_deg": random.uniform(-2.0, 2.0, 80),
     }
-    result = calibrate(ResonanceSweep(frequency_khz=khz, **noise))
+    result = calibrate(Resonance(frequency_khz=khz, **noise))
     assert not result.valid
     assert any("No resonance stands out" in reason for reason in result.reasons)
-    flat = ResonanceSweep(frequency_khz=khz, amplitude=np.zeros(80), phase_deg=np.linspace(0.0, 90.0, 80))
+    flat = Resonance(frequency_khz=khz, amplitude=np.zeros(80), phase_deg=np.linspace(0.0, 90.0, 80))
     with pytest.raises(TableError, match="is 0 nm at every frequency; sweep across a resonance"):
         calibrate(flat)
 
@@ -197,7 +197,7 @@ def test_noise_or_nothing_is_no_resonance():
 def test_the_measured_sweep():
     if not REAL.exists():
         pytest.skip("the measured sweep lies outside this checkout")
-    real_sweep = read_sweep(REAL)
+    real_sweep = read_resonance(REAL)
     result = calibrate(real_sweep)
     assert result.valid, result.reasons
     # SciPy, unweighted, the linear parameters eliminated; the whole curve gives some 5 % more than the instrument's Q
@@ -228,7 +228,7 @@ def test_errors_are_those_of_correlated_noise():
         noise = lfilter([0.6], [1.0, -0.8], white)
         noisy = response + 3e-3 * clean.amplitude.max() * (noise[0] + 1j * noise[1])
         phase = np.rad2deg(np.unwrap(np.angle(noisy)))
-        sweep = ResonanceSweep(frequency_khz=clean.frequency_khz, amplitude=np.abs(noisy), phase_deg=phase)
+        sweep = Resonance(frequency_khz=clean.frequency_khz, amplitude=np.abs(noisy), phase_deg=phase)
         found = calibrate(sweep).quality_factor
         if found.standard_error is not None:
             values.append(found.value)

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from fitting.calibration.sweep import ResonanceSweep
+from fitting.calibration.sweep import Resonance
 from fitting.tables.table import parse_table
 from tests.answers import answer
 from tests.resonance_sweeps import FREQUENCY_KHZ, QUALITY_FACTOR, synthetic_sweep
@@ -18,7 +18,7 @@ def run(*arguments: object):
     return CliRunner().invoke(main, ["calibrate", *(str(argument) for argument in arguments)])
 
 
-def saved(sweep: ResonanceSweep, path: Path) -> Path:
+def saved(sweep: Resonance, path: Path) -> Path:
     columns = {"frequency_khz": sweep.frequency_khz, "amplitude_nm": sweep.amplitude, "phase_deg": sweep.phase_deg}
     known = {name: column for name, column in columns.items() if column is not None}
     np.savetxt(path, np.stack(list(known.values()), 1), "%.17g", ",", header=",".join(known), comments="")

@@ -11,7 +11,7 @@ from afm_jax.contact.bridge_leg import go_in
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, driven_by, free_tip
-from afm_jax.contact.junction import Phase, find_junction
+from afm_jax.contact.junction import ContactPhase, find_junction
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting, driven_setting_of
 from afm_jax.contact.step import TipInContact, advance
 from afm_jax.motion.contact_motion import legs_through
@@ -63,7 +63,7 @@ def driven():
 def test_straight_contacts_are_those_of_an_independent_integration(contacts, driven, accuracy):
     arrivals = column(contacts, "arrival_time_us"), -column(contacts, "approach_speed_nm_per_us")
     leg = through_contact(driven, at_threshold(driven.forms_nm, arrivals[1], arrivals[0]), quick_of(accuracy))
-    holds = np.asarray(leg.phase) == Phase.DRY
+    holds = np.asarray(leg.phase) == ContactPhase.DRY
     assert holds.sum() >= 8
     # what holds formed the junction once
     assert (column(contacts, "junctions")[holds] == 1).all()
@@ -104,7 +104,7 @@ def assert_leaves(state: ContactState, expected):
 def test_the_legs_of_driven_contacts_take_a_free_tip_where_collide_does(free):
     tip, state, expected = free
     leg = through_contact(tip, state, QuickSetting(24, 18, 30, 24, 1e-9, 12, 2, 1e-2))
-    assert (np.asarray(leg.phase) == Phase.DRY).all()
+    assert (np.asarray(leg.phase) == ContactPhase.DRY).all()
     assert_leaves(leg.state, expected)
     np.testing.assert_allclose(leg.deepest_gap_nm, expected.deepest_gap_nm, rtol=1e-12)
 
@@ -116,11 +116,11 @@ def test_steps_in_time_take_a_free_tip_where_collide_does(free):
     def through(state):
         def more(touch):
             after = advance(tip, touch, jnp.asarray(100.0), 6.0)
-            inside = touch.phase != Phase.DRY
+            inside = touch.phase != ContactPhase.DRY
             return jax.tree.map(lambda new, old: jnp.where(inside, new, old), after, touch)
 
-        touch = TipInContact.at_start(state, jnp.full(state.x.shape, Phase.BRIDGE))
-        return jax.lax.while_loop(lambda touch: jnp.any(touch.phase != Phase.DRY), more, touch)
+        touch = TipInContact.at_start(state, jnp.full(state.x.shape, ContactPhase.BRIDGE))
+        return jax.lax.while_loop(lambda touch: jnp.any(touch.phase != ContactPhase.DRY), more, touch)
 
     touch = through(state)
     assert_leaves(touch.state, expected)

@@ -12,7 +12,7 @@ from afm_jax.contact.forces import Dmt, Hertz, VanDerWaals, Viscous
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import CollisionOutcome
-from fitting import fit_law
+from fitting import law_of_contact
 
 DRY = {"hamaker_constant_aj": 0.1, "contact_distance_nm": 0.165, "range_nm": 20.0, "modulus_gpa": 100.0}
 DRY |= {"tip_radius_nm": 100.0, "viscosity_pa_s": 1.005e-3}
@@ -131,7 +131,7 @@ def test_law_of_a_dry_contact_gives_back_the_speed():
     table = make_law(contact)
     assert float(table.capture_speed_nm_per_us) == 0.0
     np.testing.assert_allclose(table.rebound_speed(SPEEDS), SPEEDS, rtol=1e-6)
-    law = fit_law(contact)
+    law = law_of_contact(contact)
     assert law.epsilon == pytest.approx(0.0, abs=1e-6)
     assert law.r == pytest.approx(1.0, abs=1e-9)
 

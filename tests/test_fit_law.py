@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from afm_jax import Contact, ImpactLaw, find_junction
-from fitting import fit_delay, fit_law
+from fitting import delay_of_contact, law_of_contact
 from tests.answers import answer, table
 from tests.reference_contact import ContactParameters, collision
 
@@ -24,7 +24,7 @@ PAPER = Contact.paper()
     ],
 )
 def test_published_table_of_laws(model, residuals, r, epsilon, viscous_loss, worst_percent):
-    law = fit_law(PAPER, model=model, residuals=residuals)
+    law = law_of_contact(PAPER, model=model, residuals=residuals)
     assert law.converged
     np.testing.assert_allclose(law.r, r, rtol=0.0, atol=0.6e-4)
     np.testing.assert_allclose(law.epsilon, epsilon, rtol=0.0, atol=0.5 if epsilon != 113.6 else 0.05)
@@ -34,7 +34,7 @@ def test_published_table_of_laws(model, residuals, r, epsilon, viscous_loss, wor
 
 
 def test_absolute_residuals_over_a_given_range():
-    law = fit_law(PAPER, speed_range=(12.0, 150.0), residuals="absolute")
+    law = law_of_contact(PAPER, speed_range=(12.0, 150.0), residuals="absolute")
     np.testing.assert_allclose((law.r, law.epsilon), (0.9980, 122.0), rtol=0.0, atol=0.5)
     np.testing.assert_allclose(law.r, 0.9980, rtol=0.0, atol=0.5e-4)
     # printed as 0.26 nm/us without the number of speeds; the ends weigh more where there are fewer
@@ -44,7 +44,7 @@ def test_absolute_residuals_over_a_given_range():
 def test_without_viscosity_the_law_is_the_hysteresis():
     contact = Contact.paper(effects=("capillary", "structural", "core", "jkr"))
     for model in ("law", "viscous", "full"):
-        law = fit_law(contact, model=model, mass_ng=2.0)
+        law = law_of_contact(contact, model=model, mass_ng=2.0)
         # u_out^2 = u_in^2 - 2 hysteresis/m exactly: only rounding and the fit's tolerance are left
         np.testing.assert_allclose(law.epsilon, float(find_junction(contact).hysteresis_aj), rtol=1e-9, atol=0.0)
         np.testing.assert_allclose(law.r, 1.0, rtol=0.0, atol=1e-11)
@@ -57,7 +57,7 @@ def test_without_viscosity_the_law_is_the_hysteresis():
 
 @pytest.mark.parametrize(("model", "residuals"), [("law", "absolute"), ("full", "relative")])
 def test_no_other_law_is_closer(model: str, residuals: str):
-    fitted = fit_law(PAPER, model=model, residuals=residuals, points=60)
+    fitted = law_of_contact(PAPER, model=model, residuals=residuals, points=60)
     speeds, rebound = fitted.approach_speed_nm_per_us, fitted.rebound_speed_nm_per_us
 
     def misfit(values):
@@ -79,16 +79,16 @@ def test_no_other_law_is_closer(model: str, residuals: str):
 
 def test_impossible_fits_are_named():
     with pytest.raises(ValueError, match="`points` must be at least the number of parameters, 3, but is 2"):
-        fit_delay(PAPER, points=2)
+        delay_of_contact(PAPER, points=2)
     with pytest.raises(ValueError, match="must rise between two positive speeds"):
-        fit_law(PAPER, speed_range=(float("nan"), 20.0))
+        law_of_contact(PAPER, speed_range=(float("nan"), 20.0))
     with pytest.raises(ValueError, match=r"is 405\.\d+ to 250 \(the capture speed is 270\.?\d* nm/us\)"):
-        fit_law(Contact.paper(viscosity_pa_s=1.0))
+        law_of_contact(Contact.paper(viscosity_pa_s=1.0))
 
 
 @pytest.fixture(scope="module")
 def delay():
-    return fit_delay(PAPER, speed_range=(15.0, 700.0))
+    return delay_of_contact(PAPER, speed_range=(15.0, 700.0))
 
 
 def test_lag_and_lead_are_the_definitions(delay):
@@ -138,12 +138,12 @@ def test_command_tells_what_the_functions_find(tmp_path):
     rows = table(tmp_path / "law_models.csv")
     assert len(rows) == payload["points"] == 512
     (told,) = (row for row in payload["models"] if row["model"] == "law")
-    law = fit_law(PAPER)
+    law = law_of_contact(PAPER)
     assert all(value == getattr(law, name) for name, value in told.items())
     fitted = [float(row["law_speed_nm_per_us"]) / float(row["rebound_speed_nm_per_us"]) for row in rows]
     worst = np.abs(np.array(fitted) - 1.0).max()
     np.testing.assert_allclose(worst, law.worst_relative_error, rtol=1e-9, atol=0.0)
     delays = table(tmp_path / "law_delay.csv")
-    delay = fit_delay(PAPER)
+    delay = delay_of_contact(PAPER)
     assert [float(row["lag_us"]) for row in delays] == delay.lag_us.tolist()
     assert payload["delay"]["lead_nm"] == float(delay.delay.lead_nm)

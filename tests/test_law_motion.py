@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.map import iterate_map
 from afm_jax.motion.record import ContactKind, MotionOutcome
@@ -58,9 +58,9 @@ def test_flights_and_impacts_are_those_of_the_map(changes):
     ):
         np.testing.assert_allclose(np.asarray(ours)[which], np.asarray(maps)[which], rtol=1e-12, atol=1e-12)
     if not captured:
-        assert (int(result.outcome), int(result.phase)) == (MotionOutcome.FINISHED, Phase.DRY)
+        assert (int(result.outcome), int(result.phase)) == (MotionOutcome.FINISHED, ContactPhase.DRY)
         return
-    assert (int(result.outcome), int(result.phase)) == (MotionOutcome.HELD, Phase.JUNCTION)
+    assert (int(result.outcome), int(result.phase)) == (MotionOutcome.HELD, ContactPhase.JUNCTION)
     approach = float(contacts.approach_speed_nm_per_us[count - 1])
     assert float(contacts.energy_lost_aj[count - 1]) == pytest.approx(0.5 * approach**2, rel=1e-14)  # 1 ng
 

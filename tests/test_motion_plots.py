@@ -12,7 +12,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import Simulation
@@ -50,7 +50,7 @@ def test_the_stretch_shown_ends_with_whole_contacts(bouncing):
     assert look.from_us < shown[0] < look.to_us
     for arrival, departure in zip(shown, look.dense.contacts.departure_time_us[-6:], strict=True):
         part = look.between(arrival, departure)
-        assert {Phase.BRIDGE, Phase.JUNCTION} <= set(part.phase.tolist())
+        assert {ContactPhase.BRIDGE, ContactPhase.JUNCTION} <= set(part.phase.tolist())
         assert part.force_nn.min() < -50.0  # the pull-off force is over 100 nN
 
 
@@ -102,7 +102,7 @@ def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(bouncing, tm
     look = look_at(scene, found)
     arrival = float(found.contacts.arrival_time_us[int(found.count) - 1])
     assert arrival < look.to_us < arrival + 45.0
-    assert look.path.phase[-1] == Phase.JUNCTION
+    assert look.path.phase[-1] == ContactPhase.JUNCTION
     # one that bounces has every picture
     scene, found = bouncing
     assert drawn(scene, found, tmp_path) == ALL

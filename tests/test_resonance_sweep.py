@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fitting import read_sweep
-from fitting.calibration.sweep import ResonanceSweep
+from fitting import read_resonance
+from fitting.calibration.sweep import Resonance
 from fitting.tables.csv_text import TableError
 
 ROWS = ("89.5,1.25,60", "90,2.5,-3.5e1", "90.5,1.125,-120")
@@ -19,10 +19,10 @@ NANONIS = (
 )
 
 
-def read(folder: Path, text: str) -> ResonanceSweep:
+def read(folder: Path, text: str) -> Resonance:
     path = folder / "sweep.txt"
     path.write_bytes(text.encode())
-    return read_sweep(path)
+    return read_resonance(path)
 
 
 @pytest.mark.parametrize("order", [(2, 1, 0), (1, 0, 2)])
@@ -70,4 +70,4 @@ def test_faults_of_sweeps_in_memory():
     )
     for columns, said in cases:
         with pytest.raises(TableError, match=said):
-            ResonanceSweep(**({"frequency_khz": one, "amplitude": one} | columns))
+            Resonance(**({"frequency_khz": one, "amplitude": one} | columns))

@@ -9,7 +9,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.motion.record import MotionOutcome, State
 from afm_jax.motion.simulate import simulate
@@ -100,7 +100,7 @@ def test_the_end_may_lie_within_a_contact():
         course = follow(system, *start, until_us=end)
         simulation = simulate(scene_of(system), state(start), end - start[0])
         np.testing.assert_allclose(float(simulation.final.position_nm), course.position_nm, rtol=0.0, atol=1e-7)
-        assert Phase(int(simulation.phase)).name.lower() == course.phase
+        assert ContactPhase(int(simulation.phase)).name.lower() == course.phase
 
 
 @pytest.mark.slow

@@ -11,10 +11,10 @@ from click.testing import CliRunner
 from scipy.stats import gamma
 
 from afm_jax.cli.main import main
-from fitting import TableError, calibrate, read_sweep, sader
+from fitting import TableError, calibrate, read_resonance, sader
 from fitting.calibration.model import deviance_root
 from fitting.calibration.stiffness import BOLTZMANN, air_at, hydrodynamic_function
-from fitting.calibration.sweep import DENSITY, ResonanceSweep
+from fitting.calibration.sweep import DENSITY, Resonance
 from tests.strict_reading import strictly
 
 REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
@@ -40,7 +40,7 @@ def thermal_spectrum(averages: float, random: np.random.Generator, *, points: in
     khz = np.linspace(86.0, 94.0, points)
     drawn = density(khz) * random.gamma(averages, 1.0 / averages, points)
     count = averages if known else None
-    return ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(drawn), amplitude_unit=DENSITY, averages=count)
+    return Resonance(frequency_khz=khz, amplitude=np.sqrt(drawn), amplitude_unit=DENSITY, averages=count)
 
 
 def run(*arguments: object):
@@ -93,14 +93,14 @@ def test_spectra_are_read_from_csv(tmp_path):
     khz = np.linspace(80.0, 100.0, 30)
     path, head = tmp_path / "spectrum.csv", "frequency_hz,psd_nm2_per_hz"
     np.savetxt(path, np.stack([1e3 * khz, density(khz)], 1), "%.17g", ",", header=head, comments="")
-    sweep = read_sweep(path)
+    sweep = read_resonance(path)
     assert (sweep.averages, sweep.spectrum) == (None, True)
-    assert read_sweep(THERMAL).averages is not None
+    assert read_resonance(THERMAL).averages is not None
     np.testing.assert_allclose(sweep.amplitude**2, density(khz), rtol=1e-14)
     cut = tmp_path / "cut.nid"
     cut.write_bytes(THERMAL.read_bytes()[:-8])
     with pytest.raises(TableError, match="announces 66952 bytes"):
-        read_sweep(cut)
+        read_resonance(cut)
 
 
 @pytest.mark.parametrize(("quality", "points"), [(60, 128), (150, 400), (1000, 400)])
@@ -109,7 +109,7 @@ def test_a_line_of_three_points_hides_no_resonance(quality: float, points: int):
     power = density(khz, quality=quality) * np.random.default_rng(points).gamma(100.0, 0.01, points)
     line = points // 10
     power[line : line + 3] += 0.1 * power.max()
-    sweep = ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(power), amplitude_unit=DENSITY, averages=100.0)
+    sweep = Resonance(frequency_khz=khz, amplitude=np.sqrt(power), amplitude_unit=DENSITY, averages=100.0)
     result = calibrate(sweep)
     assert result.valid, result.reasons
     # 90 kHz to a tenth of the half-width

@@ -6,7 +6,7 @@ from scipy.integrate import solve_ivp
 
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase, find_junction
+from afm_jax.contact.junction import ContactPhase, find_junction
 from afm_jax.contact.time_course import time_course
 from tests.reference_contact_forces import ContactParameters, constants, mp, static_force, viscous_force
 
@@ -25,7 +25,7 @@ def test_the_course_leaves_as_collide_says(speed):
 
 def test_the_way_in_is_that_of_scipy_in_time():
     course = time_course(Contact.paper(), 15.0)
-    inside = (course.phase == Phase.BRIDGE) & (course.velocity_nm_per_us < 0.0)
+    inside = (course.phase == ContactPhase.BRIDGE) & (course.velocity_nm_per_us < 0.0)
     with mp.workdps(20):
         k = constants(ContactParameters())
 
@@ -42,25 +42,25 @@ def test_the_way_in_is_that_of_scipy_in_time():
 def test_force_is_the_rate_of_momentum_and_phases_follow_the_hysteresis():
     contact = Contact.paper()
     course = time_course(contact, 20.0, 2.0)
-    for phase in (Phase.BRIDGE, Phase.JUNCTION):
+    for phase in (ContactPhase.BRIDGE, ContactPhase.JUNCTION):
         chosen = np.flatnonzero(course.phase == phase)[5:40]
         # central differences on an uneven grid
         slope = np.gradient(course.velocity_nm_per_us[chosen], course.time_us[chosen])
         scale = np.abs(course.force_nn[chosen]).max()
         np.testing.assert_allclose(2.0 * slope[1:-1], course.force_nn[chosen][1:-1], rtol=0, atol=0.02 * scale)
     junction, inwards = find_junction(contact), course.velocity_nm_per_us < 0.0
-    assert set(course.phase) == set(Phase)
+    assert set(course.phase) == set(ContactPhase)
     for way, bridge, solid in ((inwards, 3.5, junction.forms_gap_nm), (~inwards, 4.7, junction.breaks_gap_nm)):
         thresholds = (-np.inf, float(solid), bridge, np.inf)
         for phase, low, high in zip(
-            (Phase.JUNCTION, Phase.BRIDGE, Phase.DRY), thresholds, thresholds[1:], strict=False
+            (ContactPhase.JUNCTION, ContactPhase.BRIDGE, ContactPhase.DRY), thresholds, thresholds[1:], strict=False
         ):
             gap = course.gap_nm[(course.phase == phase) & way]
             # a point exactly on a threshold may count for either side
             assert np.all((gap >= low - 1e-9) & (gap <= high + 1e-9))
 
 
-@pytest.mark.parametrize(("modulus_gpa", "last"), [(100.0, Phase.BRIDGE), (1.0, Phase.JUNCTION)])
+@pytest.mark.parametrize(("modulus_gpa", "last"), [(100.0, ContactPhase.BRIDGE), (1.0, ContactPhase.JUNCTION)])
 def test_a_captured_tip_is_followed_until_it_stops(modulus_gpa, last):
     course = time_course(Contact.paper(modulus_gpa=modulus_gpa), 8.0)
     assert course.captured
@@ -73,4 +73,4 @@ def test_a_captured_tip_is_followed_until_it_stops(modulus_gpa, last):
 def test_a_soft_junction_breaks_straight_into_dry_air():
     course = time_course(Contact.paper(modulus_gpa=1.0), 60.0)
     out = course.phase[course.velocity_nm_per_us > 0.0]
-    assert set(out) == {Phase.JUNCTION, Phase.DRY}
+    assert set(out) == {ContactPhase.JUNCTION, ContactPhase.DRY}

@@ -7,7 +7,7 @@ from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Positive, Quantity, Share
 from fitting.calibration.calibrate import calibrate
-from fitting.calibration.sweep import read_sweep
+from fitting.calibration.sweep import read_resonance
 
 
 class CalibrationOptions:
@@ -51,7 +51,7 @@ def calibration(
             itself.
         **lever: as `CalibrationOptions`.
     """
-    measured = read_sweep(sweep)
+    measured = read_resonance(sweep)
     with session.working(f"fitting {measured.points} points"):
         result = calibrate(measured, static=deflection == "static", **lever)
     return Output.of(result, "calibration")

@@ -19,7 +19,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface, Wave
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces.force import ElasticCurve
-from afm_jax.contact.junction import Junction, Phase, find_junction
+from afm_jax.contact.junction import ContactPhase, Junction, find_junction
 
 
 class ContactState(NamedTuple):
@@ -117,7 +117,7 @@ class Driven(NamedTuple):
 
     def gap(self, x: Float[Array, "..."], phase: Int[Array, "..."]) -> Float[Array, "..."]:
         """Return the gap in nm, from s in the junction."""
-        return jnp.where(phase == Phase.JUNCTION, self.gap_of_root(x), x)
+        return jnp.where(phase == ContactPhase.JUNCTION, self.gap_of_root(x), x)
 
     def rates(self, state: ContactState, solid: Bool[Array, "..."]) -> ContactState:
         """Return the rates of a state per unit of time (bridge) or of fictitious time (junction).

@@ -5,7 +5,7 @@ The force of the bridge at a gap fixes the point of the JKR curve that bears it 
 one equation for the gap, which is D_on; the point of the JKR curve fixes where the curve sits on the gap axis, depth =
 shift - gap. D_off is the fold of the JKR curve. A dry contact forms and breaks where its solids meet.
 
-Which forces act depends on where the tip has been (`Phase`), and within a phase they are smooth:
+Which forces act depends on where the tip has been (`ContactPhase`), and within a phase they are smooth:
 
     DRY ----- gap falls to bridge_forms_nm ---> BRIDGE ----- gap falls to D_on ----> JUNCTION
     DRY <---- gap rises to bridge_breaks_nm --- BRIDGE <---- gap rises to D_off ---- JUNCTION
@@ -233,7 +233,7 @@ def explain_missing_junction(contact: Contact) -> str:
     )
 
 
-class Phase(enum.IntEnum):
+class ContactPhase(enum.IntEnum):
     """What is between tip and sample: nothing (DRY), a liquid bridge, or the solid junction."""
 
     DRY = 0
@@ -254,4 +254,4 @@ def force_in_phase(
     bridge = contact.forces(jnp.where(gap > 0.0, gap, 1.0), gap_rate_nm_per_us)
     solid = contact.solid.force(junction.shift_nm - gap)
     here = jnp.asarray(phase)
-    return jnp.where(here == Phase.DRY, dry, jnp.where(here == Phase.BRIDGE, bridge, solid))
+    return jnp.where(here == ContactPhase.DRY, dry, jnp.where(here == ContactPhase.BRIDGE, bridge, solid))

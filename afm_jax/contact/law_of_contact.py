@@ -1,8 +1,9 @@
 """The law that a contact amounts to: rebound speed and delay of its free collisions, in parameters and in tables.
 
-Five functions make a law of collisions: the formula closest to their rebound speeds (`fit_law`), the formula
-closest to their delays (`fit_delay`), both roughly and at once where a guess will do (`law_of_contact`), a table for
-scenes and files (`make_law`), and a table that has derivatives in every parameter, for fits of a contact (`tabulated`).
+Five functions make a law of collisions: the formula closest to their rebound speeds (`law_of_contact`), the formula
+closest to their delays (`delay_of_contact`), both roughly and at once where a guess will do (`approximate_law`), a
+table for scenes and files (`make_law`), and a table with derivatives in every parameter, for fits of a contact
+(`tabulated`).
 
 The delay is what the straight paths in and out, extrapolated to gap 0, leave between them; the difference of two times:
 
@@ -46,9 +47,9 @@ FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full":
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
 RESIDUALS = ("relative", "absolute")
 LAW_SPEEDS = 1.5, 250.0
-"""The range of `fit_law` if none is given: from this multiple of the capture speed to this speed in nm/us."""
+"""The range of `law_of_contact` if none is given: from this multiple of the capture speed to this speed in nm/us."""
 DELAY_SPEEDS = 1.37, 700.0
-"""The range of `fit_delay` if none is given, likewise: for the paper's contact 15 to 700 nm/us."""
+"""The range of `delay_of_contact` if none is given, likewise: for the paper's contact 15 to 700 nm/us."""
 _NAMES = ("r", "epsilon", "viscous_loss")
 _TOLERANCE, _SETTLED = 1e-28, 1e-18
 """Distances of the sum of squares to its minimum, over the squared rebound speeds, to stop at and to have settled."""
@@ -158,7 +159,7 @@ class ContactLaw(Result):
 
 
 @checked
-def fit_law(
+def law_of_contact(
     contact: Contact,
     *,
     speed_range: tuple[float, float] | None = None,
@@ -184,7 +185,7 @@ def fit_law(
 
     >>> import jax
     >>> with jax.enable_x64(True):
-    ...     law = fit_law(Contact.paper(), model="viscous")
+    ...     law = law_of_contact(Contact.paper(), model="viscous")
     >>> round(law.epsilon, 1), round(law.viscous_loss, 1)
     (113.6, 0.5)
     """
@@ -363,7 +364,7 @@ class ContactDelay(Result):
 
 
 @checked
-def fit_delay(
+def delay_of_contact(
     contact: Contact, *, speed_range: tuple[float, float] | None = None, mass_ng: float = 1.0, points: int = 512
 ) -> ContactDelay:
     """Return a contact's delay, and the delay law a u^(-1/5) - b (1/w - 1/u) - d/u that is closest to it.
@@ -488,19 +489,20 @@ def contact_laws(
 
     Args:
         contact: the contact, of numbers.
-        speed_range: of `fit_law`.
-        delay_range: the speed range of `fit_delay`.
-        residuals: of `fit_law`.
+        speed_range: of `law_of_contact`.
+        delay_range: the speed range of `delay_of_contact`.
+        residuals: of `law_of_contact`.
         mass_ng: the tip's mass in ng.
         points: number of speeds.
     """
     how: dict[str, Any] = {"mass_ng": mass_ng, "points": points}
-    formulas = [fit_law(contact, speed_range=speed_range, model=model, residuals=residuals, **how) for model in FREE]
-    delay = fit_delay(contact, speed_range=delay_range, **how)
+    of_speeds: dict[str, Any] = how | {"speed_range": speed_range, "residuals": residuals}
+    formulas = [law_of_contact(contact, model=model, **of_speeds) for model in FREE]
+    delay = delay_of_contact(contact, speed_range=delay_range, **how)
     return ContactLaws(formulas, delay, make_law(contact, mass_ng=mass_ng))
 
 
-def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
+def approximate_law(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     """Return the law u_out^2 = u_in^2 - c u_in - epsilon, with delay, of a contact; None if every tip is captured.
 
     Epsilon is the hysteresis, 2 E/m; c and the delay's three parameters are linear least squares to twelve collisions.

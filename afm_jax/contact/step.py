@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.driven import ContactState, Driven
 from afm_jax.contact.forces.force import slope_of
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 
 _NEAR = 1e-7
 """Relative distance from a threshold within which the parabola is exact to rounding."""
@@ -47,7 +47,7 @@ class TipInContact(NamedTuple):
 
     state: ContactState
     phase: Int[Array, "..."]
-    """A `Phase`."""
+    """A `ContactPhase`."""
     trial_length: Float[Array, "..."]
     """Length of the next trial; 0: chosen from the state; negative: a trial that ends at a turning point."""
     junctions: Int[Array, "..."]
@@ -69,12 +69,12 @@ class TipInContact(NamedTuple):
     @classmethod
     def arriving(cls, driven: Driven, state: ContactState, arrives: Bool[Array, "..."]) -> "TipInContact":
         """Return a tip that meets the bridge, or solids between which nothing acts before; a free tip else."""
-        tip = cls.at_start(state, jnp.where(arrives, Phase.BRIDGE, Phase.DRY))
+        tip = cls.at_start(state, jnp.where(arrives, ContactPhase.BRIDGE, ContactPhase.DRY))
         if driven.bridge.spans:
             return tip
         return tip._replace(
             state=state._replace(x=jnp.where(arrives, driven.junction.forms_root, state.x)),
-            phase=jnp.where(arrives, Phase.JUNCTION, Phase.DRY).astype(jnp.int32),
+            phase=jnp.where(arrives, ContactPhase.JUNCTION, ContactPhase.DRY).astype(jnp.int32),
             junctions=arrives.astype(jnp.int32),
             junction_forms_us=jnp.where(arrives, state.time_us, 0.0),
         )
@@ -101,8 +101,8 @@ def advance(
     forms, breaks = ~solid & at_low & ~repeats, solid & at_low & ~repeats
     leaves = ~solid & at_high & ~repeats
     # the junction breaks into the bridge where that outlives it, else into free flight
-    after_junction = jnp.where(driven.junction.breaks_gap_nm < driven.breaks_nm, Phase.BRIDGE, Phase.DRY)
-    phase = jnp.where(forms, Phase.JUNCTION, jnp.where(leaves, Phase.DRY, tip.phase))
+    after_junction = jnp.where(driven.junction.breaks_gap_nm < driven.breaks_nm, ContactPhase.BRIDGE, ContactPhase.DRY)
+    phase = jnp.where(forms, ContactPhase.JUNCTION, jnp.where(leaves, ContactPhase.DRY, tip.phase))
     phase = jnp.where(breaks, after_junction, phase).astype(tip.phase.dtype)
     x = jnp.where(forms, driven.junction.forms_root, jnp.where(breaks, driven.junction.breaks_gap_nm, end.x))
     in_junction = jnp.where(solid, end.time_us - tip.state.time_us, 0.0)
@@ -157,7 +157,7 @@ def _try_step(
     driven: Driven, tip: TipInContact, until_us: Float[Array, "..."], fineness: float | Float[Array, "..."]
 ) -> _Trial:
     """Return a trial: to a threshold or the end if it lies within 1.2 usual steps, unless its length is given."""
-    start, solid = tip.state, tip.phase == Phase.JUNCTION
+    start, solid = tip.state, tip.phase == ContactPhase.JUNCTION
     low = jnp.where(solid, driven.solid.fold, driven.junction.forms_gap_nm)
     high = jnp.where(solid, jnp.inf, driven.breaks_nm)
     rates = driven.rates(start, solid)

@@ -13,7 +13,7 @@ from afm_jax.checks import as_parameter, check_parameter, check_scalar, checked,
 from afm_jax.contact.bridge_leg import Way, collocate, margin_of, pull_at, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
-from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase, require_junction
+from afm_jax.contact.junction import ContactPhase, Junction, find_junction, force_in_phase, require_junction
 from afm_jax.contact.junction_leg import Stretch, stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import halved
@@ -25,7 +25,7 @@ _FLIGHT = 0.5
 """Free flight shown before and after contact, as a fraction of the gap at which the bridge breaks."""
 
 
-@public_result(phase=Phase)
+@public_result(phase=ContactPhase)
 class TimeCourse(ResultTuple):
     """Gap, velocity and force of a free tip during one impact on a sample at rest; arrays of one length by rising time.
 
@@ -38,7 +38,7 @@ class TimeCourse(ResultTuple):
     velocity_nm_per_us: Float[np.ndarray, " points"]
     """Rate dD/dt of the gap: negative on the way in."""
     phase: Int[np.ndarray, " points"]
-    """What is between tip and sample, the number of a `Phase`."""
+    """What is between tip and sample, the number of a `ContactPhase`."""
     force_nn: Float[np.ndarray, " points"]
     """Force of the sample on the tip; attraction is negative."""
     captured: bool
@@ -137,10 +137,12 @@ def _joined(
     if not energies[0] > 0.0:
         raise ValueError("the bridge turns the tip round before the junction forms; take a higher speed")
     flight = _FLIGHT * breaks
-    parts = [(Phase.DRY, np.array([-flight / speed, 0.0]), np.array([forms + flight, forms]), np.full(2, -speed))]
+    before = np.array([-flight / speed, 0.0])
+    parts = [(ContactPhase.DRY, before, np.array([forms + flight, forms]), np.full(2, -speed))]
     begin = 0.0
     _, off, rebound = energies
-    for phase, leg in zip((Phase.BRIDGE, Phase.JUNCTION, Phase.JUNCTION, Phase.BRIDGE), legs, strict=True):
+    phases = ContactPhase.BRIDGE, ContactPhase.JUNCTION, ContactPhase.JUNCTION, ContactPhase.BRIDGE
+    for phase, leg in zip(phases, legs, strict=True):
         if not leg.duration_us > 0.0 or (leg is legs[-1] and off <= 0.0):
             continue
         parts.append((phase, begin + np.asarray(leg.time_us), np.asarray(leg.gap_nm), np.asarray(leg.velocity)))
@@ -148,7 +150,7 @@ def _joined(
     captured = not rebound > 0.0
     if not captured:
         after = np.array([begin, begin + flight / rebound])
-        parts.append((Phase.DRY, after, np.array([breaks, breaks + flight]), np.full(2, rebound)))
+        parts.append((ContactPhase.DRY, after, np.array([breaks, breaks + flight]), np.full(2, rebound)))
     time, gap, velocity = (np.concatenate([part[place] for part in parts]) for place in (1, 2, 3))
     phase = np.concatenate([np.full(part[1].shape, int(part[0])) for part in parts])
     force = np.asarray(force_in_phase(contact, junction, phase, gap, velocity))

@@ -19,7 +19,7 @@ from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.dynamics.impact_loop import GRAZING, LoopFamily, LoopReading, driven_part, highest_of_flights, lowest_gap
 from afm_jax.dynamics.impact_orbits import (
     ManyImpactOrbits,
@@ -218,7 +218,7 @@ def _closed(
 
 def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, "guesses n"]:
     """Return the orbits of the law with delay closest to the contact, as guesses: m departure phases, m speeds."""
-    law = law_of_contact(scene.interaction, float(scene.cantilever.mass_ng))
+    law = approximate_law(scene.interaction, float(scene.cantilever.mass_ng))
     if law is None:
         return np.zeros((0, 2 * impacts))
     law_scene = eqx.tree_at(lambda scene: scene.interaction, scene, law)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.first_impact import Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import Departure, NextImpact, Search, end_of_flight, flight_from, impact_at_end
@@ -271,7 +271,7 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
     arrival = np.where(leaves, contacts.arrival_time_us, np.nan)
     full = count == _ROWS
     since = motion.final.time_us - np.nanmax(np.column_stack([tips.time_us, departure]), axis=1)
-    held = (motion.phase != Phase.DRY) & (since > HELD_PERIODS * slower)
+    held = (motion.phase != ContactPhase.DRY) & (since > HELD_PERIODS * slower)
     outcome = np.select(
         [full, held, since > _AWAY * slower],
         [Outcome.IMPACT, Outcome.CAPTURED, Outcome.NO_FURTHER_IMPACT],

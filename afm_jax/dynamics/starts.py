@@ -16,7 +16,7 @@ from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.dynamics.many_tips import MAX_STEPS, Tips, after_impacts
 from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
@@ -204,7 +204,7 @@ def laws_of(scenes: Scene) -> tuple[Law, Bool[np.ndarray, " lanes"]] | None:
     each = []
     for lane in first:
         contact = jax.tree.map(lambda leaf, lane=lane: jnp.asarray(leaf)[lane], scenes.interaction)
-        each.append(law_of_contact(contact, float(columns[-1][lane])))
+        each.append(approximate_law(contact, float(columns[-1][lane])))
     some = next((law for law in each if law is not None), None)
     if some is None:
         return None

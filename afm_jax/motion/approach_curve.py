@@ -18,7 +18,7 @@ from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.scene import Scene, drive_of, require_one_frequency
 from afm_jax.apparatus.surface import drive_per_free_height, force_per_height, surface_of
 from afm_jax.checks import check_count, checked, require_float64
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.observe import Observables, observe
 from afm_jax.motion.record import Simulation, State, to_gap
@@ -274,7 +274,7 @@ def _why_over(run: LongRun) -> HeightReading | None:
 def _top_of_swing(dense: DensePath, from_us: float, to_us: float, period_us: float) -> State | None:
     """Return the tip in flight where it is highest between two times, its time in the first drive period."""
     path = dense.at(np.linspace(from_us, to_us, _TIMES))
-    heights = np.where(path.phase == Phase.DRY, path.position_nm, -np.inf)
+    heights = np.where(path.phase == ContactPhase.DRY, path.position_nm, -np.inf)
     top = int(np.argmax(heights))
     if not np.isfinite(heights[top]):
         return None

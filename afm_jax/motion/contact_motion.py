@@ -27,7 +27,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.bridge_leg import go_in, go_out
 from afm_jax.contact.driven import ContactState, Driven, Leg, driven_by
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.contact.junction_leg import go_through_junction
 from afm_jax.contact.settings import DrivenSetting
 from afm_jax.contact.step import TipInContact, advance, inverse_junction_step
@@ -193,7 +193,7 @@ def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, row
     sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & above
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START)
     outcome = jnp.where(driven.junction.exists, outcome, MotionOutcome.NO_JUNCTION)
-    phase = jnp.where(leaves | (gap_nm > driven.forms_nm), Phase.DRY, Phase.BRIDGE)
+    phase = jnp.where(leaves | (gap_nm > driven.forms_nm), ContactPhase.DRY, ContactPhase.BRIDGE)
     none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(time_us)
     state = ContactState(gap_nm, rate, time_us, zero)
     tip = TipInContact.at_start(state, phase)
@@ -204,13 +204,13 @@ def _at_start(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, *, row
 def _round(driven: Driven, until_us: Array, setting: DrivenSetting, reverse: bool, course: FollowedTip) -> FollowedTip:  # noqa: FBT001
     """Return a tip after one round: flight, legs through the contact, steps in time where those do not hold."""
     (tip, arrival, repeats), active = course.tip, ~course.done
-    free = (tip.phase == Phase.DRY) & active
+    free = (tip.phase == ContactPhase.DRY) & active
     flown, arrives, lost = _fly(driven, tip.state, free, until_us)
     tip, arrival = where(free, TipInContact.arriving(driven, flown, arrives), tip), where(arrives, flown, arrival)
     tip = _through_legs(driven, tip, arrives, active & (repeats.times == 0), until_us, setting)
     tip = _step_in_time(driven, tip, active, repeats.times, until_us, setting, reverse=reverse)
 
-    in_contact, leaves, over = active & (arrives | ~free), tip.phase == Phase.DRY, tip.state.time_us >= until_us
+    in_contact, leaves, over = active & (arrives | ~free), tip.phase == ContactPhase.DRY, tip.state.time_us >= until_us
     again, repeats = _repetition(tip, arrival, repeats, in_contact & leaves & ~over, setting)
     ends, finite = in_contact & (leaves | over) & ~again, jnp.isfinite(tip.state.x)
     outcome = jnp.where(ends & ~leaves, MotionOutcome.HELD, MotionOutcome.FINISHED)
@@ -250,7 +250,8 @@ def _fly(
 
 def at_junction(driven: Driven, tip: TipInContact) -> Bool[Array, "..."]:
     """Return whether a tip has just formed the junction, so that legs may go on from there."""
-    return (tip.phase == Phase.JUNCTION) & (tip.state.x == driven.junction.forms_root) & (tip.trial_length == 0.0)
+    at_its_begin = (tip.state.x == driven.junction.forms_root) & (tip.trial_length == 0.0)
+    return (tip.phase == ContactPhase.JUNCTION) & at_its_begin
 
 
 def _through_legs(
@@ -289,7 +290,7 @@ def legs_through(
 
     inward = go_in(driven, tip.state, quick)
     forms = takes(inward, arrives)
-    tip = _at_end_of(inward, tip, forms, Phase.JUNCTION)
+    tip = _at_end_of(inward, tip, forms, ContactPhase.JUNCTION)
     tip = tip._replace(
         junctions=tip.junctions + forms.astype(tip.junctions.dtype),
         junction_forms_us=jnp.where(forms, tip.state.time_us, tip.junction_forms_us),
@@ -304,16 +305,16 @@ def legs_through(
     first_step = lax.stop_gradient(1.0 / (setting.fineness * inverse_junction_step(driven, at_forming)))
     tip = tip._replace(trial_length=jnp.where(waits & ~breaks, first_step, tip.trial_length))
     in_junction = tip.time_in_junction_us + solid.state.time_us - tip.state.time_us
-    tip = _at_end_of(solid, tip, breaks, Phase.BRIDGE)
+    tip = _at_end_of(solid, tip, breaks, ContactPhase.BRIDGE)
     tip = tip._replace(
         junction_breaks_us=jnp.where(breaks, tip.state.time_us, tip.junction_breaks_us),
         time_in_junction_us=jnp.where(breaks, in_junction, tip.time_in_junction_us),
     )
     outward = go_out(driven, tip.state, quick)
-    return _at_end_of(outward, tip, takes(outward, breaks), Phase.DRY)
+    return _at_end_of(outward, tip, takes(outward, breaks), ContactPhase.DRY)
 
 
-def _at_end_of(leg: Leg, tip: TipInContact, takes: Array, phase: Phase) -> TipInContact:
+def _at_end_of(leg: Leg, tip: TipInContact, takes: Array, phase: ContactPhase) -> TipInContact:
     """Return a tip in a phase at the end of a leg where it takes the leg, else as it was."""
     return tip._replace(
         state=where(takes, leg.state, tip.state),
@@ -338,7 +339,7 @@ def _step_in_time(
 
     def needs_steps(driven, tip, active, fineness, until_us):
         finite = jnp.isfinite(tip.state.x) & jnp.isfinite(tip.state.gap_rate)
-        moves = active & (tip.phase != Phase.DRY) & (tip.state.time_us < until_us) & finite
+        moves = active & (tip.phase != ContactPhase.DRY) & (tip.state.time_us < until_us) & finite
         if setting.quick is None:
             return moves
         # a tip that has just formed the junction waits for its leg, unless that did not hold or the contact is repeated

@@ -14,7 +14,7 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, contacts_of
 from afm_jax.motion.settle import Settled, held_since, is_stuck, settled, slower_period_us
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
@@ -79,7 +79,7 @@ def follow_in_pieces(
         onward, contacts = None, int(motion.count)
         if departures.size and not stuck and (full or motion.broke_off is None):
             onward, contacts = state_after(motion, int(departures[-1])), int(departures[-1]) + 1
-        elif motion.outcome == MotionOutcome.FINISHED and motion.phase == Phase.DRY:
+        elif motion.outcome == MotionOutcome.FINISHED and motion.phase == ContactPhase.DRY:
             onward = motion.final
         yield Piece(motion, length, contacts, onward, stuck)
         if not (full or motion.broke_off is None) or (length == to_end and not (full and onward)):

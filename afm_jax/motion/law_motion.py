@@ -23,7 +23,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, time_above
 from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
@@ -115,12 +115,13 @@ def follow_law(  # noqa: PLR0913
     row, no_gap = LawRow(*course.rows.T), jnp.zeros(max_contacts)
     arrival, departure = State(row.arrival_us, no_gap, -row.approach), State(row.departure_us, no_gap, row.rebound)
     lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
+    held = course.outcome == MotionOutcome.HELD
     return Simulation(
         start=start,
         contacts=contacts_in_lab(surface, response, row.kind, arrival, departure, lost),
         count=course.contacts,
         final=_final(seen, response, course.tip, course.outcome, until),
-        phase=jnp.where(course.outcome == MotionOutcome.HELD, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
+        phase=jnp.where(held, jnp.int32(ContactPhase.JUNCTION), jnp.int32(ContactPhase.DRY)),
         outcome=course.outcome,
     )
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from afm_jax.apparatus.scene import drive_of
-from afm_jax.contact.junction import Phase
+from afm_jax.contact.junction import ContactPhase
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.motion.follow import LongRun
 from afm_jax.motion.observe import OBSERVABLES, Observables, why_absent
@@ -73,7 +73,7 @@ class MotionTable(NamedTuple):
             "start": {name: float(value) for name, value in simulation.start._asdict().items()},
             "final": {
                 **{name: float(value) for name, value in simulation.final._asdict().items()},
-                "phase": Phase(int(simulation.phase)).name.lower(),
+                "phase": ContactPhase(int(simulation.phase)).name.lower(),
             },
             "outcome": MotionOutcome(int(simulation.outcome)).sentence,
             "valid": self.reason is None,
@@ -84,7 +84,7 @@ class MotionTable(NamedTuple):
     def printed(self) -> list[str | None]:
         """Return a short summary, a line each."""
         simulation, seen, verdict, window = self.run.simulation, self.seen, self.run.verdict, self.seen.window
-        begin, final, phase = simulation.start, simulation.final, Phase(int(simulation.phase)).name.lower()
+        begin, final, phase = simulation.start, simulation.final, ContactPhase(int(simulation.phase)).name.lower()
         times, mean = f"{float(begin.time_us):.6g} to {float(final.time_us):.6g}", ""
         reading = ["Less than a response period: no means, energies, amplitudes and phases; follow the motion longer."]
         if window.responses:
@@ -113,7 +113,7 @@ class MotionTable(NamedTuple):
         # a tip that is held rings through the whole stretch
         inner = inner[:: math.ceil((inner.size + 1) / _MOST_NODES)]
         tip = self.dense.at(np.union1d(np.linspace(begin, end, _POINTS), inner))._asdict()
-        tip["phase"] = [Phase(phase).name.lower() for phase in tip["phase"].tolist()]
+        tip["phase"] = [ContactPhase(phase).name.lower() for phase in tip["phase"].tolist()]
         return {"contacts.csv": _contact_columns(simulation), "trajectory.csv": tip}
 
 

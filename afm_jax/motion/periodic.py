@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase, find_junction, require_junction
+from afm_jax.contact.junction import ContactPhase, find_junction, require_junction
 from afm_jax.motion.follow import Run, follow_in_pieces, why_over
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.trajectory import DensePath, flights_of
@@ -125,7 +125,7 @@ def _orbit_of(scene: Scene, near: np.ndarray, periods: int, run: Run) -> Orbit |
 
 def ends_in_flight(motion: Simulation) -> np.ndarray:
     """Return position and velocity at the end of a motion, a column each of a batch; NaN if not in flight then."""
-    free = (np.asarray(motion.outcome) == MotionOutcome.FINISHED) & (np.asarray(motion.phase) == Phase.DRY)
+    free = (np.asarray(motion.outcome) == MotionOutcome.FINISHED) & (np.asarray(motion.phase) == ContactPhase.DRY)
     return np.where(free, np.stack([motion.final.position_nm, motion.final.velocity_nm_per_us]), np.nan)
 
 

@@ -128,7 +128,7 @@ class Simulation(Result, eqx.Module):
     """Number of contacts, the unfinished one of a held tip included."""
     final: State
     phase: Int[Array, "..."]
-    """What is between tip and sample at the end, a `Phase` (laws: JUNCTION where the platform holds the tip)."""
+    """What is between tip and sample at the end, a `ContactPhase` (laws: JUNCTION where the platform holds the tip)."""
     outcome: Int[Array, "..."]
     """How the simulation ended, the number of a `MotionOutcome`."""
 

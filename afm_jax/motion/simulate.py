@@ -14,7 +14,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, is_traced, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase, end_of_contact, find_junction, require_junction
+from afm_jax.contact.junction import ContactPhase, end_of_contact, find_junction, require_junction
 from afm_jax.contact.settings import driven_setting_of
 from afm_jax.impact.law import Law
 from afm_jax.motion.contact_motion import follow_contacts, has_just_left
@@ -126,7 +126,7 @@ def _follow_free(cantilever: Cantilever, response: Surface | None, start: State,
     sane = jnp.isfinite(final.position_nm) & jnp.isfinite(final.velocity_nm_per_us)
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START).astype(jnp.int32)
     contacts = Contacts(none.astype(jnp.int32), *[none] * 9, detail=None)
-    return Simulation(start, contacts, count, final, jnp.full_like(count, Phase.DRY), outcome)
+    return Simulation(start, contacts, count, final, jnp.full_like(count, ContactPhase.DRY), outcome)
 
 
 def _with_room(follow: Callable[..., Simulation], room: int) -> Simulation:

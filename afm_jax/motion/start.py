@@ -13,7 +13,7 @@ from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import end_of_contact
-from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import State, with_response
@@ -45,7 +45,7 @@ def default_start(scene: Scene) -> State:
         return state(0.0, 0.0, 0.0)
     law = scene.interaction
     if isinstance(law, Contact):
-        law = law_of_contact(law, float(scene.cantilever.mass_ng))
+        law = approximate_law(law, float(scene.cantilever.mass_ng))
     seconds = (part.second for part in (scene.platform, scene.base, scene.force) if part is not None)
     still = eqx.tree_at(
         lambda s: s.platform.offset_rate_nm_per_us, scene, jnp.zeros_like(scene.platform.offset_rate_nm_per_us)

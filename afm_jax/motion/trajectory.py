@@ -21,7 +21,7 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, Driven, driven_by
-from afm_jax.contact.junction import Phase, force_in_phase
+from afm_jax.contact.junction import ContactPhase, force_in_phase
 from afm_jax.contact.step import TipInContact, advance, eighth_order_step
 from afm_jax.motion.record import Simulation, State, contacts_of, to_gap, to_lab, where
 from afm_jax.results import ResultTuple, public_result
@@ -37,10 +37,10 @@ _NODES_PER_PANEL = 16
 _PANEL_RAD = 1.5
 """Phase of the fastest motion that one panel of a flight spans."""
 FLIGHT, REST, CONTACT = -1, -2, -3
-_PHASES = {FLIGHT: int(Phase.DRY), REST: int(Phase.JUNCTION)}
+_PHASES = {FLIGHT: int(ContactPhase.DRY), REST: int(ContactPhase.JUNCTION)}
 
 
-@public_result(phase=Phase)
+@public_result(phase=ContactPhase)
 class Trajectory(ResultTuple):
     """Height, velocity, gap and force of the tip at given times; NumPy arrays of the times' shape."""
 
@@ -51,7 +51,7 @@ class Trajectory(ResultTuple):
     gap_nm: np.ndarray
     gap_rate_nm_per_us: np.ndarray
     phase: np.ndarray
-    """What is between tip and sample, numbers of `Phase`.
+    """What is between tip and sample, numbers of `ContactPhase`.
 
     With a law JUNCTION while the platform holds the tip, or the collision delay lasts.
     """
@@ -131,7 +131,7 @@ class DensePath:
         place = ContactState(gap, rate, arrival.time_us, jnp.zeros(lanes))
         tip = TipInContact.arriving(self.driven, place, jnp.arange(lanes) < len(contacts.x))
         until, taken = jnp.asarray(self.end_us), [Pieces(*np.zeros((6, 0)))]
-        while np.any((np.asarray(tip.phase) != Phase.DRY) & (np.asarray(tip.state.time_us) < self.end_us)):
+        while np.any((np.asarray(tip.phase) != ContactPhase.DRY) & (np.asarray(tip.state.time_us) < self.end_us)):
             tip, (steps, accepted) = _some_trials(self.driven, tip, until)
             taken.append(Pieces(*(np.asarray(column)[np.asarray(accepted)] for column in steps)))
         joined = Pieces(*map(np.concatenate, zip(*taken, strict=True)))
@@ -175,7 +175,7 @@ class DensePath:
         if not self.simulation.start.time_us <= time_us <= self.simulation.final.time_us:
             return None
         tip = self.at(time_us)
-        return State(*map(jnp.asarray, tip[:3])) if tip.phase == Phase.DRY else None
+        return State(*map(jnp.asarray, tip[:3])) if tip.phase == ContactPhase.DRY else None
 
     def nodes(self, from_us: float, to_us: float) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
         """Return times and weights in us whose weighted sums are integrals between two times of the stretch.
@@ -255,7 +255,7 @@ def _some_trials(
     """Return tips after some trial steps, these steps as columns of `Pieces`, and which of them were accepted."""
 
     def once(tip, _):
-        going = (tip.phase != Phase.DRY) & (tip.state.time_us < until)
+        going = (tip.phase != ContactPhase.DRY) & (tip.state.time_us < until)
         after = advance(driven, tip, until, _FINENESS)
         place, begin = tip.state, tip.state.time_us
         step = (begin, after.state.time_us, tip.phase, begin, place.x, place.gap_rate)
@@ -276,7 +276,7 @@ def _states_at(
         phase: its phase.
         time_us: the times.
     """
-    solid = phase == Phase.JUNCTION
+    solid = phase == ContactPhase.JUNCTION
 
     def stepped(length):
         return eighth_order_step(lambda place: driven.rates(place, solid), start, length)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import Phase, find_junction
+from afm_jax.contact.junction import ContactPhase, find_junction
 from afm_jax.motion.observe import peaks_between_contacts, poincare_section
 from afm_jax.motion.record import Simulation, contacts_of
 from afm_jax.motion.settle import Settled, is_stuck, settled, slower_period_us, window_of
@@ -196,7 +196,7 @@ def _course_shown(scene: Scene, simulation: Simulation) -> tuple[float, float]:
 def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
     """Shade where the tip is in the bridge or in the junction, or held by the platform of a law."""
     joined = "solid junction" if isinstance(contact, Contact) else "held by the platform"
-    for phase, colour, name in ((Phase.BRIDGE, BLUE, "liquid bridge"), (Phase.JUNCTION, ACCENT, joined)):
+    for phase, colour, name in ((ContactPhase.BRIDGE, BLUE, "liquid bridge"), (ContactPhase.JUNCTION, ACCENT, joined)):
         inside = path.phase == phase
         if inside.any():
             style: dict[str, Any] = {"color": colour, "alpha": 0.18, "linewidth": 0, "label": name}

@@ -33,7 +33,7 @@ from afm_jax.compilation_cache import quick_options
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import ContactState, driven_by, free_tip
-from afm_jax.contact.junction import Phase, find_junction
+from afm_jax.contact.junction import ContactPhase, find_junction
 from afm_jax.contact.parameters import PAPER
 from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting, Setting
 from afm_jax.dynamics.starts import evenly_spread
@@ -98,13 +98,15 @@ class EquationOfMotion(eqx.Module):
     def rates(self, phase: Any, x: Any, rate: Any, time_us: Any) -> tuple[Array, Array, Array]:
         """Return the rates of gap (or s), gap rate and time by the time (in the junction: fictitious time)."""
         state = ContactState(x, rate, time_us, jnp.zeros_like(x))
-        found = (x, x, x) if self.driven is None else self.driven.rates(state, jnp.asarray(phase == Phase.JUNCTION))[:3]
+        solid = jnp.asarray(phase == ContactPhase.JUNCTION)
+        found = (x, x, x) if self.driven is None else self.driven.rates(state, solid)[:3]
         if self.cantilever is None:
             return found
         height, speed = self.surface.position_and_velocity(time_us)
         pull = self.cantilever.acceleration(x + height, rate + speed) - self.surface.acceleration(time_us)
         flight = (rate, pull, jnp.ones_like(x))
-        return jax.tree.map(lambda flying, touching: jnp.where(phase == Phase.DRY, flying, touching), flight, found)
+        flies = phase == ContactPhase.DRY
+        return jax.tree.map(lambda flying, touching: jnp.where(flies, flying, touching), flight, found)
 
     def levels(self, phase: Any) -> tuple[Array, Array]:
         """Return where a phase ends: x has fallen to the first, or risen to the second."""
@@ -112,9 +114,9 @@ class EquationOfMotion(eqx.Module):
         if self.driven is None:
             return jnp.zeros(()), never
         driven = self.driven
-        inward = jnp.where(phase == Phase.BRIDGE, driven.junction.forms_gap_nm, driven.forms_nm)
-        inward = jnp.where(phase == Phase.JUNCTION, driven.solid.fold, inward)
-        return inward, jnp.where(phase == Phase.BRIDGE, driven.breaks_nm, never)
+        inward = jnp.where(phase == ContactPhase.BRIDGE, driven.junction.forms_gap_nm, driven.forms_nm)
+        inward = jnp.where(phase == ContactPhase.JUNCTION, driven.solid.fold, inward)
+        return inward, jnp.where(phase == ContactPhase.BRIDGE, driven.breaks_nm, never)
 
     def after(self, tip: Tip, risen: Bool[Array, ""]) -> Tip:
         """Return what follows the end of a phase; the rate of a tip that a law captures is NaN."""
@@ -124,11 +126,11 @@ class EquationOfMotion(eqx.Module):
             leaves = tip.time_us + speeds.delay
             return Tip(tip.phase, jnp.zeros_like(rebound), rebound, leaves, tip.time_us, tip.crossings + 2)
         driven, (down, up) = self.driven, self.levels(tip.phase)
-        flew, pressed = tip.phase == Phase.DRY, tip.phase == Phase.JUNCTION
+        flew, pressed = tip.phase == ContactPhase.DRY, tip.phase == ContactPhase.JUNCTION
         presses = ~risen & (~pressed & ~flew if self.spans else flew)
         gap = jnp.where(pressed, driven.junction.breaks_gap_nm, jnp.where(risen, up, down))
         leaves = risen | (pressed & (driven.junction.breaks_gap_nm >= driven.breaks_nm))
-        phase = jnp.where(leaves, Phase.DRY, jnp.where(presses, Phase.JUNCTION, Phase.BRIDGE))
+        phase = jnp.where(leaves, ContactPhase.DRY, jnp.where(presses, ContactPhase.JUNCTION, ContactPhase.BRIDGE))
         return Tip(
             phase=phase.astype(tip.phase.dtype),
             x=jnp.where(presses, driven.junction.forms_root, gap),
@@ -263,7 +265,7 @@ def _longest_step(motion: EquationOfMotion, phase: Any) -> Array:
     if motion.cantilever is None:
         return jnp.asarray(jnp.inf)
     fastest = jnp.maximum(motion.surface.fastest_angular_frequency, motion.cantilever.angular_frequency)
-    return jnp.where(phase == Phase.DRY, 2.0 * jnp.pi / fastest / _STEPS_A_PERIOD, jnp.inf)
+    return jnp.where(phase == ContactPhase.DRY, 2.0 * jnp.pi / fastest / _STEPS_A_PERIOD, jnp.inf)
 
 
 def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters: Parameters) -> Values:
@@ -279,7 +281,7 @@ def by_diffrax(problem: AccuracyProblem, tolerance: Float[Array, ""], parameters
             diffrax.ODETerm(lambda _, y, __: motion.rates(tip.phase, *y)),
             diffrax.Dopri8(),
             0.0,
-            jnp.where(tip.phase == Phase.DRY, _LONGEST_US, _LONGEST_TOUCH_US),
+            jnp.where(tip.phase == ContactPhase.DRY, _LONGEST_US, _LONGEST_TOUCH_US),
             None,
             (tip.x, tip.rate, tip.time_us),
             stepsize_controller=diffrax.PIDController(
@@ -360,7 +362,7 @@ class ScipyPrograms:
         self.flight = jax.jit(lambda vector: _flight_numbers(of(vector)))
         self.rates = {
             phase: jax.jit(lambda vector, y, phase=phase: jnp.stack(of(vector).rates(phase, *y)))
-            for phase in (Phase.BRIDGE, Phase.JUNCTION)
+            for phase in (ContactPhase.BRIDGE, ContactPhase.JUNCTION)
         }
 
     @staticmethod
@@ -373,7 +375,7 @@ def _flight_numbers(motion: EquationOfMotion) -> tuple[Array, ...]:
     """Return Omega^2, Omega/Q, the longest step, offset and ramp of the surface, and its cosines as rows."""
     cantilever, surface = motion.cantilever, motion.surface
     waves = jnp.array([[wave.cosine, wave.sine, wave.angular_frequency] for wave in surface.waves])
-    own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, Phase.DRY)
+    own = cantilever.angular_frequency**2, 2.0 * cantilever.decay_rate, _longest_step(motion, ContactPhase.DRY)
     return *own, surface.offset_nm, surface.offset_rate_nm_per_us, waves.reshape(-1, 3)
 
 
@@ -394,7 +396,7 @@ def by_scipy(programs: ScipyPrograms, vector: Array, tip: Tip, crossings: int, t
         if tip.crossings >= crossings:
             return tip
         down, up = (float(level) for level in programs.levels(vector, tip.phase))
-        through = _flown_by_scipy if int(tip.phase) == Phase.DRY else _touched_by_scipy
+        through = _flown_by_scipy if int(tip.phase) == ContactPhase.DRY else _touched_by_scipy
         risen, ended = through(programs, vector, tip, (down, up), tolerance)
         tip = jax.tree.map(np.asarray, programs.after(vector, ended, risen))
         if not np.isfinite(tip.rate):
@@ -406,7 +408,7 @@ def _touched_by_scipy(
     programs: ScipyPrograms, vector: Array, tip: Tip, levels: tuple[float, float], tolerance: float
 ) -> tuple[np.ndarray, Tip]:
     """Return whether a phase of a contact ends at the gap that the tip rises to, and the tip there."""
-    rates, (down, up) = programs.rates[Phase(int(tip.phase))], levels
+    rates, (down, up) = programs.rates[ContactPhase(int(tip.phase))], levels
     ends: list[Any] = [lambda _, y: y[0] - down]
     ends += [lambda _, y: y[0] - up] if math.isfinite(up) else []
     state = [float(tip.x), float(tip.rate), float(tip.time_us)]
@@ -500,7 +502,7 @@ def impact_times(tips: int) -> AccuracyProblem:
         now = starts + parameters[0]
         rate = speeds + parameters[1] - scene.platform.velocity(now)
         motion = EquationOfMotion(scene.cantilever, scene.platform, scene.interaction)
-        return motion, tips_at(Phase.DRY, jnp.zeros_like(rate), rate, now)
+        return motion, tips_at(ContactPhase.DRY, jnp.zeros_like(rate), rate, now)
 
     return AccuracyProblem(
         what="time of the next impact (us)",
@@ -515,7 +517,7 @@ def impact_times(tips: int) -> AccuracyProblem:
     )
 
 
-def tips_at(phase: Phase, x: Any, rate: Any, now: Any) -> Tip:
+def tips_at(phase: ContactPhase, x: Any, rate: Any, now: Any) -> Tip:
     """Return tips at the beginning of a phase, as many as there are gap rates."""
     rate = jnp.asarray(rate)
     like = partial(jnp.broadcast_to, shape=rate.shape)
@@ -544,7 +546,7 @@ def rebound_speeds(tips: int) -> AccuracyProblem:
         contact = contact_at(parameters)
         driven = free_tip(contact, find_junction(contact), jnp.ones(()))
         rate = -speeds * jnp.exp(parameters[0])
-        return EquationOfMotion(driven=driven), tips_at(Phase.BRIDGE, driven.forms_nm, rate, 0.0)
+        return EquationOfMotion(driven=driven), tips_at(ContactPhase.BRIDGE, driven.forms_nm, rate, 0.0)
 
     return AccuracyProblem(
         what="rebound speed (relative)",
@@ -602,7 +604,8 @@ def contact_arrivals(name: str, contacts: int) -> AccuracyProblem:
     def begin(parameters: Parameters) -> tuple[EquationOfMotion, Tip]:
         gap, rate = to_gap(*world, moved(parameters))
         # a start on the surface but for rounding lies on it
-        return motion, tips_at(Phase.DRY, jnp.where(jnp.abs(gap) < 1e-9, 0.0, gap)[None], rate[None], start.time_us)
+        gap = jnp.where(jnp.abs(gap) < 1e-9, 0.0, gap)
+        return motion, tips_at(ContactPhase.DRY, gap[None], rate[None], start.time_us)
 
     problem = AccuracyProblem(
         what=f"arrival of contact {contacts} (us)",

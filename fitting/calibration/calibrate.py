@@ -19,7 +19,7 @@ from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, counted, decimals, with_error
 from fitting.calibration.model import chi2_without_resonance, minimum
 from fitting.calibration.stiffness import equipartition, sader
-from fitting.calibration.sweep import ResonanceSweep, read_sweep
+from fitting.calibration.sweep import Resonance, read_resonance
 from fitting.tables.csv_text import TableError, given_value
 
 _Given = tuple[float, float | None] | float | str | None
@@ -78,7 +78,7 @@ class Calibration(JudgedResult):
     degrees_of_freedom: int
     p_value: float
     fitted: np.ndarray
-    sweep: ResonanceSweep
+    sweep: Resonance
     reasons: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -133,7 +133,7 @@ class Calibration(JudgedResult):
 
 @checked
 def calibrate(
-    sweep: ResonanceSweep | str | os.PathLike[str],
+    sweep: Resonance | str | os.PathLike[str],
     *,
     averages: float | None = None,
     temperature_k: _Given = None,
@@ -147,8 +147,8 @@ def calibrate(
     The frequency is the undamped natural one; the amplitude is largest a little lower, at f0 sqrt(1 - 1/2Q^2).
 
     Args:
-        sweep: from `read_sweep`, or a file; its phase is used where it is there. Without errors of the amplitudes these
-            are estimated from the misfit, and goodness of fit cannot be judged.
+        sweep: from `read_resonance`, or a file; its phase is used if there is one. Without errors of the amplitudes
+            these are estimated from the misfit, and goodness of fit cannot be judged.
         averages: how many spectra a thermal spectrum is the mean of; None: the file's.
         temperature_k: of lever and air, a number, a pair with its error or '296 +- 3', which is assumed of a file
             that says none.
@@ -165,8 +165,8 @@ def calibrate(
         ValueError: if an option is impossible, or a lever has one side only.
         TableError: if the scan has too few points, or its amplitude is the same everywhere.
     """
-    if not isinstance(sweep, ResonanceSweep):
-        sweep = read_sweep(Path(os.fspath(sweep)))
+    if not isinstance(sweep, Resonance):
+        sweep = read_resonance(Path(os.fspath(sweep)))
     check_parameter("averages", averages, "above 0.5", optional=True)
     check_parameter("scale_error", scale_error, "positive")
     warm = temperature_k or (sweep.instrument.get("temperature_k", 296.0), 3.0)
@@ -191,7 +191,7 @@ def calibrate(
     return replace(found, spring_constant_n_per_m=springs, **said)
 
 
-def _check_sweep(sweep: ResonanceSweep) -> None:
+def _check_sweep(sweep: Resonance) -> None:
     """Refuse scans with fewer frequencies than the model has parameters, or with nothing that changes."""
     count = len(np.unique(sweep.frequency_khz))
     if count < _LEAST_FREQUENCIES:
@@ -201,7 +201,7 @@ def _check_sweep(sweep: ResonanceSweep) -> None:
         raise TableError(f"{sweep.source}: the amplitude is {value} at every frequency; sweep across a resonance")
 
 
-def _fitted(sweep: ResonanceSweep) -> Calibration:
+def _fitted(sweep: Resonance) -> Calibration:
     """Return the fit of a scan or of a part of a spectrum, with what makes it invalid and its warnings."""
     largest, averages = float(sweep.amplitude.max()), sweep.averages if sweep.spectrum else None
     # without errors they are what makes chi2/dof 1
@@ -292,7 +292,7 @@ def _autocorrelation(residual: Float[np.ndarray, "kinds points"]) -> float:
     return float(np.sum(residual[:, 1:] * residual[:, :-1])) / total if total > 1e-12 * residual.size else 0.0
 
 
-def _of_spectrum(sweep: ResonanceSweep) -> Calibration:
+def _of_spectrum(sweep: Resonance) -> Calibration:
     """Return the fit of as much of a spectrum around its resonance as one oscillator and white noise explain.
 
     The resonance is the peak that stands out most of its surroundings. Lines of up to three points (mains, a clock)

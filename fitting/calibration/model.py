@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from afm_jax.solve.least_squares import Lowest, Sum, levenberg_marquardt
-from fitting.calibration.sweep import ResonanceSweep
+from fitting.calibration.sweep import Resonance
 
 Points = Float[np.ndarray, " points"]
 Response = Complex[np.ndarray, " points"]
@@ -32,7 +32,7 @@ _LEAST_SQUARE = 1e-12
 _STEPS, _SETTLED = 100, 1e-20
 
 
-def measured_response(sweep: ResonanceSweep) -> Response:
+def measured_response(sweep: Resonance) -> Response:
     """Return what was measured as complex numbers, in units of the largest amplitude."""
     phase = np.zeros(sweep.points) if sweep.phase_deg is None else np.deg2rad(sweep.phase_deg)
     return sweep.amplitude / sweep.amplitude.max() * np.exp(1j * phase)
@@ -48,7 +48,7 @@ def response(frequency: Float[np.ndarray, " n"], natural: float, quality_factor:
     return np.stack([shape, by_natural, -shape + shape * damping / below], axis=1)
 
 
-def _terms(sweep: ResonanceSweep, natural: float, quality_factor: float) -> Complex[np.ndarray, "n terms 3"]:
+def _terms(sweep: Resonance, natural: float, quality_factor: float) -> Complex[np.ndarray, "n terms 3"]:
     """Return what the linear parameters multiply, and its derivatives by ln f0 and ln Q."""
     shape = response(sweep.frequency_khz, natural, quality_factor)
     constant = np.ones((sweep.points, 1)) * [1.0, 0.0, 0.0]
@@ -71,7 +71,7 @@ def _parts(numbers: Complex[np.ndarray, "n ..."]) -> Float[np.ndarray, "m ..."]:
 
 
 def _evaluate(
-    sweep: ResonanceSweep, measured: Response, error: Points, place: Float[np.ndarray, " p"]
+    sweep: Resonance, measured: Response, error: Points, place: Float[np.ndarray, " p"]
 ) -> tuple[Sum, Response]:
     """Return chi2 and the model at ln f0, ln Q and the linear parameters; arguments as of `_linear`."""
     terms = _terms(sweep, *np.exp(place[:2]).tolist())
@@ -94,7 +94,7 @@ def _evaluate(
 
 
 def _linear(
-    sweep: ResonanceSweep, measured: Response, natural: float, quality_factor: float
+    sweep: Resonance, measured: Response, natural: float, quality_factor: float
 ) -> tuple[float, Float[np.ndarray, " p"]]:
     """Return the sum of squares about which the best place for a frequency and a quality factor leaves, and it."""
     columns = _terms(sweep, natural, quality_factor)[:, :, 0]
@@ -112,7 +112,7 @@ def _linear(
     return chi2, np.array([np.log(natural), np.log(quality_factor), *found])
 
 
-def minimum(sweep: ResonanceSweep, error: Points) -> tuple[Lowest, Response, bool]:
+def minimum(sweep: Resonance, error: Points) -> tuple[Lowest, Response, bool]:
     """Return the least squares of a scan, from the best place of a grid of frequencies and widths.
 
     A place is ln f0, ln Q and the linear parameters: real and imaginary parts of A, B, C in turn; or a, b, c.
@@ -144,7 +144,7 @@ def minimum(sweep: ResonanceSweep, error: Points) -> tuple[Lowest, Response, boo
     return best, _evaluate(sweep, signed, error, best.place)[1], signed is not measured
 
 
-def chi2_without_resonance(sweep: ResonanceSweep, error: Points) -> float:
+def chi2_without_resonance(sweep: Resonance, error: Points) -> float:
     """Return chi2 of a parabola through amplitude or response, which has no resonance; arguments as of `minimum`."""
     columns, measured = np.vander(sweep.position, 3).astype(complex), measured_response(sweep)
     # the root of a density has half its relative error

@@ -53,14 +53,14 @@ SWEEP = Form(
     ),
     "point",
 )
-"""The columns that a CSV file may have, and the attribute of `ResonanceSweep` that each becomes."""
+"""The columns that a CSV file may have, and the attribute of `Resonance` that each becomes."""
 _UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}
 _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error")
 
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ResonanceSweep(Result):
+class Resonance(Result):
     """A free resonance sweep, sorted by frequency; the arrays are read-only NumPy copies.
 
     Attributes:
@@ -125,7 +125,7 @@ class ResonanceSweep(Result):
         start, end = self.frequency_khz[[0, -1]]
         return (2.0 * self.frequency_khz - start - end) / max(end - start, 1e-300)
 
-    def within(self, low_khz: float, high_khz: float) -> "ResonanceSweep":
+    def within(self, low_khz: float, high_khz: float) -> "Resonance":
         """Return the points between two frequencies; of a spectrum those that are above zero."""
         kept = (self.frequency_khz >= low_khz) & (self.frequency_khz <= high_khz) & (self.amplitude > 0.0)
         columns = {name: getattr(self, name) for name in _COLUMNS}
@@ -133,7 +133,7 @@ class ResonanceSweep(Result):
 
 
 @checked
-def read_sweep(path: str | Path) -> ResonanceSweep:
+def read_resonance(path: str | Path) -> Resonance:
     """Read a free resonance sweep from plain CSV or Nanonis text, or a thermal spectrum, and check all of it.
 
     Args:
@@ -149,14 +149,14 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         return _sweep_of(read_recording(path))
     used, columns, lines, _ = read_columns(path, SWEEP, {})
     named: dict[str, Any] = {**columns, "amplitude_unit": _UNITS.get(used["amplitude"].name, "")}
-    return ResonanceSweep(**named, lines=lines, source=str(path))
+    return Resonance(**named, lines=lines, source=str(path))
 
 
 _NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)
 _FOUND = ("frequency_khz", "quality_factor", "spring_constant_n_per_m", "temperature_k")
 
 
-def _sweep_of(recording: Recording) -> ResonanceSweep:
+def _sweep_of(recording: Recording) -> Resonance:
     """Return the thermal spectrum, or the scan in Nanonis text, that a file of an instrument holds.
 
     Raises:
@@ -181,7 +181,7 @@ def _sweep_of(recording: Recording) -> ResonanceSweep:
     known = {key.removeprefix("free_"): one.value for key, one in recording.known.items()}
     used = (khz > 0.0) & (amplitude > 0.0) if spectrum else np.ones(len(khz), dtype=bool)
     phase = None if spectrum else found.get("angle: Phase")
-    return ResonanceSweep(
+    return Resonance(
         frequency_khz=khz[used],
         amplitude=amplitude[used],
         phase_deg=None if phase is None else phase[used],

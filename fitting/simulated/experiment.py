@@ -19,7 +19,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
 from afm_jax.checks import check_count, check_parameter, checked, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.contact.law_of_contact import approximate_law
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome
@@ -76,7 +76,7 @@ def steady_rows(
         ValueError: if the contact has no junction.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
-    law = interaction if isinstance(interaction, ImpactLaw) else law_of_contact(interaction, float(cantilever.mass_ng))
+    law = interaction if isinstance(interaction, ImpactLaw) else approximate_law(interaction, float(cantilever.mass_ng))
     if law is None:
         return {}, dict.fromkeys(range(len(drives.order)), "the contact captures tips of every speed")
     follow = _follower(interaction, cantilever, drives)

@@ -35,8 +35,8 @@ REFUSED: dict[str, Callable[[], object]] = {
     "bifurcation_diagram": lambda: afm.bifurcation_diagram(bouncing(), "platform.amplitude_nm", np.array([1.0, 2.0])),
     "contact_orbits": lambda: afm.contact_orbits(_contact(), 1, 1),
     "continue_orbits": lambda: afm.continue_orbits(bouncing(), 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0)),
-    "fit_delay": lambda: fitting.fit_delay(afm.Contact.paper()),
-    "fit_law": lambda: fitting.fit_law(afm.Contact.paper()),
+    "delay_of_contact": lambda: fitting.delay_of_contact(afm.Contact.paper()),
+    "law_of_contact": lambda: fitting.law_of_contact(afm.Contact.paper()),
     "iterate_batch": lambda: afm.iterate_batch(bouncing(), np.array([4.0]), np.array([60.0]), 2),
     "iterate_map": lambda: afm.iterate_map(bouncing(), 4.0, 60.0, 2),
     "lyapunov_spectrum": lambda: afm.lyapunov_spectrum(bouncing()),
@@ -82,7 +82,7 @@ NO_NUMBERS = {
     *("dimensionless_scene", "load", "load_law", "load_scene", "save_law", "save_scene", "scene_family"),
     *("use_cache", "trajectory"),
     *("prior_of_values", "design", "drive_grid", "calibrate", "lockin", "posterior", "read_curve"),
-    *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "tapping_map"),
+    *("read_curves", "read_resonance", "read_table", "read_trace", "sader", "tapping_map"),
     *("tapping_together", "table_of_curve", "write_table"),
 }
 
