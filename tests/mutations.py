@@ -271,8 +271,8 @@ MUTATIONS = {
         "apart = tried {- => +} basis @ (basis.T @ tried)",
         "tests/test_discrepancy.py::test_residuals_that_run_together_over_the_speed_are_seen",
     ),
-    "closest formula by half of the distance": Mutation(
-        "w**2 - {2.0 *  => }w * rebound",
+    "closest formula of a law that is slower": Mutation(
+        "weight * (np.where(leaves, w, 0.0) - {rebound => 0.99 * rebound})",
         "tests/test_discrepancy.py::test_the_parameters_are_those_of_the_closest_formula_and_as_unsure",
     ),
     "collisions beside capture in few steps": Mutation(
