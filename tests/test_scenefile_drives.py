@@ -116,7 +116,7 @@ TWO = np.array([1.0, 2.0])
     [
         (
             {"platform": Platform(1.0, 50.0, second=Tone(1.0, 50.0, 90.0))},
-            "the second frequency of `platform` is that of the first: add the two up to one cosine",
+            r"\[platform.second\] has the frequency of \[platform\]; add the two up to one cosine",
         ),
         ({"base": BaseDrive(1.0, 90.0)}, "`base` drives an undamped cantilever"),
         ({"base": BaseDrive(TWO, 91.0)}, r"`amplitude_nm` has shape \(2,\), but a scene file holds one scene"),

@@ -111,8 +111,14 @@ def usual_unit(role: str) -> str:
     return "deg" if role == "phase_lag_deg" else "nm"
 
 
+_WAY = re.compile(r"_(Ex|Rt)(?=_|$)")
+
+
 def _numbered(channel: str, names: list[str]) -> str:
-    """Return the channel that is meant: of that name, else of that number."""
+    """Return the channel that is meant: of that name, of the pair of ways that the name is of, else of that number."""
+    first = channel.partition("/")[0].strip()
+    if channel not in names and _WAY.search(first) and _WAY.sub("", first) in names:
+        return _WAY.sub("", first)
     counted = channel not in names and channel.isdecimal() and 0 < int(channel) <= len(names)
     return names[int(channel) - 1] if counted else channel
 
@@ -128,7 +134,11 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Record
         TableError: if one of two channels is not there, or some columns have two channels and others one.
     """
     names = recording.channels
-    both = {role: one.channel for role, one in wanted.items() if "/" in one.channel and one.channel not in names}
+    both = {
+        role: one.channel
+        for role, one in wanted.items()
+        if "/" in one.channel and _numbered(one.channel, names) not in names
+    }
     pairs = {role: [_numbered(name.strip(), names) for name in both[role].split("/", 1)] for role in both}
     if not pairs:
         return recording

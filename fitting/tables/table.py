@@ -397,8 +397,11 @@ class AmplitudeTable(Result):
         own = {field.name for field in fields(cls)}
         known: dict[str, Any] = {"source": "data frame"}
         known |= {name: value for name, value in frame.attrs.items() if name in own} | header
-        names = [name for name in frame.columns if name != "lines"]
-        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), Source(str(known["source"]), "row"))
+        names, source = [name for name in frame.columns if name != "lines"], Source(str(known["source"]), "row")
+        check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), source)
+        if "free_frequency_khz" not in known:
+            how = "as free_frequency_khz=... to AmplitudeTable.from_dataframe"
+            raise source.fault(f"free_frequency_khz is missing; give it in `frame.attrs`, or {how}")
         return _completed({name: np.asarray(frame[name], np.float64) for name in names}, known, noise)
 
     @property
