@@ -263,7 +263,9 @@ def stated_errors(prior: Prior, rows: Explained, chosen: Int[np.ndarray, " point
         rows: the drives, from `explained`.
         chosen: numbers of the rows.
     """
-    law, own, measured = rows.model.law, prior.problem.own, np.isin(np.arange(len(rows.found.number)), chosen)[:, None]
+    law = rows.model.law
+    own = prior.problem.own
+    measured = np.isin(np.arange(len(rows.found.number)), chosen)[:, None]
     orbits = rows.end.orbits._replace(x=np.where(measured, rows.end.orbits.x, np.nan))
     if isinstance(law, FormulaLaw):
         # a fit has drag whatever the formula is; a prior that a fit left is of the formula alone

@@ -307,7 +307,8 @@ def _excluded(evidence: Evidence) -> list[str]:
 def _model_error(evidence: Evidence) -> str:
     """Return how large a model error was added to which rows, in words."""
     error = np.where(evidence.rows.used, evidence.rows.model_error, 0.0)
-    small, lines = "small amplitudes" if evidence.table.tapping else "slow impacts", _lines(evidence, error > _STATED)
+    small = "small amplitudes" if evidence.table.tapping else "slow impacts"
+    lines = _lines(evidence, error > _STATED)
     return f"{100.0 * error.max():.1f} % was added to the errors of {small}: {lines}" if lines else ""
 
 

@@ -454,7 +454,8 @@ def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
     measured = "measured: scatter of the free rows"
     if curve.amplitude_unit == "nm":
         if not any(look.jump for look in looks.values()):
-            how, error = f"measured: median of {curve.free.sum()} free rows", max(v.level_error for v in looks.values())
+            how = f"measured: median of {curve.free.sum()} free rows"
+            error = max(v.level_error for v in looks.values())
             known.setdefault("free_amplitude_nm", Known(level, "nm", how, float(error)))
         how = measured if noise else "assumed: 1 % of the free amplitude"
         known.setdefault("amplitude_error_nm", Known(noise or 0.01 * level, "nm", how))

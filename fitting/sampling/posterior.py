@@ -197,7 +197,8 @@ def log_density_of(explained: Explained) -> LogDensity:
     covariance, slope = covariance_of_unknowns(explained), np.ones(middle.size)
     errors = np.sqrt(np.diag(covariance))[: len(parameters)]
     for i, known in enumerate(parameters):
-        by_unknown, off = law.slope_of(known.name, middle[i]), law.value_of(known.name, middle[i]) - known.reference
+        by_unknown = law.slope_of(known.name, middle[i])
+        off = law.value_of(known.name, middle[i]) - known.reference
         errors[i] *= abs(by_unknown)
         distance = max(abs(off) / errors[i], 0.5)
         share = -np.expm1(-distance)

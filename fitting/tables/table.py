@@ -397,7 +397,8 @@ class AmplitudeTable(Result):
         own = {field.name for field in fields(cls)}
         known: dict[str, Any] = {"source": "data frame"}
         known |= {name: value for name, value in frame.attrs.items() if name in own} | header
-        names, source = [name for name in frame.columns if name != "lines"], Source(str(known["source"]), "row")
+        names = [name for name in frame.columns if name != "lines"]
+        source = Source(str(known["source"]), "row")
         check_names(names, FORMS.get(known.get("drive", "sample"), TABLE), source)
         if "free_frequency_khz" not in known:
             how = "as free_frequency_khz=... to AmplitudeTable.from_dataframe"

@@ -307,7 +307,9 @@ class Lever:
     def nuisances(self, number: int, minimum: Solution | None = None) -> tuple[Nuisance, ...]:
         """Return what is stated of the instrument of a curve and where a least squares ends."""
         minimum = self.minimum if minimum is None else minimum
-        curve, values, errors = self.curves[number], self.values(minimum.at), np.sqrt(np.diag(minimum.covariance))
+        curve = self.curves[number]
+        values = self.values(minimum.at)
+        errors = np.sqrt(np.diag(minimum.covariance))
         found: list[Nuisance] = []
         for i, unknown in enumerate(self.unknowns):
             if unknown.curve not in {None, number}:
@@ -349,7 +351,8 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]
         rows, start, error = np.flatnonzero(here & free & np.isfinite(off)), zero, _ANY_ZERO_DEG
         if len(rows):
             first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
-            start, error = float(first + np.average(turned(off[rows] - first), weights=weights)), _WIDE_ZERO_DEG
+            start = float(first + np.average(turned(off[rows] - first), weights=weights))
+            error = _WIDE_ZERO_DEG
         found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, error)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
     each = [(levels == level).astype(float) for level in range(levels.max(initial=-1) + 1)]

@@ -105,7 +105,8 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     cells = []
     for branch in result.branches:
         curve, top = branch.curve, int(np.argmax(branch.curve.energy_aj))
-        ratio, largest = curve.amplitude_ratio, (float(curve.energy_low_aj[top]), float(curve.energy_high_aj[top]))
+        ratio = curve.amplitude_ratio
+        largest = (float(curve.energy_low_aj[top]), float(curve.energy_high_aj[top]))
         at = ("-" if (band := curve.at(ratio)) is None else _band_in_words(*band) for ratio in HEADLINE)
         name = branch.name + _of_drive(branch, result.branches)
         at = (*at, f"{_band_in_words(*largest)} at {ratio[top]:.2f}")
@@ -232,7 +233,8 @@ def _write(folder: Path, name: str, result: Tapping | TappingTogether, report: R
     seen = ReportSection("Picture", pictures_of([svg_of(figure)], [shows]))
     page = result.in_unit(page_of(replace(report, sections=[seen, *report.sections])))
     kind = "tapping" if name == "tapping" else f"tapping {name}"
-    data, text = {"format": f"afm-jax {kind}", "format_version": 1, **result.to_dict()}, result.in_unit(text_of(report))
+    data = {"format": f"afm-jax {kind}", "format_version": 1, **result.to_dict()}
+    text = result.in_unit(text_of(report))
     return write_report_files(folder, name, text=text, data=data, picture=picture, page=page)
 
 

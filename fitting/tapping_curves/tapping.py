@@ -107,7 +107,8 @@ def energies_of_table(table: AmplitudeTable, *, scale_errors: bool = False) -> T
     curve = _with_zero_of_free_rows(curve, table.remarks)
     if curve.phase.origin == "assumed":
         # energies of both signs differ as by a change of f0 that takes 1 - s^2 to its opposite
-        frequency, detuning = curve.free_frequency_khz, phase_readings(curve, np.zeros(curve.rows, bool)).detuning
+        frequency = curve.free_frequency_khz
+        detuning = phase_readings(curve, np.zeros(curve.rows, bool)).detuning
         error = float(np.hypot(frequency.error, detuning * frequency.value))
         curve = replace(curve, free_frequency_khz=Given(frequency.value, error))
     free, held = free_rows(curve), held_rows(curve)
@@ -311,7 +312,8 @@ def _check_zero(curve: TappingCurve, readings: PhaseReadings, off: float) -> Non
     if not seen.any():
         return
     stated = curve.phase_zero_deg.value if curve.phase_zero_deg else 0.0
-    middle, wanted = float(np.median(curve.lag_deg[seen] - stated)), float(np.median(readings.free_lag_deg[seen]))
+    middle = float(np.median(curve.lag_deg[seen] - stated))
+    wanted = float(np.median(readings.free_lag_deg[seen]))
     if np.nanmax(np.abs(curve.lag_deg)) < 2.0 * np.pi and abs(np.rad2deg(abs(middle)) - wanted) < _OFF_DEG:
         raise TableError(
             f"{name}: phase_lag_deg is {middle:.3g} where the tip is free and lags by {wanted:.1f} degrees: write "

@@ -157,7 +157,8 @@ def together(curves: Sequence[Tapping], refused: Sequence[dict[str, Any]] = ()) 
     chosen = [i for i, one in enumerate(curves) if one.branches]
     if len(chosen) < 2:
         return TappingTogether(curves=tuple(curves), lever=None, scatter=(), refused=tuple(refused))
-    moved, lever = list(curves), Lever([curves[i].curve for i in chosen], [curves[i].rows.free for i in chosen])
+    moved = list(curves)
+    lever = Lever([curves[i].curve for i in chosen], [curves[i].rows.free for i in chosen])
     states = [np.array(curves[i].rows.state) for i in chosen]
     repulsive = [state == "repulsive" for state in states]
     touching = [np.isin(state, ["attractive", "repulsive"]) for state in states]
