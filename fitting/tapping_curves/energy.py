@@ -352,6 +352,8 @@ def _unknowns_of(number: int, curve: TappingCurve, free: Mask) -> list[_Unknown]
         if len(rows):
             first, weights = off[rows[0]], curve.lag_error_deg[rows] ** -2.0
             start = float(first + np.average(turned(off[rows] - first), weights=weights))
+            # of a zero that nothing is known of, any turn will do
+            start = float(turned(start)) if curve.phase_zero_deg is None else start
             error = _WIDE_ZERO_DEG
         found.append(_Unknown("phase_zero_deg", number, here.astype(float), Given(start, error)))
     known = Given(1.0, max(curve.free_amplitude_error, 1e-6))
