@@ -141,7 +141,12 @@ class Inversion(JudgedResult):
 
 @checked
 @in_float64
-def invert(table: TableLike, *, noise: float | None = None, quality_factor: Any = None) -> Inversion:
+def invert(
+    table: TableLike,
+    *,
+    noise: float | None = None,
+    quality_factor: tuple[float, float | None] | float | str | None = None,
+) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and lines through the losses.
 
     A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
