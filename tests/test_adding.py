@@ -29,7 +29,7 @@ FORCE = {
         "import { => Attraction, }CoreRepulsion",
         '    "viscous": Viscous,\n{ =>     "attraction": Attraction,\n}',
         '{ => attraction_constant_aj: ArrayLike = PAPER["attraction_constant_aj"],\n        }tip_radius_nm: ArrayLike',
-        '{ => "attraction": lambda: Attraction(value["attraction_constant_aj"], radius),\n            }"viscous": lambda',
+        '{ => "attraction": lambda: Attraction(value["attraction_constant_aj"], radius),\n            }"viscous": l',
     ],
     # like a force that is there
     "afm_jax/contact/forces/solid.py": ["{ => class Attraction(StaticForce):VAN DER WAALS\n\n\n}class VanDerWaals("],
