@@ -214,6 +214,13 @@ class StabilityChart(Result):
         frequency, amplitude = np.meshgrid(self.x_values, self.y_values)
         return frequency.ravel(), amplitude.ravel()
 
+    def tongue(self, order: int) -> Bool[np.ndarray, "rows columns"]:
+        """Return where an orbit of this order is stable with a flight shorter than the tip's free period (n > N/2).
+
+        Longer flights, past the platform without a touch, are possible too: islands apart from the tongue.
+        """
+        return self.stable[order - 1] & (self.x_values > 0.5 * order)
+
     def table(self) -> list[dict[str, object]]:
         """Return the rows of chart.csv, one a point."""
         return rows_of(self.tables()["chart.csv"])

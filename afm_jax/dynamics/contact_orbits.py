@@ -346,7 +346,8 @@ def single_contact_orbits(
         for row in np.flatnonzero(roots.converged):
             place, loop = (number, lane[row]), roots.details[row]
             columns["admissible"][place], columns["unresolved"][place] = True, False
-            multiplier, peak = np.abs(multipliers_of(*loop.trace_and_determinant)[0]), loop.heights()[0]
+            largest, _ = np.abs(multipliers_of(*map(np.asarray, loop.trace_and_determinant)))
+            multiplier, peak = largest, loop.heights()[0]
             if multiplier < 1.0 and not peak < columns["peak_amplitude_nm"][place]:
                 columns["stable"][place] = True
                 columns["peak_amplitude_nm"][place], columns["largest_multiplier"][place] = peak, multiplier

@@ -276,7 +276,7 @@ def _stretch(scenes: Scene, tips: Tips, accuracy: float) -> tuple[Tips, Record]:
         [full, held, since > _AWAY * slower],
         [Outcome.IMPACT, Outcome.CAPTURED, Outcome.NO_FURTHER_IMPACT],
         Outcome.STEP_LIMIT,
-    )
+    ).astype(np.int32)
     approach, velocity = (
         np.where(leaves, part, np.nan)
         for part in (contacts.approach_speed_nm_per_us, contacts.departure_velocity_nm_per_us)

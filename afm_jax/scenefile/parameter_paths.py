@@ -96,8 +96,7 @@ def parameter_values(scene: Scene) -> dict[str, float]:
         values[path.replace("frequency_khz", "reduced_frequency")] = values[path] / (2.0 * free)
     for name, drive in (("base", scene.base), ("force", scene.force)):
         if drive is not None:
-            with jax.ensure_compile_time_eval():
-                per_free = float(drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive)))
+            per_free = float(drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive)))
             if per_free > 0.0:
                 values[f"{name}.free_amplitude_nm"] = float(drive.tones[0].amplitude) / per_free
     return values

@@ -263,9 +263,12 @@ def _setting(key: str, value: Any, usual: Any) -> Any:
     return tuple(numbers) if several else type(usual)(numbers[0])
 
 
-def _scenes(scene: Scene, paths: Sequence[str], columns: Columns) -> Scene:
-    """Return a batch of scenes from columns of parameters; the scene where none of it changes."""
-    return scene_batch(scene, {path: columns[path] for path in paths}) if paths else scene
+def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
+    """Return a function that makes a batch of scenes from columns of parameters; the scene where none of it changes."""
+    if not paths:
+        return lambda _: scene
+    family = scene_family(scene, *paths)
+    return lambda columns: jax.vmap(family)(*(jnp.asarray(columns[path], float) for path in paths))
 
 
 def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Columns]:
@@ -302,8 +305,10 @@ def _orbits(
         record = partial(_contact_orbits, scene, orders, accuracy)
         return Recorder(_one_by_one(record), 16, ("peak_amplitude_nm", "stable"), extra, alone=True)
 
+    made = _scenes(scene, paths)
+
     def record_batch(columns: Columns) -> Columns:
-        scenes = _scenes(scene, paths, columns)
+        scenes = made(columns)
         found = highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float), names=names)
         if not isinstance(scene.interaction, TabulatedLaw):
             return found
@@ -350,10 +355,12 @@ def _collisions(
     if not isinstance(scene.interaction, Contact):
         raise ValueError("'collide' is about a resolved contact: the scene needs model = \"contact\"")  # noqa: TRY004
 
+    made = _scenes(scene, paths)
+
     def record(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
         speeds = jnp.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
-        scenes = _scenes(scene, paths, columns)
+        scenes = made(columns)
         found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
         trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
         # 0 of a tip that is captured
@@ -373,7 +380,7 @@ def _lyapunov(
     sample_driven(scene)
     resolved = isinstance(scene.interaction, Contact)
     lanes = 16 if resolved else LANES
-    made = jax.jit(partial(_scenes, scene, paths))
+    made = jax.jit(_scenes(scene, paths))
     exponents = ("exponents_per_impact", "exponents_per_us", "exponents_per_impact_error", "exponents_per_us_error")
 
     def work(columns: Columns) -> Columns:
