@@ -107,7 +107,7 @@ class Impact(eqx.Module):
 
     @property
     @abstractmethod
-    def lowest(self) -> Float[Array, ""]:
+    def lowest(self) -> Float[Array, "..."]:
         """Coordinate in nm/us at which the tip is captured."""
 
     @property
@@ -283,7 +283,7 @@ class ImpactLaw(Law):
         return self.r
 
     @property
-    def lowest(self) -> Float[Array, ""]:
+    def lowest(self) -> Float[Array, "..."]:
         """Coordinate q = sqrt(epsilon + c^2/4r^2) in nm/us at which the tip is captured."""
         square = self.epsilon + (self.viscous_loss / (2.0 * self.r)) ** 2
         positive = square > 0.0
@@ -596,7 +596,7 @@ class TabulatedLaw(Law):
         return self.r * jnp.exp(0.5 * _spline(self.loss_spline, self.knots, jnp.zeros_like(self.r)))
 
     @property
-    def lowest(self) -> Float[Array, ""]:
+    def lowest(self) -> Float[Array, "..."]:
         """Coordinate at which the tip is captured: the capture speed."""
         return self.capture
 
