@@ -89,4 +89,5 @@ def test_sweeps_say_where_the_law_is_extrapolated(folder, tmp_path):
     axis = '[[axes]]\nparameter = "platform.amplitude_nm"\nlinear = [3.0, 5.0, 3]\n'
     (tmp_path / "sweep.toml").write_text(f'scene = "{formula}"\n[record]\nwhat = "orbits"\n{axis}')
     swept = run("sweep", tmp_path / "sweep.toml", "--workers", 1, "--out", tmp_path / "out", "--law", fast)
-    assert re.match(r"Extrapolated: at [123] of 3 points impacts come outside the speeds that the law is known for", swept["extrapolated"])
+    said = r"Extrapolated: at [123] of 3 points impacts come outside the speeds that the law is known for\."
+    assert re.match(said, swept["extrapolated"])
