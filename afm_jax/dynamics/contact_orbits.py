@@ -174,10 +174,8 @@ def _flown(
     for row in np.flatnonzero(ends):
         number = flies[row]
         gaps = later[row].T - np.stack([following[number], np.roll(rebound[number], -1)])
-        scene, contact = (
-            jax.tree.map(lambda leaf, row=row: leaf[row, 0], there),
-            jax.tree.map(lambda leaf, row=row: leaf[row], contacts),
-        )
+        scene = jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row, 0]), there)
+        contact = jax.tree.map(lambda leaf, row=row: leaf[row], contacts)
         departures = phase[number] / np.asarray(omega)[row]
         flown[number] = FlownLoop(scene, loops[number], gaps.ravel(), maps[row], contact, departures)
     return flown
