@@ -80,7 +80,7 @@ def approach(
     )
 
 
-def _points(curve: ApproachCurve) -> dict[str, list[Any]]:
+def _points(curve: ApproachCurve) -> dict[str, Any]:
     """Return the columns of curve_points.csv, a row a height."""
     names = ("height_nm", "amplitude_nm", "phase_lag_deg", "dissipated_in_contact_aj", "virial_aj")
     told = curve.periods > 0
