@@ -71,31 +71,6 @@ def implicit_system(
     return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, system=True)
 
 
-def implicit_step(
-    residual: Callable[[Float[Array, " n"], Any], Float[Array, " rows"]],
-    root: Float[Array, " n"],
-    parameters: Any,
-    slopes: Float[Array, "rows n"],
-) -> tuple[Float[Array, " n"], Float[Array, " more"]]:
-    """Attach the first implicit derivative to a root, as `implicit_system` does, with slopes from the search itself.
-
-    Args:
-        residual: f(x, parameters) and, below these n equations, more functions g(x, parameters).
-        root: the value of x that the search found; its own derivative is ignored.
-        parameters: pytree of arrays, of what the root depends on.
-        slopes: derivatives of f and g by x at the root, held constant: there are no second derivatives.
-
-    Returns:
-        The root x(p), and g(x(p), p).
-    """
-    root = lax.stop_gradient(root)
-    value, count = residual(root, parameters), root.shape[0]
-    # a step of Newton's method for what changes
-    step = -solved_columns(list(slopes[:count].T), (value - lax.stop_gradient(value))[:count])
-    # a product and a sum: under vmap a matrix product of this size costs ten times as much
-    return root + step, value[count:] + jnp.sum(slopes[count:] * step, axis=-1)
-
-
 def _differentiate(primals, tangents, *, residual, structure, system):
     """Differentiate: dx = -(df/dp dp) / (df/dx) at the root, summed over the parameters that move."""
     root, *leaves = primals

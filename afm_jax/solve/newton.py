@@ -74,9 +74,8 @@ class Root(NamedTuple):
     """A `NewtonOutcome`."""
     residual: Float[Array, " n"]
     """The residual before the last step; infinite where no round was made."""
-    slopes: Float[Array, "rows n"]
-    """Derivatives of the residual by the unknowns before the last step, and below them of what `newton` was asked for
-    besides; 0 where no round was made."""
+    slopes: Float[Array, "n n"]
+    """Derivatives of the residual by the unknowns before the last step; 0 where no round was made."""
 
 
 def newton(
@@ -86,7 +85,6 @@ def newton(
     settings: Newton,
     *,
     where: Bool[Array, ""] | None = None,
-    extended: Callable[[Array, Any], Float[Array, " rows"]] | None = None,
 ) -> Root:
     """Return the root of f(x, parameters) = 0 that Newton's method finds from a guess, differentiable.
 
@@ -96,23 +94,21 @@ def newton(
         parameters: pytree of arrays.
         settings: rounds, tolerances and limits.
         where: whether a root is asked for; if not, the guess is returned, and no round is made for it.
-        extended: f and, below it, more functions of the same arguments, for their slopes; None: f alone.
 
     Returns:
         The root with its implicit derivative, also where the search has not converged; 0 where df/dx is singular.
     """
     fixed = lax.stop_gradient(parameters)
     begin = lax.stop_gradient(guess)
-    count = begin.shape[0]
 
     def twice(x: Array) -> tuple[Array, Array]:
-        value = (residual if extended is None else extended)(x, fixed)
-        return value, value[:count]
+        value = residual(x, fixed)
+        return value, value
 
     def improve(state: tuple[Array, Root]) -> tuple[Array, Root]:
         done, (x, outcome, *before) = state
         slopes, value = jax.jacfwd(twice, has_aux=True)(x)
-        full = -solved_columns(list(slopes[:count].T), value)
+        full = -solved_columns(list(slopes.T), value)
         step, sizes = settings.limited(x, full)
         # of two equations the solution is 0 where the matrix is singular
         stands = jnp.all(full == 0.0) & jnp.any(value != 0.0)
@@ -131,8 +127,7 @@ def newton(
     asked = jnp.ones((), bool) if where is None else where
     first = jnp.where(asked, NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NOT_ASKED).astype(jnp.int32)
     # the batch's own from the start: a loop whose state joins the batch later is traced once more
-    none = jnp.zeros(count if extended is None else jax.eval_shape(extended, begin, fixed).shape[0])
-    start = Root(begin, first, jnp.abs(begin) + jnp.inf, jnp.outer(none, begin))
+    start = Root(begin, first, jnp.abs(begin) + jnp.inf, jnp.outer(jnp.zeros(begin.shape[0]), begin))
     root = lax.while_loop(unsettled, improve, (jnp.zeros((), jnp.int32), start))[1]
     return root._replace(x=implicit_system(residual, root.x, parameters))
 
