@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from fitting.instruments.recording import UNITS, Recording, quantity_of, two_ways, unit_named
+from fitting.instruments.recording import UNITS, WAY, Recording, quantity_of, two_ways, unit_named
 from fitting.tables.csv_text import NUMBER, TableError
 
 ROLES = {
@@ -111,14 +111,11 @@ def usual_unit(role: str) -> str:
     return "deg" if role == "phase_lag_deg" else "nm"
 
 
-_WAY = re.compile(r"_(Ex|Rt)(?=_|$)")
-
-
 def _numbered(channel: str, names: list[str]) -> str:
     """Return the channel that is meant: of that name, of the pair of ways that the name is of, else of that number."""
     first = channel.partition("/")[0].strip()
-    if channel not in names and _WAY.search(first) and _WAY.sub("", first) in names:
-        return _WAY.sub("", first)
+    if channel not in names and WAY.search(first) and WAY.sub("", first) in names:
+        return WAY.sub("", first)
     counted = channel not in names and channel.isdecimal() and 0 < int(channel) <= len(names)
     return names[int(channel) - 1] if counted else channel
 

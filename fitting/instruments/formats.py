@@ -19,6 +19,7 @@ from afm_jax.whole_files import MOST_VALUES
 from afm_jax.words import printable
 from fitting.instruments.recording import (
     UNITS,
+    WAY,
     Known,
     Recording,
     Segment,
@@ -152,7 +153,9 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
         titles = [str(k + 1) for k in range(len(titles))]
     else:
         titles, body = [printable(title) or f"column {k + 1}" for k, title in enumerate(titles)], body[1:]
-        titles = [re.sub(r"^(.*)_Rt(?=_|$)", r"[bwd] \1", re.sub(r"_Ex(?=_|$)", "", title)) for title in titles]
+        ways = [WAY.search(title) for title in titles]
+        back = ["[bwd] " if way and way[1] == "Rt" else "" for way in ways]
+        titles = [mark + WAY.sub("", title) for mark, title in zip(back, titles, strict=True)]
         if body and not any(map(NUMBER.fullmatch, body[0])):
             below, body = body[0], body[1:]
     if not body:

@@ -78,6 +78,10 @@ class Segment:
     channels: dict[str, Float[np.ndarray, "..."]]
 
 
+WAY = re.compile(r"_(Ex|Rt)(?=_|$)")
+"""The way, extend or retract, in the name of a channel of Bruker's exports."""
+
+
 def two_ways(segments: Iterable[Segment], pairs: Mapping[str, Sequence[str]]) -> tuple[Segment, ...]:
     """Return an approach and a retract out of every segment, whose channels are each a pair of its channels."""
     return tuple(
