@@ -184,11 +184,11 @@ def calibrate(
     if doubt is not None:
         how = "`length_um=...` and `width_um=...` give k by Sader's method"
         if len(springs) == 1:
-            said = f"The spring constant is not calibrated: {doubt}; {how}."
-            reasons.append(f"{said} Frequency and Q do not depend on it.")
+            reasons.append(
+                f"The spring constant is not calibrated: {doubt}; {how}. Frequency and Q do not depend on it."
+            )
         warnings.append(f"The spring constants contradict each other: {doubt}.")
-    said = {"reasons": tuple(reasons), "warnings": tuple(warnings)}
-    return replace(found, spring_constant_n_per_m=springs, **said)
+    return replace(found, spring_constant_n_per_m=springs, reasons=tuple(reasons), warnings=tuple(warnings))
 
 
 def _check_sweep(sweep: Resonance) -> None:
