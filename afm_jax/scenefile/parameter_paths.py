@@ -182,9 +182,17 @@ def scene_batch(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
     Raises:
         ValueError: if the scene lacks a parameter.
     """
-    columns = [jnp.asarray(column, float) for column in values.values()]
     # operation by operation, which JAX knows again: a program of a new function would be compiled at every call
-    return jax.vmap(scene_family(scene, *values))(*columns)
+    return batch_family(scene, tuple(values))(values)
+
+
+def batch_family(scene: Scene, paths: Sequence[str]) -> Callable[[Mapping[str, ArrayLike]], Scene]:
+    """Return a function from columns of parameters to a batch of scenes; programs call it, and it is made before.
+
+    Arguments and errors are as of `scene_family`.
+    """
+    family = scene_family(scene, *paths)
+    return lambda values: jax.vmap(family)(*(jnp.asarray(values[path], float) for path in paths))
 
 
 def with_numbers(scene: Scene, values: Mapping[str, ArrayLike], source: str = "the scene") -> Scene:

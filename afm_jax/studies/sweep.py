@@ -46,6 +46,7 @@ from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import unit_of, words_of
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
+    batch_family,
     check_ranges,
     parameter_values,
     parse_range,
@@ -265,10 +266,7 @@ def _setting(key: str, value: Any, usual: Any) -> Any:
 
 def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
     """Return a function that makes a batch of scenes from columns of parameters; the scene where none of it changes."""
-    if not paths:
-        return lambda _: scene
-    family = scene_family(scene, *paths)
-    return lambda columns: jax.vmap(family)(*(jnp.asarray(columns[path], float) for path in paths))
+    return batch_family(scene, paths) if paths else lambda _: scene
 
 
 def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Columns]:
