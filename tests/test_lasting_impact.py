@@ -7,12 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline
 from scipy.special import beta
 
 import afm_jax as afm
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR, tabulated
+from afm_jax.contact.time_course import time_course
 from afm_jax.impact.lasting_impact import (
     AIR,
     PULLS,
@@ -150,7 +152,7 @@ def test_a_delay_with_an_offset_is_that_of_a_raised_surface(pull):
     impact = ImpactLaw(1.0, delay=CollisionDelay(HERTZ_TIME, 0.0, 2.0 * raised))
     found = corrected(lasting(HERTZ_TIME - 2.0 * raised), around(pull), UNDAMPED, impact)
     assert float(found.delay) == pytest.approx(leaves - 2.0 * beside, rel=1e-6)
-    depth = float(depth_of_impact(impact, jnp.array(1.0), around(pull), UNDAMPED, 0.0))
+    depth = float(depth_of_impact(impact, jnp.array(1.0), jnp.array(1.0), around(pull), UNDAMPED, 0.0))
     assert depth == pytest.approx(flown - np.trapezoid(end.sol(times)[0], times), rel=1e-5)
 
 
@@ -167,6 +169,24 @@ def test_air_takes_what_an_integrated_damped_contact_loses():
     found = corrected(lasting(tau), around(0.0), cantilever, impact_of(tau, 0.0))
     lost = 1.0 - left(motion)[0] ** 2
     assert 1.0 - float(found.rebound) ** 2 == pytest.approx(lost, rel=1e-2)  # second order: lost is 6e-4
+
+
+@pytest.mark.parametrize(
+    "numbers", [{}, {"relative_humidity": 0.637, "adhesion_energy_j_per_m2": 0.19, "modulus_gpa": 32.9}]
+)
+def test_a_tip_is_as_deep_as_its_course_through_bridge_and_solid(numbers):
+    """From 1.5 times the capture speed on; of a soft and wet contact the bridge makes up a half."""
+    contact = afm.Contact.paper(**numbers)
+    impact = tabulated(contact, jnp.array(1.0))
+    for ratio in (1.5, 2.0, 3.0, 5.0):
+        speed = ratio * impact.lowest
+        speeds, course = impact.speeds(speed), time_course(contact, speed)
+        later = np.flatnonzero(np.diff(course.time_us, prepend=-1.0) > 0.0)
+        time, gap = course.time_us[later], course.gap_nm[later]
+        area = CubicHermiteSpline(time, gap, course.velocity_nm_per_us[later]).integrate(time[0], time[-1])
+        deep = 0.5 * gap[0] ** 2 / speed + 0.5 * gap[-1] ** 2 / speeds.rebound - area
+        found = depth_of_impact(impact, speed, speeds.rebound, around(0.0), UNDAMPED, 0.0)
+        assert float(found) == pytest.approx(float(deep), rel=0.06)
 
 
 def test_middle_of_contact_is_the_platforms_motion_half_a_delay_earlier():

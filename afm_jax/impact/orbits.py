@@ -371,10 +371,10 @@ def _lockin(
     depth = 0.0
     if impact.lasts:
         # in contact the tip is below the platform's rest surface by the indentation
-        approach, delay = state.speeds.approach, state.speeds.delay
+        approach, rebound, delay = state.speeds
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
         nu = platform.angular_frequency / (1.0 if at_drive else order)
-        depth = depth_of_impact(impact, approach, middle, cantilever, nu)
+        depth = depth_of_impact(impact, approach, rebound, middle, cantilever, nu)
     settings: Any = {"delayed": impact.delayed, "indentation": depth, "at_drive": at_drive}
     return lockin(cantilever, platform, state.flight, order, **settings)
 

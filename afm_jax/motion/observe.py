@@ -498,8 +498,9 @@ def _integral_in_impacts(motion: MotionWindow, angular_frequency: float) -> comp
     cantilever, (surface, response), depth = motion.scene.cantilever, surface_of(motion.scene), 0.0
     if law.lasts:
         at_middle = middle_of_contact(cantilever, surface, jnp.asarray(middle[impacts]))
-        approach = jnp.asarray(rows.approach_speed_nm_per_us)[impacts]
-        depth = np.asarray(depth_of_impact(law, approach, at_middle, cantilever, angular_frequency))
+        speeds = (rows.approach_speed_nm_per_us, rows.rebound_speed_nm_per_us)
+        approach, rebound = (jnp.asarray(each)[impacts] for each in speeds)
+        depth = np.asarray(depth_of_impact(law, approach, rebound, at_middle, cantilever, angular_frequency))
     total = -np.sum(depth * np.exp(-1j * angular_frequency * middle[impacts]))
     # flights from their beginning to the end of the flight before
     early = impacts[departure[impacts] < arrival[impacts], None]

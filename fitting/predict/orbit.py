@@ -145,7 +145,7 @@ def _turn(x: Float[Array, " 3"], local: Local, row: Row, table: AnyLaw, drive: s
         free = law.speeds_with(coordinate, local.square, local.late)
         middle = middle_of_contact(cantilever, platform, phase / omega + 0.5 * delay)
         speeds = corrected(free, middle, cantilever, law)
-        depth = depth_of_impact(law, speeds.approach, middle, cantilever, omega / order)
+        depth = depth_of_impact(law, speeds.approach, speeds.rebound, middle, cantilever, omega / order)
     start = phase / omega + delay
     duration = order * platform.period_us - delay
     height, rate = platform.position_and_velocity(start)
