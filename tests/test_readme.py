@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli import main
+from fitting import read_table
 from tests.mutations import MUTATIONS
 from tests.resonance_sweeps import synthetic_sweep
 
@@ -84,7 +85,8 @@ def test_readme_shows_what_its_commands_print(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     (table,) = blocks(README, "csv")
-    (tmp_path / "my_amplitudes.csv").write_text(table)
+    (tmp_path / "table.csv").write_text(table)
+    assert read_table(tmp_path / "table.csv").rows == 2
     (tmp_path / "fitting").symlink_to(ROOT / "fitting")
     typed = [line for line in re.findall(r"^ {4}afm-jax (.*)$", README, re.MULTILINE) if "MY_FILE" not in line]
     printed = [told for line in typed for told in printed_by(line, shlex.split(line))]
