@@ -26,7 +26,6 @@ def approach_curve_figure(curve: ApproachCurve) -> Figure:
     ):
         axes.axhline(free, color=GRID, linewidth=1.2, label="free tip")
         _draw(axes, curve, values)
-        axes.grid(color=GRID, alpha=0.25)
     what = "deflection" if curve.drive == "base" else "height"
     label_axes(amplitude, x="", y=f"amplitude of the {what} (nm)")
     label_axes(lag, x="height of the sample over the rest position (nm)", y=f"lag behind the {curve.drive} (degrees)")

@@ -57,7 +57,6 @@ def continuation_figure(found: Continuation) -> Figure:
         )
     label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
-    axes.grid(color=GRID, alpha=0.25)
     axes.margins(x=0.02)
     legend_once(axes)
     return figure
@@ -124,7 +123,6 @@ def curves_figure(found: Continuation) -> Figure:
             axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=name)
     label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
-    axes.grid(color=GRID, alpha=0.25)
     axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))
     legend_once(axes)
     return figure

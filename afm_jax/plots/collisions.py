@@ -53,8 +53,6 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     middle.axhline(0.0, color=GRID, lw=0.8)
     lower.margins(y=0.35)
     lower.set_ylim(bottom=0.0)
-    for axes in panels:
-        axes.grid(color=GRID, alpha=0.25)
     upper.legend(fontsize=10, loc="upper left")
     lower.legend(fontsize=10, loc="upper right", ncols=3)
     figure.suptitle(title or f"Collisions of {counted(usable.size, 'free tip')}", fontsize=12)

@@ -11,7 +11,7 @@ from afm_jax.contact.contact import FORCES, Contact, check_effects
 from afm_jax.contact.forces.force import Force
 from afm_jax.contact.forces.liquid import Liquid
 from afm_jax.contact.forces.solid import CoreRepulsion
-from afm_jax.contact.junction import explain_missing_junction, find_junction
+from afm_jax.contact.junction import find_junction, require_junction
 from afm_jax.contact.parameters import CONTACT_RANGES
 from afm_jax.units import AJ_NM6_PER_J_M6
 
@@ -33,8 +33,8 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     for name, value in parameters.items():
         check_parameter(name, value, CONTACT_RANGES[name])
     contact = Contact.of(tuple(effects), **parameters)
-    if not any(map(is_traced, parameters.values())) and not bool(junction_of(contact).exists):
-        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
+    if not any(map(is_traced, parameters.values())):
+        require_junction(contact, _junction_of(contact).exists)
     return contact
 
 
@@ -69,23 +69,12 @@ def _own_parameters(term: Force) -> dict[str, Any]:
         if isinstance(value, Liquid):
             values |= vars(value)
         elif isinstance(term, CoreRepulsion) and field == "constant_aj_nm6":
-            values["core_constant_j_m6"] = _core_constant(term)
+            # in 64 bits: 1e-78 has no place in 32
+            values["core_constant_j_m6"] = np.asarray(value, float) / AJ_NM6_PER_J_M6
         else:
             values[field if field in CONTACT_RANGES else f"{effect}_{field}"] = value
     return values
 
 
-def _core_constant(term: CoreRepulsion) -> Any:
-    """Return B in J m^6 such that its product with the unit is the stored number again, to the last digit."""
-    stored = np.asarray(term.constant_aj_nm6)
-    # in 64 bits: 1e-78 has no place in 32
-    constant = stored.astype(float) / AJ_NM6_PER_J_M6
-    below, above = np.nextafter(constant, 0.0), np.nextafter(constant, np.inf)
-    for nearby in (below, above, np.nextafter(below, 0.0), np.nextafter(above, np.inf)):
-        exact = (constant * AJ_NM6_PER_J_M6).astype(stored.dtype) == stored
-        constant = np.where(exact, constant, nearby)
-    return constant
-
-
-junction_of = eqx.filter_jit(find_junction)
+_junction_of = eqx.filter_jit(find_junction)
 """`find_junction`, with one compilation for every choice of effects."""
