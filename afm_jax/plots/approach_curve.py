@@ -1,5 +1,7 @@
 """Picture of an approach curve: amplitude and lag against the sample's height, approach and retract."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +19,7 @@ _OTHERS = {
 
 
 def approach_curve_figure(curve: ApproachCurve) -> Figure:
-    """Return amplitude above and lag below; where the tip was captured a mark stands at the foot."""
+    """Return amplitude above and lag below; where there are none of a steady tip a mark at the foot says why."""
     figure = new_figure(7.0, 6.4)
     amplitude, lag = figure.subplots(2, 1, sharex=True)
     for axes, values, free in (
@@ -47,13 +49,5 @@ def _draw(axes: Axes, curve: ApproachCurve, values: np.ndarray) -> None:
     for kind, (marker, label) in _OTHERS.items():
         those = curve.outcome == kind
         if those.any():
-            read = np.isfinite(values[those])
-            # what has no value stands at the foot
-            for part, height, transform in (
-                (read, values[those][read], axes.transData),
-                (~read, np.full(np.count_nonzero(~read), 0.04), axes.get_xaxis_transform()),
-            ):
-                if part.any():
-                    (marks,) = axes.plot(curve.height_nm[those][part], height, marker, transform=transform)
-                    marks.set(linestyle="", color=DARK, markersize=6, markerfacecolor="none", label=label)
-                    label = ""  # noqa: PLW2901
+            style: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "color": DARK, "mfc": "none", "ls": ""}
+            axes.plot(curve.height_nm[those], np.full(those.sum(), 0.04), marker, ms=6, label=label, **style)
