@@ -1,7 +1,7 @@
 """Results as JSON files that give back the same object: every float exact, nothing that a program is needed to read.
 
 ```json
-{"format": "afm-jax result", "format_version": 1, "afm_jax": "0.1.0", "type": "afm_jax.motion.record.State",
+{"format": "afm-jax result", "format_version": 1, "afm_jax": "0.1.0", "type": "State",
  "fields": {"time_us": {"array": "float64", "shape": [2], "values": [0.0, 1.5]}, ...}}
 ```
 An array has its `shape` and its `values` in nested lists: NaN is null, infinity "inf" or "-inf", a complex number a
@@ -16,7 +16,10 @@ import enum
 import importlib
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -131,13 +134,13 @@ def load(path: str | Path) -> Any:
         )
     try:
         return _value({"type": payload["type"], "fields": payload["fields"]})
-    except (KeyError, TypeError, AttributeError, ValueError, ImportError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         refuse(f"is no saved result that can be read here ({type(error).__name__}: {error})")
 
 
 def _record(record: Any, place: str) -> dict[str, Any]:
     return {
-        "type": _name_of(type(record)),
+        "type": type(record).__name__,
         "fields": {name: _plain(value, f"{place}.{name}") for name, value in fields_of(record)},
     }
 
@@ -146,7 +149,7 @@ def _plain(value: Any, place: str) -> Any:
     if is_abstract(value):
         raise ValueError(f"{place} is traced: save a result outside `jit`, `vmap` and `grad`")
     if isinstance(value, enum.Enum):
-        return {"type": _name_of(type(value)), "name": value.name}
+        return {"type": type(value).__name__, "name": value.name}
     if isinstance(value, np.generic):
         value = value.item()
     if is_array(value):
@@ -240,16 +243,16 @@ def _as_number(value: float | str | None) -> float:
     return math.nan if value is None else float(value)
 
 
+@cache
 def _class_named(name: str) -> Any:
-    """Return the record or enumeration of a module of this project; of nothing else, whatever a file says."""
-    module, _, own = name.rpartition(".")
-    if module.partition(".")[0] not in _PACKAGES:
-        raise KeyError(f"there is no record called {name}")
-    kind = getattr(importlib.import_module(module), own)
-    if not (dataclasses.is_dataclass(kind) or issubclass(kind, tuple | enum.Enum)):
-        raise KeyError(f"{name} is no record")
-    return kind
-
-
-def _name_of(kind: type) -> str:
-    return f"{kind.__module__}.{kind.__qualname__}"
+    """Return the record or enumeration of a name, wherever in the packages it lies: names of classes are unique."""
+    for package in _PACKAGES:
+        spec = find_spec(package)
+        for root in () if spec is None else spec.submodule_search_locations or ():
+            for path in sorted(Path(root).rglob("*.py")):
+                if re.search(rf"^class {re.escape(name)}\b", path.read_text(encoding="utf-8"), re.MULTILINE):
+                    parts = path.relative_to(root).with_suffix("").parts
+                    kind = getattr(importlib.import_module(".".join((package, *parts))), name)
+                    if dataclasses.is_dataclass(kind) or issubclass(kind, tuple | enum.Enum):
+                        return kind
+    raise KeyError(f"there is no record called {name}")
