@@ -1,11 +1,10 @@
 """Pictures of what motions come to: orbits, exponents, bifurcation diagrams, charts of orbits, basins."""
 
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
@@ -63,37 +62,15 @@ def label_of(path: str) -> str:
     return f"{words} ({unit})" if unit else words
 
 
-def orbits_figure(orbits: SingleImpactOrbits) -> Figure:
-    """Return the picture of single-impact orbits, of one scene or of many: where they hit, and how high they go."""
-    names = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "peak_amplitude_nm")
-    columns = [np.asarray(getattr(orbits, name), float).ravel() for name in names]
-    kinds = [np.asarray(getattr(orbits, name)).ravel() for name in ("exists", "admissible", "stable")]
-    return _orbits([part[:, None] for part in columns[:3]], columns[3], *kinds)
-
-
-def many_orbits_figure(orbits: ManyImpactOrbits) -> Figure:
-    """Return the picture of orbits of several impacts: where each hits, in their order, and how high it goes."""
-    names = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "peak_amplitude_nm")
-    *impacts, peak = (np.asarray(getattr(orbits.reading, name), float) for name in names)
-    return _orbits(impacts, peak, np.isfinite(peak), np.asarray(orbits.reading.admissible), np.asarray(orbits.stable))
-
-
-def _orbits(
-    impacts: Sequence[Float[np.ndarray, "orbits impacts"]],
-    peak: Float[np.ndarray, " orbits"],
-    exists: Bool[np.ndarray, " orbits"],
-    admissible: Bool[np.ndarray, " orbits"],
-    stable: Bool[np.ndarray, " orbits"],
-) -> Figure:
-    """Return the picture of orbits.
-
-    Args:
-        impacts: drive phase in rad, velocity after and approach speed in nm/us of every impact.
-        peak: their largest heights in nm.
-        exists: which of them are orbits at all; the others are left out.
-        admissible: they stay above the sample.
-        stable: they last.
-    """
+def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits) -> Figure:
+    """Return the picture of orbits, of one scene or of many: where they hit, in their order, and how high they go."""
+    reading = orbits.reading if isinstance(orbits, ManyImpactOrbits) else orbits
+    peak = np.asarray(reading.peak_amplitude_nm, float).ravel()
+    phase, velocity, approach = (
+        np.asarray(getattr(reading, name), float).reshape(peak.size, -1)
+        for name in ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us")
+    )
+    admissible, stable = np.asarray(reading.admissible).ravel(), np.asarray(orbits.stable).ravel()
     figure = new_figure(10.0, 4.8)
     left, right = figure.subplots(1, 2)
     kinds = {
@@ -101,8 +78,8 @@ def _orbits(
         "unstable": (admissible & ~stable, {"marker": "o", "color": BLUE, "markerfacecolor": "white"}),
         "not admissible": (~admissible, {"marker": "x", "color": ACCENT}),
     }
-    phase, velocity, approach = impacts
-    exists = exists & np.isfinite(peak) & np.isfinite(phase).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    # slots without an orbit hold NaN
+    exists = np.isfinite(peak) & np.isfinite(phase).all(axis=1) & np.isfinite(velocity).all(axis=1)
     for label, (which, style) in kinds.items():
         chosen = np.flatnonzero(exists & which)
         size = 8.0 if chosen.size <= _FEW else 3.0
