@@ -403,7 +403,9 @@ class Collisions(NamedTuple):
         """The fields of the tips, None where there is no value; outcomes as sentences."""
         lost = self.tips.outcome > CollisionOutcome.CAPTURED_BY_JUNCTION
         gaps = self.tips._unknown() | {"captured": lost}  # noqa: SLF001
-        told = self.tips._asdict() | {"outcome": [CollisionOutcome(end).sentence for end in self.tips.outcome.tolist()]}
+        told: dict[str, Any] = self.tips._asdict() | {
+            "outcome": [CollisionOutcome(end).sentence for end in self.tips.outcome.tolist()]
+        }
         return {name: np.where(gaps.get(name, False), None, part).tolist() for name, part in told.items()}
 
     @property

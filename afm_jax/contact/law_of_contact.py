@@ -125,34 +125,19 @@ class ContactLaw(Result):
         return float(self.approach_speed_nm_per_us[0]), float(self.approach_speed_nm_per_us[-1])
 
     @property
-    def error_nm_per_us(self) -> Float[np.ndarray, " n"]:
-        """Fitted less simulated rebound speed."""
-        return self.fitted_speed_nm_per_us - self.rebound_speed_nm_per_us
-
-    @property
     def relative_error(self) -> Float[np.ndarray, " n"]:
-        """Error as a share of the rebound speed."""
-        return self.error_nm_per_us / self.rebound_speed_nm_per_us
+        """Fitted less simulated rebound speed, as a share of the simulated one."""
+        return self.fitted_speed_nm_per_us / self.rebound_speed_nm_per_us - 1.0
 
     @property
     def worst_relative_error(self) -> float:
-        """Largest error as a share of the rebound speed."""
+        """Largest of them in size."""
         return float(np.abs(self.relative_error).max())
 
     @property
-    def worst_error_nm_per_us(self) -> float:
-        """Largest error in nm/us."""
-        return float(np.abs(self.error_nm_per_us).max())
-
-    @property
     def rms_relative_error(self) -> float:
-        """Root of the mean square of the relative errors."""
+        """Root of the mean of their squares."""
         return float(np.sqrt(np.mean(self.relative_error**2)))
-
-    @property
-    def rms_error_nm_per_us(self) -> float:
-        """Root of the mean square of the errors in nm/us."""
-        return float(np.sqrt(np.mean(self.error_nm_per_us**2)))
 
 
 @checked
@@ -426,7 +411,6 @@ class ContactLaws(NamedTuple):
             "c\nnm/us": "viscous_loss:.3g",
             "worst error\n%": lambda law: f"{100.0 * law.worst_relative_error:.3g}",
             "rms error\n%": lambda law: f"{100.0 * law.rms_relative_error:.3g}",
-            "worst error\nnm/us": "worst_error_nm_per_us:.3g",
             "capture speed\nnm/us": "capture_speed_nm_per_us:.5g",
         }
         (low, high), (slow, fast) = first.speed_range, delay.speed_range
@@ -456,7 +440,7 @@ class ContactLaws(NamedTuple):
 
 _MODEL_KEYS = (
     *("model", "r", "epsilon", "viscous_loss", "worst_relative_error", "rms_relative_error"),
-    *("worst_error_nm_per_us", "rms_error_nm_per_us", "capture_speed_nm_per_us", "converged"),
+    *("capture_speed_nm_per_us", "converged"),
 )
 """Columns of a formula: attributes of `ContactLaw`."""
 _DELAY_NUMBERS = ("hertz", "lead_nm", "offset_nm")
