@@ -85,7 +85,7 @@ def _points(curve: ApproachCurve) -> dict[str, Any]:
     return {
         **{name: getattr(curve, name) for name in names},
         "direction": np.where(curve.retract, "retract", "approach").tolist(),
-        **{name: np.where(told, getattr(curve, name), None).tolist() for name in ("contacts", "periods")},
+        **{name: list(np.where(told, getattr(curve, name), None)) for name in ("contacts", "periods")},
         "outcome": [CurveOutcome(kind).name.lower() for kind in curve.outcome.tolist()],
         "reason": list(curve.reasons),
     }

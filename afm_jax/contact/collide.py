@@ -406,7 +406,7 @@ class Collisions(NamedTuple):
         told: dict[str, Any] = self.tips._asdict() | {
             "outcome": [CollisionOutcome(end).sentence for end in self.tips.outcome.tolist()]
         }
-        return {name: np.where(gaps.get(name, False), None, part).tolist() for name, part in told.items()}
+        return {name: list(np.where(gaps.get(name, False), None, part)) for name, part in told.items()}
 
     @property
     def reason(self) -> str | None:
@@ -475,12 +475,7 @@ _MOST_PRINTED = 40
 
 
 def collisions(
-    contact: Contact,
-    speeds: Sequence[float] | None = None,
-    mass_ng: float = 1.0,
-    *,
-    accuracy: float = 1e-9,
-    method: str = "diffrax",
+    contact: Contact, speeds: Sequence[float] | None = None, mass_ng: float = 1.0, *, accuracy: float = 1e-9
 ) -> Collisions:
     """Return a table of collisions of free tips with a sample at rest, with the capture speed and the junction.
 
@@ -489,7 +484,6 @@ def collisions(
         speeds: approach speeds in nm/us; None: twenty from 1.1 times the capture speed to 200 nm/us or ten times it.
         mass_ng: the tip's mass in ng.
         accuracy: as in `collide`.
-        method: as in `collide`.
 
     Raises:
         RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
@@ -501,7 +495,7 @@ def collisions(
     junction = find_junction(contact)
     numbers = {name: float(getattr(junction, name)) for name in (*junction._fields, "hysteresis_aj")}
     return Collisions(
-        tips=collide_in_blocks(contact, chosen, mass_ng, accuracy=accuracy, method=method),
+        tips=collide_in_blocks(contact, chosen, mass_ng, accuracy=accuracy),
         capture_speed_nm_per_us=capture if math.isfinite(capture) else None,
         junction={name: value for name, value in numbers.items() if name not in ("exists", "forms_root")},
     )
