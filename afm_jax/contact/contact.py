@@ -32,12 +32,6 @@ from afm_jax.contact.parameters import ALL_EFFECTS, DEFAULTS, EFFECTS, PAPER, RE
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 
-def _flat(forces: Force | Sequence[Force]) -> ForceSum:
-    check_kind("forces", forces, Force | Sequence[Force])
-    terms = [forces] if isinstance(forces, Force) else list(forces)
-    return ForceSum(tuple(term for force in terms for term in terms_of(force)))
-
-
 class Contact(eqx.Module):
     """What happens when the tip meets the sample: forces over a gap, and a solid contact (section IV of the paper).
 
@@ -82,7 +76,9 @@ class Contact(eqx.Module):
         range_nm: ArrayLike | None = None,
     ):
         """Fill in the gaps that are not given."""
-        self.forces = _flat(forces)
+        check_kind("forces", forces, Force | Sequence[Force])
+        given = [forces] if isinstance(forces, Force) else forces
+        self.forces = ForceSum(tuple(term for force in given for term in terms_of(force)))
         self.junction = Jkr() if junction is None else junction
         forms, breaks = PAPER["bridge_forms_nm"], PAPER["bridge_breaks_nm"]
         if isinstance(junction, Dmt):

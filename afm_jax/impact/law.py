@@ -130,11 +130,6 @@ class Impact(eqx.Module):
         """Whether platform, spring and air act during the contact; True of a resolved contact."""
         return True
 
-    @property
-    def reach(self) -> Float[Array, ""]:
-        """Distance in nm/us from the lowest coordinate over which adhesion counts: up to twice the capture speed."""
-        return self.lowest
-
     def at_approach(self, approach_speed: Float[Array, "..."]) -> Speeds:
         """Return the speeds in nm/us and the delay in us at an approach speed, which is a contact's coordinate."""
         return self.speeds(approach_speed)
