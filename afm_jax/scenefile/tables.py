@@ -180,12 +180,13 @@ class SceneTable(NamedTuple):
             if key not in keys_of(self.name, self.model):
                 self.fail(advise_key(self.name, key, self.model), key)
             kind = _NO_NUMBERS.get(key, float)
-            good = isinstance(value, kind)
+            good = isinstance(value, kind) and (kind is not list or all(isinstance(each, str) for each in value))
             if kind is float:
                 # arrays are those of a scene whose numbers are replaced, maybe by traced ones
                 good = is_array(value) or (isinstance(value, int | float) and not isinstance(value, bool))
             if not good:
-                self.fail(f"must be {_WORDS[kind]}, but is {in_words(value)}", key)
+                must = "a list of texts" if kind is list else _WORDS[kind]
+                self.fail(f"must be {must}, but is {in_words(value)}", key)
         for pair in _EITHER:
             if set(pair) <= set(self.values):
                 self.fail(f"has both {' and '.join(pair)}; give one of them")
