@@ -77,12 +77,10 @@ def check_parameter(name: str, value: Any, allowed: str, *, optional: bool = Fal
         raise ValueError(f"`{name}` must be a number or an array of them, but holds none")
     # An infinite quality factor is a meaningful limit; every other infinity is a mistake.
     finite = ~np.isnan(number) if allowed == "above 0.5" else np.abs(number) <= _LARGEST
-    good = finite & _RANGES[allowed](number)
+    must, inside = _RANGES[allowed]
+    good = finite & inside(number)
     if not np.all(good):
         offender = float(number[~good].flat[0]) if number.ndim else float(number)
-        must = {"finite": "be a finite number", "above 0": "be positive", "not negative": "not be negative"}.get(
-            allowed, f"be {allowed}"
-        )
         if np.isfinite(offender) and abs(offender) > _LARGEST:
             must = f"be at most {_LARGEST:g} in size, so that its powers stay numbers"
         elif allowed == "positive" and 0.0 < offender < 1.0 / _LARGEST:
@@ -299,15 +297,16 @@ _SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
 }
 
 _LARGEST = 1e30
-_RANGES = {
-    "finite": lambda number: np.full(number.shape, fill_value=True),
-    "positive": lambda number: number >= 1.0 / _LARGEST,
-    "above 0": lambda number: number > 0,
-    "not negative": lambda number: number >= 0,
-    "above 0.5": lambda number: number > 0.5,
-    "in [0, 1]": lambda number: (number >= 0) & (number <= 1),
-    "between 0 and 1": lambda number: (number > 0) & (number < 1),
+_RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "finite": ("be a finite number", lambda number: np.full(number.shape, fill_value=True)),
+    "positive": ("be positive", lambda number: number >= 1.0 / _LARGEST),
+    "above 0": ("be positive", lambda number: number > 0),
+    "not negative": ("not be negative", lambda number: number >= 0),
+    "above 0.5": ("be above 0.5", lambda number: number > 0.5),
+    "in [0, 1]": ("be in [0, 1]", lambda number: (number >= 0) & (number <= 1)),
+    "between 0 and 1": ("be between 0 and 1", lambda number: (number > 0) & (number < 1)),
 }
+"""What a value must do, in words, and whether it does."""
 
 
 def readable(self: Any) -> str:

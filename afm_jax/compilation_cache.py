@@ -125,24 +125,16 @@ def cache_folder() -> Path | None:
 
 
 def user_cache_folder() -> Path | None:
-    """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax.
+    """Return where a user keeps what programs can do without, XDG_CACHE_HOME or ~/.cache, in a folder named afm-jax.
 
     None where that depends on a home folder and there is none: a user without an entry in the system's list, as
     containers have, and without HOME; or one whose HOME is no absolute path.
     """
-    base = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")
-    try:
-        home = Path.home()
-    except RuntimeError:
-        home = Path()
-    # The specification says that a relative path there is to be ignored.
-    if sys.platform != "darwin" and Path(base).is_absolute():
-        return Path(base) / "afm-jax" / ("cache" if sys.platform == "win32" else "")
-    if not home.is_absolute():
-        return None
-    if sys.platform == "win32":
-        return home / "AppData" / "Local" / "afm-jax" / "cache"
-    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "afm-jax"
+    base = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    with suppress(RuntimeError):
+        # The specification says that a relative path there is to be ignored.
+        base = base if base.is_absolute() else Path.home() / ".cache"
+    return base / "afm-jax" if base.is_absolute() else None
 
 
 def processor_key() -> str:

@@ -70,3 +70,51 @@ def within_turn(angle: Any, turn: Any) -> Any:
     (270.0, 0.0)
     """
     return angle % turn % turn
+
+
+UNITS = {
+    "nm_per_us": "nm/us",
+    "nm2_per_us2": "nm^2/us^2",
+    "nm2_per_us": "nm^2/us",
+    "cm3_per_mol": "cm^3/mol",
+    "j_per_m2": "J/m^2",
+    "n_per_m": "N/m",
+    "per_us": "1/us",
+    "j_m6": "J m^6",
+    "pa_s": "Pa s",
+    "gpa": "GPa",
+    "nm": "nm",
+    "us": "us",
+    "khz": "kHz",
+    "mhz": "MHz",
+    "deg": "degrees",
+    "rad": "rad",
+    "aj": "aJ",
+    "nn": "nN",
+    "ng": "ng",
+    "ev": "eV",
+    "k": "K",
+}
+"""Units by the end of a field's name."""
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that a field's name ends with; empty for a number.
+
+    >>> unit_of("rebound_speed_nm_per_us"), unit_of("peak_amplitude_error_nm"), unit_of("stable")
+    ('nm/us', 'nm', '')
+    """
+    return UNITS.get(_ending(name), "")
+
+
+def words_of(name: str) -> str:
+    """Return a field's name in words, without its unit.
+
+    >>> words_of("rebound_speed_nm_per_us")
+    'rebound speed'
+    """
+    return name.removesuffix(f"_{_ending(name)}").replace("_", " ")
+
+
+def _ending(name: str) -> str:
+    return next((end for end in UNITS if name.endswith(f"_{end}")), "")

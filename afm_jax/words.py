@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any, SupportsFloat
@@ -167,22 +166,6 @@ def lines_at_most(width: int) -> Iterator[None]:
 
 
 _room: ContextVar[float] = ContextVar("_room", default=math.inf)
-
-
-def broken(text: str, width: int, indent: str = "") -> list[str]:
-    """Return a text in lines of at most so many signs, broken between words; a value keeps its error beside it.
-
-    Args:
-        text: one line.
-        width: signs in a line; words that are longer stay whole.
-        indent: what all lines but the first begin with.
-
-    >>> broken("epsilon 59.8 +- 0.3 nm^2/us^2 (given)", 16)
-    ['epsilon', '59.8 +- 0.3', 'nm^2/us^2', '(given)']
-    """
-    whole = text.replace(" +- ", "\0+-\0")
-    lines = textwrap.wrap(whole, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
-    return [line.replace("\0", " ") for line in lines] or [""]
 
 
 def bullets(title: str, items: Sequence[str]) -> list[str]:

@@ -64,9 +64,6 @@ MUTATIONS = {
         f"{APPARATUS}test_sine_and_cosine_are_right_to_the_last_digit",
     ),
     "viscous loss that gives": Mutation("** 2 {- => +} viscous_loss * u - epsilon", LAW),
-    "energy that an impact takes as a sum": Mutation(
-        "(u * u {- => +} self.rebound_speed(u) ** 2)", "tests/test_law.py::test_without_losses_it_is_equation_1"
-    ),
     "lead of the delay as a sum": Mutation("self.lead_nm * (1.0 / w {- => +} 1.0 / u) - self.offset_nm / u\n", LAW),
     "capture speed with half its adhesion": Mutation("{4.0 => 2.0} * self.r**2 * square", LAW),
     "bound of the gap without the platform": Mutation(

@@ -21,15 +21,13 @@ ROOT = Path(__file__).parent.parent
 FORCE = {
     "afm_jax/contact/parameters.py": [
         '"viscous", { => "attraction", }"jkr")',
-        """{ =>     ContactParameter(name="attraction_constant_aj", unit="aJ", default=0.01, allowed="not negative",
+        """{ =>     ContactParameter(name="attraction_constant_aj", default=0.01, allowed="not negative",
         meaning="H of the attraction", fitted=(1e-4, 10.0), serves=("attraction",)),
 }    ContactParameter(name="tip_radius_nm\"""",
     ],
     "afm_jax/contact/contact.py": [
         "import { => Attraction, }CoreRepulsion",
         '    "viscous": Viscous,\n{ =>     "attraction": Attraction,\n}',
-        '{ => attraction_constant_aj: ArrayLike = PAPER["attraction_constant_aj"],\n        }tip_radius_nm: ArrayLike',
-        '{ => "attraction": lambda: Attraction(value["attraction_constant_aj"], radius),\n            }"viscous": l',
     ],
     # like a force that is there
     "afm_jax/contact/forces/solid.py": ["{ => class Attraction(StaticForce):VAN DER WAALS\n\n\n}class VanDerWaals("],
@@ -62,7 +60,7 @@ def changed(folder: Path, edits: dict[str, list[str]]) -> None:
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
     for name, marked in edits.items():
         text = (folder / name).read_text()
-        body = text.partition("class VanDerWaals(StaticForce):")[2]
+        body = text.partition("class VanDerWaals(StaticForce):")[2].replace("hamaker_", "attraction_")
         for edit in marked:
             old, new = before_and_after(edit)
             assert old in text, f"{name} has no {old!r}"

@@ -89,7 +89,7 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     (lambda: afm.next_impact(SCENE, TWO, 30.0), r"`time_us` must be one number.*: `iterate_batch` and"),
     (lambda: afm.iterate_map(SCENE, TWO[:0], 30.0, 3), r"`time_us` must be one number, but has the shape \(0,"),
     (lambda: afm.next_impact(SCENE, 0.0, 30.0, max_steps=0), "`max_steps` must be 1 or more, but is 0"),
-    (lambda: afm.next_impact(SCENE, 0.0, 30.0, root_tolerance_us=-1.0), "`root_tolerance_us` must be pos"),
+    (lambda: afm.iterate_map(SCENE, 0.0, 30.0, 1, root_tolerance_us=-1.0), "`root_tolerance_us` must be pos"),
     (lambda: afm.map_jacobian(SCENE, np.nan, 30.0), "`time_us` must be a finite number, but is nan"),
     (lambda: afm.many_impact_orbits(SCENE, 1, 2, starts=0), "`starts` must be 1 or more, but is 0"),
     (
@@ -104,9 +104,9 @@ IMPOSSIBLE: list[tuple[Any, str]] = [
     # a cantilever, platforms and laws
     (lambda: afm.Platform(np.array([1.0, -2.0, 3.0]), 180.0), "`amplitude_nm` must not be negative, but is -2"),
     (lambda: afm.Platform(np.array([1.0, 1e40]), 180.0), r"at most 1e\+30"),  # its square is no number
-    (lambda: afm.iterate_map(SCENE, 4.0, 60.0, 0), "`impacts` must be a positive integer, but is 0"),
+    (lambda: afm.iterate_map(SCENE, 4.0, 60.0, 0), "`impacts` must be 1 or more, but is 0"),
     (lambda: afm.iterate_batch(SCENE, np.zeros((2, 1)), TWO, 1), "must have one shape"),
-    (lambda: afm.iterate_batch(SCENE, TWO, TWO, 1, block=0), "`block` must be a positive integer, but is 0"),
+    (lambda: afm.iterate_batch(SCENE, TWO, TWO, 0), "`impacts` must be 1 or more, but is 0"),
     (lambda: afm.iterate_batch(SCENE, TWO[:0], TWO[:0], 1), "at least one row"),
     # forces and contacts
     (lambda: afm.Contact((VanDerWaals(),), Hertz()), r"Hertz\(\) is a contact without other forces; VanDerWaals\(\)"),

@@ -30,11 +30,12 @@ def scattered_starts(scene: Scene, batch: int) -> tuple[jax.Array, jax.Array]:
 
 
 @pytest.mark.parametrize(("batch", "block"), [(1, 500), (7, 3), (8, 4)])
-def test_blocks_change_nothing(batch: int, block: int):
+def test_blocks_change_nothing(batch: int, block: int, monkeypatch: pytest.MonkeyPatch):
     """The restitution differs from row to row."""
+    monkeypatch.setattr("afm_jax.impact.map.BLOCK", block)
     scene, r = load_scene("figure2"), jnp.linspace(0.3, 0.8, batch)
     time, velocity = (np.asarray(part)[:batch] for part in scattered_starts(scene, 8))
-    rows = iterate_batch(with_r(scene, r), time, velocity, IMPACTS, block=block)
+    rows = iterate_batch(with_r(scene, r), time, velocity, IMPACTS)
     alone = [iterate_map(with_r(scene, r[row]), time[row], velocity[row], IMPACTS) for row in range(batch)]
     for name in ("time_us", "velocity_after_nm_per_us", "velocity_before_nm_per_us", "outcome", "near_grazing"):
         expected = np.stack([np.asarray(getattr(one, name)) for one in alone])
@@ -61,12 +62,13 @@ def derivatives_by_r(scene: Scene, time_us: float, velocity: float) -> list[floa
     return [float((high.time_us - low.time_us) / (2 * step)) for high, low in zip(up, down, strict=True)]
 
 
-def test_forward_and_reverse_derivatives_agree_with_50_digits():
+def test_forward_and_reverse_derivatives_agree_with_50_digits(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("afm_jax.impact.map.BLOCK", 2)
     scene = load_scene("figure2")
     starts = scattered_starts(scene, 3)
 
     def times(r: jax.Array) -> jax.Array:
-        return iterate_batch(with_r(scene, r), *starts, IMPACTS, block=2).time_us
+        return iterate_batch(with_r(scene, r), *starts, IMPACTS).time_us
 
     r = scene.interaction.r
     exact = [derivatives_by_r(scene, float(time), float(speed)) for time, speed in zip(*starts, strict=True)]

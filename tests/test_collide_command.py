@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.main import main
 from afm_jax.cli.values import Numbers
-from afm_jax.contact.collide import Collision, Collisions, capture_speed, collide, default_speeds
+from afm_jax.contact.collide import capture_speed, collide, collisions, default_speeds
 from afm_jax.contact.junction import find_junction
 from tests import answers
 from tests.strict_reading import strictly
@@ -68,11 +68,7 @@ def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any], out
 
 
 def test_picture_shows_curve_capture_delay_and_losses(paper: dict[str, Any]):
-    rows = [
-        dict(zip(Collision._fields, row, strict=True))
-        for row in zip(*(paper[name] for name in Collision._fields), strict=True)
-    ]
-    panels = Collisions(rows, paper["capture_speed_nm_per_us"], {}).plot().axes
+    panels = collisions(Contact.paper(), paper["approach_speed_nm_per_us"]).plot().axes
     drawn = [{line.get_label(): np.asarray(line.get_ydata())[1:] for line in axes.lines} for axes in panels]
     np.testing.assert_array_equal(drawn[0]["contact"], paper["rebound_speed_nm_per_us"][1:])
     np.testing.assert_array_equal(next(iter(drawn[1].values())), paper["collision_delay_us"][1:])

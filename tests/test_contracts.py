@@ -43,8 +43,7 @@ def platform_motion(scene: Scene) -> Any:
 
 def impact_law(scene: Scene) -> Any:
     law = impact_law_of(scene)
-    speeds = law.rebound_speed(40.0), law.rebound_slope(40.0), law.approach_speed(30.0)
-    return jnp.stack([*speeds, law.energy_lost(40.0)])
+    return jnp.stack([law.rebound_speed(40.0), law.rebound_slope(40.0), law.approach_speed(30.0)])
 
 
 def collision_delay(scene: Scene) -> Any:

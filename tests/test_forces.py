@@ -82,7 +82,7 @@ def test_a_sum_does_not_depend_on_order_or_brackets(forces, gap, rate):
 def test_the_quartic_is_inverted_in_closed_form(s):
     with mpmath.workdps(40):
         exact = mpmath.mpf(s) ** 4 - 2 * mpmath.sqrt(6) / 3 * s
-        back = float(jkr_formulas.root_of_depth(float(exact)))
+        back = float(Jkr().curve.root_of_depth(float(exact)))
     # near the fold the root is a square root of the depth: half of the digits
     assert back == pytest.approx(s, rel=4e-15 + 3e-16 / (s - jkr_formulas.FOLD))
 

@@ -10,7 +10,6 @@ from afm_jax.cli.scenes import NamedScene
 from afm_jax.cli.session import Session
 from afm_jax.columns import Cell, printed_table, rows_of
 from afm_jax.motion.approach_curve import ApproachCurve, CurveOutcome, approach_curve
-from afm_jax.scenefile.scenefile import scene_tables
 from fitting.simulated.experiment import table_of_curve
 from fitting.tables.table import write_table
 
@@ -54,13 +53,9 @@ def approach(
     )
     return Output(
         payload={
-            "drive": curve.drive,
-            "drive_frequency_khz": curve.drive_frequency_khz,
-            "free_amplitude_nm": curve.free_amplitude_nm,
-            "free_phase_lag_deg": curve.free_phase_lag_deg,
+            **{name: getattr(curve, name) for name in _OF_FREE_TIP},
             **points,
             "valid": repeats > 0,
-            "scene": scene_tables(scene.scene),
             "settings": settings | errors,
         },
         text=[
@@ -80,6 +75,9 @@ def approach(
     )
 
 
+_OF_FREE_TIP = ("drive", "drive_frequency_khz", "free_amplitude_nm", "free_phase_lag_deg")
+
+
 def _points(curve: ApproachCurve) -> dict[str, Any]:
     """Return the columns of curve_points.csv, a row a height."""
     names = ("height_nm", "amplitude_nm", "phase_lag_deg", "dissipated_in_contact_aj", "virial_aj")
@@ -87,10 +85,7 @@ def _points(curve: ApproachCurve) -> dict[str, Any]:
     return {
         **{name: getattr(curve, name) for name in names},
         "direction": np.where(curve.retract, "retract", "approach").tolist(),
-        **{
-            name: [n if t else None for n, t in zip(getattr(curve, name).tolist(), told, strict=True)]
-            for name in ("contacts", "periods")
-        },
+        **{name: list(np.where(told, getattr(curve, name), None)) for name in ("contacts", "periods")},
         "outcome": [CurveOutcome(kind).name.lower() for kind in curve.outcome.tolist()],
         "reason": list(curve.reasons),
     }

@@ -6,13 +6,12 @@ from typing import Annotated, Any
 import click
 from click import IntRange
 
-from afm_jax.checks import check_parameter
 from afm_jax.cli.command import Output, later, picture_of
 from afm_jax.cli.session import Session, add_note
 from afm_jax.cli.values import Ends, Numbers, Positive, option_of
 from afm_jax.contact.collide import collisions
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.parameters import CONTACT_RANGES, DEFAULTS, EFFECTS, idle_without
+from afm_jax.contact.parameters import DEFAULTS, EFFECTS, idle_without
 from afm_jax.scenefile.contact import contact_parameters, make_contact
 from afm_jax.scenefile.law_files import save_law, save_law_csv
 from afm_jax.scenefile.scenefile import MASS_ASSUMED, read_scene
@@ -93,10 +92,7 @@ def chosen_contact(scene: str | None, options: Mapping[str, Any]) -> tuple[Conta
         ValueError: if a value is impossible, the scene has no contact, or the contact no junction.
     """
     changed = {name: options[name] for name in DEFAULTS if options[name] is not None}
-    for name, value in changed.items():
-        check_parameter(option_of(name), value, CONTACT_RANGES[name], optional=True)
     mass = options["mass_ng"]
-    check_parameter("--mass-ng", mass, "positive", optional=True)
     effects, parameters = EFFECTS, {}
     if scene is not None:
         found, _, assumed = read_scene(scene)

@@ -71,7 +71,7 @@ class Output:
         told = {
             "payload": {**result.to_dict(), "reason": result.reason},
             "text": result.printed(),
-            "tables": result.tables(),
+            "tables": {} if "tables" in more else result.tables(),
             "impact_speeds": getattr(result, "impact_speeds_nm_per_us", None),
             "not_valid": result.reason,
         }

@@ -10,6 +10,7 @@ import math
 import os
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ import click
 from afm_jax.columns import columns_of, csv_cells
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import in_callers_words, write_whole
-from afm_jax.words import broken, lines_at_most, shown, text_table
+from afm_jax.words import lines_at_most, shown, text_table
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
@@ -246,13 +247,13 @@ def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | Non
 
 
 def _broken(text: str, width: int) -> str:
-    """Return a text whose lines break between words, below where they begin; words and numbers stay whole."""
+    """Return a text whose lines break between words, below where they begin; a value keeps its error beside it."""
     lines = []
-    for line in text.split("\n"):
+    for line in text.replace(" +- ", "\0+-\0").split("\n"):
         indent = " " * (len(line) - len(line.lstrip()))
-        indent += indent and "  "
-        lines += [line] if len(line) <= width else broken(line, width, indent)
-    return "\n".join(lines)
+        hanging: dict[str, Any] = {"subsequent_indent": indent and f"{indent}  ", "break_long_words": False}
+        lines += textwrap.wrap(line, width, **hanging, break_on_hyphens=False) if len(line) > width else [line]
+    return "\n".join(lines).replace("\0", " ")
 
 
 def _table_text(console: Any, table: Any) -> Any:

@@ -95,14 +95,8 @@ def simulation(  # noqa: PLR0913
             _write_trace(session, dense, seen.window)
         return draw_motion(scene.scene, run.simulation, folder, verdict=run.verdict, dense=dense)
 
-    return Output(
-        payload=told.to_dict(),
-        text=told.printed(),
-        tables={} if session.out is None else told.tables(),
-        json_file="simulate.json",
-        report=report,
-        not_valid=told.reason,
-    )
+    tables, payload = {} if session.out is None else told.tables(), told.to_dict()
+    return Output.of(told, payload=payload, tables=tables, json_file="simulate.json", report=report)
 
 
 def _check_duration(scene: Scene, duration_us: float) -> None:

@@ -25,7 +25,7 @@ from afm_jax.checks import (
     refuse_float32,
     require_float64,
 )
-from afm_jax.columns import Cell, columns_of, printed_table, rows_of
+from afm_jax.columns import Cell, printed_table, rows_of
 from afm_jax.contact.bridge_leg import (
     Passage,
     approach_through_bridge,
@@ -383,16 +383,15 @@ def _collided(contact: Contact, mass: Array, speeds: Array, setting: Setting) ->
 
 
 class Collisions(NamedTuple):
-    """Collisions row by row.
+    """A table of collisions.
 
     Attributes:
-        rows: one dict a tip, the fields of `Collision` as numbers, None where there is none; `outcome` a sentence and
-            `outcome_name` a word or two.
+        tips: in NumPy arrays of one axis.
         capture_speed_nm_per_us: None where it is not a number.
         junction: where it forms and breaks, and its hysteresis.
     """
 
-    rows: list[dict[str, Any]]
+    tips: Collision
     capture_speed_nm_per_us: float | None
     junction: dict[str, float]
 
@@ -400,10 +399,21 @@ class Collisions(NamedTuple):
     _picture = "afm_jax.plots.collisions:collisions_figure"
 
     @property
+    def columns(self) -> dict[str, list[Any]]:
+        """The fields of the tips, None where there is no value; outcomes as sentences."""
+        lost = self.tips.outcome > CollisionOutcome.CAPTURED_BY_JUNCTION
+        gaps = self.tips._unknown() | {"captured": lost}  # noqa: SLF001
+        told: dict[str, Any] = self.tips._asdict() | {
+            "outcome": [CollisionOutcome(end).sentence for end in self.tips.outcome.tolist()]
+        }
+        return {name: list(np.where(gaps.get(name, False), None, part)) for name, part in told.items()}
+
+    @property
     def reason(self) -> str | None:
         """Why not every collision has a result; None where all have."""
-        failed = [row["outcome"] for row in self.rows if row["captured"] is None]
-        return f"{len(failed)} of {len(self.rows)} collisions: {failed[0]}" if failed else None
+        columns = self.columns
+        failed = [end for end, stays in zip(columns["outcome"], columns["captured"], strict=True) if stays is None]
+        return f"{len(failed)} of {len(columns['outcome'])} collisions: {failed[0]}" if failed else None
 
     @property
     def capture_speed_reason(self) -> str | None:
@@ -416,7 +426,7 @@ class Collisions(NamedTuple):
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax collide`."""
         return {
-            **columns_of(self.rows, Collision._fields),
+            **self.columns,
             "capture_speed_nm_per_us": self.capture_speed_nm_per_us,
             "capture_speed_reason": self.capture_speed_reason,
             "junction": self.junction,
@@ -436,13 +446,15 @@ class Collisions(NamedTuple):
             "outcome": "outcome_name",
         }
         title = "Collisions of a free tip with the sample at rest"
-        parts: list[str | Table] = [printed_table(title, cells, self.rows[:_MOST_PRINTED])]
-        if len(self.rows) > _MOST_PRINTED:
-            which = f"The first {_MOST_PRINTED} of {len(self.rows)} collisions"
+        names = [CollisionOutcome(end).name.lower().replace("_", " ") for end in self.tips.outcome.tolist()]
+        rows = rows_of(self.columns | {"outcome_name": names})
+        parts: list[str | Table] = [printed_table(title, cells, rows[:_MOST_PRINTED])]
+        if len(rows) > _MOST_PRINTED:
+            which = f"The first {_MOST_PRINTED} of {len(rows)} collisions"
             parts.append(f"{which}; the JSON object and collide.csv have all.")
-        parts += sorted({row["outcome"] for row in self.rows})
+        parts += sorted(set(self.columns["outcome"]))
         capture, junction = self.capture_speed_nm_per_us, self.junction
-        if all(row["captured"] for row in self.rows):
+        if all(self.columns["captured"]):
             parts.append(f"All of these tips are captured{'; faster ones leave again' if capture else ''}.")
         parts.append(self.capture_speed_reason or f"Capture speed: {capture:.6g} nm/us.")
         parts.append(
@@ -455,7 +467,7 @@ class Collisions(NamedTuple):
 
     def tables(self) -> dict[str, dict[str, list[Any]]]:
         """Return the columns of collide.csv, a row a tip."""
-        return {"collide.csv": columns_of(self.rows, Collision._fields)}
+        return {"collide.csv": self.columns}
 
 
 _MOST_PRINTED = 40
@@ -463,12 +475,7 @@ _MOST_PRINTED = 40
 
 
 def collisions(
-    contact: Contact,
-    speeds: Sequence[float] | None = None,
-    mass_ng: float = 1.0,
-    *,
-    accuracy: float = 1e-9,
-    method: str = "diffrax",
+    contact: Contact, speeds: Sequence[float] | None = None, mass_ng: float = 1.0, *, accuracy: float = 1e-9
 ) -> Collisions:
     """Return a table of collisions of free tips with a sample at rest, with the capture speed and the junction.
 
@@ -477,7 +484,6 @@ def collisions(
         speeds: approach speeds in nm/us; None: twenty from 1.1 times the capture speed to 200 nm/us or ten times it.
         mass_ng: the tip's mass in ng.
         accuracy: as in `collide`.
-        method: as in `collide`.
 
     Raises:
         RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
@@ -487,10 +493,9 @@ def collisions(
     capture = float(capture_speed(contact, mass_ng))
     chosen = default_speeds(capture) if speeds is None else np.asarray(speeds, dtype=float)
     junction = find_junction(contact)
-    rows = _rows(collide_in_blocks(contact, chosen, mass_ng, accuracy=accuracy, method=method))
     numbers = {name: float(getattr(junction, name)) for name in (*junction._fields, "hysteresis_aj")}
     return Collisions(
-        rows=rows,
+        tips=collide_in_blocks(contact, chosen, mass_ng, accuracy=accuracy),
         capture_speed_nm_per_us=capture if math.isfinite(capture) else None,
         junction={name: value for name, value in numbers.items() if name not in ("exists", "forms_root")},
     )
@@ -502,13 +507,3 @@ def default_speeds(capture_speed_nm_per_us: float) -> Float[np.ndarray, " n"]:
     low = 1.1 * capture_speed_nm_per_us if known else 10.0
     speeds = np.geomspace(low, max(200.0, 10.0 * low), 20)
     return np.array([float(f"{speed:.4g}") for speed in speeds])
-
-
-def _rows(found: Collision) -> list[dict[str, Any]]:
-    lost = found.outcome > CollisionOutcome.CAPTURED_BY_JUNCTION
-    gaps = found._unknown() | {"captured": lost}  # noqa: SLF001
-    rows = rows_of({name: np.where(gaps.get(name, False), None, part) for name, part in found._asdict().items()})
-    for row in rows:
-        outcome = CollisionOutcome(row["outcome"])
-        row |= {"outcome": outcome.sentence, "outcome_name": outcome.name.lower().replace("_", " ")}
-    return rows

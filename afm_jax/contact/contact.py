@@ -5,7 +5,8 @@ damping.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,12 +30,6 @@ from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
 from afm_jax.contact.forces.solid import CoreRepulsion, VanDerWaals
 from afm_jax.contact.parameters import ALL_EFFECTS, DEFAULTS, EFFECTS, PAPER, REQUIRED_EFFECTS
 from afm_jax.units import AJ_NM6_PER_J_M6
-
-
-def _flat(forces: Force | Sequence[Force]) -> ForceSum:
-    check_kind("forces", forces, Force | Sequence[Force])
-    terms = [forces] if isinstance(forces, Force) else list(forces)
-    return ForceSum(tuple(term for force in terms for term in terms_of(force)))
 
 
 class Contact(eqx.Module):
@@ -81,7 +76,9 @@ class Contact(eqx.Module):
         range_nm: ArrayLike | None = None,
     ):
         """Fill in the gaps that are not given."""
-        self.forces = _flat(forces)
+        check_kind("forces", forces, Force | Sequence[Force])
+        given = [forces] if isinstance(forces, Force) else forces
+        self.forces = ForceSum(tuple(term for force in given for term in terms_of(force)))
         self.junction = Jkr() if junction is None else junction
         forms, breaks = PAPER["bridge_forms_nm"], PAPER["bridge_breaks_nm"]
         if isinstance(junction, Dmt):
@@ -118,50 +115,34 @@ class Contact(eqx.Module):
             )
 
     @classmethod
-    def paper(  # noqa: PLR0913
-        cls,
-        *,
-        effects: Sequence[str] = EFFECTS,
-        relative_humidity: ArrayLike = PAPER["relative_humidity"],
-        temperature_k: ArrayLike = PAPER["temperature_k"],
-        surface_tension_n_per_m: ArrayLike = PAPER["surface_tension_n_per_m"],
-        molar_volume_cm3_per_mol: ArrayLike = PAPER["molar_volume_cm3_per_mol"],
-        viscosity_pa_s: ArrayLike = PAPER["viscosity_pa_s"],
-        tip_radius_nm: ArrayLike = PAPER["tip_radius_nm"],
-        structural_amplitude_n_per_m: ArrayLike = PAPER["structural_amplitude_n_per_m"],
-        structural_decay_nm: ArrayLike = PAPER["structural_decay_nm"],
-        structural_offset_nm: ArrayLike = PAPER["structural_offset_nm"],
-        core_constant_j_m6: ArrayLike = PAPER["core_constant_j_m6"],
-        adhesion_energy_j_per_m2: ArrayLike = PAPER["adhesion_energy_j_per_m2"],
-        modulus_gpa: ArrayLike = PAPER["modulus_gpa"],
-        bridge_forms_nm: ArrayLike = PAPER["bridge_forms_nm"],
-        bridge_breaks_nm: ArrayLike = PAPER["bridge_breaks_nm"],
-    ) -> "Contact":
+    def paper(cls, *, effects: Sequence[str] = EFFECTS, **parameters: ArrayLike) -> "Contact":
         """Return the contact of section IV; every value can be changed by its keyword, every effect left out.
 
         Args:
             effects: which of "capillary", "structural", "core", "viscous" and "jkr" there are; what is absent is
                 absent from the compiled program.
-            relative_humidity: p/p_s, between 0 and 1.
-            temperature_k: temperature in K.
-            surface_tension_n_per_m: gamma_l in N/m.
-            molar_volume_cm3_per_mol: V_m of the liquid in cm^3/mol.
-            viscosity_pa_s: eta of the liquid in Pa s.
-            tip_radius_nm: R in nm.
-            structural_amplitude_n_per_m: A_0 in N/m.
-            structural_decay_nm: tau in nm.
-            structural_offset_nm: delta in nm.
-            core_constant_j_m6: B in J m^6.
-            adhesion_energy_j_per_m2: w in J/m^2.
-            modulus_gpa: reduced modulus K in GPa.
-            bridge_forms_nm: gap at which the bridge forms, in nm.
-            bridge_breaks_nm: gap at which it breaks, in nm.
+            parameters: the paper's values if left out:
+
+                relative_humidity: p/p_s, between 0 and 1.
+                temperature_k: temperature in K.
+                surface_tension_n_per_m: gamma_l in N/m.
+                molar_volume_cm3_per_mol: V_m of the liquid in cm^3/mol.
+                viscosity_pa_s: eta of the liquid in Pa s.
+                tip_radius_nm: R in nm.
+                structural_amplitude_n_per_m: A_0 in N/m.
+                structural_decay_nm: tau in nm.
+                structural_offset_nm: delta in nm.
+                core_constant_j_m6: B in J m^6.
+                adhesion_energy_j_per_m2: w in J/m^2.
+                modulus_gpa: reduced modulus K in GPa.
+                bridge_forms_nm: gap at which the bridge forms, in nm.
+                bridge_breaks_nm: gap at which it breaks, in nm.
 
         Raises:
             ValueError: if an effect is unknown or a required one missing, or a value outside its range.
+            TypeError: if there is no such parameter.
         """
-        given = locals()
-        return cls.of(effects, **{name: given[name] for name in PAPER})
+        return cls.of(effects, **parameters)
 
     @classmethod
     def of(cls, effects: Sequence[str], **parameters: ArrayLike) -> "Contact":
@@ -174,37 +155,31 @@ class Contact(eqx.Module):
         Raises:
             ValueError: if an effect is unknown, a required one missing, two do not go together, or a value is outside
                 its range.
+            TypeError: if there is no such parameter.
 
         >>> Contact.of(["van_der_waals", "dmt"], modulus_gpa=1.0).junction.modulus_gpa.item()
         1.0
         """
         check_effects(effects)
-        value = DEFAULTS | parameters
-        radius, solid = value["tip_radius_nm"], (value["modulus_gpa"], value["tip_radius_nm"])
+        for name in parameters:
+            if name not in DEFAULTS:
+                raise TypeError(f"a contact has no parameter `{name}`; it has {', '.join(DEFAULTS)}")
+        value: dict[str, Any] = DEFAULTS | parameters
+        value["core_constant_aj_nm6"] = value["core_constant_j_m6"] * AJ_NM6_PER_J_M6
 
-        def liquid() -> Liquid:
-            return Liquid(*(value[name] for name in _OF_LIQUID))
+        def make(kind: type[Any], effect: str = "") -> Any:
+            # a field has the parameter's name, in full or without the effect's in front
+            names = [field.name for field in fields(kind)]
+            if "liquid" in names:
+                value["liquid"] = make(Liquid)
+            return kind(**{name: value.get(f"{effect}_{name}", value.get(name)) for name in names})
 
-        makers: dict[str, Callable[[], Force]] = {
-            "capillary": lambda: Capillary(radius, liquid()),
-            "structural": lambda: Structural(
-                value["structural_amplitude_n_per_m"],
-                value["structural_decay_nm"],
-                value["structural_offset_nm"],
-                radius,
-                liquid(),
-            ),
-            "core": lambda: CoreRepulsion(value["core_constant_j_m6"] * AJ_NM6_PER_J_M6, radius),
-            "van_der_waals": lambda: VanDerWaals(value["hamaker_constant_aj"], radius),
-            "viscous": lambda: Viscous(value["viscosity_pa_s"], radius),
-        }
-        forces = [make() for name, make in makers.items() if name in effects]
+        forces = [make(kind, effect) for effect, kind in FORCES.items() if effect in effects]
         if "hertz" in effects:
-            return cls((), Hertz(*solid))
+            return cls((), make(Hertz))
         if "dmt" in effects:
-            return cls(forces, Dmt(*solid, value["contact_distance_nm"]), range_nm=value["range_nm"])
-        adhesive = Jkr(value["adhesion_energy_j_per_m2"], *solid)
-        return cls(forces, adhesive, value["bridge_forms_nm"], value["bridge_breaks_nm"])
+            return cls(forces, make(Dmt), range_nm=value["range_nm"])
+        return cls(forces, make(Jkr), value["bridge_forms_nm"], value["bridge_breaks_nm"])
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -228,8 +203,6 @@ class Contact(eqx.Module):
             return self.junction.curve
         return dry_curve(self.junction, -bridge_of(self).force(self.junction.begins_nm))
 
-
-_OF_LIQUID = ("relative_humidity", "temperature_k", "surface_tension_n_per_m", "molar_volume_cm3_per_mol")
 
 FORCES = {
     "capillary": Capillary,

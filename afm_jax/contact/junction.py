@@ -86,18 +86,18 @@ def find_junction(contact: Contact) -> Junction:
     """
     if not isinstance(contact.junction, Jkr):
         return _dry_junction(contact, contact.junction)
-    forces, solid = bridge_of(contact), contact.junction
+    forces, solid, curve = bridge_of(contact), contact.junction, contact.junction.curve
     scales = solid.load_scale_nn, solid.depth_scale_nm
     log_gap, exists = _tangency(lax.stop_gradient((forces, *scales)), lax.stop_gradient(contact.bridge_forms_nm))
     gap = jnp.exp(implicit_root(_excess_stiffness, log_gap, (forces, *scales)))
     force = forces.force(gap)
     root = jkr.root_of_load(force / solid.load_scale_nn)
-    shift = gap + solid.depth_scale_nm * jkr.depth(root)
+    shift = gap + solid.depth_scale_nm * curve.depth(root)
     breaks = shift - solid.pull_off_depth_nm
     stretched = forces.potential(contact.bridge_breaks_nm) - forces.potential(contact.bridge_forms_nm)
     # where the junction outlives the bridge, what it takes beyond the bridge's breaking is its own
     regained = forces.potential(jnp.minimum(breaks, contact.bridge_breaks_nm)) - forces.potential(gap)
-    elastic = solid.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(root))
+    elastic = solid.energy_scale_aj * (curve.work(curve.fold) - curve.work(root))
     return Junction(
         exists=exists & (gap <= contact.bridge_forms_nm) & _meniscus_fits(contact),
         forms_gap_nm=gap,

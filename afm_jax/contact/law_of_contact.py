@@ -45,14 +45,13 @@ from afm_jax.solve.least_squares import Sum, levenberg_marquardt
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
-RESIDUALS = ("relative", "absolute")
 LAW_SPEEDS = 1.5, 250.0
 """The range of `law_of_contact` if none is given: from this multiple of the capture speed to this speed in nm/us."""
 DELAY_SPEEDS = 1.37, 700.0
 """The range of `delay_of_contact` if none is given, likewise: for the paper's contact 15 to 700 nm/us."""
 _NAMES = ("r", "epsilon", "viscous_loss")
 _TOLERANCE, _SETTLED = 1e-28, 1e-18
-"""Distances of the sum of squares to its minimum, over the squared rebound speeds, to stop at and to have settled."""
+"""Distances of the mean of the squares to its minimum to stop at, and to have settled."""
 
 _NEAREST, _FASTEST = 0.2, 700.0
 """Where the table of `make_law` begins, as sqrt(u^2 - u_c^2) over the capture speed, and ends, in nm/us."""
@@ -82,7 +81,6 @@ class ContactLaw(Result):
 
     Attributes:
         model: a key of `FREE`.
-        residuals: what was made small, "relative" (u_fit/u_out - 1) or "absolute" (u_fit - u_out).
         law: the fitted law, without a delay.
         converged: whether the search ended at a minimum.
         approach_speed_nm_per_us: the speeds, uniform over the range, shape (n,).
@@ -93,7 +91,6 @@ class ContactLaw(Result):
     """
 
     model: str
-    residuals: str
     law: ImpactLaw
     converged: bool
     approach_speed_nm_per_us: Float[np.ndarray, " n"]
@@ -128,34 +125,19 @@ class ContactLaw(Result):
         return float(self.approach_speed_nm_per_us[0]), float(self.approach_speed_nm_per_us[-1])
 
     @property
-    def error_nm_per_us(self) -> Float[np.ndarray, " n"]:
-        """Fitted less simulated rebound speed."""
-        return self.fitted_speed_nm_per_us - self.rebound_speed_nm_per_us
-
-    @property
     def relative_error(self) -> Float[np.ndarray, " n"]:
-        """Error as a share of the rebound speed."""
-        return self.error_nm_per_us / self.rebound_speed_nm_per_us
+        """Fitted less simulated rebound speed, as a share of the simulated one."""
+        return self.fitted_speed_nm_per_us / self.rebound_speed_nm_per_us - 1.0
 
     @property
     def worst_relative_error(self) -> float:
-        """Largest error as a share of the rebound speed."""
+        """Largest of them in size."""
         return float(np.abs(self.relative_error).max())
 
     @property
-    def worst_error_nm_per_us(self) -> float:
-        """Largest error in nm/us."""
-        return float(np.abs(self.error_nm_per_us).max())
-
-    @property
     def rms_relative_error(self) -> float:
-        """Root of the mean square of the relative errors."""
+        """Root of the mean of their squares."""
         return float(np.sqrt(np.mean(self.relative_error**2)))
-
-    @property
-    def rms_error_nm_per_us(self) -> float:
-        """Root of the mean square of the errors in nm/us."""
-        return float(np.sqrt(np.mean(self.error_nm_per_us**2)))
 
 
 @checked
@@ -164,24 +146,22 @@ def law_of_contact(
     *,
     speed_range: tuple[float, float] | None = None,
     model: str = "law",
-    residuals: str = "relative",
     mass_ng: float = 1.0,
     points: int = 512,
 ) -> ContactLaw:
-    """Return the impact law that is closest to a contact's rebound speeds.
+    """Return the impact law that is closest to a contact's rebound speeds, relative to them.
 
     Args:
         contact: the contact, of numbers.
         speed_range: lowest and highest approach speed in nm/us; None: from 1.5 times the capture speed to 250 nm/us.
         model: "law" (r and epsilon, eq. 6), "viscous" (epsilon and a loss linear in speed) or "full" (all three).
-        residuals: "relative" or "absolute".
         mass_ng: the tip's mass in ng.
         points: number of speeds, uniform over the range.
 
     Raises:
         RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
-        ValueError: if the contact has no junction, a tip of the range is captured, or there is no such model, range,
-            number of points or kind of residuals.
+        ValueError: if the contact has no junction, a tip of the range is captured, or there is no such model, range or
+            number of points.
 
     >>> import jax
     >>> with jax.enable_x64(True):
@@ -192,17 +172,14 @@ def law_of_contact(
     require_float64(contact)
     if model not in FREE:
         raise ValueError(f"`model` must be one of {', '.join(FREE)}, but is {model!r}")
-    if residuals not in RESIDUALS:
-        raise ValueError(f"`residuals` must be one of {', '.join(RESIDUALS)}, but is {residuals!r}")
     if points < len(FREE[model]):
         raise ValueError(f"`points` must be at least the number of parameters, {len(FREE[model])}, but is {points}")
     capture = float(capture_speed(contact, mass_ng))
     approach = np.linspace(*_range_above_capture(speed_range, capture, *LAW_SPEEDS), points)
     rebound = _rebounds(contact, approach, mass_ng).rebound_speed_nm_per_us
-    law, converged = _closest_law(approach, rebound, model, residuals)
+    law, converged = _closest_law(approach, rebound, model)
     return ContactLaw(
         model=model,
-        residuals=residuals,
         law=law,
         converged=converged,
         approach_speed_nm_per_us=approach,
@@ -246,39 +223,36 @@ def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS
 
 
 def _closest_law(
-    approach: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], model: str, residuals: str
+    approach: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], model: str
 ) -> tuple[ImpactLaw, bool]:
-    """Return the law with the least sum of squared residuals, and whether the search converged.
+    """Return the law with the least sum of squared residuals u_fit/u_out - 1, and whether the search converged.
 
     Args:
         approach: u_in in nm/us.
         rebound: u_out in nm/us, positive.
         model: a key of `FREE`.
-        residuals: one of `RESIDUALS`.
     """
     free = np.array([name in FREE[model] for name in _NAMES])
     # u_out^2 = u_in^2 - (1 - r^2) u_in^2 - epsilon - c u_in; the scales make the parameters of order one
     scales = np.array([1e-2, approach[0] ** 2, approach[0] * 1e-1])[free]
     losses = np.stack([approach**2, np.ones_like(approach), approach], axis=1)[:, free] * scales
-    weights = 1.0 / rebound if residuals == "relative" else np.ones_like(rebound)
 
     def evaluate(place: Float[np.ndarray, " p"]) -> Sum:
         # a law that captures a tip of the range has the smallest speed instead: far from any minimum
         fitted = np.sqrt(np.maximum(approach**2 - losses @ place, 1e-12))
-        residual = (fitted - rebound) * weights
-        return Sum(float(residual @ residual), residual, (-0.5 * weights / fitted)[:, None] * losses)
+        residual = fitted / rebound - 1.0
+        return Sum(float(residual @ residual), residual, (-0.5 / (rebound * fitted))[:, None] * losses)
 
     # to first order the residual is that of the squares over 2 u_out
-    linear = weights / (2.0 * rebound)
+    linear = 0.5 / rebound**2
     guess = np.linalg.lstsq(losses * linear[:, None], (approach**2 - rebound**2) * linear, rcond=None)[0].clip(0.0)
     guess /= max(1.0, 1.01 * float(np.max(losses @ guess / approach**2)))
-    size = float(np.sum((weights * rebound) ** 2))
-    minimum = levenberg_marquardt(evaluate, guess, settled=_TOLERANCE * size, most=100, lowest=0.0)
+    minimum = levenberg_marquardt(evaluate, guess, settled=_TOLERANCE * len(rebound), most=100, lowest=0.0)
     values = np.zeros(3)
     values[free] = minimum.place * scales
     loss, epsilon, viscous_loss = values.tolist()
     law = ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss)
-    return law, minimum.distance < _SETTLED * size
+    return law, minimum.distance < _SETTLED * len(rebound)
 
 
 def _rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> Any:
@@ -413,7 +387,7 @@ class ContactLaws(NamedTuple):
         """Return the JSON object."""
         first, delay = self.formulas[0], self.delay
         return {
-            "residuals": first.residuals,
+            "residuals": "relative",
             "speed_range_nm_per_us": first.speed_range,
             "points": len(first.approach_speed_nm_per_us),
             "models": [{name: getattr(law, name) for name in _MODEL_KEYS} for law in self.formulas],
@@ -437,7 +411,6 @@ class ContactLaws(NamedTuple):
             "c\nnm/us": "viscous_loss:.3g",
             "worst error\n%": lambda law: f"{100.0 * law.worst_relative_error:.3g}",
             "rms error\n%": lambda law: f"{100.0 * law.rms_relative_error:.3g}",
-            "worst error\nnm/us": "worst_error_nm_per_us:.3g",
             "capture speed\nnm/us": "capture_speed_nm_per_us:.5g",
         }
         (low, high), (slow, fast) = first.speed_range, delay.speed_range
@@ -445,7 +418,7 @@ class ContactLaws(NamedTuple):
         numbers = ", ".join(f"{name} {float(getattr(delay.delay, name)):.4g}" for name in _DELAY_NUMBERS)
         errors = f"rms error {delay.rms_us:.2g} us, worst {delay.worst_us:.2g} us"
         return [
-            printed_table(f"{formula}, {first.residuals} residuals", formulas, self.formulas),
+            printed_table(f"{formula}, relative residuals", formulas, self.formulas),
             f"Capture speed of the contact: {first.contact_capture_speed_nm_per_us:.6g} nm/us.",
             "law: the paper's eq. 6; viscous: r = 1 and a loss c linear in speed; full: all three.",
             "Delay law in us: hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
@@ -467,7 +440,7 @@ class ContactLaws(NamedTuple):
 
 _MODEL_KEYS = (
     *("model", "r", "epsilon", "viscous_loss", "worst_relative_error", "rms_relative_error"),
-    *("worst_error_nm_per_us", "rms_error_nm_per_us", "capture_speed_nm_per_us", "converged"),
+    *("capture_speed_nm_per_us", "converged"),
 )
 """Columns of a formula: attributes of `ContactLaw`."""
 _DELAY_NUMBERS = ("hertz", "lead_nm", "offset_nm")
@@ -477,8 +450,6 @@ def contact_laws(
     contact: Contact,
     *,
     speed_range: tuple[float, float] | None = None,
-    delay_range: tuple[float, float] | None = None,
-    residuals: str = "relative",
     mass_ng: float = 1.0,
     points: int = 512,
 ) -> ContactLaws:
@@ -490,15 +461,12 @@ def contact_laws(
     Args:
         contact: the contact, of numbers.
         speed_range: of `law_of_contact`.
-        delay_range: the speed range of `delay_of_contact`.
-        residuals: of `law_of_contact`.
         mass_ng: the tip's mass in ng.
         points: number of speeds.
     """
     how: dict[str, Any] = {"mass_ng": mass_ng, "points": points}
-    of_speeds: dict[str, Any] = how | {"speed_range": speed_range, "residuals": residuals}
-    formulas = [law_of_contact(contact, model=model, **of_speeds) for model in FREE]
-    delay = delay_of_contact(contact, speed_range=delay_range, **how)
+    formulas = [law_of_contact(contact, model=model, speed_range=speed_range, **how) for model in FREE]
+    delay = delay_of_contact(contact, **how)
     return ContactLaws(formulas, delay, make_law(contact, mass_ng=mass_ng))
 
 

@@ -5,6 +5,8 @@ Without JAX, so that `--help` needs none.
 
 from dataclasses import dataclass
 
+from afm_jax.units import unit_of
+
 EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")
 """The effects of the paper's contact, by the names of scene files and options."""
 
@@ -35,7 +37,6 @@ class ContactParameter:
 
     Attributes:
         name: with its unit, as in scene files.
-        unit: in words.
         default: the paper's value.
         allowed: which values `afm_jax.checks.check_parameter` lets pass.
         meaning: what it is, in a line.
@@ -51,7 +52,6 @@ class ContactParameter:
     """
 
     name: str
-    unit: str
     default: float
     allowed: str = "positive"
     meaning: str
@@ -62,6 +62,11 @@ class ContactParameter:
     evenly: tuple[float, float] | None = None
     serves: tuple[str, ...] = ()
     advice: str = ""
+
+    @property
+    def unit(self) -> str:
+        """In words, as the name ends."""
+        return unit_of(self.name)
 
     def error_at(self, value: float) -> float:
         """Return the standard error that is assumed of a value at which a fit holds it."""
@@ -80,7 +85,6 @@ _LIQUID = ("capillary", "structural")
 CONTACT_PARAMETERS = (
     ContactParameter(
         name="relative_humidity",
-        unit="",
         default=0.5,
         allowed="between 0 and 1",
         meaning="p/p_s of the vapour",
@@ -92,7 +96,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="temperature_k",
-        unit="K",
         default=293.15,
         meaning="temperature",
         unsure=0.02,
@@ -102,7 +105,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="surface_tension_n_per_m",
-        unit="N/m",
         default=0.0728,
         meaning="of the liquid",
         unsure=0.2,
@@ -112,7 +114,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="molar_volume_cm3_per_mol",
-        unit="cm^3/mol",
         default=18.0795,
         meaning="of the liquid",
         unsure=0.1,
@@ -122,7 +123,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="viscosity_pa_s",
-        unit="Pa s",
         default=1.005e-3,
         allowed="not negative",
         meaning="of the liquid",
@@ -130,10 +130,9 @@ CONTACT_PARAMETERS = (
         serves=("viscous",),
         advice="measure over a wider range of drives, or hold it fixed at the liquid's known value",
     ),
-    ContactParameter(name="tip_radius_nm", unit="nm", default=100.0, meaning="R", fitted=(1.0, 1e4)),
+    ContactParameter(name="tip_radius_nm", default=100.0, meaning="R", fitted=(1.0, 1e4)),
     ContactParameter(
         name="structural_amplitude_n_per_m",
-        unit="N/m",
         default=40.0,
         allowed="not negative",
         meaning="A_0 of the structural force",
@@ -142,7 +141,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="structural_decay_nm",
-        unit="nm",
         default=0.6,
         meaning="tau of the structural force",
         unsure=0.2,
@@ -151,7 +149,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="structural_offset_nm",
-        unit="nm",
         default=0.6,
         allowed="finite",
         meaning="delta of the structural force",
@@ -163,7 +160,6 @@ CONTACT_PARAMETERS = (
     ContactParameter(
         name="core_constant_j_m6",
         allowed="above 0",
-        unit="J m^6",
         default=1e-78,
         meaning="B of the core repulsion",
         unsure=0.5,
@@ -172,7 +168,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="adhesion_energy_j_per_m2",
-        unit="J/m^2",
         default=0.3,
         meaning="w of the JKR contact",
         fitted=(0.02, 5.0),
@@ -181,7 +176,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="modulus_gpa",
-        unit="GPa",
         default=100.0,
         meaning="reduced modulus K of the JKR contact",
         fitted=(1.0, 2e3),
@@ -189,7 +183,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="bridge_forms_nm",
-        unit="nm",
         default=3.5,
         meaning="gap at which the bridge forms",
         unsure=0.2,
@@ -199,7 +192,6 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="bridge_breaks_nm",
-        unit="nm",
         default=4.7,
         meaning="gap at which the bridge breaks",
         unsure=0.2,
@@ -213,7 +205,6 @@ CONTACT_PARAMETERS = (
 DRY_PARAMETERS = (
     ContactParameter(
         name="hamaker_constant_aj",
-        unit="aJ",
         default=0.1,
         allowed="not negative",
         meaning="H of the van der Waals force; 0.1 is typical in air",
@@ -222,7 +213,6 @@ DRY_PARAMETERS = (
     ),
     ContactParameter(
         name="contact_distance_nm",
-        unit="nm",
         default=0.165,
         meaning="a0, the gap at which the solids of a DMT contact meet",
         fitted=(0.05, 5.0),
@@ -230,7 +220,6 @@ DRY_PARAMETERS = (
     ),
     ContactParameter(
         name="range_nm",
-        unit="nm",
         default=20.0,
         meaning="gap at which a DMT contact begins and ends: the force is cut there",
         fitted=(1.0, 1e3),

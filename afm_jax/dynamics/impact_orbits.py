@@ -70,7 +70,7 @@ IMPACT_COLUMNS = (
 """Columns of an impact: attributes of `LoopReading`."""
 
 
-@public_result(picture="afm_jax.plots.dynamics:many_orbits_figure")
+@public_result(picture="afm_jax.plots.dynamics:orbits_figure")
 class ManyImpactOrbits(ResultTuple):
     """Orbits of m impacts in N drive periods, by falling peak amplitude; NumPy arrays.
 

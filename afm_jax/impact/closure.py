@@ -423,7 +423,7 @@ def _quartic_roots(problem: OrbitProblem) -> Coordinates:
 
 def _scale(problem: OrbitProblem) -> Float[Array, ""]:
     """Return the unit in nm/us of distances from capture: the drive's top speed, or where adhesion counts."""
-    return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.reach)
+    return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.lowest)
 
 
 def _scanned_roots(problem: OrbitProblem, scan: Scan) -> Coordinates:

@@ -21,6 +21,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument, as_parameter, as_real, check_kind, check_parameter, is_traced, readable
 from afm_jax.solve.derivatives import implicit_root
+from afm_jax.strict_json import plain
 
 BRIDGE_NM = 4.7
 """Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""
@@ -129,11 +130,6 @@ class Impact(eqx.Module):
         """Whether platform, spring and air act during the contact; True of a resolved contact."""
         return True
 
-    @property
-    def reach(self) -> Float[Array, ""]:
-        """Distance in nm/us from the lowest coordinate over which adhesion counts: up to twice the capture speed."""
-        return self.lowest
-
     def at_approach(self, approach_speed: Float[Array, "..."]) -> Speeds:
         """Return the speeds in nm/us and the delay in us at an approach speed, which is a contact's coordinate."""
         return self.speeds(approach_speed)
@@ -226,11 +222,6 @@ class Law(Impact):
     def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether an approach speed in nm/us is outside those that the law is known for: a formula's never is."""
         return jnp.zeros(jnp.shape(approach_speed), bool)
-
-    def energy_lost(self, approach_speed: ArrayLike, mass_ng: ArrayLike = 1.0) -> Float[Array, "..."]:
-        """Return the energy lost in an impact in aJ, m (u_in^2 - u_out^2)/2; all of it where the tip is captured."""
-        u = as_argument(approach_speed)
-        return 0.5 * as_argument(mass_ng) * (u * u - self.rebound_speed(u) ** 2)
 
 
 class ImpactLaw(Law):
@@ -545,26 +536,21 @@ class TabulatedLaw(Law):
         """Return the law as numbers and lists, from which `law_of_dict` makes it again; what is absent is left out."""
         # a program for laws of however many unknowns
         found = _at_knots(_replaced(self, deviations=None))
+        numbers = {name: getattr(self, name) for name in _NUMBERS}
         told: dict[str, Any] = {
-            "approach_speed_nm_per_us": np.asarray(found.approach).tolist(),
-            "rebound_speed_nm_per_us": np.asarray(found.rebound).tolist(),
+            "approach_speed_nm_per_us": found.approach,
+            "rebound_speed_nm_per_us": found.rebound,
+            "capture_speed_nm_per_us": self.capture,
+            "speed_range_nm_per_us": [self.slowest_nm_per_us, self.fastest_nm_per_us],
+            "mass_ng": self.mass_ng,
+            "origin": self.origin.text or None,
+            "numbers": numbers,
+            "deviations": self.deviations,
         }
         if self.delay is not None:
-            told["collision_delay_us"] = np.asarray(found.delay).tolist()
-            told["corrections"] = self.delay.corrections
-        told["capture_speed_nm_per_us"] = float(self.capture)
-        told["speed_range_nm_per_us"] = [float(self.slowest_nm_per_us), float(self.fastest_nm_per_us)]
-        if self.mass_ng is not None:
-            told["mass_ng"] = float(self.mass_ng)
-        if self.origin.text:
-            told["origin"] = self.origin.text
-        numbers = {name: getattr(self, name) for name in _NUMBERS}
-        if self.delay is not None:
+            told |= {"collision_delay_us": found.delay, "corrections": self.delay.corrections}
             numbers |= {name: getattr(self.delay, name) for name in _OF_DELAY}
-        told["numbers"] = {name: np.asarray(number).tolist() for name, number in numbers.items()}
-        if self.deviations is not None:
-            told["deviations"] = {name: np.asarray(change).tolist() for name, change in self.deviations.items()}
-        return told
+        return {name: plain(value) for name, value in told.items() if value is not None}
 
     def __repr__(self) -> str:
         """Return what the law is of, without its splines."""
@@ -683,7 +669,7 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
     missing = [name for name in names[:2] if not isinstance(told.get(name), list | np.ndarray)]
     if missing:
         raise ValueError(f"the law lacks {' and '.join(missing)}")
-    u, w, late = (_as_numbers(name, told.get(name, ())) for name in names)
+    u, w, late = (_told(name, told.get(name, ())) for name in names)
     columns, numbers = (u, w, late if late.size else None), told.get("numbers")
     mass, origin = told.get("mass_ng"), str(told.get("origin", ""))
     if not isinstance(numbers, Mapping):
@@ -717,24 +703,22 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
     )
 
 
-def _told(name: str, number: Any, shape: tuple[int, ...]) -> Array:
+def _told(name: str, number: Any, shape: tuple[int, ...] | None = None) -> Any:
     """Return a number of a law that a file tells, or an array of them.
 
     Raises:
-        ValueError: if it is not of that shape, or not finite.
+        ValueError: if it is no number, not of that shape, or not finite; None: a column, which is checked elsewhere.
     """
-    found = _as_numbers(name, number)
+    try:
+        found = np.asarray(number, float)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` of the law must be numbers") from error
+    if shape is None:
+        return found
     if found.shape != shape or not np.isfinite(found).all():
         many = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
         raise ValueError(f"`{name}` of the law must be {many}")
     return jnp.asarray(found)
-
-
-def _as_numbers(name: str, told: Any) -> Float[np.ndarray, "..."]:
-    try:
-        return np.asarray(told, float)
-    except (OverflowError, TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` of the law must be numbers") from error
 
 
 def axes_of_one(scene: Scene) -> Scene:

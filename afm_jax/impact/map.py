@@ -100,7 +100,6 @@ def next_impact(
     velocity_nm_per_us: ArrayLike,
     *,
     max_steps: int = DEFAULT_MAX_STEPS,
-    root_tolerance_us: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
 ) -> NextImpact:
     """Return the next impact of a tip that has just left the platform (eqs. 2-4 and 6; the Poincare map).
 
@@ -109,7 +108,6 @@ def next_impact(
         time_us: when the flight starts, scalar; the tip is then at the platform's position.
         velocity_nm_per_us: tip velocity in the lab just after the impact, scalar, above the platform's velocity.
         max_steps: steps of the search for the impact before it gives up.
-        root_tolerance_us: remaining error of the impact time at which the search stops.
 
     Returns:
         The impact, differentiable in everything: forward, reverse, to any order (implicit function theorem).
@@ -126,8 +124,8 @@ def next_impact(
     ...     print(round(float(next_impact(scene, 4.0, 6.0).time_us), 6))
     9.646489
     """
-    seen, response, start, tolerance = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
-    return _in_lab(_next_impact(seen, start, tolerance, max_steps=max_steps), response)
+    seen, response, start = _free_start(scene, time_us, velocity_nm_per_us, max_steps)
+    return _in_lab(_next_impact(seen, start, max_steps=max_steps), response)
 
 
 @checked
@@ -159,36 +157,36 @@ def iterate_map(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if `impacts` is not positive, or an undamped cantilever is driven at its free frequency.
     """
-    seen, response, start, tolerance = _free_start(scene, time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
-    if impacts < 1:
-        raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
+    seen, response, start = _free_start(scene, time_us, velocity_nm_per_us, max_steps)
+    check_scalar("root_tolerance_us", root_tolerance_us)
+    check_parameter("root_tolerance_us", root_tolerance_us, "above 0")
+    tolerance = jnp.asarray(root_tolerance_us, start.time_us.dtype)
+    check_count("impacts", impacts)
     return _in_lab(follow_impacts(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
 
 
 def _free_start(
-    scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike
-) -> tuple[Scene, Surface | None, Departure, Float[Array, ""]]:
-    """Return scene, steady response to base and force, start without it, and tolerance in us, checked.
+    scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int
+) -> tuple[Scene, Surface | None, Departure]:
+    """Return scene, steady response to base and force, and the start without it, checked.
 
     A start that is no flight is an outcome.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if something is an array, or the search has no step or no tolerance.
+        ValueError: if something is an array, or the search has no step.
     """
     require_float64(scene)
     impact_law_of(scene)
     for name, value in (("time_us", time_us), ("velocity_nm_per_us", velocity_nm_per_us)):
         check_scalar(name, value, "`iterate_batch` and `jax.vmap` take many")
-    check_scalar("root_tolerance_us", tolerance_us)
     check_count("max_steps", max_steps)
-    check_parameter("root_tolerance_us", tolerance_us, "above 0")
     seen, response = seen_freely(scene)
     dtype = scene.platform.frequency_khz.dtype
     time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
     start = Departure(time, None, velocity if response is None else velocity - response.velocity(time))
-    return seen, response, start, jnp.asarray(tolerance_us, dtype)
+    return seen, response, start
 
 
 def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
@@ -208,8 +206,8 @@ def _in_lab(impacts: NextImpact, response: Surface | None) -> NextImpact:
 
 
 @partial(jax.jit, static_argnames=("max_steps",))
-def _next_impact(scene: Scene, departure: Departure, tolerance: Float[Array, ""], *, max_steps: int) -> NextImpact:
-    return impact_after(scene, departure, Search(max_steps, tolerance))
+def _next_impact(scene: Scene, departure: Departure, *, max_steps: int) -> NextImpact:
+    return impact_after(scene, departure, Search(max_steps))
 
 
 def impact_after(
@@ -317,7 +315,7 @@ def follow_impacts(
     return lax.scan(one_flight, (departure, jnp.array(True)), length=impacts)[1]  # noqa: FBT003
 
 
-DEFAULT_BLOCK = 1000
+BLOCK = 1000
 """Tips that run together; 300 to 2000 differ little on processors with vector units and 0.5 to 2 MB of cache."""
 
 
@@ -328,9 +326,7 @@ def iterate_batch(
     velocity_nm_per_us: ArrayLike,
     impacts: int,
     *,
-    block: int = DEFAULT_BLOCK,
     max_steps: int = DEFAULT_MAX_STEPS,
-    root_tolerance_us: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
 ) -> NextImpact:
     """Return the impacts of many tips: `iterate_map` for every row of a batch of any size.
 
@@ -339,9 +335,7 @@ def iterate_batch(
         time_us: when the first flights start, shape (batch,).
         velocity_nm_per_us: tip velocities in the lab then, shape (batch,).
         impacts: how many impacts to follow.
-        block: how many tips run together; does not change a result.
         max_steps: steps of the search for one impact before it gives up.
-        root_tolerance_us: remaining error of an impact time at which a search stops.
 
     Returns:
         A `NextImpact` of shape (batch, impacts), differentiable in scene and starts.
@@ -349,18 +343,13 @@ def iterate_batch(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if shapes do not fit together, or `impacts` or `block` is not positive.
+        ValueError: if shapes do not fit together, or `impacts` is not positive.
     """
     require_float64(scene)
     impact_law_of(scene)
     dtype = scene.platform.frequency_khz.dtype
     times, velocities = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
-    _check(scene, times, velocities, impacts, block)
-    tolerance = jnp.asarray(root_tolerance_us, dtype)
-    return _iterate_batch(scene, (times, velocities), tolerance, impacts=impacts, block=block, max_steps=max_steps)
-
-
-def _check(scene: Scene, times: Array, velocities: Array, impacts: int, block: int) -> None:
+    check_count("impacts", impacts)
     if times.ndim != 1 or times.shape != velocities.shape or times.size == 0:
         raise ValueError(
             "`time_us` and `velocity_nm_per_us` must have one shape (batch,) with at least one row, "
@@ -371,32 +360,21 @@ def _check(scene: Scene, times: Array, velocities: Array, impacts: int, block: i
             raise ValueError(
                 f"a parameter of the scene has shape {leaf.shape}; it must be a number or match {times.shape}"
             )
-    for name, value in (("impacts", impacts), ("block", block)):
-        if value < 1:
-            raise ValueError(f"`{name}` must be a positive integer, but is {value}")
+    return _iterate_batch(scene, (times, velocities), impacts=impacts, max_steps=max_steps)
 
 
-@partial(jax.jit, static_argnames=("impacts", "block", "max_steps"))
+@partial(jax.jit, static_argnames=("impacts", "max_steps"))
 def _iterate_batch(
     scene: Scene,
     starts: tuple[Float[Array, " batch"], Float[Array, " batch"]],
-    tolerance: Float[Array, ""],
     *,
     impacts: int,
-    block: int,
     max_steps: int,
 ) -> NextImpact:
     varied, shared = eqx.partition(scene, jax.tree.map(lambda leaf, axes: leaf.ndim > axes, scene, axes_of_one(scene)))
 
     def one_tip(row):
         parameters, (time, velocity) = row
-        return iterate_map(
-            eqx.combine(parameters, shared),
-            time,
-            velocity,
-            impacts,
-            max_steps=max_steps,
-            root_tolerance_us=tolerance,
-        )
+        return iterate_map(eqx.combine(parameters, shared), time, velocity, impacts, max_steps=max_steps)
 
-    return map_in_blocks(jax.vmap(one_tip), (varied, starts), block=block)
+    return map_in_blocks(jax.vmap(one_tip), (varied, starts), block=BLOCK)

@@ -163,5 +163,5 @@ def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface 
     if not (bool(leaves) or float(gap) > float(junction.forms_gap_nm)):
         raise ValueError(
             f"the start is inside the sample: the gap is {float(gap):.6g} nm, but must be above "
-            f"{float(junction.forms_gap_nm):.6g} nm, where the junction forms; raise `position_nm`"
+            f"{float(junction.forms_gap_nm):.6g} nm, where the junction forms; start higher"
         )

@@ -5,7 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_figure
 
 _SMALLEST = 1e-17
 """Errors below this are 0 but for rounding; they are drawn here."""
@@ -38,7 +38,6 @@ def accuracy_figure(result: Mapping[str, Any]) -> Figure:
             axes.axvline(result[own], color=DARK, linestyle=":", label="error of the reference")
         axes.set(xscale="log", yscale="log", title=kind)
         axes.invert_xaxis()
-        axes.grid(color=GRID, alpha=0.25)
         label_axes(axes, x=f"error of the {'' if kind == 'value' else 'gradient of the '}{result['value_of']}", y="")
     panels[0].set_ylabel("time (µs), one core")
     panels[0].legend(frameon=False)

@@ -1,5 +1,7 @@
 """Picture of an approach curve: amplitude and lag against the sample's height, approach and retract."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -17,7 +19,7 @@ _OTHERS = {
 
 
 def approach_curve_figure(curve: ApproachCurve) -> Figure:
-    """Return amplitude above and lag below; where the tip was captured a mark stands at the foot."""
+    """Return amplitude above and lag below; where there are none of a steady tip a mark at the foot says why."""
     figure = new_figure(7.0, 6.4)
     amplitude, lag = figure.subplots(2, 1, sharex=True)
     for axes, values, free in (
@@ -26,7 +28,6 @@ def approach_curve_figure(curve: ApproachCurve) -> Figure:
     ):
         axes.axhline(free, color=GRID, linewidth=1.2, label="free tip")
         _draw(axes, curve, values)
-        axes.grid(color=GRID, alpha=0.25)
     what = "deflection" if curve.drive == "base" else "height"
     label_axes(amplitude, x="", y=f"amplitude of the {what} (nm)")
     label_axes(lag, x="height of the sample over the rest position (nm)", y=f"lag behind the {curve.drive} (degrees)")
@@ -48,13 +49,5 @@ def _draw(axes: Axes, curve: ApproachCurve, values: np.ndarray) -> None:
     for kind, (marker, label) in _OTHERS.items():
         those = curve.outcome == kind
         if those.any():
-            read = np.isfinite(values[those])
-            # what has no value stands at the foot
-            for part, height, transform in (
-                (read, values[those][read], axes.transData),
-                (~read, np.full(np.count_nonzero(~read), 0.04), axes.get_xaxis_transform()),
-            ):
-                if part.any():
-                    (marks,) = axes.plot(curve.height_nm[those][part], height, marker, transform=transform)
-                    marks.set(linestyle="", color=DARK, markersize=6, markerfacecolor="none", label=label)
-                    label = ""  # noqa: PLW2901
+            style: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "color": DARK, "mfc": "none", "ls": ""}
+            axes.plot(curve.height_nm[those], np.full(those.sum(), 0.04), marker, ms=6, label=label, **style)

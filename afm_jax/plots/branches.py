@@ -1,7 +1,5 @@
 """Pictures of continuations: branches with their special points and bands, and curves in two parameters."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -9,7 +7,7 @@ from matplotlib.figure import Figure
 
 from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
-from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
+from afm_jax.dynamics.special_points import OrbitBranch
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, legend_once, new_figure
 from afm_jax.units import TWO_SIDED_95
@@ -33,7 +31,7 @@ def continuation_figure(found: Continuation) -> Figure:
     figure = new_figure(7.0, 4.6)
     axes = figure.subplots()
     for number, branch in enumerate(found.branches):
-        _draw_branch(axes, branch, [one for one in found.special if one.branch == number])
+        _draw_branch(axes, branch)
         if found.amplitude_errors is not None:
             _draw_band(axes, branch, found.amplitude_errors[number])
     for index, point in enumerate(found.special):
@@ -57,31 +55,23 @@ def continuation_figure(found: Continuation) -> Figure:
         )
     label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
-    axes.grid(color=GRID, alpha=0.25)
     axes.margins(x=0.02)
     legend_once(axes)
     return figure
 
 
-def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint]) -> None:
-    """Draw a branch, through its special points, where the style of the line changes."""
+def _draw_branch(axes: Axes, branch: OrbitBranch) -> None:
+    """Draw a branch; where its state changes, the line has the style of the lesser one."""
     stable = is_stable(multipliers_of(np.asarray(branch.reading.trace), np.asarray(branch.reading.determinant)))
     state = np.where(branch.reading.admissible, np.where(stable, 2, 1), 0)
-    place = np.array([*range(len(state)), *(one.position for one in special)])
-    rank = np.argsort(place, kind="stable")
-    x = np.array([*branch.parameter, *(one.parameter for one in special)])[rank]
-    y = np.array([*branch.reading.peak_amplitude_nm, *(float(one.reading.peak_amplitude_nm) for one in special)])[rank]
-    # a line from or to a special point is in the state of its other end
-    known = np.array([*state, *[-1] * len(special)])[rank]
-    left, right = known[:-1], known[1:]
-    lines = np.where(left < 0, right, np.where(right < 0, left, np.minimum(left, right)))
+    lines = np.minimum(state[:-1], state[1:])
     styles = ((":", GRID, "passes through the sample"), ("--", ACCENT, "unstable"), ("-", BLUE, "stable"))
     begin = 0
     for end in [*(np.flatnonzero(np.diff(lines)) + 1).tolist(), len(lines)]:
-        if lines[begin] >= 0:
-            line, colour, name = styles[int(lines[begin])]
-            piece = slice(begin, end + 1)
-            axes.plot(x[piece], y[piece], line, color=colour, linewidth=1.8, label=name)
+        line, colour, name = styles[int(lines[begin])]
+        piece = slice(begin, end + 1)
+        height = branch.reading.peak_amplitude_nm[piece]
+        axes.plot(branch.parameter[piece], height, line, color=colour, linewidth=1.8, label=name)
         begin = end
 
 
@@ -124,7 +114,6 @@ def curves_figure(found: Continuation) -> Figure:
             axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=name)
     label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
-    axes.grid(color=GRID, alpha=0.25)
     axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))
     legend_once(axes)
     return figure

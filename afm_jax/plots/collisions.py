@@ -19,12 +19,8 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
             captured tip.
         title: of the picture.
     """
-    if isinstance(found, Collision):
-        capture_speed_nm_per_us = None
-        columns = {name: array.astype(float).ravel() for name, (array, _) in known_columns(found).items()}
-    else:
-        capture_speed_nm_per_us = found.capture_speed_nm_per_us
-        columns = {name: np.array([row[name] for row in found.rows], float) for name in (*_DRAWN, *_LOSSES)}
+    tips, capture = (found, None) if isinstance(found, Collision) else found[:2]
+    columns = {name: array.astype(float).ravel() for name, (array, _) in known_columns(tips).items()}
     usable = np.flatnonzero(columns["approach_speed_nm_per_us"] > 0.0)
     usable = usable[np.argsort(columns["approach_speed_nm_per_us"][usable], kind="stable")]
     columns = {name: array[usable] for name, array in columns.items()}
@@ -43,7 +39,7 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     if is_captured.any():
         style = {"color": ACCENT, "ms": 7, "label": "captured", "clip_on": False}
         upper.plot(approach[is_captured], np.zeros(is_captured.sum()), "x", **style)
-    held_below = capture_speed_nm_per_us or np.max(approach[is_captured], initial=0.0)
+    held_below = capture or np.max(approach[is_captured], initial=0.0)
     for axes in panels:
         axes.axvspan(0.0, held_below, color=ACCENT, alpha=0.13, lw=0.0)
     upper.set(xlim=(0.0, end), ylim=(0.0, end))
@@ -53,8 +49,6 @@ def collisions_figure(found: Collision | Collisions, title: str = "") -> Figure:
     middle.axhline(0.0, color=GRID, lw=0.8)
     lower.margins(y=0.35)
     lower.set_ylim(bottom=0.0)
-    for axes in panels:
-        axes.grid(color=GRID, alpha=0.25)
     upper.legend(fontsize=10, loc="upper left")
     lower.legend(fontsize=10, loc="upper right", ncols=3)
     figure.suptitle(title or f"Collisions of {counted(usable.size, 'free tip')}", fontsize=12)

@@ -1,11 +1,10 @@
 """Pictures of what motions come to: orbits, exponents, bifurcation diagrams, charts of orbits, basins."""
 
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
@@ -27,12 +26,15 @@ from afm_jax.plots.picture_style import (
     SKY,
     cell_edges,
     label_axes,
+    legend_once,
     new_figure,
 )
-from afm_jax.results import unit_of, words_of
+from afm_jax.units import unit_of, words_of
 
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8c6bb1", "#a6761d", "#999999")
 """Colours that stand apart for every kind of colour vision (Okabe and Ito's, and three more)."""
+_ABOVE: dict[str, Any] = {"loc": "outside upper center", "ncols": 3, "fontsize": 11, "frameon": False}
+"""The place of a figure's legend."""
 _LABELS = {
     "platform.reduced_frequency": r"reduced drive frequency  $n = \omega/2\Omega$",
     "platform.amplitude_nm": r"drive amplitude  $\beta$ (nm)",
@@ -60,37 +62,15 @@ def label_of(path: str) -> str:
     return f"{words} ({unit})" if unit else words
 
 
-def orbits_figure(orbits: SingleImpactOrbits) -> Figure:
-    """Return the picture of single-impact orbits, of one scene or of many: where they hit, and how high they go."""
-    names = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "peak_amplitude_nm")
-    columns = [np.asarray(getattr(orbits, name), float).ravel() for name in names]
-    kinds = [np.asarray(getattr(orbits, name)).ravel() for name in ("exists", "admissible", "stable")]
-    return _orbits([part[:, None] for part in columns[:3]], columns[3], *kinds)
-
-
-def many_orbits_figure(orbits: ManyImpactOrbits) -> Figure:
-    """Return the picture of orbits of several impacts: where each hits, in their order, and how high it goes."""
-    names = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "peak_amplitude_nm")
-    *impacts, peak = (np.asarray(getattr(orbits.reading, name), float) for name in names)
-    return _orbits(impacts, peak, np.isfinite(peak), np.asarray(orbits.reading.admissible), np.asarray(orbits.stable))
-
-
-def _orbits(
-    impacts: Sequence[Float[np.ndarray, "orbits impacts"]],
-    peak: Float[np.ndarray, " orbits"],
-    exists: Bool[np.ndarray, " orbits"],
-    admissible: Bool[np.ndarray, " orbits"],
-    stable: Bool[np.ndarray, " orbits"],
-) -> Figure:
-    """Return the picture of orbits.
-
-    Args:
-        impacts: drive phase in rad, velocity after and approach speed in nm/us of every impact.
-        peak: their largest heights in nm.
-        exists: which of them are orbits at all; the others are left out.
-        admissible: they stay above the sample.
-        stable: they last.
-    """
+def orbits_figure(orbits: SingleImpactOrbits | ManyImpactOrbits) -> Figure:
+    """Return the picture of orbits, of one scene or of many: where they hit, in their order, and how high they go."""
+    reading = orbits.reading if isinstance(orbits, ManyImpactOrbits) else orbits
+    peak = np.asarray(reading.peak_amplitude_nm, float).ravel()
+    phase, velocity, approach = (
+        np.asarray(getattr(reading, name), float).reshape(peak.size, -1)
+        for name in ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us")
+    )
+    admissible, stable = np.asarray(reading.admissible).ravel(), np.asarray(orbits.stable).ravel()
     figure = new_figure(10.0, 4.8)
     left, right = figure.subplots(1, 2)
     kinds = {
@@ -98,8 +78,8 @@ def _orbits(
         "unstable": (admissible & ~stable, {"marker": "o", "color": BLUE, "markerfacecolor": "white"}),
         "not admissible": (~admissible, {"marker": "x", "color": ACCENT}),
     }
-    phase, velocity, approach = impacts
-    exists = exists & np.isfinite(peak) & np.isfinite(phase).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    # slots without an orbit hold NaN
+    exists = np.isfinite(peak) & np.isfinite(phase).all(axis=1) & np.isfinite(velocity).all(axis=1)
     for label, (which, style) in kinds.items():
         chosen = np.flatnonzero(exists & which)
         size = 8.0 if chosen.size <= _FEW else 3.0
@@ -113,12 +93,8 @@ def _orbits(
     right.set(xlim=(0.0, None), ylim=(0.0, None))
     label_axes(left, x="drive phase just after the impact (deg)", y=r"velocity after it (nm/$\mu$s)")
     label_axes(right, x=r"approach speed, of the hardest impact (nm/$\mu$s)", y="peak amplitude (nm)")
-    for axes in (left, right):
-        axes.grid(color=GRID, alpha=0.25)
-    handles, labels = left.get_legend_handles_labels()
-    if handles:
-        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=11, frameon=False)
-    else:
+    legend_once(left, figure, **_ABOVE)
+    if not left.lines:
         left.set_title("no orbit", fontsize=12)
     return figure
 
@@ -155,13 +131,10 @@ def exponents_figure(found: Lyapunov) -> Figure:
         axes.plot(values[gone], np.full(gone.sum(), low - 0.3), "|", label=label, **style)
     margin = 0.5 if len(values) == 1 else 0.0
     axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.3, high + 0.2))
-    axes.grid(color=GRID, alpha=0.25)
     axes.axhline(0.0, color="black", linewidth=1.0)
     x = "number of the motion" if found.along is None else label_of(found.along.path)
     label_axes(axes, x=x, y="Lyapunov exponent per impact")
-    legend = figure.legend(loc="outside upper center", ncols=3, fontsize=11, frameon=False)
-    for handle in legend.get_lines():
-        handle.set_markersize(10.0)
+    legend_once(axes, figure, **_ABOVE)
     return figure
 
 
@@ -201,14 +174,7 @@ def bifurcation_figure(ramped: BifurcationDiagram | Ramps, ordinate: str = "heig
     ends = [end for sweep in sweeps for end in (sweep.values.min(), sweep.values.max())]
     margin = 0.5 * (max(ends) - min(ends)) / len(sweeps[0].values)
     panels[0].set_xlim(min(ends) - margin, max(ends) + margin)
-    for axes in panels:
-        axes.grid(color=GRID, alpha=0.25)
-    named = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
-    legend = figure.legend(
-        named.values(), named.keys(), loc="outside upper center", ncols=2, fontsize=11, frameon=False
-    )
-    for handle in legend.get_lines():
-        handle.set(markersize=10.0, alpha=1.0)
+    legend_once(panels[0], figure, **_ABOVE | {"ncols": 2})
     return figure
 
 
@@ -272,8 +238,8 @@ def chart_figure(chart: StabilityChart) -> Figure:
     figure.colorbar(mesh, ax=right, label="modulus of its larger multiplier; 1: stability is lost")
     right.set_title("how fast its orbit attracts", fontsize=12)
     x = "first parameter" if chart.x is None else label_of(chart.x.path)
-    label_axes(left, x=x, y="second parameter" if chart.y is None else label_of(chart.y.path))
-    label_axes(right, x=x, y="")
+    label_axes(left, x=x, y="second parameter" if chart.y is None else label_of(chart.y.path), grid=False)
+    label_axes(right, x=x, y="", grid=False)
     figure.legend(handles=known, loc="outside lower center", ncols=2, fontsize=11, frameon=False)
     return figure
 
@@ -301,6 +267,6 @@ def basins_figure(basins: Basins) -> Figure:
         for phase, speed in zip(np.degrees(attractor.phase_rad), attractor.rebound_speed_nm_per_us, strict=True):
             axes.plot(phase, min(speed, top), "o" if speed <= top else "^", clip_on=False, **style)
     handles += [Line2D([], [], ls="", marker="o", label="impacts of the orbits", **style)]
-    label_axes(axes, x="drive phase at the start (deg)", y=r"rebound speed at the start (nm/$\mu$s)")
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=11, frameon=False)
+    label_axes(axes, x="drive phase at the start (deg)", y=r"rebound speed at the start (nm/$\mu$s)", grid=False)
+    figure.legend(handles=handles, **_ABOVE)
     return figure

@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, label_axes, new_figure
 from afm_jax.studies.effects import EffectStudy
 
 _LEAST = 1e-6
@@ -33,8 +33,6 @@ def effects_figure(study: EffectStudy) -> Figure:
     if study.cost is not None:
         right.axvline(study.cost, color=ACCENT, lw=1.2, ls=":", label="full scene")
     label_axes(right, x="time without it (µs/drive period)", y="")
-    for axes in (left, right):
-        axes.grid(axis="x", color=GRID, alpha=0.25)
     figure.legend(loc="outside lower center", ncols=4, fontsize=10)
     figure.suptitle("Leaving out one effect", fontsize=12)
     return figure

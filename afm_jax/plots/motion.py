@@ -23,7 +23,6 @@ from afm_jax.plots.picture_style import (
     label_axes,
     new_figure,
     save,
-    with_zero_line,
 )
 
 _CONTACTS_SHOWN = 6
@@ -224,7 +223,7 @@ def _course(axes: Axes, look: Look) -> None:
         base = np.asarray(look.scene.base.position_and_velocity(time)[0])
         axes.plot(time, base, "--", color=BLUE, linewidth=1.2, label="base")
     shade_phases(axes, look.path, look.scene.interaction)
-    with_zero_line(axes)
+    axes.axhline(0.0, color=GRID, linewidth=0.8)
     axes.set_xlim(look.from_us, look.to_us)
     _with_legend_above(axes, x="time (µs)", y="height (nm)")
     count = len(look.dense.contacts.kind)
@@ -247,7 +246,7 @@ def _peaks(axes: Axes, look: Look) -> None:
     peaks = peaks_between_contacts(look.scene, look.dense.simulation)
     axes.plot(look.dense.contacts.arrival_time_us[:-1], peaks, ".", color=BLUE, markersize=4.0)
     axes.axvspan(look.from_us, look.to_us, color=GRID, alpha=0.4, linewidth=0, label="shown above")
-    with_zero_line(axes)
+    axes.axhline(0.0, color=GRID, linewidth=0.8)
     what = "contact" if isinstance(look.scene.interaction, Contact) else "impact"
     _with_legend_above(axes, x="time (µs)", y=f"peak after each {what} (nm)")
 
@@ -279,7 +278,7 @@ def force_gap_figure(look: Look) -> Figure:
     for (name, (colour, dashes)), gap in zip(_MARKS.items(), gaps, strict=True):
         part.axvline(float(gap), color=colour, linewidth=1.0, linestyle=dashes, label=name)
     for axes in (whole, part):
-        with_zero_line(axes)
+        axes.axhline(0.0, color=GRID, linewidth=0.8)
         label_axes(axes, x="gap (nm)", y="force on the tip (nN)" if axes is whole else "")
     whole.set_xlim(right=_GAP_SHOWN_NM)
     part.set(xlim=(-0.6, _GAP_SHOWN_NM), ylim=(1.1 * least - 5.0, -0.6 * least + 5.0))
@@ -306,7 +305,6 @@ def section_figure(look: Look) -> Figure:
     bar.set_label("contact", fontsize=11)
     label_axes(axes, x="phase of the drive at departure (degrees)", y="departure velocity (nm/µs)")
     axes.set(xlim=(0.0, 360.0), xticks=range(0, 361, 60))
-    axes.grid(color=GRID, alpha=0.25)
     # what is left of a settled motion is rounding: the axis does not magnify it
     middle, spread = 0.5 * float(velocity.max() + velocity.min()), 0.5 * float(velocity.max() - velocity.min())
     half = max(1.1 * spread, _LEAST_SHOWN * float(np.abs(velocity).max()))
@@ -374,7 +372,6 @@ def spectrum_figure(look: Look) -> Figure:
             axes.vlines(places, floor, top, label=label, **style)
     axes.set(xlim=(0.0, 1.02 * right), ylim=(floor, top), yscale="log")
     label_axes(axes, x="frequency (kHz)", y="amplitude (nm)")
-    axes.grid(color=GRID, alpha=0.25)
     axes.legend(loc="upper right", fontsize=10, ncols=3, framealpha=1.0)
     periods = look.responses.periods
     kind = f"{periods} response periods" if repeats else f"{periods} drive periods, nothing repeats"

@@ -33,24 +33,29 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
-def label_axes(axes: Axes, *, x: str, y: str) -> None:
-    """Label both axes in the common size, ticks inside the labels' size."""
+def label_axes(axes: Axes, *, x: str, y: str, grid: bool = True) -> None:
+    """Label both axes in the common size, ticks inside the labels' size; draw a light grid where that hides nothing."""
     axes.set_xlabel(x, fontsize=_FONT + 1)
     axes.set_ylabel(y, fontsize=_FONT + 1)
     axes.tick_params(labelsize=_FONT)
+    if grid:
+        axes.grid(color=GRID, alpha=0.25)
 
 
-def legend_once(axes: Axes, **style: Any) -> None:
-    """Add a legend in which every label stands once, however many lines have it; none without labels."""
+def legend_once(axes: Axes, owner: Axes | Figure | None = None, **style: Any) -> None:
+    """Add a legend in which every label stands once, however many lines have it; none without labels.
+
+    Args:
+        axes: whose lines it is of.
+        owner: the figure whose legend it becomes, where it is not that of the axes.
+        style: of the legend.
+    """
     named = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if named:
-        axes.legend(named.values(), named.keys(), frameon=False, fontsize=10, **style)
-
-
-def with_zero_line(axes: Axes) -> None:
-    """Draw a light grid, and a line at 0 of the vertical axis."""
-    axes.axhline(0.0, color=GRID, linewidth=0.8)
-    axes.grid(color=GRID, alpha=0.25)
+        legend = (owner or axes).legend(named.values(), named.keys(), **{"frameon": False, "fontsize": 10} | style)
+        for handle in legend.get_lines():
+            handle.set(alpha=1.0)
+            handle.set_markersize(max(handle.get_markersize(), 8.0))
 
 
 def save(figure: Figure, path: Path, *, named_by_user: bool = False) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, DARK, label_axes, new_figure
-from afm_jax.results import known_columns, known_rows, unit_of, words_of
+from afm_jax.results import known_columns, known_rows
+from afm_jax.units import unit_of, words_of
 
 _MOST_PANELS = 4
 _COLOURS = (DARK, ACCENT, "#0072B2", "#009E73", "#CC79A7", "#7a6a00")
@@ -51,7 +52,7 @@ def _map(name: str, plane: np.ndarray) -> Figure:
     figure = new_figure(7.0, 5.0)
     axes = figure.add_subplot()
     image = axes.imshow(plane.reshape(plane.shape[0], -1), origin="lower", aspect="auto", interpolation="nearest")
-    label_axes(axes, x="column", y="row")
+    label_axes(axes, x="column", y="row", grid=False)
     figure.colorbar(image, label=_label(name))
     return figure
 

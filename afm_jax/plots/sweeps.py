@@ -82,7 +82,7 @@ def _draw(panel: Axes, found: "xarray.Dataset", name: str, swept: Sequence[str])
     else:
         found.plot.scatter(ax=panel, x=x, y=others[0], hue=name, s=12.0, **colours)
         panel.set(**scales)
-    label_axes(panel, x=labels[0], y=labels[1])
+    label_axes(panel, x=labels[0], y=labels[1], grid=not others)
     for side, each in zip("xy", swept, strict=False):
         low, high = found[each].values.min(), found[each].values.max()
         # all that was swept, also where there is no result

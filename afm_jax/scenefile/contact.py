@@ -8,10 +8,7 @@ import numpy as np
 
 from afm_jax.checks import check_parameter, is_traced
 from afm_jax.contact.contact import FORCES, Contact, check_effects
-from afm_jax.contact.forces.force import Force
-from afm_jax.contact.forces.liquid import Liquid
-from afm_jax.contact.forces.solid import CoreRepulsion
-from afm_jax.contact.junction import explain_missing_junction, find_junction
+from afm_jax.contact.junction import find_junction, require_junction
 from afm_jax.contact.parameters import CONTACT_RANGES
 from afm_jax.units import AJ_NM6_PER_J_M6
 
@@ -33,8 +30,8 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     for name, value in parameters.items():
         check_parameter(name, value, CONTACT_RANGES[name])
     contact = Contact.of(tuple(effects), **parameters)
-    if not any(map(is_traced, parameters.values())) and not bool(junction_of(contact).exists):
-        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
+    if not any(map(is_traced, parameters.values())):
+        require_junction(contact, _junction_of(contact).exists)
     return contact
 
 
@@ -54,38 +51,19 @@ def contact_parameters(contact: Contact) -> dict[str, Any]:
     elif contact.spans:
         values |= {"bridge_forms_nm": contact.bridge_forms_nm, "bridge_breaks_nm": contact.bridge_breaks_nm}
     for term in contact.forces.terms:
-        for name, value in _own_parameters(term).items():
+        effect = next(name for name, kind in FORCES.items() if isinstance(term, kind))
+        own = dict(vars(term))
+        liquid = own.pop("liquid", None)
+        for field, value in (own if liquid is None else own | vars(liquid)).items():
+            name = field if field in CONTACT_RANGES else f"{effect}_{field}"
+            if name == "core_constant_aj_nm6":
+                # in 64 bits: 1e-78 has no place in 32
+                name, value = "core_constant_j_m6", np.asarray(value, float) / AJ_NM6_PER_J_M6  # noqa: PLW2901
             if name in values and not np.array_equal(values[name], value):
                 raise ValueError(f"a scene file has one `{name}`, but the contact's forces have different ones")
             values[name] = value
     return {name: values[name] for name in CONTACT_RANGES if name in values}
 
 
-def _own_parameters(term: Force) -> dict[str, Any]:
-    """Return the parameters of one force by their names in a scene file: a field's, or the effect's and the field's."""
-    effect = next(name for name, kind in FORCES.items() if isinstance(term, kind))
-    values: dict[str, Any] = {}
-    for field, value in vars(term).items():
-        if isinstance(value, Liquid):
-            values |= vars(value)
-        elif isinstance(term, CoreRepulsion) and field == "constant_aj_nm6":
-            values["core_constant_j_m6"] = _core_constant(term)
-        else:
-            values[field if field in CONTACT_RANGES else f"{effect}_{field}"] = value
-    return values
-
-
-def _core_constant(term: CoreRepulsion) -> Any:
-    """Return B in J m^6 such that its product with the unit is the stored number again, to the last digit."""
-    stored = np.asarray(term.constant_aj_nm6)
-    # in 64 bits: 1e-78 has no place in 32
-    constant = stored.astype(float) / AJ_NM6_PER_J_M6
-    below, above = np.nextafter(constant, 0.0), np.nextafter(constant, np.inf)
-    for nearby in (below, above, np.nextafter(below, 0.0), np.nextafter(above, np.inf)):
-        exact = (constant * AJ_NM6_PER_J_M6).astype(stored.dtype) == stored
-        constant = np.where(exact, constant, nearby)
-    return constant
-
-
-junction_of = eqx.filter_jit(find_junction)
+_junction_of = eqx.filter_jit(find_junction)
 """`find_junction`, with one compilation for every choice of effects."""

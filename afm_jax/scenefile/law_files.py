@@ -1,7 +1,7 @@
 """Files that hold an impact law: a fit's, a contact's, or a table of speeds that somebody measured.
 
 Three kinds, recognized by their content: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
-with a column of approach speeds, one of rebound speeds, and maybe one of delays, their units in their names. A tip that
+with a column of approach speeds, one of rebound speeds, and maybe one of delays, named as below. A tip that
 is captured leaves at 0, or has a blank cell where a column `captured` says true (as of `collide --out`):
 
     # mass_ng = 1.2
@@ -13,7 +13,6 @@ is captured leaves at 0, or has a blank cell where a column `captured` says true
 import csv
 import json
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,23 +26,19 @@ from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.saved import FIT_FORMAT, why_no_fit
 from afm_jax.scenefile.tables import SceneError, read_text
 from afm_jax.strict_json import strict_json
-from afm_jax.units import effective_mass_ng
 from afm_jax.whole_files import write_whole
 from afm_jax.words import printable
 
 FORMAT, FORMAT_VERSION = "afm-jax law", 1
-_SPEED_UNITS = {"nm_per_us": 1.0, "um_per_s": 1e-3, "mm_per_s": 1.0, "m_per_s": 1e3}
-_TIME_UNITS = {"us": 1.0, "ns": 1e-3, "ms": 1e3, "s": 1e6}
-_COLUMNS = ("approach_speed", "rebound_speed", "rebound_speed_error", "collision_delay", "collision_delay_error")
-_COLUMN = re.compile(rf"({'|'.join(_COLUMNS)})(?:_((?!error).*))?")
-"""A column's kind and its unit."""
+_APPROACH, _REBOUND, _DELAY = "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us"
+_ERRORS = ("rebound_speed_error_nm_per_us", "collision_delay_error_us")
+_COLUMNS = (_APPROACH, _REBOUND, _ERRORS[0], _DELAY, _ERRORS[1])
 _BESIDES = ("rebound_low", "rebound_high", "delay_low", "delay_high", "captured", "outcome", "time_in_", "deepest_gap_")
 _BESIDES += ("bridge_", "junction_", "viscous_loss_", "end_energy_")
 """How other columns begin: the band of a fit's law, which cannot be drawn from a table alone, and what collisions
 are written with."""
-_WRITTEN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "rebound_low_nm_per_us", "rebound_high_nm_per_us")
-_WRITTEN += ("collision_delay_us", "delay_low_us", "delay_high_us")
-_NUMBERS = ("mass_ng", "spring_constant_n_per_m", "frequency_khz", "capture_speed_nm_per_us")
+_WRITTEN = (_APPROACH, _REBOUND, "rebound_low_nm_per_us", "rebound_high_nm_per_us")
+_WRITTEN += (_DELAY, "delay_low_us", "delay_high_us")
 
 
 @checked
@@ -144,46 +139,36 @@ def _of_csv(text: str) -> TabulatedLaw:
     names, *cells = (
         [cell.strip() for cell in row] for row in csv.reader((line for _, line in lines), delimiter=delimiter)
     )
-    columns = _columns_of(names)
-    values: dict[str, list[float]] = {kind: [] for kind in columns}
+    _check_columns(names)
+    values: dict[str, list[float]] = {name: [] for name in _COLUMNS if name in names}
     for (number, _), row in zip(lines[1:], cells, strict=True):
         if len(row) != len(names):
             raise ValueError(f"line {number} has {len(row)} values for {len(names)} columns")
-        stays = "captured" in names and row[names.index("captured")].lower() == "true"
-        for kind, (place, unit) in columns.items():
-            empty = stays and kind != "approach_speed" and not row[place]
-            values[kind].append(0.0 if empty else unit * _number(row[place], f"line {number}: `{names[place]}`"))
-    return _law_of_columns({kind: np.array(column) for kind, column in values.items()}, settings)
+        cell = dict(zip(names, row, strict=True))
+        stays = cell.get("captured", "").lower() == "true"
+        for name, column in values.items():
+            column.append(0.0 if stays and not cell[name] else _number(cell[name], f"line {number}: `{name}`"))
+    return _law_of_columns({name: np.array(column) for name, column in values.items()}, settings)
 
 
 def _law_of_columns(values: Mapping[str, np.ndarray], settings: Mapping[str, str]) -> TabulatedLaw:
     """Return the law of columns and of what the comments say of it."""
-    numbers = {key: _number(settings[key], f"`# {key}`") for key in _NUMBERS if key in settings}
-    for key, value in numbers.items():
-        check_parameter(f"# {key}", value, "not negative")
+    options: dict[str, Any] = {"origin": settings.get("origin", "")}
+    for key in ("mass_ng", "capture_speed_nm_per_us"):
+        options[key] = _number(settings[key], f"`# {key}`") if key in settings else None
     corrections = settings.get("corrections", "true")
     if corrections not in ("true", "false"):
         raise ValueError(f"`# corrections` must be true or false, but is {corrections!r}")
-    mass = numbers.get("mass_ng")
-    if mass is None and "spring_constant_n_per_m" in numbers:
-        if "frequency_khz" not in numbers:
-            raise ValueError(
-                "`spring_constant_n_per_m` gives a mass only together with `# frequency_khz = `: add it, or mass_ng"
-            )
-        mass = effective_mass_ng(numbers["spring_constant_n_per_m"], numbers["frequency_khz"])
-    delay = values.get("collision_delay")
+    delay = values.get(_DELAY)
     # how a fit of instantaneous impacts writes its law
     delay = None if delay is not None and not delay.any() else delay
-    columns = values["approach_speed"], values["rebound_speed"], delay
-    options = {"mass_ng": mass, "origin": settings.get("origin", "")}
-    options["capture_speed_nm_per_us"] = numbers.get("capture_speed_nm_per_us")
-    kinds, nothing = ("rebound_speed_error", "collision_delay_error"), np.zeros(len(columns[0]))
-    errors = {kind: values[kind] for kind in kinds if kind in values}
-    for kind, column in errors.items():
-        check_parameter(kind, column, "not negative")
-    if errors:
+    columns = values[_APPROACH], values[_REBOUND], delay
+    errors = [values.get(name, np.zeros(len(columns[0]))) for name in _ERRORS]
+    for name, column in zip(_ERRORS, errors, strict=True):
+        check_parameter(name, column, "not negative")
+    if any(name in values for name in _ERRORS):
         # every reading has its own
-        changes, rows = np.diag(np.concatenate([errors.get(kind, nothing) for kind in kinds])), len(nothing)
+        changes, rows = np.diag(np.concatenate(errors)), len(columns[0])
         options |= {"rebound_changes": changes[:, :rows], "delay_changes": None if delay is None else changes[:, rows:]}
         law = TabulatedLaw.with_errors(*columns, **options)
     else:
@@ -193,28 +178,16 @@ def _law_of_columns(values: Mapping[str, np.ndarray], settings: Mapping[str, str
     return eqx.tree_at(lambda law: law.delay, law, replace(law.delay, corrections=False))
 
 
-def _columns_of(names: list[str]) -> dict[str, tuple[int, float]]:
-    """Return place and unit, in nm/us or us, of the columns that a law's table has, by their kinds."""
-    columns: dict[str, tuple[int, float]] = {}
-    for place, name in enumerate(names):
-        matched = _COLUMN.fullmatch(name)
-        if matched is None:
-            if name.startswith(_BESIDES):
-                continue
-            known = ", ".join(_COLUMNS)
-            raise ValueError(f"column {printable(name)} is none of a law's; it has {known}, each with its unit")
-        kind, unit = matched.groups()
-        units = _SPEED_UNITS if "speed" in kind else _TIME_UNITS
-        if unit not in units:
-            wrong = "missing" if unit is None else "not known"
-            raise ValueError(f"column {printable(name)}: the unit is {wrong}; use one of {', '.join(units)}")
-        if kind in columns:
-            raise ValueError(f"has two columns of {kind}: {names[columns[kind][0]]} and {name}")
-        columns[kind] = place, units[unit]
-    missing = [kind for kind in ("approach_speed", "rebound_speed") if kind not in columns]
-    if missing:
-        raise ValueError(f"has no column {missing[0]}_nm_per_us; it has {', '.join(names)}")
-    return columns
+def _check_columns(names: list[str]) -> None:
+    """Check that a table has the columns that a law needs, each once, and no others than are known."""
+    for name in names:
+        if name not in _COLUMNS and not name.startswith(_BESIDES):
+            raise ValueError(f"column {printable(name)} is none of a law's; it has {', '.join(_COLUMNS)}")
+        if names.count(name) > 1:
+            raise ValueError(f"has two columns {name}")
+    for name in (_APPROACH, _REBOUND):
+        if name not in names:
+            raise ValueError(f"has no column {name}; it has {', '.join(names)}")
 
 
 def _number(text: str, what: str) -> float:

@@ -90,7 +90,12 @@ def parameter_values(scene: Scene) -> dict[str, float]:
     """
     values: dict[str, float] = {}
     for table, contents in scene_tables(scene).items():
-        _collect(table, contents, values)
+        inner = {f"{table}.{key}": part for key, part in contents.items() if isinstance(part, dict) and key != "table"}
+        for name, numbers in {table: contents, **inner}.items():
+            values |= {f"{name}.{key}": value for key, value in numbers.items() if isinstance(value, float)}
+    # of a law with errors, in standard deviations
+    unknowns = getattr(scene.interaction, "unknowns", 0)
+    values |= {f"{UNKNOWN}{number}": 0.0 for number in range(1, unknowns + 1)}
     free = float(scene.cantilever.frequency_khz)
     for path in [path for path in values if path.endswith(".frequency_khz") and not path.startswith("cantilever")]:
         values[path.replace("frequency_khz", "reduced_frequency")] = values[path] / (2.0 * free)
@@ -100,18 +105,6 @@ def parameter_values(scene: Scene) -> dict[str, float]:
             if per_free > 0.0:
                 values[f"{name}.free_amplitude_nm"] = float(drive.tones[0].amplitude) / per_free
     return values
-
-
-def _collect(table: str, contents: dict[str, Any], values: dict[str, float]) -> None:
-    for key, value in contents.items():
-        if key == "table":
-            # of a law: its errors' unknowns, in standard deviations
-            unknowns = len(value.get("deviations", {}).get("capture", []))
-            values.update((f"{table}.unknown_{number}", 0.0) for number in range(1, unknowns + 1))
-        elif isinstance(value, dict):
-            _collect(f"{table}.{key}", value, values)
-        elif isinstance(value, float):
-            values[f"{table}.{key}"] = value
 
 
 def check_ranges(scene: Scene, *ranges: ParameterRange) -> None:

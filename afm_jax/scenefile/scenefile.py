@@ -207,14 +207,19 @@ def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
         if name not in tables:
             keys = ", ".join(key for key in KEYS[name] if f"{name}.{key}" not in INNER_TABLES)
             raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {keys}")
-    model = _model_of(tables["interaction"])
+    # looked at first: it decides which keys are known
+    model = tables["interaction"].values.get("model")
+    if model not in MODELS:
+        wrong = "missing; add model =" if model is None else "must be"
+        tables["interaction"].fail(f'{wrong} "law" or "contact", or "none" for a free cantilever', "model")
     tables["interaction"] = tables["interaction"]._replace(model=model)
+    for table in tables.values():
+        table.check()
     for name in INNER_TABLES:
         outer, _, key = name.partition(".")
-        if outer in tables and key in tables[outer].values and (outer != "interaction" or model == "law"):
+        if outer in tables and key in tables[outer].values:
             tables[name] = _table(source, name, tables[outer].values[key])
-    for table in tables.values():
-        table.check_keys()
+            tables[name].check()
     return tables
 
 
@@ -222,16 +227,6 @@ def _table(source: str, name: str, value: Any) -> SceneTable:
     if not isinstance(value, dict):
         raise SceneError(f"{printable(source)}: {name} must be a table, [{name}], but is {in_words(value)}")
     return SceneTable(source, name, value)
-
-
-def _model_of(table: SceneTable) -> str:
-    """Return the model, looked at first: it decides which keys are known."""
-    model = table.values.get("model")
-    if model is None:
-        table.fail('missing; add model = "law" or model = "contact", or model = "none" for a free cantilever', "model")
-    if model not in MODELS:
-        table.fail('must be "law" or "contact", or "none" for a free cantilever', "model")
-    return model
 
 
 def _scene_of(tables: dict[str, SceneTable]) -> Scene:
@@ -278,28 +273,22 @@ def _tone(table: SceneTable, name: str, cantilever: Cantilever, *, may_rest: boo
     The amplitude may be given as that of the free tip's height, `free_amplitude_nm`, the frequency as a reduced one.
     """
     amplitude, free = _amplitude(name), "free_amplitude_nm"
-    if amplitude in table.values and free in table.values:
-        table.fail(f"has both {amplitude} and {free}; give one of them")
     given = free if free in table.values else amplitude
     numbers = table.numbers(*(() if may_rest else (given,)))
     reduced = numbers.pop("reduced_frequency", None)
-    if reduced is not None and "frequency_khz" in numbers:
-        table.fail("has both frequency_khz and reduced_frequency; give one of them")
     if reduced is not None:
         table.build(check_parameter, "reduced_frequency", reduced, "positive")
         # omega / 2 Omega
         numbers["frequency_khz"] = 2.0 * reduced * cantilever.frequency_khz
     if "frequency_khz" not in numbers and not (may_rest and not numbers.get(amplitude)):
         table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
+    table.build(check_parameter, given, numbers.get(given, 0.0), "not negative")
     if given == free:
-        table.build(check_parameter, free, numbers[free], "not negative")
         # the tone's amplitude only says that it moves
         tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
         table.build(check_steady_response, cantilever, (tone,), name)
         per_height = drive_per_free_height(cantilever, numbers["frequency_khz"], _KINDS[name])
         numbers[amplitude] = numbers.pop(free) * per_height
-    elif amplitude in numbers:
-        table.build(check_parameter, amplitude, numbers[amplitude], "not negative")
     return numbers
 
 
@@ -312,36 +301,24 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
         from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
         from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
 
-        effects = table.value("effects", _are_texts, 'a list of texts alone, ["..."]')
-        return table.build(make_contact, EFFECTS if effects is None else effects, table.numbers())
-    if "file" in table.values or "table" in table.values:
-        return _tabulated(table)
+        return table.build(make_contact, table.values.get("effects", EFFECTS), table.numbers())
+    source = next((key for key in ("file", "table") if key in table.values), None)
+    if source is not None:
+        others = [key for key in table.values if key not in ("model", source)]
+        if others:
+            table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
+        if source == "file":
+            return table.build(load_law, Path(table.source).parent / table.values["file"])
+        try:
+            return table.build(law_of_dict, table.values["table"])
+        except (KeyError, TypeError) as error:
+            table.fail(f"is no law: {error}", "table")
     numbers, delay = table.numbers("r"), tables.get("interaction.delay")
     if delay is None:
         return table.build(ImpactLaw, **numbers)
-    corrections = delay.value("corrections", lambda value: isinstance(value, bool), "true or false")
-    parameters = delay.numbers("hertz", "lead_nm", "offset_nm") | {"corrections": corrections is not False}
-    return table.build(ImpactLaw, **numbers, delay=delay.build(CollisionDelay, **parameters))
-
-
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(entry, str) for entry in value)
-
-
-def _tabulated(table: SceneTable) -> TabulatedLaw:
-    """Return the law of a file that the table names, or that is written out in it."""
-    source = "file" if "file" in table.values else "table"
-    others = [key for key in table.values if key not in ("model", source)]
-    if others:
-        table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
-    if source == "file":
-        path = table.value("file", lambda value: isinstance(value, str), "the path of a law's file, as text")
-        return table.build(load_law, Path(table.source).parent / path)
-    given = table.value("table", lambda value: isinstance(value, dict), "a table, [interaction.table]")
-    try:
-        return table.build(law_of_dict, given)
-    except (KeyError, TypeError) as error:
-        table.fail(f"is no law: {error}", "table")
+    parameters = delay.numbers("hertz", "lead_nm", "offset_nm")
+    corrections = delay.values.get("corrections", True)
+    return table.build(ImpactLaw, **numbers, delay=delay.build(CollisionDelay, **parameters, corrections=corrections))
 
 
 def _drive_table(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[str, Any]:
@@ -440,19 +417,8 @@ def check_start(start: Start, scene: Scene) -> None:
                 f"is {start.velocity_nm_per_us:.6g}: start faster or higher"
             )
         return
-    # else the tip would start inside the sample
+    # else the tip would start inside the sample; whether it starts inside a junction, `simulate` says
     check_parameter("height_above_platform_nm", height, "not negative" if law else "above 0")
-    if law:
-        return
-    # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.scenefile.contact import junction_of  # noqa: PLC0415
-
-    junction = junction_of(scene.interaction)
-    forms = float(junction.forms_gap_nm)
-    if bool(junction.exists) and height <= forms:
-        raise ValueError(
-            f"`height_above_platform_nm` must be above {forms:.6g}, where the solid junction forms, but is {height:g}"
-        )
 
 
 def as_in_file(scene: Scene, state: State) -> Start:

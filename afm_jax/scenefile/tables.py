@@ -30,8 +30,13 @@ KEYS = {
 }
 """For every table of a scene file the keys it may have; those of the interaction are an impact law's."""
 
-_NO_NUMBERS = ("model", "effects", "delay", "corrections", "file", "table", "second")
-"""Keys that hold something else than a number."""
+_NO_NUMBERS = {"model": str, "effects": list, "delay": dict, "corrections": bool, "file": str, "table": dict}
+_NO_NUMBERS["second"] = dict
+"""Keys that hold something else than a number, and what."""
+
+_EITHER = (("frequency_khz", "reduced_frequency"),)
+_EITHER += (("amplitude_nm", "free_amplitude_nm"), ("amplitude_nn", "free_amplitude_nm"))
+"""Keys that say the same in two ways."""
 
 TABLES = tuple(name for name in KEYS if "." not in name)
 """The tables at the top of a file."""
@@ -79,7 +84,7 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     if table == "interaction" and others:
         return f'unknown key of model = "{model}"; it belongs to model = "{others[0]}"'
     without_unit = [name for name in keys if name.startswith(f"{plain}_")]
-    nearest = without_unit or difflib.get_close_matches(plain, keys, cutoff=0.7)
+    nearest = without_unit or difflib.get_close_matches(plain, keys, n=1)
     if nearest:
         return f"unknown key; use {nearest[0]}"
     owners = _owners(plain)
@@ -165,15 +170,26 @@ class SceneTable(NamedTuple):
         where = f"{printable(self.source)}: [{self.name}] "
         raise SceneError(f"{where}{message}" if key is None else f"{where}{printable(key)}: {message}")
 
-    def check_keys(self) -> None:
-        """Check that the table has no unknown keys.
+    def check(self) -> None:
+        """Check that the table has no unknown keys, none that contradict each other, and of each key what it holds.
 
         Raises:
-            SceneError: at the first unknown key, with the one to use instead.
+            SceneError: if not, at the first that is wrong.
         """
-        for key in self.values:
+        for key, value in self.values.items():
             if key not in keys_of(self.name, self.model):
                 self.fail(advise_key(self.name, key, self.model), key)
+            kind = _NO_NUMBERS.get(key, float)
+            good = isinstance(value, kind) and (kind is not list or all(isinstance(each, str) for each in value))
+            if kind is float:
+                # arrays are those of a scene whose numbers are replaced, maybe by traced ones
+                good = is_array(value) or (isinstance(value, int | float) and not isinstance(value, bool))
+            if not good:
+                must = "a list of texts" if kind is list else _WORDS[kind]
+                self.fail(f"must be {must}, but is {in_words(value)}", key)
+        for pair in _EITHER:
+            if set(pair) <= set(self.values):
+                self.fail(f"has both {' and '.join(pair)}; give one of them")
 
     def numbers(self, *required: str) -> dict[str, Any]:
         """Return all numbers that the table has, by their keys.
@@ -182,28 +198,17 @@ class SceneTable(NamedTuple):
             required: keys that must be there.
 
         Raises:
-            SceneError: if a required one is missing or one is not a number.
+            SceneError: if a required one is missing.
         """
         for key in required:
             if key not in self.values:
                 self.fail("missing; add it", key)
-        return {key: self._number(key) for key in self.values if key not in _NO_NUMBERS}
-
-    def value(self, key: str, good: Callable[[Any], bool], must: str) -> Any:
-        """Return what the table has under a key, if that is good; None if the key is left out.
-
-        Args:
-            key: of the table.
-            good: says whether a value may stand there.
-            must: what it must be, in words.
-
-        Raises:
-            SceneError: if there is something else.
-        """
-        value = self.values.get(key)
-        if value is not None and not good(value):
-            self.fail(f"must be {must}, but is {in_words(value)}", key)
-        return value
+        # of a whole number beyond all floats its text is infinite, and refused by its name
+        return {
+            key: value if is_array(value) else float(str(value))
+            for key, value in self.values.items()
+            if key not in _NO_NUMBERS
+        }
 
     def build(self, kind: Callable[..., Built], *arguments: Any, **parameters: Any) -> Built:
         """Return `kind(*arguments, **parameters)`; what that finds wrong becomes an error of this table.
@@ -216,22 +221,10 @@ class SceneTable(NamedTuple):
         except ValueError as error:
             self.fail(str(error))
 
-    def _number(self, key: str) -> Any:
-        value = self.values[key]
-        if is_array(value):
-            # of a scene whose numbers are replaced, maybe by traced ones
-            return value
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            self.fail(f"must be a number, but is {in_words(value)}", key)
-        try:
-            return float(value)
-        except OverflowError:
-            self.fail("is too large a number", key)
+
+_WORDS = {str: "a text", list: "a list", dict: "a table", bool: "true or false", int: "a number", float: "a number"}
 
 
 def in_words(value: Any) -> str:
     """Return what a value in a TOML file is, short enough for a message."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    words = {str: "a text", list: "a list", dict: "a table", int: "a number", float: "a number"}
-    return words.get(type(value), "a date or time")
+    return str(value).lower() if isinstance(value, bool) else _WORDS.get(type(value), "a date or time")

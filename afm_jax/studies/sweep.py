@@ -43,7 +43,6 @@ from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.results import unit_of, words_of
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     batch_family,
@@ -56,6 +55,7 @@ from afm_jax.scenefile.parameter_paths import (
 from afm_jax.scenefile.scenefile import Start, scene_of_tables, scene_tables
 from afm_jax.solve.lanes import LANES, filled, in_blocks
 from afm_jax.strict_json import strict_json
+from afm_jax.units import unit_of, words_of
 from afm_jax.version import __version__, version_of
 from afm_jax.whole_files import check_plain, whole_folder
 

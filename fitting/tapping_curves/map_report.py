@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import label_axes, new_figure, png_of
-from afm_jax.results import words_of
 from afm_jax.strict_json import strict_json
+from afm_jax.units import words_of
 from afm_jax.whole_files import whole_folder, write_whole
 from fitting.report.sections import Bullets, Report, ReportSection, Table, Text, text_of
 from fitting.tapping_curves.maps import ARRAYS, PixelState, TappingMap
@@ -71,7 +71,7 @@ def map_figure(result: TappingMap) -> Figure:
         colour = {"cmap": colours, "vmin": low, "vmax": high, "interpolation": "nearest"}
         shown = axes.imshow(image[::step, ::step], extent=extent, **colour)
         figure.colorbar(shown, ax=axes, label=f"{name} ({result.unit})", shrink=0.8)
-        label_axes(axes, x=f"x ({where})", y=f"y ({where})")
+        label_axes(axes, x=f"x ({where})", y=f"y ({where})", grid=False)
     common = f"; common error at the median {result.energy_common_error:.2g} {result.unit}" if used.any() else ""
     figure.suptitle(f"Energy of a tap: {used.sum()} pixels, {(~used).sum()} masked (grey){common}", fontsize=11)
     return figure

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.checks import checked
-from afm_jax.results import JudgedResult, public_result, words_of
+from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
-from afm_jax.units import TWO_SIDED_95
+from afm_jax.units import TWO_SIDED_95, words_of
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of_phase, turned
 from fitting.instruments.recording import ASSUMED_RESONANCE, Known, given_numbers

@@ -16,13 +16,15 @@ from scipy.integrate import quad
 from afm_jax.contact.forces import Jkr
 from afm_jax.contact.forces import jkr as jkr_formulas
 
+CURVE = Jkr().curve
+
 
 def test_jkr_at_its_fold_and_at_its_largest_tension():
     solid = Jkr()
     pull = float(solid.force(solid.pull_off_depth_nm))
     assert pull == pytest.approx(-5.0 / 6.0 * float(solid.load_scale_nn), rel=1e-7)
     # load control: -3/2 pi w R where s^3 = sqrt(6)/2
-    deepest = float(jkr_formulas.load((6.0**0.5 / 2.0) ** (1.0 / 3.0)))
+    deepest = float(CURVE.load((6.0**0.5 / 2.0) ** (1.0 / 3.0)))
     assert deepest == pytest.approx(-1.5, rel=1e-15)
     assert jnp.isfinite(jax.grad(solid.force)(solid.pull_off_depth_nm + 1e-9))
     for depth in (-0.1, 0.0, 0.5, 4.0):
@@ -43,7 +45,7 @@ def test_force_and_stiffness_next_to_the_fold_lose_half_of_the_digits_and_no_mor
     assert s > jkr_formulas.FOLD
 
     def force(x):
-        return jkr_formulas.load(jkr_formulas.root_of_depth(x))
+        return CURVE.load(CURVE.root_of_depth(x))
 
     # the root of a distance known to rounding
     lost = float(np.finfo(float).eps) / away

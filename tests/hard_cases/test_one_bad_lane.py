@@ -34,7 +34,7 @@ def _impacts(velocity: np.ndarray) -> Any:
     offset = np.where(velocity < 0.0, -100.0, -1.0)
     platform = Platform(4.0 * np.ones(LANES), 181.8 * np.ones(LANES), offset, np.zeros(LANES))
     scene = Scene(Cantilever(90.0, 1e7), platform, ImpactLaw(r=0.95, epsilon=1.0))
-    return iterate_batch(scene, np.linspace(0.0, 5.0, LANES), np.abs(velocity), 20, block=LANES)
+    return iterate_batch(scene, np.linspace(0.0, 5.0, LANES), np.abs(velocity), 20)
 
 
 def _collisions(velocity: np.ndarray) -> Any:

@@ -123,20 +123,19 @@ class ForceSum(Force):
 
     def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
         """Return the potential of the static forces in aJ at a gap in nm."""
-        gap = as_argument(gap_nm)
-        parts = (term.potential(gap) for term in self.terms if isinstance(term, StaticForce))
-        return sum(parts, start=jnp.zeros_like(gap))
+        return self._total("potential", StaticForce, gap_nm)
 
     def stiffness(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
         """Return -dF/dD of the static forces in nN/nm at a gap in nm."""
-        gap = as_argument(gap_nm)
-        parts = (term.stiffness(gap) for term in self.terms if isinstance(term, StaticForce))
-        return sum(parts, start=jnp.zeros_like(gap))
+        return self._total("stiffness", StaticForce, gap_nm)
 
     def damping(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
         """Return the damping of the dissipative forces in nN us/nm at a gap in nm."""
+        return self._total("damping", DissipativeForce, gap_nm)
+
+    def _total(self, what: str, kind: type[Force], gap_nm: ArrayLike) -> Float[Array, "..."]:
         gap = as_argument(gap_nm)
-        parts = (term.damping(gap) for term in self.terms if isinstance(term, DissipativeForce))
+        parts = (getattr(term, what)(gap) for term in self.terms if isinstance(term, kind))
         return sum(parts, start=jnp.zeros_like(gap))
 
 

@@ -23,30 +23,6 @@ FOLD_DEPTH = -3.0 * 6.0 ** (-2.0 / 3.0)
 """Delta at the fold."""
 
 
-def load(s: ArrayLike) -> Float[Array, "..."]:
-    """Return the normalised load s^6 - sqrt(6) s^3 (eq. 15)."""
-    cube = as_argument(s) ** 3
-    return cube * (cube - math.sqrt(6.0))
-
-
-def depth(s: ArrayLike) -> Float[Array, "..."]:
-    """Return the normalised depth s^4 - (2 sqrt(6)/3) s (eq. 15)."""
-    root = as_argument(s)
-    return root * (root**3 - SLOPE)
-
-
-def depth_slope(s: ArrayLike) -> Float[Array, "..."]:
-    """Return d Delta/ds = 4 s^3 - 2 sqrt(6)/3; 0 at the fold."""
-    return 4.0 * as_argument(s) ** 3 - SLOPE
-
-
-def work(s: ArrayLike) -> Float[Array, "..."]:
-    """Return the normalised potential, the integral of P dDelta from s = 0: (2/5) s^10 - (2 sqrt(6)/3) s^7 + s^4."""
-    root = as_argument(s)
-    cube = root**3
-    return root * cube * (cube * (0.4 * cube - SLOPE) + 1.0)
-
-
 def root_of_load(normalised_load: ArrayLike) -> Float[Array, "..."]:
     """Return the s of the stable branch under load control, s^3 = (sqrt(6) + sqrt(6 + 4 P))/2, for P >= -3/2."""
     return jnp.cbrt(cube_of_load(normalised_load))
@@ -59,23 +35,6 @@ def cube_of_load(normalised_load: ArrayLike) -> Float[Array, "..."]:
     return 0.5 * (math.sqrt(6.0) + jnp.where(held, jnp.sqrt(jnp.where(held, square, 1.0)), 0.0))
 
 
-def root_of_depth(normalised_depth: ArrayLike) -> Float[Array, "..."]:
-    """Return the s of the branch that is stable under a pull, for Delta >= -3 6^(-2/3); below it that of the fold.
-
-    The quartic s^4 - q s - Delta = 0 is split into two quadratics by the one positive root y of y^3 + Delta y = 1/3.
-    """
-    third = jnp.maximum(as_argument(normalised_depth), FOLD_DEPTH) / 3.0
-    discriminant = 1.0 / 36.0 + third**3
-    above = discriminant > 0.0
-    large = jnp.cbrt(1.0 / 6.0 + jnp.where(above, jnp.sqrt(jnp.where(above, discriminant, 1.0)), 0.0))
-    # y = large - small with large * small = Delta/3 and large^3 - small^3 = 1/3, without the cancellation
-    small = third / large
-    y = 1.0 / (3.0 * (large**2 + third + small**2))
-    inner = SLOPE * jnp.sqrt(2.0 / y) - 2.0 * y
-    inside = inner > 0.0
-    return 0.5 * (jnp.sqrt(2.0 * y) + jnp.where(inside, jnp.sqrt(jnp.where(inside, inner, 1.0)), 0.0))
-
-
 class JkrCurve(ElasticCurve):
     """The JKR contact in normalised variables: load in units of pi w R, depth in units of (pi^2 w^2 R / K^2)^(1/3)."""
 
@@ -83,24 +42,40 @@ class JkrCurve(ElasticCurve):
     reversible = False
 
     def load(self, s: ArrayLike) -> Float[Array, "..."]:
-        """Return the normalised load s^6 - sqrt(6) s^3."""
-        return load(s)
+        """Return the normalised load s^6 - sqrt(6) s^3 (eq. 15)."""
+        cube = as_argument(s) ** 3
+        return cube * (cube - math.sqrt(6.0))
 
     def depth(self, s: ArrayLike) -> Float[Array, "..."]:
-        """Return the normalised depth s^4 - (2 sqrt(6)/3) s."""
-        return depth(s)
+        """Return the normalised depth s^4 - (2 sqrt(6)/3) s (eq. 15)."""
+        root = as_argument(s)
+        return root * (root**3 - SLOPE)
 
     def depth_slope(self, s: ArrayLike) -> Float[Array, "..."]:
-        """Return the derivative of the normalised depth by s, 0 at the fold."""
-        return depth_slope(s)
+        """Return d Delta/ds = 4 s^3 - 2 sqrt(6)/3; 0 at the fold."""
+        return 4.0 * as_argument(s) ** 3 - SLOPE
 
     def work(self, s: ArrayLike) -> Float[Array, "..."]:
-        """Return the normalised potential (2/5) s^10 - (2 sqrt(6)/3) s^7 + s^4."""
-        return work(s)
+        """Return the normalised potential, the integral of P dDelta: (2/5) s^10 - (2 sqrt(6)/3) s^7 + s^4."""
+        root = as_argument(s)
+        cube = root**3
+        return root * cube * (cube * (0.4 * cube - SLOPE) + 1.0)
 
     def root_of_depth(self, normalised_depth: ArrayLike) -> Float[Array, "..."]:
-        """Return s of the branch that is stable under a pull; below the depth of the fold that of the fold."""
-        return root_of_depth(normalised_depth)
+        """Return the s of the branch that is stable under a pull, for Delta >= -3 6^(-2/3); below it that of the fold.
+
+        The quartic s^4 - q s - Delta = 0 is split into two quadratics by the positive root y of y^3 + Delta y = 1/3.
+        """
+        third = jnp.maximum(as_argument(normalised_depth), FOLD_DEPTH) / 3.0
+        discriminant = 1.0 / 36.0 + third**3
+        above = discriminant > 0.0
+        large = jnp.cbrt(1.0 / 6.0 + jnp.where(above, jnp.sqrt(jnp.where(above, discriminant, 1.0)), 0.0))
+        # y = large - small with large * small = Delta/3 and large^3 - small^3 = 1/3, without the cancellation
+        small = third / large
+        y = 1.0 / (3.0 * (large**2 + third + small**2))
+        inner = SLOPE * jnp.sqrt(2.0 / y) - 2.0 * y
+        inside = inner > 0.0
+        return 0.5 * (jnp.sqrt(2.0 * y) + jnp.where(inside, jnp.sqrt(jnp.where(inside, inner, 1.0)), 0.0))
 
     @property
     def terms(self) -> tuple[Terms, Terms]:
@@ -191,4 +166,5 @@ class Jkr(Parameters):
 
     def potential(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
         """Return the potential energy in aJ at a depth in nm, 0 where the contact radius would vanish."""
-        return self.energy_scale_aj * work(root_of_depth(as_argument(depth_nm) / self.depth_scale_nm))
+        curve = self.curve
+        return self.energy_scale_aj * curve.work(curve.root_of_depth(as_argument(depth_nm) / self.depth_scale_nm))
