@@ -34,7 +34,7 @@ from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.results import Result
-from afm_jax.studies.timing import Compiled, compiled_for, time_compiled
+from afm_jax.studies.timing import Compiled, time_compiled
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 from afm_jax.words import counted, known
 
@@ -236,8 +236,8 @@ class EffectStudy:
 
     def printed(self) -> list[str | Table]:
         """Return what `afm-jax effects` prints: the full scene, a table of effects, and which are not needed."""
-        told = self.to_dict()
-        full, reduction = told["full"], self.reduction
+        payload, reduction = self.to_dict(), self.reduction
+        full, joint = payload["full"], payload["joint_change"]
         cells: dict[str, Cell] = {
             "effect": "name",
             "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
@@ -247,13 +247,11 @@ class EffectStudy:
             "time\nus/period": "time_us_per_period:.4g",
             "": lambda effect: "required" if effect["required"] else "" if effect["needed"] else "not needed",
         }
-        periods, impacts = full["drive_periods"], counted(full["impacts"], "impact")
-        motion = f"no steady orbit, {impacts} in the last fifth of the duration"
-        if periods is not None:
-            motion = f"steady orbit, {impacts} in {counted(periods, 'drive period')}"
+        periods, window = full["drive_periods"], "the last fifth of the duration; no steady orbit"
         summary = (
-            f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, lock-in at "
-            f"{full['lockin_frequency_khz']:.6g} kHz "
+            f"Full scene: {counted(full['impacts'], 'impact')} in "
+            f"{window if periods is None else counted(periods, 'drive period')}; "
+            f"peak {full['peak_amplitude_nm']:.5g} nm, lock-in at {full['lockin_frequency_khz']:.6g} kHz "
             f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
             f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(self.cost, '.4g')} us to compute "
             "a drive period."
@@ -263,10 +261,10 @@ class EffectStudy:
         if reduction.left_out:
             conclusion = (
                 f"these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes by "
-                f"{_percent(reduction.change.peak_amplitude)}, the lock-in amplitude by "
-                f"{_percent(reduction.change.lockin_amplitude)}; {known(reduction.cost, '.4g')} us per drive period."
+                f"{_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
+                f"{known(reduction.cost, '.4g')} us per drive period."
             )
-        table = printed_table("Without the effect", cells, told["effects"])
+        table = printed_table("Without the effect", cells, payload["effects"])
         return [summary, table, *reasons, f"For amplitudes to {100.0 * self.accuracy:g} % {conclusion}"]
 
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -361,7 +359,8 @@ class _View:
         self.settles = self.drive.aperiodic is None
         self.start = default_start(scene) if start is None else start
         self.duration_us = PERIODS_AT_MOST * self.drive.period_us if duration_us is None else duration_us
-        self._compiled: dict[Any, Compiled] = {}
+        # compiled once for every choice of effects; numbers change without compiling again
+        self._follow = jax.jit(partial(simulate, max_contacts=_ROWS), compiler_options=quick_options())
         self._costs: dict[Any, float] = {}
 
     def observed(self, scene: Scene) -> Observed:
@@ -416,23 +415,18 @@ class _View:
         if structure not in self._costs:
             start = self.start if observed.orbit is None else observed.orbit.start
             duration = min(_PERIODS_TIMED * self.drive.period_us, self.duration_us)
-            program, arguments = self._program(observed.scene, start, duration)
-            timing, _ = time_compiled(program, *arguments, repetitions=_REPETITIONS)
+            arguments = _arguments(observed.scene, start, duration)
+            timing, _ = time_compiled(Compiled(self._follow, 0.0), *arguments, repetitions=_REPETITIONS)
             self._costs[structure] = 1e6 * timing.median_s * self.drive.period_us / duration
         return self._costs[structure]
 
     def _run(self, scene: Scene, start: State, duration_us: float) -> Simulation:
-        program, arguments = self._program(scene, start, duration_us)
-        return program.run(*arguments)
+        return self._follow(*_arguments(scene, start, duration_us))
 
-    def _program(self, scene: Scene, start: State, duration_us: float) -> tuple[Compiled, tuple[Any, ...]]:
-        """Return `simulate`, compiled once for every choice of effects; numbers change without compiling again."""
-        arguments = (scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float))
-        structure = jax.tree.structure(scene)
-        if structure not in self._compiled:
-            follow = partial(simulate, max_contacts=_ROWS)
-            self._compiled[structure] = compiled_for(follow, *arguments, options=quick_options())
-        return self._compiled[structure], arguments
+
+def _arguments(scene: Scene, start: State, duration_us: float) -> tuple[Scene, State, Any]:
+    """Return arguments of one type, whatever numbers they were: each type would compile again."""
+    return scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float)
 
 
 def _periods_read(observed: Observed) -> int:

@@ -169,32 +169,24 @@ class Tapping(JudgedResult):
         if not self.branches:
             return None
         branch, point = largest_of(self.branches)
-        curve = self.branches[branch].curve
-        band = float(curve.energy_low_aj[point]), float(curve.energy_high_aj[point])
-        return {
-            "value": float(curve.energy_aj[point]),
-            "standard_error": float(curve.energy_error_aj[point]),
-            "interval95": band,
-            "said": said_of(*band),
-            "branch": branch,
-            "amplitude_ratio": float(curve.amplitude_ratio[point]),
-        }
+        ratio = float(self.branches[branch].curve.amplitude_ratio[point])
+        return {"branch": branch, "amplitude_ratio": ratio, **self._energy_at(branch, ratio)}
+
+    def _energy_at(self, branch: int, ratio: float, unit: str = "") -> dict[str, Any]:
+        """Return the middle of a branch's band at an amplitude, its standard error, the band, and what that says."""
+        low, high = self.branches[branch].curve.at(ratio).tolist()
+        found = 0.5 * (low + high), 0.5 * (high - low) / TWO_SIDED_95, (low, high)
+        names = f"energy{unit}" if unit else "value", f"standard_error{unit}", f"interval95{unit}"
+        return {**dict(zip(names, found, strict=True)), "said": said_of(low, high)}
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:
         """Energy of a tap at some amplitudes of each branch that has them, in aJ."""
         return [
-            {
-                "branch": i,
-                "amplitude_ratio": ratio,
-                "energy_aj": 0.5 * sum(band),
-                "standard_error_aj": 0.5 * (band[1] - band[0]) / TWO_SIDED_95,
-                "interval95_aj": band,
-                "said": said_of(*band),
-            }
+            {"branch": i, "amplitude_ratio": ratio, **self._energy_at(i, ratio, "_aj")}
             for i, branch in enumerate(self.branches)
             for ratio in HEADLINE
-            if (band := branch.curve.at(ratio)) is not None
+            if np.isfinite(branch.curve.at(ratio)).all()
         ]
 
     def in_unit(self, said: Any) -> Any:
