@@ -124,13 +124,11 @@ def dimension_of(parameter: str) -> str:
 
 
 def _axis(table: Mapping[str, Any], sample: str) -> Axis:
-    kinds = [kind for kind in KINDS if kind in table]
-    if len(kinds) != 1:
-        raise ValueError(f"has {' and '.join(kinds) or 'no values'}; give one of {', '.join(KINDS)}, as in {_EXAMPLE}")
-    kind = kinds[0]
+    kind = next((kind for kind in KINDS if kind in table), "linear")
     keys = (kind, "count", "seed") if kind == "random" else ("parameter", kind)
     if set(table) != set(keys):
-        raise ValueError(f"has {', '.join(table)}; an axis of this kind has {', '.join(keys)}, as in {_EXAMPLE}")
+        wanted = "`parameter` and one of linear, log and list, or `random`, `count` and `seed`"
+        raise ValueError(f"has {', '.join(table) or 'nothing'}; give {wanted}, as in {_EXAMPLE}")
     values, parameter = table[kind], table.get("parameter")
     if kind == "random":
         if not isinstance(values, Mapping) or not values:
@@ -332,6 +330,7 @@ def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row:
 _CONTACT_NUMBERS, _CONTACT_TRUTHS = ("peak_amplitude_nm", "largest_multiplier"), ("stable", "admissible", "unresolved")
 """Of the orbits of contacts; unresolved: the law closest to the contact has an orbit, but none was found."""
 _COLLISION_NUMBERS = (
+    "rebound_speed_nm_per_us",
     "collision_delay_us",
     "time_in_contact_us",
     "time_in_junction_us",
@@ -360,11 +359,11 @@ def _collisions(
         speeds = jnp.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
         scenes = made(columns)
         found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
-        trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
-        # 0 of a tip that is captured
-        exists = dict.fromkeys(("rebound_speed_nm_per_us", *_COLLISION_NUMBERS), trusted)
-        exists |= dict.fromkeys(set(ONLY_FREE) & set(_COLLISION_NUMBERS), trusted & ~found.captured)
-        numbers = {name: jnp.where(known, getattr(found, name), jnp.nan) for name, known in exists.items()}
+        trusted, numbers = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION, {}
+        for name in _COLLISION_NUMBERS:
+            # the rebound speed of a tip that is captured is 0
+            stays = found.captured & (name in ONLY_FREE and name != _COLLISION_NUMBERS[0])
+            numbers[name] = jnp.where(trusted & ~stays, getattr(found, name), jnp.nan)
         return numbers | {"captured": found.captured, "outcome": found.outcome}
 
     shown, words = ("rebound_speed_nm_per_us", "collision_delay_us"), {"outcome": _codes(CollisionOutcome)}
@@ -521,9 +520,8 @@ def plan_of(
     axes = axes_of(whole.get("axes", ()))
     recorder = recorder_of(whole, axes)
     chunk = whole.get("chunk")
-    plan = SweepPlan(
-        whole | {"chunk": recorder.points if chunk is None else _whole(chunk, "chunk", 1, _MOST)}, axes, recorder
-    )
+    whole["chunk"] = recorder.points if chunk is None else _whole(chunk, "chunk", 1, _MOST)
+    plan = SweepPlan(whole, axes, recorder)
     if math.prod(plan.shape) > 1_000_000 * math.prod(plan.block):
         raise ValueError("that makes too many chunks: `chunk` must be larger, or take fewer values along the axes")
     return plan
