@@ -552,12 +552,10 @@ def _is_begun(folder: Path, plan: SweepPlan) -> bool:
         return False
     try:
         attributes = json.loads(head.read_bytes())["attributes"]
-        kept, version = json.loads(attributes["input"]), attributes["format_version"]
+        kept = {"format_version": attributes["format_version"]} | json.loads(attributes["input"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{store}: is not a sweep of afm-jax; choose another folder") from error
-    if version != FORMAT_VERSION:
-        raise ValueError(f"{store}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
-    for name, wanted in plan.given.items():
+    for name, wanted in ({"format_version": FORMAT_VERSION} | plan.given).items():
         if kept.get(name) != wanted:
             difference = f"{name} is {json.dumps(kept.get(name))}, not {json.dumps(wanted)}"
             raise ValueError(
@@ -592,6 +590,7 @@ def _fill(group: Any, plan: SweepPlan, results: Columns) -> None:
     axes = [axis.dimension for axis in plan.axes]
     for name, array in results.items():
         further, is_float = array.shape[len(axes) :], array.dtype.kind == "f"
+        dtype, blank = ("string", "") if array.dtype.kind == "U" else (array.dtype, math.nan if is_float else 0)
         words = plan.recorder.words.get(name, {})
         flags = {"flag_values": list(words), "flag_meanings": " ".join(words.values())} if words else {}
         units = {"units": _unit(name)} if is_float else {}
@@ -599,8 +598,8 @@ def _fill(group: Any, plan: SweepPlan, results: Columns) -> None:
             name,
             shape=plan.shape + further,
             chunks=plan.block + further,
-            dtype="string" if array.dtype.kind == "U" else array.dtype,
-            fill_value=math.nan if is_float else "" if array.dtype.kind == "U" else 0,
+            dtype=dtype,
+            fill_value=blank,
             dimension_names=[*axes, *plan.recorder.extra][: array.ndim],
             attributes={"long_name": words_of(name), **units, **flags, "coordinates": " ".join(others)},
         )
