@@ -54,7 +54,7 @@ from afm_jax.scenefile.parameter_paths import (
     scene_family,
 )
 from afm_jax.scenefile.scenefile import Start, scene_of_tables, scene_tables
-from afm_jax.solve.lanes import LANES, filled, in_blocks
+from afm_jax.solve.lanes import LANES, in_blocks
 from afm_jax.strict_json import strict_json
 from afm_jax.version import __version__, version_of
 from afm_jax.whole_files import check_plain, whole_folder
@@ -271,8 +271,7 @@ def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Col
     """Return a function of columns of any length, block by block on all cores; blocks of one shape, so one program."""
     # what a processor's cache holds, or what fills an accelerator
     block = 1024 if jax.default_backend() == "cpu" else 1 << 16
-    program = jax.jit(record)
-    return lambda columns: in_blocks(program, columns, block=block, widths=(block,))
+    return partial(in_blocks, jax.jit(record), block=block, widths=(block,))
 
 
 def _one_by_one(record: Callable[[dict[str, float]], dict[str, Any]]) -> Callable[[Columns], Columns]:
@@ -380,20 +379,18 @@ def _lyapunov(
     made = jax.jit(_scenes(scene, paths))
     exponents = ("exponents_per_impact", "exponents_per_us", "exponents_per_impact_error", "exponents_per_us_error")
 
-    def work(columns: Columns) -> Columns:
-        count = len(next(iter(columns.values())))
-        # always whole blocks of lanes, so that there is one shape of every program
-        width = lanes * -(-count // lanes)
-        whole = {name: jnp.asarray(filled(column, width)) for name, column in columns.items()}
-        found = lyapunov_spectrum(made(whole), impacts=impacts, transient=transient, accuracy=accuracy)
+    def record(columns: Columns) -> Columns:
+        found = lyapunov_spectrum(made(columns), impacts=impacts, transient=transient, accuracy=accuracy)
         verdicts = found.verdicts
         results = {name: getattr(found, name) for name in (*exponents, "impacts")}
         results |= {"kind": verdicts.kind, "orbit_impacts": verdicts.impacts, "orbit_periods": verdicts.periods}
         if isinstance(scene.interaction, TabulatedLaw):
             outside = scene.interaction.extrapolated(found.approach_speed_nm_per_us)
             results[EXTRAPOLATED] = np.asarray(outside).any(axis=1)
-        return {name: np.asarray(part)[:count] for name, part in results.items()}
+        return results
 
+    # blocks of one width, so that there is one shape of every program
+    work = partial(in_blocks, record, block=lanes, widths=(lanes,))
     points, words = lanes if resolved else 4 * lanes, {"kind": _codes(MotionKind)}
     return Recorder(work, points, exponents[:2], {"exponent": (1, 2)}, words, alone=resolved)
 

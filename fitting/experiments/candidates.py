@@ -73,8 +73,8 @@ def drive_grid(
     names = ("orders", "detunings", "amplitudes_nm", "offsets_nm" if heights is None else "heights")
     asked = (orders, detunings, amplitudes_nm, offsets_nm if heights is None else heights)
     lists = [usual if given is None else given for usual, given in zip(_USUAL[sample], asked, strict=True)]
-    for name, values, allowed in zip(names, lists, ("positive", "positive", "positive", "finite"), strict=True):
-        check_parameter(name, np.asarray(values), allowed)
+    for name, values in zip(names, lists, strict=True):
+        check_parameter(name, np.asarray(values), "finite" if name == names[-1] else "positive")
     if any(order != int(order) or not (sample or order == 1) for order in lists[0]):
         allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
         raise ValueError(f"`orders` must hold {allowed}, but is {list(lists[0])}")
@@ -99,9 +99,9 @@ def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.nda
 LEFT_OUT = {
     "measured": "already measured",
     "no orbit": "no steady single-impact orbit",
-    "unsure": "several steady orbits, or none, or one near its end, for some of the values that the prior allows",
+    "unsure": "several steady orbits, or none, for some of the values that the prior allows",
     "too large": "amplitudes above what the instrument takes",
-    "inaccurate": "impacts too slow, or under too strong a pull, for the model: a fit excludes such rows",
+    "inaccurate": "impacts too slow or too strongly pulled: a fit excludes such rows",
 }
 """Why a drive is no candidate, in words."""
 

@@ -33,10 +33,7 @@ from fitting.infer.result import FitResult
 from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import Drives
 
-_EXACT = (
-    "The quality factor is assumed to be exact, which makes every forecast too good: give it with its error, such "
-    "as '40 +- 2'."
-)
+_EXACT = "The quality factor is taken as exact, which makes forecasts too good: give its error, as '40 +- 2'."
 
 
 _EXPECTED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg", "approach_speed_nm_per_us")
@@ -115,11 +112,15 @@ class Design(JudgedResult):
     def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
         parameters, values = self.prior.problem.parameters, self.prior.values
         errors = np.where(np.isfinite(self.errors[count]), self.errors[count], np.nan)
-        lowest, highest = np.array([(parameter.lowest, parameter.highest) for parameter in parameters]).T
-        ends = np.clip(values + TWO_SIDED_95 * errors * np.array([[-1.0], [1.0]]), lowest, highest).T
-        columns = {"value": values, "unit": [parameter.unit for parameter in parameters]}
-        rows = rows_of({**columns, "standard_error": errors, "interval95": ends})
-        return dict(zip(self.prior.problem.names, plain(rows), strict=True))
+        lowest, highest = np.array([(known.lowest, known.highest) for known in parameters]).T
+        half = TWO_SIDED_95 * errors
+        columns = {
+            "value": values,
+            "unit": [known.unit for known in parameters],
+            "standard_error": errors,
+            "interval95": np.clip([values - half, values + half], lowest, highest).T,
+        }
+        return dict(zip(self.prior.problem.names, plain(rows_of(columns)), strict=True))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax design`; what is not known is None."""
@@ -223,7 +224,7 @@ def design(  # noqa: PLR0913
     usable, information = np.flatnonzero(candidates.usable), candidates.information
     matters = np.isin(names, interest)
     chosen = usable[choose_points(prior.information, information[usable], points, matters)]
-    errors = standard_errors(prior.information + np.cumsum([0.0 * prior.information, *information[chosen]], axis=0))
+    errors = standard_errors(np.cumsum([prior.information, *information[chosen]], axis=0))
     if prior.problem.lasting and chosen.size:
         errors[1:] = [stated_errors(prior, rows, chosen[: 1 + last]) for last in range(len(chosen))]
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
@@ -231,7 +232,7 @@ def design(  # noqa: PLR0913
     if not chosen.size:
         reasons = ["No drive can be planned with; try others."]
     elif undetermined:
-        more = "choose more points, or drives at more frequencies, amplitudes, orders or offsets"
+        more = "choose more points or drives"
         reasons = [f"The chosen points do not determine {' and '.join(undetermined)}: {more}."]
     beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
     exact = prior.quality_factor is not None and "quality_factor" not in names

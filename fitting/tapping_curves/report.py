@@ -243,12 +243,14 @@ _OF_CURVES = ("energy_aj", "energy_scatter_aj", "energy_own_error_aj", "energy_c
 
 def together_report(result: TappingTogether) -> Report:
     """Return what several curves of one lever say together: mean and scatter of each branch, the instrument."""
-    cells = [
-        [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", *(f"{error:.2g}" for error in at[1:])]
-        for one in result.scatter
-        for ratio in HEADLINE
-        if np.isfinite(at := interpolated(ratio, one.amplitude_ratio, *(getattr(one, name) for name in _OF_CURVES)))[0]
-    ]
+    cells = []
+    for one in result.scatter:
+        columns = [getattr(one, name) for name in _OF_CURVES]
+        for ratio in HEADLINE:
+            mean, *errors = interpolated(ratio, one.amplitude_ratio, *columns)
+            if np.isfinite(mean):
+                numbers = f"{mean:.3g}", *(f"{error:.2g}" for error in errors)
+                cells.append([one.name, f"{one.curves}", f"{ratio:g}", *numbers])
     head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
     caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"
     common = [

@@ -170,20 +170,21 @@ class Tapping(JudgedResult):
             return None
         branch, point = largest_of(self.branches)
         ratio = float(self.branches[branch].curve.amplitude_ratio[point])
-        return {"branch": branch, "amplitude_ratio": ratio, **self._energy_at(branch, ratio)}
+        return self._energy_at(branch, ratio, "value", "standard_error", "interval95")
 
-    def _energy_at(self, branch: int, ratio: float, unit: str = "") -> dict[str, Any]:
-        """Return the middle of a branch's band at an amplitude, its standard error, the band, and what that says."""
+    def _energy_at(self, branch: int, ratio: float, *names: str) -> dict[str, Any]:
+        """Return a branch's energy at an amplitude, its error, its band, by these names, and what the band says."""
         low, high = self.branches[branch].curve.at(ratio).tolist()
         found = 0.5 * (low + high), 0.5 * (high - low) / TWO_SIDED_95, (low, high)
-        names = f"energy{unit}" if unit else "value", f"standard_error{unit}", f"interval95{unit}"
-        return {**dict(zip(names, found, strict=True)), "said": said_of(low, high)}
+        energy = dict(zip(names, found, strict=True))
+        said = said_of(low, high)
+        return {**energy, "said": said, "branch": branch, "amplitude_ratio": ratio}
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:
         """Energy of a tap at some amplitudes of each branch that has them, in aJ."""
         return [
-            {"branch": i, "amplitude_ratio": ratio, **self._energy_at(i, ratio, "_aj")}
+            self._energy_at(i, ratio, "energy_aj", "standard_error_aj", "interval95_aj")
             for i, branch in enumerate(self.branches)
             for ratio in HEADLINE
             if np.isfinite(branch.curve.at(ratio)).all()
