@@ -66,9 +66,8 @@ def drive_grid(
     check_drive(drive)
     sample = drive == "sample"
     if heights is not None and (sample or offsets_nm is not None):
-        raise ValueError(
-            "`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven, else either"
-        )
+        instead = "give `offsets_nm` where the sample is driven, and one of the two where the tip is"
+        raise ValueError(f"`heights` are shares of a free amplitude: {instead}")
     check_parameter("free_frequency_khz", free_frequency_khz, "positive")
     names = ("orders", "detunings", "amplitudes_nm", "offsets_nm" if heights is None else "heights")
     asked = (orders, detunings, amplitudes_nm, offsets_nm if heights is None else heights)
@@ -99,7 +98,7 @@ def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.nda
 LEFT_OUT = {
     "measured": "already measured",
     "no orbit": "no steady single-impact orbit",
-    "unsure": "several steady orbits, or none, for some of the values that the prior allows",
+    "unsure": "several steady orbits, or none, or one near its end, for some of the values that the prior allows",
     "too large": "amplitudes above what the instrument takes",
     "inaccurate": "impacts too slow or too strongly pulled: a fit excludes such rows",
 }

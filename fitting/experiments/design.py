@@ -232,7 +232,7 @@ def design(  # noqa: PLR0913
     if not chosen.size:
         reasons = ["No drive can be planned with; try others."]
     elif undetermined:
-        more = "choose more points or drives"
+        more = "choose more points, or drives at more frequencies, amplitudes, orders or offsets"
         reasons = [f"The chosen points do not determine {' and '.join(undetermined)}: {more}."]
     beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
     exact = prior.quality_factor is not None and "quality_factor" not in names

@@ -76,7 +76,7 @@ class Prior(Result):
         own, spread = len(self.problem.own), self.uncertainty * self.sizes
         # what is known of the instrument says how far that may be off
         spread[own:] = 1.0 / np.sqrt(np.maximum(np.diag(self.information)[own:], spread[own:] ** -2.0))
-        # eigenvalues of at least 1
+        # in units of the spread the information has eigenvalues of at least 1
         curvature, axes = np.linalg.eigh(spread[:, None] * self.information * spread + np.eye(spread.size))
         normal = np.random.default_rng(DRAW_SEED).normal(size=(count, spread.size))
         normal[0] = 0.0
