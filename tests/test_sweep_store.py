@@ -96,7 +96,7 @@ def test_a_changed_input_is_refused_and_named(swept: Path):
             run_plan(other, swept)
     head = swept / STORE / "zarr.json"
     older = head.read_text().replace(f'"format_version": {FORMAT_VERSION}', '"format_version": 4')
-    for text, fault in ((older, "has format_version 4, not 5; ch"), ("{}", "is not a sweep of afm-jax; ch")):
+    for text, fault in ((older, "format_version is 4, not 5: ch"), ("{}", "is not a sweep of afm-jax; ch")):
         head.write_text(text)
         with pytest.raises(ValueError, match=fault):
             run_plan(same, swept)

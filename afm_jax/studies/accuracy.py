@@ -46,7 +46,7 @@ from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import ContactKind, State, to_gap
 from afm_jax.motion.start import start_of
 from afm_jax.scenefile.scenefile import load_scene, read_scene
-from afm_jax.studies.timing import compiled_for, progress, time_compiled
+from afm_jax.studies.timing import compiled_for, progress, seconds_a_call
 
 Row = dict[str, Any]
 Parameters = Float[Array, " parameters"]
@@ -187,7 +187,7 @@ class AccuracyProblem:
         """Return values and slopes, by programs that compile quickly: they are not timed."""
         value = partial(self.solve, setting)
         both = [compiled_for(each, self.at, options=quick_options(0)) for each in (value, jax.jacfwd(value))]
-        values, slopes = (np.asarray(each.run(self.at)) for each in both)
+        values, slopes = (np.asarray(run(self.at)) for run, _ in both)
         return values, slopes
 
     def errors(self, values: Any, slopes: Any, tips: Any = slice(None)) -> tuple[float, float]:
@@ -255,9 +255,10 @@ def _compiled_rows(
             value = solve if number else partial(solve, setting)
             both = value, jax.jacfwd(value, argnums=len(arguments) - 1)
             programs = [compiled_for(each, *arguments, options=problem.options) for each in both]
-        times, found = zip(*(time_compiled(run, *arguments, repetitions=repetitions) for run in programs), strict=True)
-        for of, timing, error in zip(("value", "gradient"), times, problem.errors(*found), strict=True):
-            yield _row(of, method, name, timing.best_s / events, error, compile_s=timing.compile_s)
+        errors = problem.errors(*(run(*arguments) for run, _ in programs))
+        for of, (run, compile_s), error in zip(("value", "gradient"), programs, errors, strict=True):
+            seconds = min(seconds_a_call(run, *arguments, repetitions=repetitions))
+            yield _row(of, method, name, seconds / events, error, compile_s=compile_s)
 
 
 def _longest_step(motion: EquationOfMotion, phase: Any) -> Array:

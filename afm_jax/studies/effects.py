@@ -6,6 +6,7 @@ full scene is. What the two readings differ by is what the effect changes; what 
 it costs.
 """
 
+import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,7 +16,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from rich.table import Table
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
@@ -34,8 +34,7 @@ from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.results import Result
-from afm_jax.studies.timing import Compiled, compiled_for, time_compiled
-from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
+from afm_jax.studies.timing import seconds_a_call
 from afm_jax.words import counted, known
 
 PERIODS_AT_MOST = 400.0
@@ -143,10 +142,12 @@ class Reading(NamedTuple):
 
     peak_amplitude_nm: float
     """Largest height above the rest position."""
+    lockin_frequency_khz: float
+    """Of the response."""
     lockin_amplitude_nm: float
-    """2/T |integral z exp(-i omega t)| at the frequency of the response."""
+    """2/T |integral z exp(-i omega t)| at that frequency."""
     lockin_phase_deg: float
-    """In [0, 360)."""
+    """In [0, 360/N) with N the drive periods of a response."""
     energy_per_impact_aj: float | None
     """None without impacts."""
     impacts: int
@@ -188,7 +189,6 @@ class EffectStudy:
 
     Attributes:
         observed: the full scene.
-        frequency_khz: at which the lock-in reads.
         cost: what computing a drive period takes, in us: the median of several runs.
         effects: each left out.
         accuracy: that is wanted, relative.
@@ -196,7 +196,6 @@ class EffectStudy:
     """
 
     observed: Observed
-    frequency_khz: float
     cost: float | None
     effects: list[EffectReport]
     accuracy: float
@@ -213,7 +212,6 @@ class EffectStudy:
             "compared": "last fifth of the duration" if orbit is None else "steady orbits",
             "full": {
                 **reading._asdict(),
-                "lockin_frequency_khz": self.frequency_khz,
                 "drive_periods": None if orbit is None else orbit.periods,
                 "time_us_per_period": self.cost,
             },
@@ -236,8 +234,8 @@ class EffectStudy:
 
     def printed(self) -> list[str | Table]:
         """Return what `afm-jax effects` prints: the full scene, a table of effects, and which are not needed."""
-        told = self.to_dict()
-        full, reduction = told["full"], self.reduction
+        payload, reduction = self.to_dict(), self.reduction
+        full, joint = payload["full"], payload["joint_change"]
         cells: dict[str, Cell] = {
             "effect": "name",
             "peak\nchange": lambda effect: _percent(effect["change"]["peak_amplitude"]),
@@ -247,13 +245,11 @@ class EffectStudy:
             "time\nus/period": "time_us_per_period:.4g",
             "": lambda effect: "required" if effect["required"] else "" if effect["needed"] else "not needed",
         }
-        periods, impacts = full["drive_periods"], counted(full["impacts"], "impact")
-        motion = f"no steady orbit, {impacts} in the last fifth of the duration"
-        if periods is not None:
-            motion = f"steady orbit, {impacts} in {counted(periods, 'drive period')}"
+        periods, window = full["drive_periods"], "the last fifth of the duration; no steady orbit"
         summary = (
-            f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, lock-in at "
-            f"{full['lockin_frequency_khz']:.6g} kHz "
+            f"Full scene: {counted(full['impacts'], 'impact')} in "
+            f"{window if periods is None else counted(periods, 'drive period')}; "
+            f"peak {full['peak_amplitude_nm']:.5g} nm, lock-in at {full['lockin_frequency_khz']:.6g} kHz "
             f"{full['lockin_amplitude_nm']:.5g} nm at {full['lockin_phase_deg']:.4g} deg, "
             f"{known(full['energy_per_impact_aj'], '.4g')} aJ lost per impact; {known(self.cost, '.4g')} us to compute "
             "a drive period."
@@ -263,10 +259,10 @@ class EffectStudy:
         if reduction.left_out:
             conclusion = (
                 f"these are not needed: {', '.join(reduction.left_out)}. Without all of them the peak changes by "
-                f"{_percent(reduction.change.peak_amplitude)}, the lock-in amplitude by "
-                f"{_percent(reduction.change.lockin_amplitude)}; {known(reduction.cost, '.4g')} us per drive period."
+                f"{_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
+                f"{known(reduction.cost, '.4g')} us per drive period."
             )
-        table = printed_table("Without the effect", cells, told["effects"])
+        table = printed_table("Without the effect", cells, payload["effects"])
         return [summary, table, *reasons, f"For amplitudes to {100.0 * self.accuracy:g} % {conclusion}"]
 
     def tables(self) -> dict[str, dict[str, Any]]:
@@ -334,8 +330,7 @@ def study_effects(
         reports.append(EffectReport(effect, *view.change(full, without), view.cost(without)))
     report(len(chosen) + 1, len(chosen) + 2)
     reduction = _reduced(view, full, reports, accuracy)
-    frequency_khz = view.drive.angular_frequency / _periods_read(full) / RAD_PER_US_PER_KHZ
-    return EffectStudy(full, frequency_khz, view.cost(full), reports, accuracy, reduction)
+    return EffectStudy(full, view.cost(full), reports, accuracy, reduction)
 
 
 def _reduced(view: "_View", full: Observed, reports: list[EffectReport], accuracy: float) -> Reduction:
@@ -361,7 +356,8 @@ class _View:
         self.settles = self.drive.aperiodic is None
         self.start = default_start(scene) if start is None else start
         self.duration_us = PERIODS_AT_MOST * self.drive.period_us if duration_us is None else duration_us
-        self._compiled: dict[Any, Compiled] = {}
+        # compiled once for every choice of effects; numbers change without compiling again
+        self._follow = jax.jit(partial(simulate, max_contacts=_ROWS), compiler_options=quick_options())
         self._costs: dict[Any, float] = {}
 
     def observed(self, scene: Scene) -> Observed:
@@ -385,7 +381,7 @@ class _View:
             first = float(self.start.time_us)
             fifth = last_fifth(first, first + self.duration_us, self.drive)
             window = fifth.from_us, fifth.to_us
-        return found._replace(reading=_read(scene, motion, window, self.drive.angular_frequency / _periods_read(found)))
+        return found._replace(reading=_read(scene, motion, window, _periods_read(found)))
 
     def change(self, full: Observed, without: Observed) -> tuple[Change, str | None]:
         """Return what changed, and what there is to say."""
@@ -416,23 +412,18 @@ class _View:
         if structure not in self._costs:
             start = self.start if observed.orbit is None else observed.orbit.start
             duration = min(_PERIODS_TIMED * self.drive.period_us, self.duration_us)
-            program, arguments = self._program(observed.scene, start, duration)
-            timing, _ = time_compiled(program, *arguments, repetitions=_REPETITIONS)
-            self._costs[structure] = 1e6 * timing.median_s * self.drive.period_us / duration
+            arguments = _arguments(observed.scene, start, duration)
+            seconds = statistics.median(seconds_a_call(self._follow, *arguments, repetitions=_REPETITIONS))
+            self._costs[structure] = 1e6 * seconds * self.drive.period_us / duration
         return self._costs[structure]
 
     def _run(self, scene: Scene, start: State, duration_us: float) -> Simulation:
-        program, arguments = self._program(scene, start, duration_us)
-        return program.run(*arguments)
+        return self._follow(*_arguments(scene, start, duration_us))
 
-    def _program(self, scene: Scene, start: State, duration_us: float) -> tuple[Compiled, tuple[Any, ...]]:
-        """Return `simulate`, compiled once for every choice of effects; numbers change without compiling again."""
-        arguments = (scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float))
-        structure = jax.tree.structure(scene)
-        if structure not in self._compiled:
-            follow = partial(simulate, max_contacts=_ROWS)
-            self._compiled[structure] = compiled_for(follow, *arguments, options=quick_options())
-        return self._compiled[structure], arguments
+
+def _arguments(scene: Scene, start: State, duration_us: float) -> tuple[Scene, State, Any]:
+    """Return arguments of one type, whatever numbers they were: each type would compile again."""
+    return scene, State(*(jnp.asarray(part, float) for part in start)), jnp.asarray(duration_us, float)
 
 
 def _periods_read(observed: Observed) -> int:
@@ -445,15 +436,15 @@ def _periods_read(observed: Observed) -> int:
     return 1 if orbit is None or scene.base is not None or scene.force is not None else orbit.periods
 
 
-def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
-    """Return a reading of a simulation over a window."""
-    motion = MotionWindow(DensePath(scene, simulation), *window)
-    value = motion.height.lockin(angular_frequency)
-    lost = motion.dense.contacts.energy_lost_aj[motion.begun]
+def _read(scene: Scene, simulation: Simulation, window: tuple[float, float], periods: int) -> Reading:
+    """Return a reading of a simulation over a window, by a lock-in at the drive's frequency over some periods."""
+    motion = MotionWindow(DensePath(scene, simulation), *window, periods)
+    lost, line = motion.dense.contacts.energy_lost_aj[motion.begun], motion.height.at_response
     return Reading(
         peak_amplitude_nm=motion.height.largest,
-        lockin_amplitude_nm=float(abs(value)),
-        lockin_phase_deg=float(within_turn(np.degrees(np.angle(value)), 360.0)),
+        lockin_frequency_khz=line.frequency_khz,
+        lockin_amplitude_nm=line.amplitude_nm,
+        lockin_phase_deg=line.phase_deg,
         energy_per_impact_aj=float(lost.mean()) if lost.size else None,
         impacts=int(lost.size),
     )

@@ -53,7 +53,7 @@ from afm_jax.scenefile.parameter_paths import (
     scene_family,
 )
 from afm_jax.scenefile.scenefile import Start, scene_of_tables, scene_tables
-from afm_jax.solve.lanes import LANES, filled, in_blocks
+from afm_jax.solve.lanes import LANES, in_blocks
 from afm_jax.strict_json import strict_json
 from afm_jax.units import unit_of, words_of
 from afm_jax.version import __version__, version_of
@@ -124,13 +124,11 @@ def dimension_of(parameter: str) -> str:
 
 
 def _axis(table: Mapping[str, Any], sample: str) -> Axis:
-    kinds = [kind for kind in KINDS if kind in table]
-    if len(kinds) != 1:
-        raise ValueError(f"has {' and '.join(kinds) or 'no values'}; give one of {', '.join(KINDS)}, as in {_EXAMPLE}")
-    kind = kinds[0]
+    kind = next((kind for kind in KINDS if kind in table), "linear")
     keys = (kind, "count", "seed") if kind == "random" else ("parameter", kind)
     if set(table) != set(keys):
-        raise ValueError(f"has {', '.join(table)}; an axis of this kind has {', '.join(keys)}, as in {_EXAMPLE}")
+        wanted = "`parameter` and one of linear, log and list, or `random`, `count` and `seed`"
+        raise ValueError(f"has {', '.join(table) or 'nothing'}; give {wanted}, as in {_EXAMPLE}")
     values, parameter = table[kind], table.get("parameter")
     if kind == "random":
         if not isinstance(values, Mapping) or not values:
@@ -273,8 +271,7 @@ def _in_batches(record: Callable[[Columns], Columns]) -> Callable[[Columns], Col
     """Return a function of columns of any length, block by block on all cores; blocks of one shape, so one program."""
     # what a processor's cache holds, or what fills an accelerator
     block = 1024 if jax.default_backend() == "cpu" else 1 << 16
-    program = jax.jit(record)
-    return lambda columns: in_blocks(program, columns, block=block, widths=(block,))
+    return partial(in_blocks, jax.jit(record), block=block, widths=(block,))
 
 
 def _one_by_one(record: Callable[[dict[str, float]], dict[str, Any]]) -> Callable[[Columns], Columns]:
@@ -332,6 +329,7 @@ def _contact_orbits(scene: Scene, orders: tuple[int, ...], accuracy: float, row:
 _CONTACT_NUMBERS, _CONTACT_TRUTHS = ("peak_amplitude_nm", "largest_multiplier"), ("stable", "admissible", "unresolved")
 """Of the orbits of contacts; unresolved: the law closest to the contact has an orbit, but none was found."""
 _COLLISION_NUMBERS = (
+    "rebound_speed_nm_per_us",
     "collision_delay_us",
     "time_in_contact_us",
     "time_in_junction_us",
@@ -360,11 +358,11 @@ def _collisions(
         speeds = jnp.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
         scenes = made(columns)
         found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
-        trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
-        # 0 of a tip that is captured
-        exists = dict.fromkeys(("rebound_speed_nm_per_us", *_COLLISION_NUMBERS), trusted)
-        exists |= dict.fromkeys(set(ONLY_FREE) & set(_COLLISION_NUMBERS), trusted & ~found.captured)
-        numbers = {name: jnp.where(known, getattr(found, name), jnp.nan) for name, known in exists.items()}
+        trusted, numbers = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION, {}
+        for name in _COLLISION_NUMBERS:
+            # the rebound speed of a tip that is captured is 0
+            stays = found.captured & (name in ONLY_FREE and name != _COLLISION_NUMBERS[0])
+            numbers[name] = jnp.where(trusted & ~stays, getattr(found, name), jnp.nan)
         return numbers | {"captured": found.captured, "outcome": found.outcome}
 
     shown, words = ("rebound_speed_nm_per_us", "collision_delay_us"), {"outcome": _codes(CollisionOutcome)}
@@ -381,20 +379,18 @@ def _lyapunov(
     made = jax.jit(_scenes(scene, paths))
     exponents = ("exponents_per_impact", "exponents_per_us", "exponents_per_impact_error", "exponents_per_us_error")
 
-    def work(columns: Columns) -> Columns:
-        count = len(next(iter(columns.values())))
-        # always whole blocks of lanes, so that there is one shape of every program
-        width = lanes * -(-count // lanes)
-        whole = {name: jnp.asarray(filled(column, width)) for name, column in columns.items()}
-        found = lyapunov_spectrum(made(whole), impacts=impacts, transient=transient, accuracy=accuracy)
+    def record(columns: Columns) -> Columns:
+        found = lyapunov_spectrum(made(columns), impacts=impacts, transient=transient, accuracy=accuracy)
         verdicts = found.verdicts
         results = {name: getattr(found, name) for name in (*exponents, "impacts")}
         results |= {"kind": verdicts.kind, "orbit_impacts": verdicts.impacts, "orbit_periods": verdicts.periods}
         if isinstance(scene.interaction, TabulatedLaw):
             outside = scene.interaction.extrapolated(found.approach_speed_nm_per_us)
             results[EXTRAPOLATED] = np.asarray(outside).any(axis=1)
-        return {name: np.asarray(part)[:count] for name, part in results.items()}
+        return results
 
+    # blocks of one width, so that there is one shape of every program
+    work = partial(in_blocks, record, block=lanes, widths=(lanes,))
     points, words = lanes if resolved else 4 * lanes, {"kind": _codes(MotionKind)}
     return Recorder(work, points, exponents[:2], {"exponent": (1, 2)}, words, alone=resolved)
 
@@ -521,9 +517,8 @@ def plan_of(
     axes = axes_of(whole.get("axes", ()))
     recorder = recorder_of(whole, axes)
     chunk = whole.get("chunk")
-    plan = SweepPlan(
-        whole | {"chunk": recorder.points if chunk is None else _whole(chunk, "chunk", 1, _MOST)}, axes, recorder
-    )
+    whole["chunk"] = recorder.points if chunk is None else _whole(chunk, "chunk", 1, _MOST)
+    plan = SweepPlan(whole, axes, recorder)
     if math.prod(plan.shape) > 1_000_000 * math.prod(plan.block):
         raise ValueError("that makes too many chunks: `chunk` must be larger, or take fewer values along the axes")
     return plan
@@ -554,12 +549,10 @@ def _is_begun(folder: Path, plan: SweepPlan) -> bool:
         return False
     try:
         attributes = json.loads(head.read_bytes())["attributes"]
-        kept, version = json.loads(attributes["input"]), attributes["format_version"]
+        kept = {"format_version": attributes["format_version"]} | json.loads(attributes["input"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{store}: is not a sweep of afm-jax; choose another folder") from error
-    if version != FORMAT_VERSION:
-        raise ValueError(f"{store}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
-    for name, wanted in plan.given.items():
+    for name, wanted in ({"format_version": FORMAT_VERSION} | plan.given).items():
         if kept.get(name) != wanted:
             difference = f"{name} is {json.dumps(kept.get(name))}, not {json.dumps(wanted)}"
             raise ValueError(
@@ -594,6 +587,7 @@ def _fill(group: Any, plan: SweepPlan, results: Columns) -> None:
     axes = [axis.dimension for axis in plan.axes]
     for name, array in results.items():
         further, is_float = array.shape[len(axes) :], array.dtype.kind == "f"
+        dtype, blank = ("string", "") if array.dtype.kind == "U" else (array.dtype, math.nan if is_float else 0)
         words = plan.recorder.words.get(name, {})
         flags = {"flag_values": list(words), "flag_meanings": " ".join(words.values())} if words else {}
         units = {"units": _unit(name)} if is_float else {}
@@ -601,8 +595,8 @@ def _fill(group: Any, plan: SweepPlan, results: Columns) -> None:
             name,
             shape=plan.shape + further,
             chunks=plan.block + further,
-            dtype="string" if array.dtype.kind == "U" else array.dtype,
-            fill_value=math.nan if is_float else "" if array.dtype.kind == "U" else 0,
+            dtype=dtype,
+            fill_value=blank,
             dimension_names=[*axes, *plan.recorder.extra][: array.ndim],
             attributes={"long_name": words_of(name), **units, **flags, "coordinates": " ".join(others)},
         )

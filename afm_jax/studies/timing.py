@@ -1,4 +1,4 @@
-"""Time of a compiled JAX function: compilation apart, several repetitions, the best and the median of them.
+"""Time of a compiled JAX function: compilation apart, several repetitions.
 
 A measurement runs in a Python process of its own, on one core: how many cores JAX uses is settled before it computes,
 and a process that has run other programs is a poor place to measure time in.
@@ -6,13 +6,12 @@ and a process that has run other programs is a poor place to measure time in.
 
 import os
 import signal
-import statistics
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
@@ -20,41 +19,34 @@ _SHORTEST_REPETITION_S = 0.02
 """A repetition calls the function so often that the clock's resolution and the first call's hiccups do not matter."""
 
 
-class Timing(NamedTuple):
-    """Seconds: to compile, and per call the best and the median of the repetitions."""
+def compiled_for(
+    function: Callable[..., Any], *arguments: Any, options: dict[str, Any] | None = None
+) -> tuple[Callable[..., Any], float]:
+    """Return a function compiled for arguments of these shapes and types, and the seconds that took.
 
-    compile_s: float
-    best_s: float
-    median_s: float
-
-
-class Compiled(NamedTuple):
-    """A function compiled for one kind of arguments, and the seconds that took."""
-
-    run: Callable[..., Any]
-    seconds: float
-
-
-def compiled_for(function: Callable[..., Any], *arguments: Any, options: dict[str, Any] | None = None) -> Compiled:
-    """Compile a function for arguments of these shapes and types, with the compiler's options."""
+    Args:
+        function: to compile.
+        arguments: of it.
+        options: of the compiler.
+    """
     began = time.perf_counter()
     run = jax.jit(function).lower(*arguments).compile(options)
-    return Compiled(run, time.perf_counter() - began)
+    return run, time.perf_counter() - began
 
 
-def time_compiled(compiled: Compiled, *arguments: Any, repetitions: int) -> tuple[Timing, Any]:
-    """Run a compiled function, and return the times and what it computed."""
-    result = jax.block_until_ready(compiled.run(*arguments))
-    calls = 1 + int(_SHORTEST_REPETITION_S / _seconds(compiled, arguments, 1))
-    seconds = [_seconds(compiled, arguments, calls) for _ in range(repetitions)]
-    return Timing(compiled.seconds, min(seconds), statistics.median(seconds)), result
+def seconds_a_call(run: Callable[..., Any], *arguments: Any, repetitions: int) -> list[float]:
+    """Return the seconds that a call of a compiled function takes in each of several repetitions."""
 
+    def repeated(calls: int) -> float:
+        began = time.perf_counter()
+        for _ in range(calls):
+            jax.block_until_ready(run(*arguments))
+        return (time.perf_counter() - began) / calls
 
-def _seconds(compiled: Compiled, arguments: tuple[Any, ...], calls: int) -> float:
-    began = time.perf_counter()
-    for _ in range(calls):
-        jax.block_until_ready(compiled.run(*arguments))
-    return (time.perf_counter() - began) / calls
+    # the first call is slower
+    repeated(1)
+    calls = 1 + int(_SHORTEST_REPETITION_S / repeated(1))
+    return [repeated(calls) for _ in range(repetitions)]
 
 
 def run_in_own_process(task: Callable[..., Any], **settings: Any) -> Any:

@@ -13,6 +13,7 @@ from afm_jax.solve.least_squares import covariance_of
 from fitting.experiments.prior import Prior
 from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained
+from fitting.infer.law import root_of
 from fitting.infer.rows import plain_weights, remainders_of, weights_of
 from fitting.infer.search import Descent, orbits_at
 from fitting.infer.unknowns import Data, Model, Quantity
@@ -24,21 +25,15 @@ MOST = 20_000
 """Drives that a design looks at: some minutes of computing."""
 DRAWS = 8
 """Sets of values that an orbit must bear."""
-MARGIN = 0.05
-"""Uncertainty of every parameter, relative to its size (the loss, for r), that an orbit must bear however well the law
-seems to be known: a law is none of a real contact to better than that where its orbits end."""
 PHASE_NOISE_DEG = 0.2
 """Standard error of a lag, where nothing is said of it."""
 Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
 
-
 _USUAL = {
-    "orders": ((1, 2, 3, 4), (1,)),
-    "detunings": (np.arange(97, 106) / 100, (1.02, 1.04, 1.06, 1.08, 1.1)),
-    "amplitudes_nm": ((2.0, 4.0, 7.0, 10.0), (40.0, 80.0)),
-    "places": ((-1.0, 0.0, 1.0), np.arange(1, 10) / 10),
+    True: ((1, 2, 3, 4), np.arange(97, 106) / 100, (2.0, 4.0, 7.0, 10.0), (-1.0, 0.0, 1.0)),
+    False: ((1,), (1.02, 1.04, 1.06, 1.08, 1.1), (40.0, 80.0), np.arange(1, 10) / 10),
 }
-"""What is looked at if nothing is said, where the sample or the tip is driven."""
+"""Orders, detunings, amplitudes and offsets or heights that are tried if nothing is said; True: of a driven sample."""
 
 
 @checked
@@ -69,25 +64,23 @@ def drive_grid(
         ValueError: if a list is empty or a number impossible, or there are too many combinations.
     """
     check_drive(drive)
-    if offsets_nm is not None and heights is not None:
-        raise ValueError("`offsets_nm` and `heights` both say where the sample can be; give one")
     sample = drive == "sample"
-    if heights is not None and sample:
-        raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
-    asked = (orders, detunings, amplitudes_nm, heights if offsets_nm is None else offsets_nm)
-    pairs = zip(_USUAL.items(), asked, strict=True)
-    lists = {name: usual[not sample] if given is None else given for (name, usual), given in pairs}
+    if heights is not None and (sample or offsets_nm is not None):
+        instead = "give `offsets_nm` where the sample is driven, and one of the two where the tip is"
+        raise ValueError(f"`heights` are shares of a free amplitude: {instead}")
     check_parameter("free_frequency_khz", free_frequency_khz, "positive")
-    check_parameter("offsets_nm" if heights is None else "heights", np.asarray(lists["places"]), "finite")
-    for name in ("orders", "detunings", "amplitudes_nm"):
-        check_parameter(name, np.asarray(lists[name]), "positive")
-    if any(order != int(order) or not (sample or order == 1) for order in lists["orders"]):
+    names = ("orders", "detunings", "amplitudes_nm", "offsets_nm" if heights is None else "heights")
+    asked = (orders, detunings, amplitudes_nm, offsets_nm if heights is None else heights)
+    lists = [usual if given is None else given for usual, given in zip(_USUAL[sample], asked, strict=True)]
+    for name, values in zip(names, lists, strict=True):
+        check_parameter(name, np.asarray(values), "finite" if name == names[-1] else "positive")
+    if any(order != int(order) or not (sample or order == 1) for order in lists[0]):
         allowed = "whole numbers" if sample else f"1 alone where the {drive} is driven"
-        raise ValueError(f"`orders` must hold {allowed}, but is {list(lists['orders'])}")
-    count = math.prod(map(len, lists.values()))
+        raise ValueError(f"`orders` must hold {allowed}, but is {list(lists[0])}")
+    count = math.prod(map(len, lists))
     if count > MOST:
         raise ValueError(f"these are {count} drives, more than the {MOST} a design looks at; take coarser steps")
-    order, detuning, amplitude, place = (np.ravel(axis).astype(float) for axis in np.meshgrid(*lists.values()))
+    order, detuning, amplitude, place = (np.ravel(axis).astype(float) for axis in np.meshgrid(*lists))
     frequency = (2.0 if sample else 1.0) * free_frequency_khz * order * detuning
     offset = place if sample or offsets_nm is not None else -place * amplitude
     # rounded to what an instrument is told: a thousandth of a hertz, a femtometre
@@ -107,7 +100,7 @@ LEFT_OUT = {
     "no orbit": "no steady single-impact orbit",
     "unsure": "several steady orbits, or none, or one near its end, for some of the values that the prior allows",
     "too large": "amplitudes above what the instrument takes",
-    "inaccurate": "impacts too slow, or under too strong a pull, for the model: a fit excludes such rows",
+    "inaccurate": "impacts too slow or too strongly pulled: a fit excludes such rows",
 }
 """Why a drive is no candidate, in words."""
 
@@ -223,7 +216,7 @@ def candidates_of(prior: Prior, drives: Drives, rows: Explained, largest_nm: flo
     """
     orbits, number = rows.end.orbits, rows.found.number
     sure = (number == 1) & (np.abs(orbits.fold) > NEAR_FOLD)
-    for values in prior.draws(DRAWS, least=MARGIN)[1:]:
+    for values in prior.draws(DRAWS)[1:]:
         drawn = model_of(prior, drives, values)
         found = orbits_at(*drawn, np.flatnonzero(sure))
         sure &= (found.number == 1) & (np.abs(found.orbits.fold) > NEAR_FOLD)
@@ -236,14 +229,13 @@ def candidates_of(prior: Prior, drives: Drives, rows: Explained, largest_nm: flo
         "too large": size > largest_nm,
         "inaccurate": rows.weights.reasons != "",
     }
-    why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), "") for row in range(len(sure)))
-    usable = np.array([not reason for reason in why_not])[:, None, None]
+    why_not = np.select(list(holds.values()), list(holds), "")
     return Candidates(
         drives=drives,
-        why_not=why_not,
+        why_not=tuple(why_not.tolist()),
         readings=np.mod(rows.model.data.read, [np.inf, np.inf, 360.0]),
         approach_speed_nm_per_us=orbits.approach,
-        slope=np.where(usable, slope, 0.0),
+        slope=np.where((why_not == "")[:, None, None], slope, 0.0),
     )
 
 
@@ -277,8 +269,7 @@ def stated_errors(prior: Prior, rows: Explained, chosen: Int[np.ndarray, " point
     theta[places], change = rows.end.theta, _by_unknown(rows.model, rows.end.theta)
     of_rows = (rows.weights.whitening @ model.slopes(theta, orbits))[chosen].reshape(-1, theta.size)
     of_prior = np.zeros((len(places), theta.size))
-    known, axes = np.linalg.eigh(prior.sizes[:, None] * prior.information * prior.sizes)
-    of_prior[:, places] = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / prior.sizes * change
+    of_prior[:, places] = root_of(prior.information).T * change
     of_law = np.diag(model.prior[1])[: theta.size - len(model.instrument)]
     end = rows.end._replace(theta=theta, jacobian=np.concatenate([of_rows, of_prior, of_law]))
     fit = replace(rows, model=model, end=end, weights=rows.weights._replace(used=rows.weights.used & measured))

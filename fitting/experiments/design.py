@@ -33,12 +33,10 @@ from fitting.infer.result import FitResult
 from fitting.parameters import DELAY_NAMES
 from fitting.simulated.experiment import Drives
 
-_EXACT = (
-    "The quality factor is assumed to be exact, which makes every forecast too good: give it with its error, such "
-    "as '40 +- 2'."
-)
+_EXACT = "The quality factor is taken as exact, which makes forecasts too good: give its error, as '40 +- 2'."
 
 
+_EXPECTED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg", "approach_speed_nm_per_us")
 _PRINTED = {
     "order": ("N", "d"),
     "drive_frequency_khz": ("kHz", ".8g"),
@@ -90,11 +88,10 @@ class Design(JudgedResult):
         found, amplitude = self.candidates, "free" if self.prior.problem.tapping else "drive"
         names = "order", "drive_frequency_khz", f"{amplitude}_amplitude_nm", "offset_nm"
         columns: dict[str, Any] = dict(zip(names, self.drives, strict=True))
-        readings = "peak_amplitude_nm", "lockin_amplitude_nm", "phase_lag_deg"
-        for name, reading in zip(readings, found.readings[self.chosen].T, strict=True):
-            if np.isfinite(reading).all():
-                columns[f"expected_{name}"] = reading
-        columns["expected_approach_speed_nm_per_us"] = found.approach_speed_nm_per_us[self.chosen]
+        expected = [*found.readings[self.chosen].T, found.approach_speed_nm_per_us[self.chosen]]
+        for name, column in zip(_EXPECTED, expected, strict=True):
+            if np.isfinite(column).all():
+                columns[f"expected_{name}"] = column
         return {name: column.tolist() for name, column in columns.items()}
 
     def points(self) -> list[dict[str, Any]]:
@@ -113,17 +110,17 @@ class Design(JudgedResult):
         return self._known_after(-1)
 
     def _known_after(self, count: int) -> dict[str, dict[str, Any]]:
-        entries = {}
-        each = zip(self.prior.problem.parameters, self.prior.values.tolist(), self.errors[count].tolist(), strict=True)
-        for parameter, value, error in each:
-            known, ends = np.isfinite(error), value + TWO_SIDED_95 * error * np.array([-1.0, 1.0])
-            entries[parameter.name] = {
-                "value": value,
-                "unit": parameter.unit,
-                "standard_error": error if known else None,
-                "interval95": np.clip(ends, parameter.lowest, parameter.highest).tolist() if known else [None, None],
-            }
-        return entries
+        parameters, values = self.prior.problem.parameters, self.prior.values
+        errors = np.where(np.isfinite(self.errors[count]), self.errors[count], np.nan)
+        lowest, highest = np.array([(known.lowest, known.highest) for known in parameters]).T
+        half = TWO_SIDED_95 * errors
+        columns = {
+            "value": values,
+            "unit": [known.unit for known in parameters],
+            "standard_error": errors,
+            "interval95": np.clip([values - half, values + half], lowest, highest).T,
+        }
+        return dict(zip(self.prior.problem.names, plain(rows_of(columns)), strict=True))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of `afm-jax design`; what is not known is None."""
@@ -146,29 +143,28 @@ class Design(JudgedResult):
 
     def printed(self) -> list[Any]:
         """Return the verdict, the points, what they will determine, and notes."""
-        usable, points = self.candidates.usable, self.points()
-        table = {
-            head: [f"{value:{form}}" for value in self.columns[name]]
-            for name, (head, form) in _PRINTED.items()
-            if name in self.columns
-        }
+        columns, points, problem = self.columns, self.points(), self.prior.problem
+        printed = {name: style for name, style in _PRINTED.items() if name in columns}
+        table = {head: [f"{value:{form}}" for value in columns[name]] for name, (head, form) in printed.items()}
         for name in self.interest[:4]:
             table[f"+- {name}"] = [known(point["standard_errors"][name], ".2g") for point in points]
-        then = [
+        after = [
             f"{name} {with_error(entry['value'], entry['standard_error'])} {entry['unit']}".rstrip()
             for name, entry in self.expected.items()
         ]
-        left_out = [f"{count} left out: {LEFT_OUT[name]}" for name, count in self.candidates.left_out.items()]
-        prior = self.prior
+        usable, left_out = self.candidates.usable, self.candidates.left_out
         title = f"{self.verdict}: {len(self.chosen)} points to measure next for {', '.join(self.interest)}"
         return [
-            f"{title} ({prior.problem.model}, {prior.source})",
+            f"{title} ({problem.model}, {self.prior.source})",
             *bullets("Reasons:", self.reasons),
             "",
             *text_table([*table], zip(*table.values(), strict=True), words=()),
             "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
-            f"After all: {', '.join(then)}",
-            *bullets(f"{usable.sum()} of {usable.size} drives can be planned with.", left_out),
+            f"After all: {', '.join(after)}",
+            *bullets(
+                f"{usable.sum()} of {usable.size} drives can be planned with.",
+                [f"{count} left out: {LEFT_OUT[name]}" for name, count in left_out.items()],
+            ),
             *bullets("Notes:", self.warnings),
         ]
 
@@ -198,7 +194,7 @@ def design(  # noqa: PLR0913
         drives: what can be driven, from `drive_grid`; None: what that looks at if nothing is said.
         points: how many to choose.
         noise: standard error of an amplitude relative to it (0.01 stands for 1 %).
-        interest: the parameters to be known well, all others being unknown too; None: those of the law.
+        interest: the parameters to be known well, all others being unknown too; none: those of the law.
         amplitudes: what is read of each point: "peak", "lockin" or "both"; of a cantilever that is driven itself always
             the lock-in amplitude and the lag.
         largest_nm: peak amplitude that the instrument takes (of a cantilever that is driven itself the free one); None:
@@ -213,13 +209,10 @@ def design(  # noqa: PLR0913
     """
     prior = prior_of_fit(prior) if isinstance(prior, FitResult) else prior
     names = prior.problem.names
-    if interest is None:
-        interest = [name for name in prior.problem.own if name not in DELAY_NAMES]
+    interest = interest or [name for name in prior.problem.own if name not in DELAY_NAMES]
     for name in interest:
         if name not in names:
             raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(names)}")
-    if not interest or len({*interest}) < len(interest):
-        raise ValueError("`interest` must name at least one parameter, and none twice")
     check_count("points", points, 1)
     check_parameter("noise", noise, "between 0 and 1")
     check_parameter("largest_nm", largest_nm, "positive", optional=True)
@@ -228,24 +221,21 @@ def design(  # noqa: PLR0913
         drives = drive_grid(free_frequency_khz=prior.free_frequency_khz, drive=prior.problem.drive)
     rows = explained(prior, drives, noise=noise, amplitudes=amplitudes, phase_noise_deg=phase_noise_deg)
     candidates = candidates_of(prior, drives, rows, largest_nm or np.inf)
-    usable = np.flatnonzero(candidates.usable)
-    matters = np.array([name in interest for name in names])
-    chosen = usable[choose_points(prior.information, candidates.information[usable], points, matters)]
-    each = candidates.information[chosen]
-    errors = standard_errors(prior.information + np.cumsum([np.zeros_like(prior.information), *each], axis=0))
+    usable, information = np.flatnonzero(candidates.usable), candidates.information
+    matters = np.isin(names, interest)
+    chosen = usable[choose_points(prior.information, information[usable], points, matters)]
+    errors = standard_errors(np.cumsum([prior.information, *information[chosen]], axis=0))
     if prior.problem.lasting and chosen.size:
         errors[1:] = [stated_errors(prior, rows, chosen[: 1 + last]) for last in range(len(chosen))]
     undetermined = [name for name in interest if not np.isfinite(errors[-1, names.index(name)])]
-    left_out = "; ".join(f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items())
-    reasons = {
-        f"No drive can be planned with ({left_out}); try others.": not chosen.size,
-        f"The chosen points do not determine {' and '.join(undetermined)}: choose more points, or drives at more "
-        "frequencies, amplitudes, orders or offsets.": bool(chosen.size and undetermined),
-    }
-    few = f"Only {chosen.size} of the {points} points asked for can be planned with: all are chosen."
+    reasons = []
+    if not chosen.size:
+        reasons = ["No drive can be planned with; try others."]
+    elif undetermined:
+        more = "choose more points, or drives at more frequencies, amplitudes, orders or offsets"
+        reasons = [f"The chosen points do not determine {' and '.join(undetermined)}: {more}."]
     beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
     exact = prior.quality_factor is not None and "quality_factor" not in names
-    notes = (*prior.notes, _EXACT if exact else None, few if 0 < chosen.size < points else None, beyond)
     return Design(
         prior=prior,
         interest=tuple(interest),
@@ -253,8 +243,8 @@ def design(  # noqa: PLR0913
         candidates=candidates,
         chosen=chosen,
         errors=errors,
-        reasons=[said for said, holds in reasons.items() if holds],
-        warnings=[note for note in notes if note],
+        reasons=reasons,
+        warnings=[*prior.notes, *filter(None, [_EXACT if exact else None, beyond])],
     )
 
 

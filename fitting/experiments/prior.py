@@ -25,6 +25,9 @@ from fitting.tables.csv_text import FARTHEST, TableError, read_fit_json
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
 DRAW_SEED = 1997
+MARGIN = 0.05
+"""Uncertainty of every parameter, relative to its size (the loss, for r), that an orbit must bear however well the law
+seems to be known: a law is none of a real contact to better than that where its orbits end."""
 
 
 @public_result()
@@ -68,13 +71,8 @@ class Prior(Result):
         pairs = zip(self.problem.parameters, self.values.tolist(), strict=True)
         return np.array([abs(value - known.reference) or known.width or 1.0 for known, value in pairs])
 
-    def draws(self, count: int, *, least: float = 0.0) -> Float[np.ndarray, "count p"]:
-        """Return values that are as likely as the prior is uncertain, the prior ones first; seeded.
-
-        Args:
-            count: how many.
-            least: the uncertainty, relative to the parameters' sizes, that is left to any combination of them.
-        """
+    def draws(self, count: int) -> Float[np.ndarray, "count p"]:
+        """Return values that are as likely as the prior is uncertain, by `MARGIN` at least; the prior ones first."""
         own, spread = len(self.problem.own), self.uncertainty * self.sizes
         # what is known of the instrument says how far that may be off
         spread[own:] = 1.0 / np.sqrt(np.maximum(np.diag(self.information)[own:], spread[own:] ** -2.0))
@@ -82,10 +80,9 @@ class Prior(Result):
         curvature, axes = np.linalg.eigh(spread[:, None] * self.information * spread + np.eye(spread.size))
         normal = np.random.default_rng(DRAW_SEED).normal(size=(count, spread.size))
         normal[0] = 0.0
-        width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
-        values = self.values + spread * ((normal * width) @ axes.T)
+        width = np.maximum(1.0 / np.sqrt(curvature), MARGIN / self.uncertainty)
         ends = np.array([(known.lowest, known.highest) for known in self.problem.parameters]).T
-        return np.clip(values, *ends)
+        return np.clip(self.values + spread * ((normal * width) @ axes.T), *ends)
 
 
 @checked
@@ -130,10 +127,7 @@ def prior_of_values(  # noqa: PLR0913
     given = {name: value for name, (value, _) in known.items()} | dict(values or {})
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), drive=drive)
     assumed = ", ".join(name for name in own if name not in given)
-    note = (
-        f"Not given, and taken from the paper's contact: {assumed}. The forecast is as good as these values; design "
-        "again from a first fit."
-    )
+    note = f"Not given, and taken from the paper's contact: {assumed}. Design again from a first fit."
     return Prior(
         problem=problem,
         values=_checked_values(problem, paper_values(model, mass_ng or 1.0) | given),
@@ -155,7 +149,8 @@ def _checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.n
     """
     for parameter in problem.parameters:
         value = values[parameter.name]
-        if not np.isfinite(value) or not parameter.lowest <= value <= parameter.highest:
+        # NaN is in no range
+        if not parameter.lowest <= value <= parameter.highest:
             raise TableError(
                 f"{parameter.name} must be between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
             )

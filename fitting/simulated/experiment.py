@@ -30,7 +30,6 @@ from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.results import Result, ResultTuple, public_result
 from afm_jax.solve.lanes import in_blocks
-from afm_jax.units import within_turn
 from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
@@ -168,10 +167,8 @@ def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: 
 def _readings(scene: Scene, motion: Simulation, begin_us: float, order: int) -> Readings:
     """Return what is read of one response period."""
     end_us = begin_us + order * scene.platform.period_us
-    window = MotionWindow(DensePath(scene, motion), begin_us, float(end_us))
-    value = window.height.lockin(float(scene.platform.angular_frequency) / order)
-    degrees = within_turn(np.degrees(np.angle(value)), 360.0 / order)
-    return window.height.largest, float(abs(value)), float(degrees)
+    height = MotionWindow(DensePath(scene, motion), begin_us, float(end_us), order).height
+    return height.largest, height.at_response.amplitude_nm, height.at_response.phase_deg
 
 
 @public_result()

@@ -569,9 +569,19 @@ class EnergyCurve:
         """The standard error that a band of this width has."""
         return 0.5 * (self.energy_high_aj - self.energy_low_aj) / TWO_SIDED_95
 
-    def at(self, ratio: float) -> tuple[float, ...] | None:
-        """Return the band at an amplitude, of the free one; None beyond the branch."""
-        return within(ratio, self.amplitude_ratio, self.energy_low_aj, self.energy_high_aj)
+    def at(self, ratio: Any) -> Float[np.ndarray, "2 ..."]:
+        """Return the band at amplitudes, of the free one, NaN beyond the branch."""
+        return interpolated(ratio, self.amplitude_ratio, self.energy_low_aj, self.energy_high_aj)
+
+    def estimates_at(self, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return energy, its own standard error and its change by the instrument at some amplitudes, NaN beyond.
+
+        With the instrument where statements and free rows put it: differences of branches and curves hardly depend on
+        it.
+        """
+        columns = self.estimate_aj, self.noise_aj, *self.by_instrument.T
+        energy, noise, *by = interpolated(ratio, self.amplitude_ratio, *columns)
+        return energy, noise, np.stack(by, axis=-1)
 
     def to_dict(self) -> dict[str, Any]:
         """Return amplitude ratio, height, energy and virial with their bands, and what is said of each point."""
@@ -584,11 +594,9 @@ class EnergyCurve:
         }
 
 
-def within(ratio: float, measured: np.ndarray, *columns: np.ndarray) -> tuple[float, ...] | None:
-    """Return columns at an amplitude, of the free one, by straight lines between those measured; None beyond them."""
-    if not measured[0] <= ratio <= measured[-1]:
-        return None
-    return tuple(float(np.interp(ratio, measured, column)) for column in columns)
+def interpolated(ratio: Any, measured: np.ndarray, *columns: np.ndarray) -> np.ndarray:
+    """Return columns at amplitudes, of the free one, by straight lines between those measured; NaN beyond them."""
+    return np.stack([np.interp(ratio, measured, column, np.nan, np.nan) for column in columns])
 
 
 @dataclass(frozen=True, eq=False)
@@ -893,23 +901,13 @@ def differences_of_ways(functions: EnergyFunctions) -> list[dict[str, Any]]:
         if one.retract or not other.retract or not same or not low < high:
             continue
         ratio = np.linspace(low, high, _POINTS)
-        (a, of_a, by_a), (b, of_b, by_b) = (estimates_at(branch.curve, ratio) for branch in (one, other))
+        (a, of_a, by_a), (b, of_b, by_b) = (branch.curve.estimates_at(ratio) for branch in (one, other))
         off, by = b - a, by_b - by_a
         error = np.sqrt(of_a**2 + of_b**2 + np.einsum("nu,uv,nv->n", by, covariance, by) + (share * off) ** 2)
         most = int(np.argmax(np.abs(off) / error))
         at = {"amplitude_ratio": ratio[most], "energy_aj": off[most], "standard_error": error[most]}
         found.append({"approach": i, "retract": j} | at)
     return found
-
-
-def estimates_at(curve: EnergyCurve, ratio: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return energy, its own standard error and its change by the instrument at some amplitudes, NaN beyond the ends.
-
-    With the instrument where statements and free rows put it: differences of branches and curves hardly depend on it.
-    """
-    columns = (curve.estimate_aj, curve.noise_aj, *curve.by_instrument.T)
-    energy, noise, *by = (np.interp(ratio, curve.amplitude_ratio, c, np.nan, np.nan) for c in columns)
-    return energy, noise, np.stack(by, axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from fitting.report.sections import (
     text_of,
 )
 from fitting.tapping_curves.branches import CurveBranch, Hysteresis
-from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, said_of, within
+from fitting.tapping_curves.energy import HEADLINE, differences_of_ways, interpolated, said_of
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.together import TappingTogether
 
@@ -89,7 +89,9 @@ def energy_in_words(result: Tapping) -> list[str]:
 
 
 def _band_in_words(low: float, high: float) -> str:
-    """Return a band of 95 % as what it is: a value with its standard error, a bracket, or an upper bound."""
+    """Return a band of 95 % as what it is: a value with its standard error, a bracket, an upper bound, or unknown."""
+    if np.isnan(low):
+        return "-"
     said = said_of(low, high)
     if said == "measured":
         return with_error(0.5 * (low + high), 0.5 * (high - low) / TWO_SIDED_95)
@@ -104,13 +106,11 @@ def _along_the_branches(result: Tapping) -> list[ReportSection]:
     head = ["energy (aJ) at A/A0 =", "measured", *(f"{ratio:g}" for ratio in HEADLINE), "largest"]
     cells = []
     for branch in result.branches:
-        curve, top = branch.curve, int(np.argmax(branch.curve.energy_aj))
-        ratio = curve.amplitude_ratio
-        largest = (float(curve.energy_low_aj[top]), float(curve.energy_high_aj[top]))
-        at = ("-" if (band := curve.at(ratio)) is None else _band_in_words(*band) for ratio in HEADLINE)
+        ratio = branch.curve.amplitude_ratio
+        top = float(ratio[np.argmax(branch.curve.energy_aj)])
+        *at, largest = (_band_in_words(*band) for band in branch.curve.at([*HEADLINE, top]).T.tolist())
         name = branch.name + _of_drive(branch, result.branches)
-        at = (*at, f"{_band_in_words(*largest)} at {ratio[top]:.2f}")
-        cells.append([name, f"{ratio[0]:.2f} to {ratio[-1]:.2f}", *at])
+        cells.append([name, f"{ratio[0]:.2f} to {ratio[-1]:.2f}", *at, f"{largest} at {top:.2f}"])
     lines = [
         f"  retract less approach, {result.branches[one['approach']].side}: "
         f"{with_error(one['energy_aj'], one['standard_error'])} aJ at A/A0 = {one['amplitude_ratio']:.2f}, where the "
@@ -243,12 +243,14 @@ _OF_CURVES = ("energy_aj", "energy_scatter_aj", "energy_own_error_aj", "energy_c
 
 def together_report(result: TappingTogether) -> Report:
     """Return what several curves of one lever say together: mean and scatter of each branch, the instrument."""
-    cells = [
-        [one.name, f"{one.curves}", f"{ratio:g}", f"{at[0]:.3g}", *(f"{error:.2g}" for error in at[1:])]
-        for one in result.scatter
-        for ratio in HEADLINE
-        if (at := within(ratio, one.amplitude_ratio, *(getattr(one, name) for name in _OF_CURVES))) is not None
-    ]
+    cells = []
+    for one in result.scatter:
+        columns = [getattr(one, name) for name in _OF_CURVES]
+        for ratio in HEADLINE:
+            mean, *errors = interpolated(ratio, one.amplitude_ratio, *columns)
+            if np.isfinite(mean):
+                numbers = f"{mean:.3g}", *(f"{error:.2g}" for error in errors)
+                cells.append([one.name, f"{one.curves}", f"{ratio:g}", *numbers])
     head = ["energy of a tap (aJ)", "curves", "A/A0", "mean", "scatter between curves", "own error", "common error"]
     caption = "Mean energy over the curves, its scatter from curve to curve, and what errors explain of that"
     common = [

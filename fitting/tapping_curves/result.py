@@ -169,32 +169,25 @@ class Tapping(JudgedResult):
         if not self.branches:
             return None
         branch, point = largest_of(self.branches)
-        curve = self.branches[branch].curve
-        band = float(curve.energy_low_aj[point]), float(curve.energy_high_aj[point])
-        return {
-            "value": float(curve.energy_aj[point]),
-            "standard_error": float(curve.energy_error_aj[point]),
-            "interval95": band,
-            "said": said_of(*band),
-            "branch": branch,
-            "amplitude_ratio": float(curve.amplitude_ratio[point]),
-        }
+        ratio = float(self.branches[branch].curve.amplitude_ratio[point])
+        return self._energy_at(branch, ratio, "value", "standard_error", "interval95")
+
+    def _energy_at(self, branch: int, ratio: float, *names: str) -> dict[str, Any]:
+        """Return a branch's energy at an amplitude, its error, its band, by these names, and what the band says."""
+        low, high = self.branches[branch].curve.at(ratio).tolist()
+        found = 0.5 * (low + high), 0.5 * (high - low) / TWO_SIDED_95, (low, high)
+        energy = dict(zip(names, found, strict=True))
+        said = said_of(low, high)
+        return {**energy, "said": said, "branch": branch, "amplitude_ratio": ratio}
 
     @property
     def energies_at(self) -> list[dict[str, Any]]:
         """Energy of a tap at some amplitudes of each branch that has them, in aJ."""
         return [
-            {
-                "branch": i,
-                "amplitude_ratio": ratio,
-                "energy_aj": 0.5 * sum(band),
-                "standard_error_aj": 0.5 * (band[1] - band[0]) / TWO_SIDED_95,
-                "interval95_aj": band,
-                "said": said_of(*band),
-            }
+            self._energy_at(i, ratio, "energy_aj", "standard_error_aj", "interval95_aj")
             for i, branch in enumerate(self.branches)
             for ratio in HEADLINE
-            if (band := branch.curve.at(ratio)) is not None
+            if np.isfinite(branch.curve.at(ratio)).all()
         ]
 
     def in_unit(self, said: Any) -> Any:

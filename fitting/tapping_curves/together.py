@@ -11,6 +11,7 @@ from afm_jax.checks import checked, in_float64
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.solve.least_squares import IMPROBABLE
 from afm_jax.strict_json import plain
+from afm_jax.units import TWO_SIDED_95
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.branches import CurveBranch, smooth_stretches
 from fitting.tapping_curves.energy import (
@@ -19,7 +20,6 @@ from fitting.tapping_curves.energy import (
     Nuisance,
     TappingBranch,
     energies_along,
-    estimates_at,
 )
 from fitting.tapping_curves.measured import CurveLike, measured
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
@@ -239,8 +239,8 @@ def _parts_at(ratio: np.ndarray, one: Tapping, branch: TappingBranch) -> Float[n
     """
     curve, covariance, common = branch.curve, one.functions.lever.minimum.covariance, len(COMMON)
     gain = np.linalg.solve(covariance[:common, :common], covariance[:common])
-    estimate, noise, by = estimates_at(curve, ratio)
+    estimate, noise, by = curve.estimates_at(ratio)
     own = np.maximum(np.einsum("nu,uv,nv->n", by, covariance - gain.T @ covariance[:common], by), 0.0) + noise**2
-    columns = np.stack([curve.energy_aj, curve.energy_error_aj])
-    middle, error = (np.interp(ratio, curve.amplitude_ratio, column, np.nan, np.nan) for column in columns)
-    return np.stack([middle, estimate, own, np.maximum(error**2 - own, 0.0)])
+    low, high = curve.at(ratio)
+    error = 0.5 * (high - low) / TWO_SIDED_95
+    return np.stack([0.5 * (low + high), estimate, own, np.maximum(error**2 - own, 0.0)])

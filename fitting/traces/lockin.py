@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from afm_jax.checks import checked
+from afm_jax.checks import check_parameter, checked
 from afm_jax.columns import printed_table, rows_of
 from afm_jax.results import JudgedResult, ResultTuple, public_result
 from afm_jax.units import within_turn
@@ -149,8 +149,7 @@ def lockin(
         raise TableError(f"{source}the drive frequency is missing; {mend}")
     if not 1 <= order <= HIGHEST_ORDER:
         raise ValueError(f"`order` must be 1 to {HIGHEST_ORDER}, but is {order}")
-    if not 0.0 < drive_frequency_khz < 1e9:
-        raise ValueError(f"`drive_frequency_khz` must be positive, but is {drive_frequency_khz!r}")
+    check_parameter("drive_frequency_khz", drive_frequency_khz, "positive")
     period = 1e3 / drive_frequency_khz
     time, height = (np.asarray(column, dtype=np.float64) for column in (time_us, deflection_nm))
     wrong = _fault(time, height, period, order)
