@@ -6,11 +6,10 @@ read by the same functions.
 """
 
 import csv
-import difflib
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,16 +19,13 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.saved import why_no_fit
 from afm_jax.whole_files import LARGEST_BYTES, read_whole
-from afm_jax.words import printable
+from afm_jax.words import NUMBER, nearest_name, printable, value_and_error
 
 # a cell may be as long as a file
 csv.field_size_limit(LARGEST_BYTES)
-NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-"""A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
 # A colon makes a key only in front of a number: "Measured: Tuesday" is a remark.
 _KEY_AND_VALUE = re.compile(r"\s*(?P<key>[^=:]+?)\s*(?:(?P<sign>=)|:(?=\s*[-+.\d]))(?P<value>.*)", re.DOTALL)
-_PLUS_MINUS = re.compile(r"\+-|\+/-|±")
 _SHORT_NAMES = {"q": "quality_factor", "q_factor": "quality_factor", "f0": "free_frequency_khz"}
 """What people call a key, too far from its name for a comparison of letters."""
 _SUGGESTIONS = 20
@@ -336,7 +332,8 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
     match = _KEY_AND_VALUE.fullmatch(text)
     if match is None or len(match["key"].split()) > 4:
         return None
-    return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
+    meant = _SHORT_NAMES.get(match["key"].lower()) or nearest_name(plain_name(match["key"]), settings)
+    return settings.get(meant or "")
 
 
 def given_value(name: str, given: Any, *, any_sign: bool = False) -> tuple[float, float | None]:
@@ -354,24 +351,11 @@ def given_value(name: str, given: Any, *, any_sign: bool = False) -> tuple[float
         ValueError: if it is none, or is impossible.
     """
     if isinstance(given, str):
-        given = _numbers_around(given, f"`{name}`", "write 40 or '40 +- 2'")
+        given = value_and_error(given, f'`{name}=40` or `{name}="40 +- 2"`')
     value, error = given if isinstance(given, tuple) else (given, None)
     if not (np.isfinite(value) and (value > 0.0 or any_sign) and (error is None or 0.0 < error < np.inf)):
         raise ValueError(f"`{name}` must be finite and above 0, but is {given!r}")
     return float(value), None if error is None else float(error)
-
-
-def _numbers_around(text: str, name: str, mend: str) -> tuple[float, float | None]:
-    """Return the number of a text, and the one behind its +-, None without it.
-
-    Raises:
-        ValueError: with the name, what stands where a number must, and how to mend it.
-    """
-    cells = [cell.strip() for cell in _PLUS_MINUS.split(text, maxsplit=1)]
-    for cell in cells:
-        if not NUMBER.fullmatch(cell):
-            raise ValueError(f"{name} has {quoted(cell)} where a number must stand; {mend}")
-    return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
 
 
 def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
@@ -395,7 +379,7 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
         raise ValueError(f"{key} must be {' or '.join(setting.choices)}, but is {quoted(value)}")
     if setting.none and value == "none":
         return None, None
-    number, error = _numbers_around(value, key, f"write '{setting.line}', with a decimal point and without the unit")
+    number, error = value_and_error(value, f"'{setting.line}', with a decimal point and without the unit")
     if setting.error == ("always" if error is None else "never"):
         wrong = "needs its standard error" if error is None else "takes no such error"
         raise ValueError(f"{key} {wrong}; write '{setting.line}'")
@@ -524,7 +508,7 @@ def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) 
     for name in {becomes[name]: name for name in names if present.count(becomes.get(name, "")) > 1}.values():
         raise source.fault("says again what another column says; remove one", line=line, column=name)
     for name in [name for name in names if name not in becomes][:_SUGGESTIONS]:
-        meant = nearest_name(name, becomes)
+        meant = nearest_name(plain_name(name), becomes)
         if name in form.strange:
             raise source.fault(form.strange[name], line=line, column=name)
         if not form.open or (meant is not None and becomes[meant] not in present):
@@ -543,20 +527,6 @@ def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) 
 def plain_name(text: str) -> str:
     """Return a name in a table's spelling: lower case, words joined by underscores, no brackets around units."""
     return "_".join(re.findall(r"\w+", text.lower().replace("_", " ")))
-
-
-_SIMILAR = 0.7
-"""Similarity (0 to 1, as difflib counts it) that a misspelling must reach."""
-
-
-def nearest_name(text: str, known: Iterable[str]) -> str | None:
-    """Return the known name that a misspelt one or one with another unit was meant to be, or None.
-
-    Args:
-        text: the name as it stands in the file.
-        known: the right names; their unit is the last word.
-    """
-    return next(iter(difflib.get_close_matches(plain_name(text), list(known), n=1, cutoff=_SIMILAR)), None)
 
 
 def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, source: Source) -> Float[np.ndarray, "..."]:
