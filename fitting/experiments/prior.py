@@ -3,6 +3,7 @@
 A fit leaves one: its values, its covariance, and the drives that were measured.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,12 +16,13 @@ from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.results import Result, public_result
+from afm_jax.saved import why_no_fit
 from afm_jax.words import printable
 from fitting.infer.result import FitResult
 from fitting.models import Problem, check_constraints
 from fitting.parameters import MODELS, NUISANCE_NAMES, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
-from fitting.tables.csv_text import FARTHEST, TableError, read_fit_json
+from fitting.tables.csv_text import FARTHEST, TableError, read_bytes
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
@@ -172,14 +174,15 @@ def read_prior(path: str | Path, uncertainty: float = UNCERTAINTY) -> Prior:
     Raises:
         TableError: if the file cannot be read, or is no fit.
     """
-    payload = read_fit_json(path)
+    data = read_bytes(path, "a fit.json")
     try:
-        return prior_of_fit(payload, uncertainty)
+        return prior_of_fit(json.loads(data), uncertainty)
     except TableError as error:
         raise TableError(f"{printable(str(path))}: {error}") from error
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        # an entry of another kind than `afm-jax fit` writes there
-        raise TableError(f"{printable(str(path))}: the saved fit is damaged; fit the table again") from error
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        # no JSON, or an entry of another kind than `afm-jax fit` writes there
+        mend = "give the fit.json of `afm-jax fit --out`, or fit the table again"
+        raise TableError(f"{printable(str(path))}: the saved fit is damaged; {mend}") from error
 
 
 def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Prior:
@@ -194,6 +197,9 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         ValueError: if the model or a parameter is none.
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
+    wrong = why_no_fit(payload)
+    if wrong is not None:
+        raise TableError(wrong)
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"

@@ -399,9 +399,9 @@ def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Map
     """Return the scale with which the amplitude falls by 1 nm per nm in contact."""
     scale, unit = 1.0 / abs(slope[0]), curve.amplitude_unit
     found = [(branch, look.slope) for branch, look in looks.items() if look.slope is not None]
-    parts = [f"{one.rows} rows of the {branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found]
+    parts = [f"{branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found]
     how = f"slope of the steepest settled part ({' and '.join(parts)}), assumed to be 1 nm per nm (a hard sample)"
-    return Known(scale, f"nm/{unit}", f"measured: {how}; unit {unit}", scale * slope[1] / abs(slope[0]))
+    return Known(scale, f"nm/{unit}", f"measured: {how}", scale * slope[1] / abs(slope[0]))
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:

@@ -203,8 +203,7 @@ def parse_wsxm(data: bytes, name: str) -> Recording:
     for start in [match.start() for match in re.finditer(b"FZ curve file", data)]:
         own, place = _wsxm_header(data, start, name)
         points = [int(v) for k, v in sorted(own.items()) if re.fullmatch(r"Number of Points \d+", k)]
-        points = points or [int(own["Number of points"])] * int(own.get("Number of lines", "1"))
-        if min(points) < 1 or sum(points) > (len(data) - place) // 16:
+        if min(points, default=0) < 1 or sum(points) > (len(data) - place) // 16:
             raise cut_off(name, f"curve {len(segments) // 2 + 1} announces {sum(points)} points that are not there")
         pairs = np.frombuffer(data, "<f8", 2 * sum(points), place).reshape(-1, 2).astype(float)
         axes = [printable(own.get(f"{axis} axis text", axis).split("[")[0].strip()) for axis in "XY"]

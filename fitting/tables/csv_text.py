@@ -6,7 +6,6 @@ read by the same functions.
 """
 
 import csv
-import json
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -17,7 +16,6 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from afm_jax.saved import why_no_fit
 from afm_jax.whole_files import LARGEST_BYTES, read_whole
 from afm_jax.words import NUMBER, nearest_name, printable, value_and_error
 
@@ -28,8 +26,6 @@ DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
 _KEY_AND_VALUE = re.compile(r"\s*(?P<key>[^=:]+?)\s*(?:(?P<sign>=)|:(?=\s*[-+.\d]))(?P<value>.*)", re.DOTALL)
 _SHORT_NAMES = {"q": "quality_factor", "q_factor": "quality_factor", "f0": "free_frequency_khz"}
 """What people call a key, too far from its name for a comparison of letters."""
-_SUGGESTIONS = 20
-"""How many unknown column names are compared with the known ones; it takes some milliseconds each."""
 
 SETTING_NAMES = frozenset(
     {
@@ -227,26 +223,6 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
-
-
-_A_FIT = "give the fit.json of `afm-jax fit --out`"
-
-
-def read_fit_json(path: str | Path) -> dict[str, Any]:
-    """Return the object of a saved fit: what `afm-jax fit --json` prints, or the fit.json of its report.
-
-    Raises:
-        TableError: if the file cannot be read or is no fit.
-    """
-    try:
-        found = json.loads(text_of(read_bytes(path, "a fit.json"), path, f"is not UTF-8 text; {_A_FIT}"))
-    except (json.JSONDecodeError, RecursionError) as error:
-        place = f"{printable(str(path))}, line {getattr(error, 'lineno', 1)}"
-        raise TableError(f"{place}: is no JSON; {_A_FIT}") from None
-    wrong = why_no_fit(found)
-    if wrong is not None:
-        raise TableError(f"{printable(str(path))}: {wrong}")
-    return found
 
 
 def read_text(path: str | Path) -> str:
@@ -507,7 +483,7 @@ def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) 
     present = [becomes[name] for name in names if name in becomes]
     for name in {becomes[name]: name for name in names if present.count(becomes.get(name, "")) > 1}.values():
         raise source.fault("says again what another column says; remove one", line=line, column=name)
-    for name in [name for name in names if name not in becomes][:_SUGGESTIONS]:
+    for name in [name for name in names if name not in becomes]:
         meant = nearest_name(plain_name(name), becomes)
         if name in form.strange:
             raise source.fault(form.strange[name], line=line, column=name)
