@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.checks import checked
+from afm_jax.checks import check_parameter, checked
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import printable
@@ -167,8 +167,7 @@ def read_curves(
         TableError: one line: the file is damaged, holds no such curve, or a channel is missing.
         ValueError: if an option is impossible.
     """
-    if bin_nm is not None and not 0.0 <= bin_nm < np.inf:
-        raise ValueError(f"`bin_nm` must be finite and not below 0, but is {bin_nm!r}")
+    check_parameter("bin_nm", bin_nm, "not negative", optional=True)
     of_slope = {"nm_per_volt": None} if numbers.get("nm_per_volt") == "slope" else {}
     known = {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
     known |= given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))

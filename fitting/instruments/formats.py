@@ -152,7 +152,7 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     named = [_name_and_unit(title) for title in titles]
     units = {plain.replace("[bwd]", "").strip(): unit for plain, unit in named}
     numbers = np.array([[float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells] for cells in body])
-    numbers = numbers.reshape(-1, len(titles))
+    numbers = numbers.reshape(len(body), len(titles))
     columns = {plain: column.copy() for (plain, _), column in zip(named, numbers.T, strict=True)}
     place = next((k for k, title in enumerate(titles) if title.lower() in {"branch", "direction", "segment"}), None)
     ways = [""] * len(body) if place is None else [_WAYS.get(cells[place].lower(), "") for cells in body]
