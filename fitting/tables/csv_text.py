@@ -263,7 +263,7 @@ def text_of(data: bytes, path: str | Path, wrong: str, *, latin: bool = False) -
 
 def read_columns(
     path: str | Path, form: Form, settings: Settings
-) -> tuple[dict[str, Column], Columns, Lines, dict[str, tuple[Any, float | None]]]:
+) -> tuple[dict[str, Column], Columns, dict[str, tuple[Any, float | None]]]:
     """Read a file of comments, a row of column names, and rows of numbers, whose form is known.
 
     Args:
@@ -272,8 +272,8 @@ def read_columns(
         settings: those that comments may make.
 
     Returns:
-        The columns that were read, and their numbers in the unit of what they become, both by that; the line of each
-        row; value and error of the settings.
+        The columns that were read, and their numbers in the unit of what they become, both by that; value and error of
+        the settings.
 
     Raises:
         TableError: with the first fault of the file.
@@ -283,7 +283,9 @@ def read_columns(
     numbers, lines = read_rows(rows, form, source)
     used = {column.becomes: column for column in form.columns if column.name in numbers}
     columns = {key: one.convert(numbers[one.name]) if one.convert else numbers[one.name] for key, one in used.items()}
-    return used, columns, lines, found
+    for key, values in columns.items():
+        form.check_numbers(key, values, lines, source)
+    return used, columns, found
 
 
 def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
