@@ -108,19 +108,24 @@ def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSourc
 
 
 def needed_channel(
-    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = CURVE
+    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = CURVE, mend: str = ""
 ) -> ColumnSource:
-    """Return the channel that becomes a column, as `channel_of`, of those that the error asks for.
+    """Return the channel that becomes a column, as `channel_of`.
+
+    Args:
+        recording: the file.
+        role: the column.
+        wanted: channels that the caller names, by column.
+        roles: the columns that the error asks for.
+        mend: what else the error says.
 
     Raises:
         TableError: if nothing tells which one, or as `channel_of`.
     """
     source = channel_of(recording, role, wanted)
     if source is None:
-        listed = ", ".join(recording.channels)
-        raise TableError(
-            f"{recording.source}: no {role} among the channels {listed}; {columns_to_paste(recording, roles)}"
-        )
+        listed, paste = ", ".join(recording.channels), columns_to_paste(recording, roles)
+        raise TableError(f"{recording.source}: no {role} among the channels {listed}; {paste}{mend}")
     return source
 
 

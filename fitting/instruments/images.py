@@ -86,7 +86,8 @@ def read_images(
         images = _read(path) if phase_path is None else _together(_read(path), _read(phase_path))
     refuse_other_modes(images.settings, images.source)
     wanted = parse_columns(columns)
-    taken = {role: needed_channel(images, role, wanted, _ROLES) for role in _ROLES}
+    two = ", or give amplitude and phase as two files"
+    taken = {role: needed_channel(images, role, wanted, _ROLES, two) for role in _ROLES}
     amplitude, phase = (
         np.asarray(images.segments[0].channels[one.channel], float) * (abs(one.factor or 1.0) * UNITS[one.unit][1])
         for one in taken.values()
