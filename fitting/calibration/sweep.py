@@ -51,7 +51,6 @@ SWEEP = Form(
         Column("amplitude_error_nm", meaning="amplitude_error"),
         Column("amplitude_error"),
     ),
-    "point",
 )
 """The columns that a CSV file may have, and the attribute of `Resonance` that each becomes."""
 _UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}

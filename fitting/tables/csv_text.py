@@ -133,7 +133,6 @@ class Form:
 
     Attributes:
         columns: the columns it may have.
-        row: what a row is measured at: a drive, a point, a sample.
         open: whether columns of other names are left alone, not refused.
         blanks: whether cells may be blank (NaN); else every cell is needed.
         largest: size of any number.
@@ -141,7 +140,6 @@ class Form:
     """
 
     columns: tuple[Column, ...]
-    row: str
     open: bool = False
     blanks: bool = False
     largest: float = FARTHEST
@@ -163,11 +161,9 @@ class Form:
         """
         kind = next(one.kind for one in self.columns if name in {one.name, one.becomes})
         lowest = {"number": -self.largest, "positive": 1.0 / FARTHEST, "whole": 1.0}.get(kind, 0.0)
-        # a whole number only has to survive the way through 64-bit floats
-        highest = {"whole": 2.0**53 - 1.0, "flag": 1.0}.get(kind, self.largest)
-        words = {"whole": "be a positive whole number (1, 2, 3, ...)", "flag": "be 0 or 1"}
-        must = words.get(kind, f"lie between {lowest:g} and {highest:g}")
-        good = (values >= lowest) & (values <= highest) & ((kind not in words) | (values == np.floor(values)))
+        highest, whole = 1.0 if kind == "flag" else self.largest, kind in {"whole", "flag"}
+        must = f"{'be a whole number' if whole else 'lie'} between {lowest:g} and {highest:g}"
+        good = (values >= lowest) & (values <= highest) & ((not whole) | (values == np.floor(values)))
         bad = ~(good | (np.isnan(values) & self.blanks))
         number = repr(float(values[np.argmax(bad)])).removesuffix(".0")
         source.refuse(bad, f"must {must}, but is {number}; correct it or remove the row", lines, name)
@@ -359,8 +355,7 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
         return None, None
     number, error = value_and_error(value, f"'{setting.line}', with a decimal point and without the unit")
     if setting.error == ("always" if error is None else "never"):
-        wrong = "needs its standard error" if error is None else "takes no such error"
-        raise ValueError(f"{key} {wrong}; write '{setting.line}'")
+        raise ValueError(f"{key} {'needs its' if error is None else 'takes no'} standard error; write '{setting.line}'")
     if wrong := fault_in_number(setting, number, error):
         raise ValueError(f"{key} {wrong}")
     return number, error
@@ -377,7 +372,7 @@ def read_comments(
         source: for messages of a misspelt key, a value that is no number and a repeated key.
 
     Raises:
-        TableError: if something is wrong, or there are no rows: the column names and what stands below.
+        TableError: if something is wrong, or there are no rows below the column names.
     """
     found: dict[str, tuple[Any, float | None]] = {}
     remarks = []
@@ -397,9 +392,8 @@ def read_comments(
                 found[setting.key] = _value_of(setting, comment)
             except ValueError as error:
                 raise source.fault(str(error), line=line) from None
-    if not rows:
-        what = "only comments" if comments else "nothing"
-        raise source.fault(f"the file holds {what}; add a row of column names and rows of numbers")
+    if len(rows) < 2:
+        raise source.fault("the file holds no rows of numbers; add a row of column names, and rows of numbers below it")
     return found, tuple(remarks), rows
 
 
@@ -441,8 +435,6 @@ def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns,
     separator = next((sign for sign in ",\t; " if sign in text.strip()), ",")
     names = cells_of(text, separator)
     check_names(names, form, source, line=head)
-    if not rows[1:]:
-        raise source.fault(f"there are column names but no rows below them; add a row for each {form.row}", line=head)
     columns: dict[str, list[float]] = {name: [] for name in names if name in form.names}
     lines = []
     for line, text in rows[1:]:
@@ -450,24 +442,16 @@ def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns,
         if text.count('"') % 2:
             raise source.fault("a quotation mark is not closed; close or remove it", line=line)
         if len(cells) != len(names):
-            hint = "fill the row up" if len(cells) < len(names) else "a decimal comma must be a point"
-            raise source.fault(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
+            mend = "fill the row up, and write points for decimal commas"
+            raise source.fault(f"there are {len(cells)} cells for {len(names)} columns; {mend}", line=line)
         lines.append(line)
         for name, cell in zip(names, cells, strict=True):
             if name in columns:
                 columns[name].append(float(cell) if NUMBER.fullmatch(cell) else math.nan)
                 if math.isnan(columns[name][-1]) and (cell or not form.blanks):
-                    raise source.fault(_unreadable(cell, form.row), line=line, column=name)
+                    wrong = f"{quoted(cell)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
+                    raise source.fault(wrong, line=line, column=name)
     return {name: np.array(column) for name, column in columns.items()}, np.array(lines, dtype=np.int64)
-
-
-def _unreadable(text: str, row: str) -> str:
-    """Return what is wrong with a cell of a row that holds no number."""
-    if not text:
-        return f"is blank; every {row} needs it: fill it in or remove the row"
-    if DECIMAL_COMMA.fullmatch(text):
-        return f"{quoted(text)} has a decimal comma; write a point"
-    return f"{quoted(text)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
 
 
 def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) -> None:

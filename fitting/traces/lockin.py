@@ -294,7 +294,6 @@ TRACE = Form(
         Column("deflection_nm", kind="number", needed="deflection"),
         Column("position_nm", kind="number", meaning="deflection_nm", needed="deflection"),
     ),
-    "sample",
     open=True,
 )
 SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180")}
