@@ -193,8 +193,7 @@ def _check_sweep(sweep: Resonance) -> None:
     if count < _LEAST_FREQUENCIES:
         raise TableError(f"{sweep.source}: measure at {_LEAST_FREQUENCIES} or more frequencies, not at {count}")
     if np.ptp(sweep.amplitude) == 0.0:
-        value = f"{sweep.amplitude[0]:g} {sweep.amplitude_unit}".strip()
-        raise TableError(f"{sweep.source}: the amplitude is {value} at every frequency; sweep across a resonance")
+        raise TableError(f"{sweep.source}: the amplitude is the same at every frequency; sweep across a resonance")
 
 
 def _fitted(sweep: Resonance) -> Calibration:

@@ -176,13 +176,18 @@ def read_prior(path: str | Path, uncertainty: float = UNCERTAINTY) -> Prior:
     """
     data = read_bytes(path, "a fit.json")
     try:
-        return prior_of_fit(json.loads(data), uncertainty)
+        payload = json.loads(data)
+        wrong = why_no_fit(payload)
+        prior = prior_of_fit(payload, uncertainty) if wrong is None else None
     except TableError as error:
         raise TableError(f"{printable(str(path))}: {error}") from error
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         # no JSON, or an entry of another kind than `afm-jax fit` writes there
         mend = "give the fit.json of `afm-jax fit --out`, or fit the table again"
         raise TableError(f"{printable(str(path))}: the saved fit is damaged; {mend}") from error
+    if prior is None:
+        raise TableError(f"{printable(str(path))}: {wrong}")
+    return prior
 
 
 def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Prior:
@@ -197,9 +202,6 @@ def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNC
         ValueError: if the model or a parameter is none.
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
-    wrong = why_no_fit(payload)
-    if wrong is not None:
-        raise TableError(wrong)
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"
