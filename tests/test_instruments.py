@@ -311,6 +311,7 @@ def test_a_ramp_there_and_back_is_parted_where_it_turns(curve_of):
         ({"amplitude": np.sqrt(0.5) * AMPLITUDE}, "falls by 0.707 +- 0.00"),
         ({"amplitude": 1.3 * AMPLITUDE}, "falls by 1.3 +- 0.00"),
         ({"phase": -LAG, **KNOWN}, "Sign: the free tip"),
+        ({"phase": LAG - 90.0, **KNOWN}, "Zero: the free tip"),
         ({"offset": -OFFSET}, "Direction: "),
         ({"columns": "offset_nm=Z:-1"}, "Direction: "),
         ({"offset": OFFSET[NEAR], "amplitude": AMPLITUDE[NEAR], "phase": LAG[NEAR]}, "There is no flat free part"),

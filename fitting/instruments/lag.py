@@ -277,15 +277,18 @@ _HOW = {
 
 
 def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -> tuple[str, ...]:
-    """Return the note on a sign that is not stated, and not that of a lag."""
-    if origin == "stated" or (origin in _HOW and sign > 0.0):
-        return ()
-    free, reads = readings.seen_free, "no row of the free tip has a phase"
+    """Return the notes on a sign that is not stated, and not that of a lag, and on a zero that is quarter turns off."""
+    free, reads, notes = readings.seen_free, "no row of the free tip has a phase", []
     if free.any():
         lag = float(np.median(readings.free_lag_deg[free]))
         reads = f"the free tip reads {turned(zero_deg + sign * lag):.1f} deg where its lag is {lag:.1f}"
-    if origin in _HOW:
-        return (f"Sign: {reads}: the phase leads ({_HOW[origin]}), and its sign was reversed.",)
-    taken = f"the phase {'leads' if sign < 0.0 else 'lags'}, which is assumed"
-    both = "with the other sign energies are nearly the same, and attractive and repulsive are exchanged; "
-    return (f"Sign: {reads}: {taken}; {both if origin == 'assumed' else ''}say {SENSE_OPTION}.",)
+    if origin in {"assumed", "unknown"}:
+        taken = f"the phase {'leads' if sign < 0.0 else 'lags'}, which is assumed"
+        both = "with the other sign energies are nearly the same, and attractive and repulsive are exchanged; "
+        notes.append(f"Sign: {reads}: {taken}; {both if origin == 'assumed' else ''}say {SENSE_OPTION}.")
+    elif sign < 0.0 and origin != "stated":
+        notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and its sign was reversed.")
+    quarters = 90 * round(zero_deg / 90.0)
+    if quarters and abs(turned(zero_deg - quarters)) < _NEAR_DEG:
+        notes.append(f"Zero: {reads}: the instrument's zero is {quarters:+d} degrees off; the free tip determines it.")
+    return tuple(notes)
