@@ -1,7 +1,9 @@
 """Numbers and tables as a person reads them: the digits that an error warrants, a dash where nothing is known."""
 
 import contextlib
+import difflib
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from typing import Any, SupportsFloat
@@ -49,24 +51,42 @@ def with_error(value: float | None, error: float | None) -> str:
     return f"{value:z.{digits}f} +- {error:.{digits}f}"
 
 
-def value_and_error(text: str) -> tuple[float, float | None]:
+NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+"""A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
+
+
+def value_and_error(text: str, example: str = "40 or '40 +- 2'") -> tuple[float, float | None]:
     """Return the value and the standard error that a text says, with +-, +/- or ± between them; None without an error.
 
     >>> value_and_error("40 +- 2"), value_and_error("40")
     ((40.0, 2.0), (40.0, None))
 
+    Args:
+        text: of a command, a call or a file.
+        example: how it may be written, for the message.
+
     Raises:
         ValueError: if it says no finite number, or an error that is not above 0.
     """
-    parts = text.replace("±", "+-").replace("+/-", "+-").split("+-")
-    try:
-        value, *error = map(float, parts)
-    except ValueError:
-        value, error = math.nan, []
+    parts = [part.strip() for part in re.split(r"\+-|\+/-|±", text)]
+    value, *error = (float(part) if NUMBER.fullmatch(part) else math.nan for part in parts)
     if not all(map(math.isfinite, (value, *error))) or len(error) > 1 or (error and error[0] <= 0.0):
-        said = cut_short(text.strip(), 60)
-        raise ValueError(f"`{said}` is neither a number nor one with a positive error; write 40 or '40 +- 2'")
+        said = printable(cut_short(text.strip(), 60))
+        raise ValueError(f"`{said}` is neither a number nor one with a positive error; write {example}")
     return value, error[0] if error else None
+
+
+def nearest_name(text: str, known: Iterable[str]) -> str | None:
+    """Return the known name that a misspelt one was meant to be, or None.
+
+    >>> nearest_name("platfrom", ["cantilever", "platform"]), nearest_name("tip", ["platform"])
+    ('platform', None)
+    """
+    return next(iter(difflib.get_close_matches(text, list(known), n=1, cutoff=_SIMILAR)), None)
+
+
+_SIMILAR = 0.7
+"""Similarity (0 to 1, as difflib counts it) that a misspelling must reach."""
 
 
 def interval(low: float, high: float) -> str:

@@ -84,9 +84,9 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
     ),
     "a width": (
         lambda path: fitting.read_curves(path / "volts.csv", bin_nm=-1.0),
-        "`bin_nm` must be finite and not below 0, but is -1.0",
+        "`bin_nm` must not be negative, but is -1",
         ("read", "volts.csv", "--bin-nm", "-1"),
-        "--bin-nm must be finite and not below 0, but is -1.0",
+        "--bin-nm must not be negative, but is -1",
     ),
     "errors": (
         lambda path: fitting.read_table(path / "no_errors.csv"),

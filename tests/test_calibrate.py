@@ -190,7 +190,7 @@ def test_noise_or_nothing_is_no_resonance():
     assert not result.valid
     assert any("No resonance stands out" in reason for reason in result.reasons)
     flat = Resonance(frequency_khz=khz, amplitude=np.zeros(80), phase_deg=np.linspace(0.0, 90.0, 80))
-    with pytest.raises(TableError, match="is 0 nm at every frequency; sweep across a resonance"):
+    with pytest.raises(TableError, match="is the same at every frequency; sweep across a resonance"):
         calibrate(flat)
 
 

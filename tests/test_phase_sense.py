@@ -187,11 +187,3 @@ def test_the_option_that_decides_is_named_and_decides(tmp_path: Path):
     assert "--phase-sense lag|lead" in refused.stderr
     told = strictly(CliRunner().invoke(main, [*call, "--phase-sense", "lead"]).stdout)
     assert (told["phase_sense"]["origin"], told["phase_sense"]["sign"]) == ("stated", -1)
-
-
-def test_a_zero_that_is_stated_decides_off_resonance():
-    tip, truth = curve_of_force("repulsive", 150.0, 0.99, "force")
-    table = replace(measured(tip, truth), calibration={"phase_zero_deg": (0.0, 0.3)})
-    for way, sign in ((1.0, 1.0), (-1.0, -1.0)):
-        found = sense_of(replace(table, phase_lag_deg=way * np.asarray(table.phase_lag_deg)))
-        assert (found.sign, found.origin) == (sign, "zero")

@@ -425,7 +425,7 @@ def test_wrong_images_and_those_for_another_command_are_one_line(tmp_path: Path)
     (tmp_path / "cut.gwy").write_bytes(b"GWYPGwyContainer\0" + struct.pack("<I", 1000) + b"/0/data\0o")
     (stored,), _ = written(tmp_path, "npz"), written(tmp_path, "gwy")
     for name, said in (
-        ("one.npz", "no channel has such a name for phase_lag_deg, of amplitude; say --columns"),
+        ("one.npz", "no phase_lag_deg among the channels amplitude; say --columns"),
         ("sizes.npz", "must be rows of one size"),
         ("volts.npz", "give --nm-per-volt NM"),
         ("ragged.csv", "cannot be read (ValueError: the number of columns changed"),

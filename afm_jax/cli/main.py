@@ -1,7 +1,6 @@
 """`afm-jax`: the commands in groups, and how their program is interrupted. `command.py` runs a command."""
 
 import contextlib
-import difflib
 import os
 import signal
 import socket
@@ -16,6 +15,7 @@ import click
 
 from afm_jax.cli.commands import COMMANDS
 from afm_jax.cli.ending import INTERRUPTED, exit_code_of
+from afm_jax.words import nearest_name
 
 
 def _check_streams() -> None:
@@ -111,8 +111,8 @@ class LazyGroup(click.Group):
         """Return the command that the first argument names; an unknown one is an error that names the nearest."""
         name = args[0]
         if name not in COMMANDS and not name.startswith("-") and not ctx.resilient_parsing:
-            nearest = difflib.get_close_matches(name, COMMANDS, n=1)
-            advice = f"did you mean `{nearest[0]}`?" if nearest else f"choose one of {', '.join(sorted(COMMANDS))}"
+            nearest = nearest_name(name, COMMANDS)
+            advice = f"did you mean `{nearest}`?" if nearest else f"choose one of {', '.join(sorted(COMMANDS))}"
             raise click.UsageError(f"there is no command `{name}`; {advice}", ctx=ctx)
         return click.Group.resolve_command(self, ctx, args)
 

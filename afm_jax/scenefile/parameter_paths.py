@@ -5,7 +5,6 @@ frequency omega/2 Omega of a drive; where the cantilever's frequency changes, th
 or force make of the free tip, `force.free_amplitude_nm`, sets their amplitude, which stays when other numbers change.
 """
 
-import difflib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -22,6 +21,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import drive_per_free_height
 from afm_jax.checks import checked, is_traced
 from afm_jax.scenefile.scenefile import scene_of_tables, scene_tables
+from afm_jax.words import nearest_name
 
 _MOST_VALUES = 10_000_000
 UNKNOWN = "interaction.unknown_"
@@ -126,8 +126,8 @@ def _check_paths(scene: Scene, paths: Sequence[str]) -> None:
     existing = parameter_values(scene)
     for path in paths:
         if path not in existing:
-            nearest = difflib.get_close_matches(path, existing, n=1)
-            meant = f"did you mean {nearest[0]}? " if nearest else ""
+            nearest = nearest_name(path, existing)
+            meant = f"did you mean {nearest}? " if nearest else ""
             raise ValueError(f"the scene has no parameter `{path}`; {meant}it has {', '.join(existing)}")
 
 

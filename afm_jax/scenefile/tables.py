@@ -3,14 +3,13 @@
 Where somebody wrote a key that there is not, the message advises the one to use instead.
 """
 
-import difflib
 import os
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
 from afm_jax.checks import is_array
 from afm_jax.whole_files import read_whole
-from afm_jax.words import printable
+from afm_jax.words import nearest_name, printable
 
 _FREQUENCY = ("frequency_khz", "reduced_frequency")
 _MOTION = ("amplitude_nm", *_FREQUENCY, "phase_deg")
@@ -84,9 +83,9 @@ def advise_key(table: str, key: str, model: str = "law") -> str:
     if table == "interaction" and others:
         return f'unknown key of model = "{model}"; it belongs to model = "{others[0]}"'
     without_unit = [name for name in keys if name.startswith(f"{plain}_")]
-    nearest = without_unit or difflib.get_close_matches(plain, keys, n=1)
+    nearest = next(iter(without_unit), None) or nearest_name(plain, keys)
     if nearest:
-        return f"unknown key; use {nearest[0]}"
+        return f"unknown key; use {nearest}"
     owners = _owners(plain)
     if owners:
         return f"unknown key; it belongs in {' or '.join(owners)}"
@@ -107,8 +106,8 @@ def advise_table(name: str, *, is_table: bool) -> str:
     if not is_table:
         tables = _owners(plain) or [f"[{table}]" for table in TABLES]
         return f"stands outside any table; write it below {' or '.join(tables)}"
-    nearest = difflib.get_close_matches(plain, TABLES, n=1) or KEYS
-    return f"unknown table; use {', '.join(f'[{table}]' for table in nearest)}"
+    nearest = nearest_name(plain, TABLES)
+    return f"unknown table; use {', '.join(f'[{table}]' for table in ([nearest] if nearest else KEYS))}"
 
 
 def _owners(key: str) -> list[str]:

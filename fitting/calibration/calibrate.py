@@ -179,16 +179,12 @@ def calibrate(
     _check_sweep(sweep)
     found = _of_spectrum(sweep) if sweep.spectrum else _fitted(sweep)
     springs = _springs(found, known, scale_error, static=static)
-    reasons, warnings = list(found.reasons), list(found.warnings)
-    doubt = next((one.reason for one in springs.values() if one.reason is not None), None)
-    if doubt is not None:
-        how = "`length_um=...` and `width_um=...` give k by Sader's method"
-        if len(springs) == 1:
-            reasons.append(
-                f"The spring constant is not calibrated: {doubt}; {how}. Frequency and Q do not depend on it."
-            )
-        warnings.append(f"The spring constants contradict each other: {doubt}.")
-    return replace(found, spring_constant_n_per_m=springs, reasons=tuple(reasons), warnings=tuple(warnings))
+    doubts = [one.reason for one in springs.values() if one.reason is not None]
+    mend = "`length_um=...` and `width_um=...` give k by Sader's method. Frequency and Q do not depend on it."
+    reasons = [f"The spring constant is not calibrated: {doubt}; {mend}" for doubt in doubts if "sader" not in springs]
+    warnings = [f"The spring constants contradict each other: {doubt}." for doubt in doubts]
+    said = {"reasons": (*found.reasons, *reasons), "warnings": (*found.warnings, *warnings)}
+    return replace(found, spring_constant_n_per_m=springs, **said)
 
 
 def _check_sweep(sweep: Resonance) -> None:
@@ -197,8 +193,7 @@ def _check_sweep(sweep: Resonance) -> None:
     if count < _LEAST_FREQUENCIES:
         raise TableError(f"{sweep.source}: measure at {_LEAST_FREQUENCIES} or more frequencies, not at {count}")
     if np.ptp(sweep.amplitude) == 0.0:
-        value = f"{sweep.amplitude[0]:g} {sweep.amplitude_unit}".strip()
-        raise TableError(f"{sweep.source}: the amplitude is {value} at every frequency; sweep across a resonance")
+        raise TableError(f"{sweep.source}: the amplitude is the same at every frequency; sweep across a resonance")
 
 
 def _fitted(sweep: Resonance) -> Calibration:
@@ -212,7 +207,7 @@ def _fitted(sweep: Resonance) -> Calibration:
         error = error * averages**-0.5
     elif sweep.amplitude_error is not None:
         error, origin = sweep.amplitude_error / largest, "file"
-    (place, best, *_), model, reverse = minimum(sweep, error)
+    (place, best, _, distance), model, reverse = minimum(sweep, error)
     freedom = len(best.residual) - len(place)
     # a scan without noise keeps rounding for an error
     scale = max(best.value / freedom, 1e-12) if origin == "estimated" else 1.0
@@ -220,7 +215,7 @@ def _fitted(sweep: Resonance) -> Calibration:
     together = _autocorrelation(best.residual.reshape(-1, sweep.points))
     # neighbours that go together by rho are worth (1 - rho)/(1 + rho) points each
     fewer = (1.0 + together) / (1.0 - together) if 3.0 / np.sqrt(len(best.residual)) < together < 1.0 else 1.0
-    covariance, slope = covariance_of(best.jacobian.T @ best.jacobian), best.jacobian.T @ best.residual
+    covariance = covariance_of(best.jacobian.T @ best.jacobian)
     natural, quality_factor = np.exp(place[:2]).tolist()
 
     def known(value: float, *slopes: float) -> CalibratedValue:
@@ -239,7 +234,6 @@ def _fitted(sweep: Resonance) -> Calibration:
     area = float(0.5 * np.pi * 1e3 * natural / quality_factor * place[2] * largest**2)
     frequency, quality = known(natural, 1.0), known(quality_factor, 0.0, 1.0)
     chi2, unknown = best.value / scale, frequency.reason or quality.reason
-    left = float(slope @ np.where(np.isfinite(covariance), covariance, 0.0) @ slope) / scale
     half, apart = 0.5 * natural / quality_factor, sweep.frequency_khz - natural
     near, count = min(-apart[0], apart[-1]) / half, int(np.sum(np.abs(apart) < half))
     khz, inside = f"{natural:.6g} kHz", f"{counted(count, 'point')} within the half-width"
@@ -251,7 +245,7 @@ def _fitted(sweep: Resonance) -> Calibration:
         f"Only {inside}: sweep in finer steps.": not sweep.spectrum and count < 3,
         f"The model does not explain the sweep: chi2 {chi2:.0f} for {freedom} degrees of freedom. "
         "Another background, a drift, or too small errors?": p_value < IMPROBABLE,
-        f"Not converged: chi2 lies an estimated {left:.2g} above its minimum.": not left < 1e-3,
+        f"Not converged: chi2 lies an estimated {distance / scale:.2g} above its minimum.": not distance < 1e-3 * scale,
         f"Not identified: {unknown}.": unknown is not None,
     }
     # of these faults the first

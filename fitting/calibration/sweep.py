@@ -20,12 +20,12 @@ passed over.
 
 import contextlib
 import re
-from dataclasses import InitVar, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
@@ -51,7 +51,6 @@ SWEEP = Form(
         Column("amplitude_error_nm", meaning="amplitude_error"),
         Column("amplitude_error"),
     ),
-    "point",
 )
 """The columns that a CSV file may have, and the attribute of `Resonance` that each becomes."""
 _UNITS = {"amplitude_nm": "nm", "asd_nm_per_sqrt_hz": DENSITY, "psd_nm2_per_hz": DENSITY}
@@ -74,7 +73,6 @@ class Resonance(Result):
             thermal spectrum also ``spring_constant_n_per_m``, and ``temperature_k`` if it says that.
         averages: how many periodograms a thermal spectrum is the mean of; None: not known.
         source: path of the file as it was given.
-        lines: only for making one: the line of the file that each point stands in, for messages.
 
     Raises:
         TableError: if a value is impossible, or the lengths differ.
@@ -88,15 +86,14 @@ class Resonance(Result):
     instrument: dict[str, float] = field(default_factory=dict)
     averages: float | None = None
     source: str = "sweep in memory"
-    lines: InitVar[Int[np.ndarray, " points"] | None] = None
 
-    def __post_init__(self, lines: Int[np.ndarray, " points"] | None):
-        source = Source(self.source, "row" if lines is None else "line")
+    def __post_init__(self):
+        source = Source(self.source, "row")
         points = np.size(self.frequency_khz)
         columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
         arrays = {name: column_of(name, values, points, source) for name, values in columns.items()}
         for name, values in arrays.items():
-            SWEEP.check_numbers(name, values, np.arange(1, points + 1) if lines is None else lines, source)
+            SWEEP.check_numbers(name, values, np.arange(1, points + 1), source)
         # The sort is stable: repeated measurements at one frequency keep their order.
         order = np.argsort(arrays["frequency_khz"], kind="stable")
         for name, values in arrays.items():
@@ -147,9 +144,9 @@ def read_resonance(path: str | Path) -> Resonance:
         text = first_bytes(path, 1 << 16)
     if text.startswith(b"[DataSet]") or _NANONIS.search(text):
         return _sweep_of(read_recording(path))
-    used, columns, lines, _ = read_columns(path, SWEEP, {})
+    used, columns, _ = read_columns(path, SWEEP, {})
     named: dict[str, Any] = {**columns, "amplitude_unit": _UNITS.get(used["amplitude"].name, "")}
-    return Resonance(**named, lines=lines, source=str(path))
+    return Resonance(**named, source=str(path))
 
 
 _NANONIS = re.compile(rb"^\[DATA\]\s*$", re.MULTILINE)

@@ -3,6 +3,7 @@
 A fit leaves one: its values, its covariance, and the drives that were measured.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,12 +16,13 @@ from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import TabulatedLaw, law_of_dict
 from afm_jax.results import Result, public_result
+from afm_jax.saved import why_no_fit
 from afm_jax.words import printable
 from fitting.infer.result import FitResult
 from fitting.models import Problem, check_constraints
 from fitting.parameters import MODELS, NUISANCE_NAMES, model_parameters, paper_values
 from fitting.simulated.experiment import check_drive
-from fitting.tables.csv_text import FARTHEST, TableError, read_fit_json
+from fitting.tables.csv_text import FARTHEST, TableError, read_bytes
 
 UNCERTAINTY = 0.1
 """How far a prior is off, relative, where no measurement says."""
@@ -167,14 +169,20 @@ def read_prior(path: str | Path, uncertainty: float = UNCERTAINTY) -> Prior:
     Raises:
         TableError: if the file cannot be read, or is no fit.
     """
-    payload = read_fit_json(path)
+    data = read_bytes(path, "a fit.json")
     try:
-        return prior_of_fit(payload, uncertainty)
+        payload = json.loads(data)
+        wrong = why_no_fit(payload)
+        prior = prior_of_fit(payload, uncertainty) if wrong is None else None
     except TableError as error:
         raise TableError(f"{printable(str(path))}: {error}") from error
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        # an entry of another kind than `afm-jax fit` writes there
-        raise TableError(f"{printable(str(path))}: the saved fit is damaged; fit the table again") from error
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        # no JSON, or an entry of another kind than `afm-jax fit` writes there
+        mend = "give the fit.json of `afm-jax fit --out`, or fit the table again"
+        raise TableError(f"{printable(str(path))}: the saved fit is damaged; {mend}") from error
+    if prior is None:
+        raise TableError(f"{printable(str(path))}: {wrong}")
+    return prior
 
 
 def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Prior:

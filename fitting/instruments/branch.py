@@ -39,14 +39,12 @@ class ContactSlope(NamedTuple):
         error: standard error of it.
         from_nm: height of its first row.
         to_nm: height of its last row, the nearest to the sample.
-        rows: how many.
     """
 
     value: float
     error: float
     from_nm: float
     to_nm: float
-    rows: int
 
 
 class BranchLook(NamedTuple):
@@ -207,7 +205,7 @@ def steepest_part(offset: Rows, values: Rows, *, deep: bool = False) -> ContactS
             chosen, first, last = part, start, end + 1
     if chosen is None or not chosen[0] < -_VAGUE * chosen[1]:
         return None
-    return ContactSlope(chosen[0], chosen[1], float(offset[first]), float(offset[last - 1]), last - first)
+    return ContactSlope(chosen[0], chosen[1], float(offset[first]), float(offset[last - 1]))
 
 
 def _straight_from(offset: Rows, values: Rows, first: int) -> int:

@@ -29,6 +29,10 @@ ROLES = {
 of a second mode, Amplitude2 and Phase2, are none."""
 
 
+CURVE = ("offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
+"""What a curve needs."""
+
+
 @dataclass(frozen=True)
 class ColumnSource:
     """Where a column of the table comes from.
@@ -93,10 +97,7 @@ def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSourc
         if not suited:
             return None
         source = ColumnSource(suited[0])
-    channel = _numbered(source.channel, names)
-    if channel not in names:
-        there = f"it has {', '.join(names)}; {columns_to_paste(recording)}"
-        raise TableError(f"{recording.source}: there is no channel `{channel}` for {role}; {there}")
+    channel = _existing(source.channel, recording)
     unit = source.unit or recording.units.get(channel) or usual_unit(role)
     if quantity_of(unit) not in quantities:
         raise TableError(
@@ -104,6 +105,28 @@ def channel_of(recording: Recording, role: str, wanted: Mapping[str, ColumnSourc
             f'`columns="{role}={channel}:{usual_unit(role)}"`'
         )
     return ColumnSource(channel, unit, source.factor)
+
+
+def needed_channel(
+    recording: Recording, role: str, wanted: Mapping[str, ColumnSource], roles: Iterable[str] = CURVE, mend: str = ""
+) -> ColumnSource:
+    """Return the channel that becomes a column, as `channel_of`.
+
+    Args:
+        recording: the file.
+        role: the column.
+        wanted: channels that the caller names, by column.
+        roles: the columns that the error asks for.
+        mend: what else the error says.
+
+    Raises:
+        TableError: if nothing tells which one, or as `channel_of`.
+    """
+    source = channel_of(recording, role, wanted)
+    if source is None:
+        listed, paste = ", ".join(recording.channels), columns_to_paste(recording, roles)
+        raise TableError(f"{recording.source}: no {role} among the channels {listed}; {paste}{mend}")
+    return source
 
 
 def usual_unit(role: str) -> str:
@@ -120,6 +143,15 @@ def _numbered(channel: str, names: list[str]) -> str:
     return names[int(channel) - 1] if counted else channel
 
 
+def _existing(channel: str, recording: Recording) -> str:
+    """Return the channel that is meant, which must be there."""
+    found, names = _numbered(channel, recording.channels), recording.channels
+    if found not in names:
+        there = f"it has {', '.join(names)}; {columns_to_paste(recording)}"
+        raise TableError(f"{recording.source}: there is no channel `{found}`; {there}")
+    return found
+
+
 _EXAMPLE = "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
 """For the usual export without a head: height, deflection, amplitude, phase, each out and back."""
 
@@ -131,34 +163,25 @@ def laid_out(recording: Recording, wanted: Mapping[str, ColumnSource]) -> Record
         TableError: if one of two channels is not there, or some columns have two channels and others one.
     """
     names = recording.channels
-    both = {
-        role: one.channel
-        for role, one in wanted.items()
+    pairs = {
+        one.channel: [_existing(name.strip(), recording) for name in one.channel.split("/", 1)]
+        for one in wanted.values()
         if "/" in one.channel and _numbered(one.channel, names) not in names
     }
-    pairs = {role: [_numbered(name.strip(), names) for name in both[role].split("/", 1)] for role in both}
     if not pairs:
         return recording
-    missing = next((name for pair in pairs.values() for name in pair if name not in names), None)
-    single = next((role for role in wanted if role not in pairs), None)
-    if missing is not None:
-        there = f"it has {', '.join(names)}; {columns_to_paste(recording)}"
-        raise TableError(f"{recording.source}: there is no channel `{missing}`; {there}")
+    single = next((f"{role}={one.channel}" for role, one in wanted.items() if one.channel not in pairs), None)
     if single is not None:
         raise TableError(
-            f"{recording.source}: {single}={wanted[single].channel} has one channel where other columns have OUT/BACK; "
+            f"{recording.source}: {single} has one channel where other columns have OUT/BACK; "
             f"write two for each, as {_EXAMPLE}"
         )
-    segments = two_ways(recording.segments, {both[role]: pair for role, pair in pairs.items()})
-    units = {both[role]: recording.units.get(pair[0], "") for role, pair in pairs.items()}
-    away = tuple(both[role] for role, pair in pairs.items() if pair[0] in recording.away)
-    return replace(recording, segments=segments, units=units, away=away)
+    units = {name: recording.units.get(pair[0], "") for name, pair in pairs.items()}
+    away = tuple(name for name, pair in pairs.items() if pair[0] in recording.away)
+    return replace(recording, segments=two_ways(recording.segments, pairs), units=units, away=away)
 
 
-_CURVE = ("offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
-
-
-def columns_to_paste(recording: Recording, roles: Iterable[str] = _CURVE) -> str:
+def columns_to_paste(recording: Recording, roles: Iterable[str] = CURVE) -> str:
     """Return what to write for channels whose names do not tell what they are, made from the file's own channels."""
     names = recording.channels
     if names == [str(k + 1) for k in range(8)]:

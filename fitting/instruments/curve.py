@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.checks import checked
+from afm_jax.checks import check_parameter, checked
 from afm_jax.results import JudgedResult, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import printable
@@ -27,6 +27,7 @@ from fitting.instruments.columns import (
     channel_of,
     columns_to_paste,
     laid_out,
+    needed_channel,
     parse_columns,
     turns_of,
 )
@@ -166,8 +167,7 @@ def read_curves(
         TableError: one line: the file is damaged, holds no such curve, or a channel is missing.
         ValueError: if an option is impossible.
     """
-    if bin_nm is not None and not 0.0 <= bin_nm < np.inf:
-        raise ValueError(f"`bin_nm` must be finite and not below 0, but is {bin_nm!r}")
+    check_parameter("bin_nm", bin_nm, "not negative", optional=True)
     of_slope = {"nm_per_volt": None} if numbers.get("nm_per_volt") == "slope" else {}
     known = {"drive": Known(drive or "base", "", "option `drive=...`" if drive else _ASSUMED_BASE)}
     known |= given_numbers(numbers | of_slope, OPTIONS, any_sign=("offset_origin_nm",))
@@ -184,15 +184,14 @@ def read_curves(
     sources = _sources(recording, wanted, notes)
     if "lockin_amplitude_nm" in sources:
         refuse_other_modes(recording.settings, recording.source, recording.channels)
-    said = {role for role, source in wanted.items() if source.factor is not None}
-    sense = phase_sense or ("lag" if "phase_lag_deg" in said else "")
-    by_curve = groupby(_ways(recording, sources, notes), key=lambda way: way[0])
+    factor = wanted["phase_lag_deg"].factor if "phase_lag_deg" in wanted else None
+    sense = phase_sense or ("" if factor is None else "lag")
+    by_curve = groupby(_ways(recording, sources), key=lambda way: way[0])
     joined = [[way[1:] for way in ways] for _, ways in by_curve]
     curves = []
     for number, ways in enumerate(joined, start=1):
-        curve = replace(_joined(recording, ways, sources), curve=number, curves=len(joined), known=dict(known))
-        curve = replace(curve, notes=(*notes, *curve.notes))
-        if "offset_nm" not in said and _running_away(curve):
+        curve = _joined(recording, ways, sources, notes, curve=number, curves=len(joined), known=dict(known))
+        if _runs_away(curve):
             curve = replace(curve, offset_nm=-curve.offset_nm, notes=(*curve.notes, _TURNED))
         if not stated and not any(_as_named(curve)):
             curve = replace(curve, branch=np.where(curve.branch == "approach", "retract", "approach"))
@@ -218,7 +217,7 @@ def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: li
     """
     sources = {}
     for role in ROLES:
-        source = channel_of(recording, role, wanted)
+        source = (needed_channel if role == "offset_nm" else channel_of)(recording, role, wanted)
         if source is None:
             continue
         channel = source.channel
@@ -228,14 +227,10 @@ def _sources(recording: Recording, wanted: Mapping[str, ColumnSource], notes: li
         if not recording.units.get(channel) and not (role in wanted and wanted[role].unit):
             notes.append(f'Unit: {channel} has none; {source.unit} is assumed; else `columns="{role}={channel}:UNIT"`.')
         sources[role] = source
-    paste = columns_to_paste(recording)
-    if "offset_nm" not in sources:
-        channels = ", ".join(recording.channels)
-        raise TableError(f"{recording.source}: no height among the channels {channels}; {paste}")
-    others = ", ".join(n for n in recording.channels if n not in {source.channel for source in sources.values()})
     missing = next((role for role in _NO if role not in sources), None)
     if missing is not None:
-        notes.append(f"{_NO[missing]}{f'; if one of the channels {others} is, {paste}' if others else ''}.")
+        paste = f"; if another channel is, {columns_to_paste(recording)}"
+        notes.append(f"{_NO[missing]}{paste if len(recording.channels) > len(sources) else ''}.")
     return sources
 
 
@@ -244,21 +239,13 @@ _NO = {
     "phase_lag_deg": "There is no phase, so that the energy of a tap has an upper bound only",
 }
 _INVERTED = "Sign: the amplitude is negative (an inverted channel), and its sign was reversed."
-_FEWEST, _JUMPS = 20, 0.05
-"""Rows, and median step of the heights, of their range, from which they are no ramp."""
-_MIXED = (
-    "Direction: heights jump to and fro, so that approach and retract cannot be distinguished: all rows are one "
-    "branch; else give a column branch."
-)
 _Columns = dict[str, np.ndarray]
 
 
-def _ways(
-    recording: Recording, sources: Mapping[str, ColumnSource], notes: list[str]
-) -> Iterator[tuple[Any, str, _Columns]]:
+def _ways(recording: Recording, sources: Mapping[str, ColumnSource]) -> Iterator[tuple[Any, str, _Columns]]:
     """Give which curve, branch and columns of every ramp; where no branch is stated the heights tell it.
 
-    An approach and a retract, the one after the other, are a curve then.
+    An approach and a retract, the one after the other, are a curve then. Heights that jump about are one branch.
     """
     for segment in recording.segments:
         columns = _converted(recording, segment, sources)
@@ -266,8 +253,6 @@ def _ways(
             yield segment.curve, segment.branch, columns
             continue
         offset = columns["offset_nm"]
-        if len(offset) >= _FEWEST and np.median(np.abs(np.diff(offset))) >= _JUMPS * np.ptp(offset):
-            notes.append(_MIXED)
         for number, (first, last) in enumerate(pairwise([0, *turns_of(offset), len(offset)])):
             branch = "approach" if offset[last - 1] >= offset[first] else "retract"
             part = {role: numbers[first:last] for role, numbers in columns.items()}
@@ -275,7 +260,11 @@ def _ways(
 
 
 def _joined(
-    recording: Recording, ways: list[tuple[str, _Columns]], sources: Mapping[str, ColumnSource]
+    recording: Recording,
+    ways: list[tuple[str, _Columns]],
+    sources: Mapping[str, ColumnSource],
+    notes: list[str],
+    **known: Any,
 ) -> MeasuredCurve:
     """Return approach and retract, the one after the other, as a curve."""
     scales = {"length": "nm", "voltage": "V", "force": "nN"}
@@ -286,8 +275,6 @@ def _joined(
     return MeasuredCurve(
         source=recording.source,
         format=recording.format,
-        curve=1,
-        curves=1,
         branch=np.concatenate([np.full(len(parts["offset_nm"]), name) for name, parts in ways]),
         offset_nm=columns["offset_nm"],
         amplitude=-amplitude if amplitude is not None and inverted else amplitude,
@@ -296,7 +283,8 @@ def _joined(
         deflection=columns.get("deflection_nm"),
         deflection_unit=units.get("deflection_nm", "nm"),
         free=np.zeros(len(columns["offset_nm"]), dtype=bool),
-        notes=(_INVERTED,) if inverted else (),
+        notes=(*notes, _INVERTED) if inverted else tuple(notes),
+        **known,
     )
 
 
@@ -304,12 +292,9 @@ def _converted(recording: Recording, segment: Segment, sources: Mapping[str, Col
     """Return the columns of a segment in the table's units, without padding at the end.
 
     Raises:
-        TableError: if a channel is not there, or a number is none, or impossible.
+        TableError: if a number is none, or impossible.
     """
     where = f"{recording.source}, curve {segment.curve}"
-    missing = next((one.channel for one in sources.values() if one.channel not in segment.channels), None)
-    if missing is not None:
-        raise TableError(f"{where}: the {segment.branch} has no channel {missing}")
     raw = {role: segment.channels[source.channel] for role, source in sources.items()}
     # rows at the end that hold nothing, or zeros alone, are the padding of a shorter way
     held = np.flatnonzero(np.any([np.isfinite(numbers) & (numbers != 0.0) for numbers in raw.values()], axis=0))
@@ -331,17 +316,13 @@ _AWAY = 0.95
 """Amplitude far from the sample over that near to it below which heights run the other way."""
 
 
-def _running_away(curve: MeasuredCurve) -> tuple[float, float] | None:
-    """Return the amplitudes farthest from the sample and nearest to it of a curve whose heights grow away from it.
-
-    Its amplitude falls towards the lower end of the heights, and only there.
-    """
+def _runs_away(curve: MeasuredCurve) -> bool:
+    """Say whether heights grow away from the sample: the amplitude falls towards their lower end, and only there."""
     if curve.amplitude is None or any(look.slope is not None for look in _looks(curve).values()):
-        return None
+        return False
     amplitude = curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
     some = max(len(amplitude) // 20, 1)
-    far, near = float(np.median(amplitude[:some])), float(np.median(amplitude[-some:]))
-    return (far, near) if far < _AWAY * near else None
+    return bool(np.median(amplitude[:some]) < _AWAY * np.median(amplitude[-some:]))
 
 
 def _as_named(curve: MeasuredCurve) -> list[bool]:
@@ -417,14 +398,14 @@ def _scale_of_slope(curve: MeasuredCurve, slope: tuple[float, float], looks: Map
     """Return the scale with which the amplitude falls by 1 nm per nm in contact."""
     scale, unit = 1.0 / abs(slope[0]), curve.amplitude_unit
     found = [(branch, look.slope) for branch, look in looks.items() if look.slope is not None]
-    parts = [f"{one.rows} rows of the {branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found]
+    parts = [f"{branch} from {one.from_nm:.2f} to {one.to_nm:.2f} nm" for branch, one in found]
     how = f"slope of the steepest settled part ({' and '.join(parts)}), assumed to be 1 nm per nm (a hard sample)"
-    return Known(scale, f"nm/{unit}", f"measured: {how}; unit {unit}", scale * slope[1] / abs(slope[0]))
+    return Known(scale, f"nm/{unit}", f"measured: {how}", scale * slope[1] / abs(slope[0]))
 
 
 def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
-    """Return why a curve must not be used: free amplitudes that jump, heights that run the wrong way."""
-    unit, away, jumps, slopes = curve.amplitude_unit, _running_away(curve), [], []
+    """Return why a curve must not be used: free amplitudes that jump, or that are nowhere seen."""
+    unit, jumps, slopes = curve.amplitude_unit, [], []
     for branch, look in looks.items():
         if look.jump is not None:
             jumps.append(f"jumps from {look.jump[0]:.4g} to {look.jump[1]:.4g} {unit} within the {branch}")
@@ -437,14 +418,7 @@ def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]
     if np.ptp(levels) > JUMP * max(levels):
         jumps.append("is " + " and ".join(f"{look.level:.4g} {unit} in the {branch}" for branch, look in looks.items()))
     changed = "the drive or the demodulation changed while the curve was recorded"
-    reasons = [f"The free amplitude {jump}: {changed}." for jump in jumps]
-    if away is not None:
-        far, near = (f"{amplitude:.4g} {unit}" for amplitude in away)
-        reasons.append(
-            f"The amplitude is smaller far from the sample ({far}) than near it ({near}): the heights run the other "
-            'way; turn them round with `columns="offset_nm=CHANNEL:-1"` (or drop that -1).'
-        )
-    return reasons + slopes
+    return [f"The free amplitude {jump}: {changed}." for jump in jumps] + slopes
 
 
 def _add_levels(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> None:
@@ -553,15 +527,11 @@ def _scale_notes(curve: MeasuredCurve) -> list[str]:
     if curve.slope is None or (scale is not None and scale.origin.startswith("measured")):
         return []
     slope, error, unit = abs(curve.slope[0]), curve.slope[1], curve.amplitude_unit
-    falls = f"Gain: in contact the amplitude falls by {slope:.3g} +- {error:.1g} {unit} per nm"
-    if unit == "V":
-        return [f'{falls}; on a hard sample that is {1.0 / slope:.3g} nm/V (`nm_per_volt="slope"`).']
-    if abs(slope - 1.0) <= max(0.1, 3.0 * error):
+    if unit == "nm" and abs(slope - 1.0) <= max(0.1, 3.0 * error):
         return []
-    named = {np.sqrt(0.5): ", as an rms amplitude would", 2.0: ", as a peak-to-peak amplitude would"}
-    why = next((what for factor, what in named.items() if abs(slope / factor - 1.0) < 0.05), "")
-    soft = ", or the sample is soft" if slope < 1.0 else ""
-    return [f'{falls}, not by 1{why}: the scale of the amplitude is off by that{soft}; `nm_per_volt="slope"` sets it.']
+    hard = "on a hard sample it falls by 1 nm (by 0.71 where it is an rms amplitude, by 2 from peak to peak)"
+    falls = f"Gain: in contact the amplitude falls by {slope:.3g} +- {error:.1g} {unit} per nm"
+    return [f'{falls}; {hard}: `nm_per_volt="slope"` sets the scale by that.']
 
 
 def table_text(curve: MeasuredCurve) -> str:

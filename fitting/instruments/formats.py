@@ -63,8 +63,7 @@ def read_recording(path: str | Path) -> Recording:
     for marks, what in _NOT_READ.items():
         if any(mark in data[:16] for mark in marks):
             raise TableError(f"{name}: {what}; energies of images: afm-jax tapping-map")
-    parse = parse_igor if is_igor(data, str(path)) else parse_text
-    parse = next((parser for mark, parser in MARKS.items() if data.startswith(mark)), parse)
+    parse = next((parser for mark, parser in MARKS.items() if data.startswith(mark)), parse_text)
     with damaged_as_one_line(name):
         recording = parse(data, name)
     if any(np.ndim(v) != 1 for s in recording.segments for v in s.channels.values()):
@@ -83,16 +82,11 @@ _NOT_READ = {
 """What files that are not read begin with, and what to do instead."""
 
 
-def is_igor(head: bytes, path: str = "") -> bool:
-    """Say whether a file that begins so is an Igor binary wave: version 5 or 2, in either order of bytes."""
-    return head[:2] in {b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"} or path.lower().endswith(".ibw")
-
-
 # ---- text
 
 
 def parse_text(data: bytes, name: str) -> Recording:
-    """Read text: comments or a head above `[DATA]`, a row of names (units in them or below), and rows of numbers.
+    """Read text: comments or a head above `[DATA]`, a row of names (units in them), and rows of numbers.
 
     Nanonis writes `[DATA]`, and names with "[bwd]" for the way back; Bruker's exports have _Ex and _Rt in the names of
     both ways. neaSNOM's comments are `key: [unit] values`; its columns carry no units.
@@ -133,7 +127,7 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     """Return the columns below a row of names (NaN where a cell holds no number), their units, and the way of each row.
 
     Raises:
-        TableError: if a row has another number of cells than the first, or there is no row of numbers.
+        TableError: if a row has another number of cells than the first.
     """
     # the last row may be cut off
     separator = _separator_of(rows[len(rows) // 2][1]) if rows else ","
@@ -148,7 +142,6 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
     odd = next((k for k, cells in enumerate(body) if len(cells) != len(titles)), None)
     if odd is not None:
         raise cut_off(f"{name}, line {rows[odd][0]}", f"there are {len(body[odd])} cells for {len(titles)} columns")
-    below = [""] * len(titles)
     if any(map(NUMBER.fullmatch, titles)):
         titles = [str(k + 1) for k in range(len(titles))]
     else:
@@ -156,16 +149,10 @@ def _columns(rows: NumberedLines, name: str) -> tuple[dict[str, np.ndarray], dic
         ways = [WAY.search(title) for title in titles]
         back = ["[bwd] " if way and way[1] == "Rt" else "" for way in ways]
         titles = [mark + WAY.sub("", title) for mark, title in zip(back, titles, strict=True)]
-        if body and not any(map(NUMBER.fullmatch, body[0])):
-            below, body = body[0], body[1:]
-    if not body:
-        raise cut_off(name, "there are no rows of numbers")
     named = [_name_and_unit(title) for title in titles]
-    units = {
-        plain.replace("[bwd]", "").strip(): unit or unit_named(own)
-        for (plain, unit), own in zip(named, below, strict=True)
-    }
+    units = {plain.replace("[bwd]", "").strip(): unit for plain, unit in named}
     numbers = np.array([[float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells] for cells in body])
+    numbers = numbers.reshape(len(body), len(titles))
     columns = {plain: column.copy() for (plain, _), column in zip(named, numbers.T, strict=True)}
     place = next((k for k, title in enumerate(titles) if title.lower() in {"branch", "direction", "segment"}), None)
     ways = [""] * len(body) if place is None else [_WAYS.get(cells[place].lower(), "") for cells in body]
@@ -216,8 +203,7 @@ def parse_wsxm(data: bytes, name: str) -> Recording:
     for start in [match.start() for match in re.finditer(b"FZ curve file", data)]:
         own, place = _wsxm_header(data, start, name)
         points = [int(v) for k, v in sorted(own.items()) if re.fullmatch(r"Number of Points \d+", k)]
-        points = points or [int(own["Number of points"])] * int(own.get("Number of lines", "1"))
-        if min(points) < 1 or sum(points) > (len(data) - place) // 16:
+        if min(points, default=0) < 1 or sum(points) > (len(data) - place) // 16:
             raise cut_off(name, f"curve {len(segments) // 2 + 1} announces {sum(points)} points that are not there")
         pairs = np.frombuffer(data, "<f8", 2 * sum(points), place).reshape(-1, 2).astype(float)
         axes = [printable(own.get(f"{axis} axis text", axis).split("[")[0].strip()) for axis in "XY"]
@@ -273,9 +259,8 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
             for line, (at, numbers) in enumerate(_nid_lines(keys, data[end - size : end]), start=1):
                 parts.setdefault((line, branches[frame]), {axis: at})[channel] = numbers
     if not parts:
-        frames = ", ".join(dict.fromkeys(keys.get("Frame", "?") for keys in sets)) or "none"
         mend = "export the spectroscopy data; energies of images: afm-jax tapping-map"
-        raise TableError(f"{name}: holds no curve and no spectrum, but {frames}; {mend}")
+        raise TableError(f"{name}: holds no curve and no spectrum; {mend}")
     known = known_from(header)
     warm = number_in(header.get("Cantilever temperature", ""))
     if warm is not None and -100.0 < warm[0] < 500.0:
@@ -366,14 +351,14 @@ def _igor_labels(data: bytes, header: Mapping[str, Any], side: int) -> list[str]
 
 def _igor_points(data: bytes) -> int:
     """Return how many numbers the header of a wave of version 5 announces, 0 for older ones."""
-    order = "little" if data[:2] == b"\x05\x00" else "big"
-    if data[:2] not in {b"\x05\x00", b"\x00\x05"}:
+    if 5 not in data[:2]:
         return 0
     # sizes of the parts, points, points along each side
-    places = (*range(4, 56, 4), 76, *range(132, 148, 4))
-    announced = [int.from_bytes(data[k : k + 4], order, signed=True) for k in places]
-    return max(announced) if min(announced) >= 0 else len(data) + 1
+    announced = np.frombuffer(data, "<i4" if data[0] else ">i4", 37)[[*range(1, 14), 19, *range(33, 37)]]
+    return int(announced.max()) if announced.min() >= 0 else len(data) + 1
 
 
-MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf}
+IGOR = (b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02")
+"""What Igor's binary waves begin with: version 5 or 2, in either order of bytes."""
+MARKS = {b"WSxM file": parse_wsxm, b"[DataSet]": parse_nanosurf, **dict.fromkeys(IGOR, parse_igor)}
 """Formats by what their files begin with."""

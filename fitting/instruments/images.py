@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import printable
-from fitting.instruments.columns import ColumnSource, channel_of, columns_to_paste, parse_columns
-from fitting.instruments.formats import is_igor, parse_igor
+from fitting.instruments.columns import channel_of, needed_channel, parse_columns
+from fitting.instruments.formats import IGOR, parse_igor
 from fitting.instruments.recording import (
     UNITS,
     Known,
@@ -85,14 +85,9 @@ def read_images(
     else:
         images = _read(path) if phase_path is None else _together(_read(path), _read(phase_path))
     refuse_other_modes(images.settings, images.source)
-    wanted, taken = parse_columns(columns), dict[str, ColumnSource]()
-    for role in _ROLES:
-        source = channel_of(images, role, wanted)
-        if source is None:
-            listed = f"no channel has such a name for {role}, of {', '.join(images.channels)}"
-            mend = columns_to_paste(images, _ROLES)
-            raise TableError(f"{images.source}: {listed}; {mend}, or give amplitude and phase as two files")
-        taken[role] = source
+    wanted = parse_columns(columns)
+    two = ", or give amplitude and phase as two files"
+    taken = {role: needed_channel(images, role, wanted, _ROLES, two) for role in _ROLES}
     amplitude, phase = (
         np.asarray(images.segments[0].channels[one.channel], float) * (abs(one.factor or 1.0) * UNITS[one.unit][1])
         for one in taken.values()
@@ -137,7 +132,7 @@ def _read(path: str | Path) -> Recording:
             spelled = {unit.lower(): unit for unit in UNITS}
             units = {printable(key): spelled.get(key.rpartition("_")[2].lower(), "") for key in arrays}
             return _of_arrays(arrays, units, name)
-        if is_igor(data):
+        if data.startswith(IGOR):
             return parse_igor(data, name)
         if _ROWS_OF_NUMBERS.match(data):
             rows = re.sub("[\t;,]", " ", data.decode("utf-8-sig")).splitlines()

@@ -186,15 +186,6 @@ class PhaseReadings(NamedTuple):
                 found.add(order[0])
         return found.pop() if len(found) == 1 else None
 
-    def sign_by_zero(self) -> float | None:
-        """Return the sign with which alone the free tip reads its lag about the zero that is stated; else None."""
-        if self.zero is None or not self.seen_free.any():
-            return None
-        value, error = self.zero
-        off = {sign: abs(turned(np.median(self.zero_deg(sign)) - value)) for sign in (1.0, -1.0)}
-        near = [sign for sign, degrees in off.items() if degrees < _SURE * np.hypot(error, _TOLERANCE_DEG)]
-        return near[0] if len(near) == 1 else None
-
 
 def _mean_angle(degrees: Rows) -> float:
     """Return the median of angles that may differ by whole turns."""
@@ -208,8 +199,8 @@ class PhaseSense(NamedTuple):
     Attributes:
         sign: 1 of a lag, -1 of a phase that leads.
         zero_deg: what the phase reads where the lag is 0, in the median of the rows.
-        origin: of the sign: "stated", "energy" or "order" (the curve decides), "zero" (that of the phase is stated),
-            "assumed" (on resonance, where energies hardly depend on it) or "unknown".
+        origin: of the sign: "stated", "energy" or "order" (the curve decides), "assumed" (on resonance, where energies
+            hardly depend on it) or "unknown".
         notes: sentences about sign and zero.
         reason: why no energy is known, naming what decides; empty where one is.
     """
@@ -251,7 +242,6 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
     decided = {
         "stated": SENSES.get(stated),
         "energy": by_energy or None,
-        "zero": None if on_resonance else readings.sign_by_zero(),
         "order": readings.sign_by_order() if on_resonance and known_zero else None,
     }
     origin = next((name for name, sign in decided.items() if sign is not None), "")
@@ -283,26 +273,22 @@ def sense_of_phase(readings: PhaseReadings, stated: str = "") -> PhaseSense:
 _HOW = {
     "energy": "with the other sign taps would gain energy",
     "order": "attraction reaches farther than repulsion",
-    "zero": "only then it agrees with the stated zero",
 }
 
 
 def _notes(readings: PhaseReadings, sign: float, origin: str, zero_deg: float) -> tuple[str, ...]:
-    """Return the notes on sign and zero."""
-    free, leads = readings.seen_free, sign < 0.0
-    reads = "no row of the free tip has a phase"
+    """Return the notes on a sign that is not stated, and not that of a lag, and on a zero that is quarter turns off."""
+    free, reads, notes = readings.seen_free, "no row of the free tip has a phase", []
     if free.any():
         lag = float(np.median(readings.free_lag_deg[free]))
         reads = f"the free tip reads {turned(zero_deg + sign * lag):.1f} deg where its lag is {lag:.1f}"
-    notes = []
     if origin in {"assumed", "unknown"}:
-        taken = f"the phase {'leads' if leads else 'lags'}, which is assumed"
+        taken = f"the phase {'leads' if sign < 0.0 else 'lags'}, which is assumed"
         both = "with the other sign energies are nearly the same, and attractive and repulsive are exchanged; "
         notes.append(f"Sign: {reads}: {taken}; {both if origin == 'assumed' else ''}say {SENSE_OPTION}.")
-    elif leads and origin != "stated":
+    elif sign < 0.0 and origin != "stated":
         notes.append(f"Sign: {reads}: the phase leads ({_HOW[origin]}), and its sign was reversed.")
-    quarters = round(zero_deg / 90.0)
-    if quarters and abs(turned(zero_deg - 90.0 * quarters)) < _NEAR_DEG:
-        off = f"the instrument's zero is {90 * quarters:+d} degrees off"
-        notes.append(f"Zero: {reads}: {off}; the free tip determines it.")
+    quarters = 90 * round(zero_deg / 90.0)
+    if quarters and abs(turned(zero_deg - quarters)) < _NEAR_DEG:
+        notes.append(f"Zero: {reads}: the instrument's zero is {quarters:+d} degrees off; the free tip determines it.")
     return tuple(notes)

@@ -119,8 +119,9 @@ class Recording:
 
     @property
     def channels(self) -> list[str]:
-        """The channels' names, in order."""
-        return list(dict.fromkeys(name for segment in self.segments for name in segment.channels))
+        """The names of the channels that all segments have, in order."""
+        names = list(self.segments[0].channels)
+        return [name for name in names if all(name in segment.channels for segment in self.segments)]
 
 
 def number_in(text: str) -> tuple[float, str] | None:

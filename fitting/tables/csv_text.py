@@ -6,11 +6,9 @@ read by the same functions.
 """
 
 import csv
-import difflib
-import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,22 +16,16 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from afm_jax.saved import why_no_fit
 from afm_jax.whole_files import LARGEST_BYTES, read_whole
-from afm_jax.words import printable
+from afm_jax.words import NUMBER, nearest_name, printable, value_and_error
 
 # a cell may be as long as a file
 csv.field_size_limit(LARGEST_BYTES)
-NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
-"""A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
 # A colon makes a key only in front of a number: "Measured: Tuesday" is a remark.
 _KEY_AND_VALUE = re.compile(r"\s*(?P<key>[^=:]+?)\s*(?:(?P<sign>=)|:(?=\s*[-+.\d]))(?P<value>.*)", re.DOTALL)
-_PLUS_MINUS = re.compile(r"\+-|\+/-|±")
 _SHORT_NAMES = {"q": "quality_factor", "q_factor": "quality_factor", "f0": "free_frequency_khz"}
 """What people call a key, too far from its name for a comparison of letters."""
-_SUGGESTIONS = 20
-"""How many unknown column names are compared with the known ones; it takes some milliseconds each."""
 
 SETTING_NAMES = frozenset(
     {
@@ -141,7 +133,6 @@ class Form:
 
     Attributes:
         columns: the columns it may have.
-        row: what a row is measured at: a drive, a point, a sample.
         open: whether columns of other names are left alone, not refused.
         blanks: whether cells may be blank (NaN); else every cell is needed.
         largest: size of any number.
@@ -149,7 +140,6 @@ class Form:
     """
 
     columns: tuple[Column, ...]
-    row: str
     open: bool = False
     blanks: bool = False
     largest: float = FARTHEST
@@ -171,11 +161,9 @@ class Form:
         """
         kind = next(one.kind for one in self.columns if name in {one.name, one.becomes})
         lowest = {"number": -self.largest, "positive": 1.0 / FARTHEST, "whole": 1.0}.get(kind, 0.0)
-        # a whole number only has to survive the way through 64-bit floats
-        highest = {"whole": 2.0**53 - 1.0, "flag": 1.0}.get(kind, self.largest)
-        words = {"whole": "be a positive whole number (1, 2, 3, ...)", "flag": "be 0 or 1"}
-        must = words.get(kind, f"lie between {lowest:g} and {highest:g}")
-        good = (values >= lowest) & (values <= highest) & ((kind not in words) | (values == np.floor(values)))
+        highest, whole = 1.0 if kind == "flag" else self.largest, kind in {"whole", "flag"}
+        must = f"{'be a whole number' if whole else 'lie'} between {lowest:g} and {highest:g}"
+        good = (values >= lowest) & (values <= highest) & ((not whole) | (values == np.floor(values)))
         bad = ~(good | (np.isnan(values) & self.blanks))
         number = repr(float(values[np.argmax(bad)])).removesuffix(".0")
         source.refuse(bad, f"must {must}, but is {number}; correct it or remove the row", lines, name)
@@ -233,26 +221,6 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
         raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
 
 
-_A_FIT = "give the fit.json of `afm-jax fit --out`"
-
-
-def read_fit_json(path: str | Path) -> dict[str, Any]:
-    """Return the object of a saved fit: what `afm-jax fit --json` prints, or the fit.json of its report.
-
-    Raises:
-        TableError: if the file cannot be read or is no fit.
-    """
-    try:
-        found = json.loads(text_of(read_bytes(path, "a fit.json"), path, f"is not UTF-8 text; {_A_FIT}"))
-    except (json.JSONDecodeError, RecursionError) as error:
-        place = f"{printable(str(path))}, line {getattr(error, 'lineno', 1)}"
-        raise TableError(f"{place}: is no JSON; {_A_FIT}") from None
-    wrong = why_no_fit(found)
-    if wrong is not None:
-        raise TableError(f"{printable(str(path))}: {wrong}")
-    return found
-
-
 def read_text(path: str | Path) -> str:
     """Return the text of a UTF-8 file, with or without a byte order mark, with every line end as a newline.
 
@@ -291,7 +259,7 @@ def text_of(data: bytes, path: str | Path, wrong: str, *, latin: bool = False) -
 
 def read_columns(
     path: str | Path, form: Form, settings: Settings
-) -> tuple[dict[str, Column], Columns, Lines, dict[str, tuple[Any, float | None]]]:
+) -> tuple[dict[str, Column], Columns, dict[str, tuple[Any, float | None]]]:
     """Read a file of comments, a row of column names, and rows of numbers, whose form is known.
 
     Args:
@@ -300,8 +268,8 @@ def read_columns(
         settings: those that comments may make.
 
     Returns:
-        The columns that were read, and their numbers in the unit of what they become, both by that; the line of each
-        row; value and error of the settings.
+        The columns that were read, and their numbers in the unit of what they become, both by that; value and error of
+        the settings.
 
     Raises:
         TableError: with the first fault of the file.
@@ -311,7 +279,9 @@ def read_columns(
     numbers, lines = read_rows(rows, form, source)
     used = {column.becomes: column for column in form.columns if column.name in numbers}
     columns = {key: one.convert(numbers[one.name]) if one.convert else numbers[one.name] for key, one in used.items()}
-    return used, columns, lines, found
+    for key, values in columns.items():
+        form.check_numbers(key, values, lines, source)
+    return used, columns, found
 
 
 def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
@@ -336,7 +306,8 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
     match = _KEY_AND_VALUE.fullmatch(text)
     if match is None or len(match["key"].split()) > 4:
         return None
-    return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
+    meant = _SHORT_NAMES.get(match["key"].lower()) or nearest_name(plain_name(match["key"]), settings)
+    return settings.get(meant or "")
 
 
 def given_value(name: str, given: Any, *, any_sign: bool = False) -> tuple[float, float | None]:
@@ -354,24 +325,11 @@ def given_value(name: str, given: Any, *, any_sign: bool = False) -> tuple[float
         ValueError: if it is none, or is impossible.
     """
     if isinstance(given, str):
-        given = _numbers_around(given, f"`{name}`", "write 40 or '40 +- 2'")
+        given = value_and_error(given, f'`{name}=40` or `{name}="40 +- 2"`')
     value, error = given if isinstance(given, tuple) else (given, None)
     if not (np.isfinite(value) and (value > 0.0 or any_sign) and (error is None or 0.0 < error < np.inf)):
         raise ValueError(f"`{name}` must be finite and above 0, but is {given!r}")
     return float(value), None if error is None else float(error)
-
-
-def _numbers_around(text: str, name: str, mend: str) -> tuple[float, float | None]:
-    """Return the number of a text, and the one behind its +-, None without it.
-
-    Raises:
-        ValueError: with the name, what stands where a number must, and how to mend it.
-    """
-    cells = [cell.strip() for cell in _PLUS_MINUS.split(text, maxsplit=1)]
-    for cell in cells:
-        if not NUMBER.fullmatch(cell):
-            raise ValueError(f"{name} has {quoted(cell)} where a number must stand; {mend}")
-    return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
 
 
 def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
@@ -395,10 +353,9 @@ def _value_of(setting: FileSetting, text: str) -> tuple[Any, float | None]:
         raise ValueError(f"{key} must be {' or '.join(setting.choices)}, but is {quoted(value)}")
     if setting.none and value == "none":
         return None, None
-    number, error = _numbers_around(value, key, f"write '{setting.line}', with a decimal point and without the unit")
+    number, error = value_and_error(value, f"'{setting.line}', with a decimal point and without the unit")
     if setting.error == ("always" if error is None else "never"):
-        wrong = "needs its standard error" if error is None else "takes no such error"
-        raise ValueError(f"{key} {wrong}; write '{setting.line}'")
+        raise ValueError(f"{key} {'needs its' if error is None else 'takes no'} standard error; write '{setting.line}'")
     if wrong := fault_in_number(setting, number, error):
         raise ValueError(f"{key} {wrong}")
     return number, error
@@ -415,7 +372,7 @@ def read_comments(
         source: for messages of a misspelt key, a value that is no number and a repeated key.
 
     Raises:
-        TableError: if something is wrong, or there are no rows: the column names and what stands below.
+        TableError: if something is wrong, or there are no rows below the column names.
     """
     found: dict[str, tuple[Any, float | None]] = {}
     remarks = []
@@ -435,9 +392,8 @@ def read_comments(
                 found[setting.key] = _value_of(setting, comment)
             except ValueError as error:
                 raise source.fault(str(error), line=line) from None
-    if not rows:
-        what = "only comments" if comments else "nothing"
-        raise source.fault(f"the file holds {what}; add a row of column names and rows of numbers")
+    if len(rows) < 2:
+        raise source.fault("the file holds no rows of numbers; add a row of column names, and rows of numbers below it")
     return found, tuple(remarks), rows
 
 
@@ -479,8 +435,6 @@ def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns,
     separator = next((sign for sign in ",\t; " if sign in text.strip()), ",")
     names = cells_of(text, separator)
     check_names(names, form, source, line=head)
-    if not rows[1:]:
-        raise source.fault(f"there are column names but no rows below them; add a row for each {form.row}", line=head)
     columns: dict[str, list[float]] = {name: [] for name in names if name in form.names}
     lines = []
     for line, text in rows[1:]:
@@ -488,24 +442,16 @@ def read_rows(rows: NumberedLines, form: Form, source: Source) -> tuple[Columns,
         if text.count('"') % 2:
             raise source.fault("a quotation mark is not closed; close or remove it", line=line)
         if len(cells) != len(names):
-            hint = "fill the row up" if len(cells) < len(names) else "a decimal comma must be a point"
-            raise source.fault(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
+            mend = "fill the row up, and write points for decimal commas"
+            raise source.fault(f"there are {len(cells)} cells for {len(names)} columns; {mend}", line=line)
         lines.append(line)
         for name, cell in zip(names, cells, strict=True):
             if name in columns:
                 columns[name].append(float(cell) if NUMBER.fullmatch(cell) else math.nan)
                 if math.isnan(columns[name][-1]) and (cell or not form.blanks):
-                    raise source.fault(_unreadable(cell, form.row), line=line, column=name)
+                    wrong = f"{quoted(cell)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
+                    raise source.fault(wrong, line=line, column=name)
     return {name: np.array(column) for name, column in columns.items()}, np.array(lines, dtype=np.int64)
-
-
-def _unreadable(text: str, row: str) -> str:
-    """Return what is wrong with a cell of a row that holds no number."""
-    if not text:
-        return f"is blank; every {row} needs it: fill it in or remove the row"
-    if DECIMAL_COMMA.fullmatch(text):
-        return f"{quoted(text)} has a decimal comma; write a point"
-    return f"{quoted(text)} is not a number like 90.25 or 9.025e1; correct it or remove the row"
 
 
 def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) -> None:
@@ -523,8 +469,8 @@ def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) 
     present = [becomes[name] for name in names if name in becomes]
     for name in {becomes[name]: name for name in names if present.count(becomes.get(name, "")) > 1}.values():
         raise source.fault("says again what another column says; remove one", line=line, column=name)
-    for name in [name for name in names if name not in becomes][:_SUGGESTIONS]:
-        meant = nearest_name(name, becomes)
+    for name in [name for name in names if name not in becomes]:
+        meant = nearest_name(plain_name(name), becomes)
         if name in form.strange:
             raise source.fault(form.strange[name], line=line, column=name)
         if not form.open or (meant is not None and becomes[meant] not in present):
@@ -543,20 +489,6 @@ def check_names(names: list[str], form: Form, source: Source, *, line: int = 0) 
 def plain_name(text: str) -> str:
     """Return a name in a table's spelling: lower case, words joined by underscores, no brackets around units."""
     return "_".join(re.findall(r"\w+", text.lower().replace("_", " ")))
-
-
-_SIMILAR = 0.7
-"""Similarity (0 to 1, as difflib counts it) that a misspelling must reach."""
-
-
-def nearest_name(text: str, known: Iterable[str]) -> str | None:
-    """Return the known name that a misspelt one or one with another unit was meant to be, or None.
-
-    Args:
-        text: the name as it stands in the file.
-        known: the right names; their unit is the last word.
-    """
-    return next(iter(difflib.get_close_matches(plain_name(text), list(known), n=1, cutoff=_SIMILAR)), None)
 
 
 def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, source: Source) -> Float[np.ndarray, "..."]:

@@ -133,7 +133,7 @@ def _form_without(*others: str, strange: str, optional: str = "") -> Form:
     """Return the form of tables that have all columns but those of the other form, of which it says what to do."""
     columns = [column for column in _COLUMNS if column.name not in others]
     columns = [replace(column, needed="") if column.name == optional else column for column in columns]
-    return Form(tuple(columns), "drive", blanks=True, largest=LARGEST, strange=dict.fromkeys(others, strange))
+    return Form(tuple(columns), blanks=True, largest=LARGEST, strange=dict.fromkeys(others, strange))
 
 
 TABLE = _form_without(

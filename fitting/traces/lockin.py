@@ -20,7 +20,7 @@ from afm_jax.columns import printed_table, rows_of
 from afm_jax.results import JudgedResult, ResultTuple, public_result
 from afm_jax.units import within_turn
 from afm_jax.words import bullets, printable
-from fitting.tables.csv_text import Column, FileSetting, Form, Source, TableError, read_columns
+from fitting.tables.csv_text import Column, FileSetting, Form, TableError, read_columns
 
 Samples = Float[np.ndarray, " samples"]
 HIGHEST_ORDER = 8
@@ -293,7 +293,6 @@ TRACE = Form(
         Column("deflection_nm", kind="number", needed="deflection"),
         Column("position_nm", kind="number", meaning="deflection_nm", needed="deflection"),
     ),
-    "sample",
     open=True,
 )
 SETTINGS = {"drive_frequency_khz": FileSetting("drive_frequency_khz", "180")}
@@ -311,8 +310,6 @@ def read_trace(path: str | Path) -> Trace:
     Raises:
         TableError: one line that names the first fault, its place, and how to mend it.
     """
-    _, columns, lines, settings = read_columns(path, TRACE, SETTINGS)
-    for name, numbers in columns.items():
-        TRACE.check_numbers(name, numbers, lines, Source(str(path)))
+    _, columns, settings = read_columns(path, TRACE, SETTINGS)
     frequency, _ = settings.get("drive_frequency_khz", (None, None))
     return Trace(columns["time_us"], columns["deflection_nm"], frequency)
