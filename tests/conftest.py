@@ -3,17 +3,40 @@
 import ctypes
 import gc
 import os
+from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import coverage
 import hypothesis
 import jax
+import jaxtyping
 import pytest
-from jaxtyping import install_import_hook
 
 # Before the packages are imported for the first time: every annotated function checks its arguments and results.
-install_import_hook(["afm_jax", "fitting"], "beartype.beartype")
+jaxtyping.install_import_hook(["afm_jax", "fitting"], "beartype.beartype")
+
+MOST_CHECKED = 20
+"""Definitions of a function within another that are checked: each costs half a millisecond, whatever the function."""
+_jaxtyped, _definitions = jaxtyping.jaxtyped, Counter()
+
+
+def _checked(*, typechecker: Callable) -> Callable:
+    """Return the decorator of the import hook, which functions that are defined over and over do not get."""
+
+    def decorate(function: Callable) -> Callable:
+        if "<locals>" in getattr(function, "__qualname__", ""):
+            code = getattr(function, "__code__", function)
+            _definitions[code] += 1
+            if _definitions[code] > MOST_CHECKED:
+                return function
+        return _jaxtyped(function, typechecker=typechecker)
+
+    return decorate
+
+
+jaxtyping.jaxtyped = _checked
 
 from afm_jax.compilation_cache import processor_key, silence_xla  # noqa: E402
 

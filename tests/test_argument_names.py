@@ -18,7 +18,6 @@ from afm_jax.cli.command import in_options
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import in_callers_words
 from fitting.instruments.curve import table_text
-from fitting.instruments.images import read_images
 from fitting.parameters import model_parameters
 from fitting.tables.several import SeveralTables
 from tests.instrument_files import separated, tapping_rows
@@ -64,41 +63,11 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
         ("read", "abc.csv"),
         "say --columns offset_nm=a:nm,lockin_amplitude_nm=b:nm,phase_lag_deg=c:deg",
     ),
-    "radians": (
-        lambda path: fitting.read_curves(path / "force.csv", drive="force", **LEVER),
-        'say `columns="phase_lag_deg=CHANNEL:rad"`',
-        ("read", "force.csv", "--drive", "force", *LEVER_OPTIONS),
-        "say --columns phase_lag_deg=CHANNEL:rad",
-    ),
-    "a unit": (
-        lambda path: fitting.read_curves(path / "wrong.csv", columns="offset_nm=Z"),
-        'say `columns="offset_nm=Z:nm"`',
-        ("read", "wrong.csv", "--columns", "offset_nm=Z"),
-        "say --columns offset_nm=Z:nm",
-    ),
     "what a table needs": (
         lambda path: table_text(fitting.read_curve(path / "volts.csv")),
         '`free_frequency_khz=KHZ` `nm_per_volt=NM_PER_V|"slope"`',
         ("tapping", "volts.csv"),
         "--free-frequency-khz KHZ --nm-per-volt NM_PER_V|slope",
-    ),
-    "a width": (
-        lambda path: fitting.read_curves(path / "volts.csv", bin_nm=-1.0),
-        "`bin_nm` must not be negative, but is -1",
-        ("read", "volts.csv", "--bin-nm", "-1"),
-        "--bin-nm must not be negative, but is -1",
-    ),
-    "errors": (
-        lambda path: fitting.read_table(path / "no_errors.csv"),
-        "give the relative noise (`noise=0.01`)",
-        ("fit", "no_errors.csv"),
-        "give the relative noise (--noise 0.01)",
-    ),
-    "a curve's Q": (
-        lambda path: fitting.tapping(path / "tap.csv"),
-        "give `quality_factor=200, quality_factor_error=2`, or",
-        ("tapping", "tap.csv"),
-        "give --quality-factor '200 +- 2', or",
     ),
     "a table's Q": (
         lambda path: fitting.invert(fitting.read_table(path / "no_quality.csv")),
@@ -111,12 +80,6 @@ CALLS: dict[str, tuple[Callable[[Path], Any], str, tuple[str, ...], str]] = {
         "give `nm_per_volt=NM`",
         ("tapping-map", "volts.npz", "--free-amplitude-nm", "13.4", "--free-phase-deg", "90", *LEVER_OPTIONS),
         "give --nm-per-volt NM",
-    ),
-    "which images": (
-        lambda path: read_images(path / "names.npz"),
-        'say `columns="lockin_amplitude_nm=first:nm,phase_lag_deg=second:deg"`',
-        ("tapping-map", "names.npz"),
-        "say --columns lockin_amplitude_nm=first:nm,phase_lag_deg=second:deg",
     ),
     "a parameter's value": (
         lambda _: model_parameters("law", fixed={"r": 3.0}),

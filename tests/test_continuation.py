@@ -4,7 +4,6 @@ Closed forms of the undamped oscillator: eq. 9's orbits and eq. 8's trace, writt
 the grazing of a resting and of a driven tip.
 """
 
-import csv
 import json
 import warnings
 from collections.abc import Callable
@@ -26,7 +25,6 @@ from afm_jax import (
     Scene,
     TabulatedLaw,
     save_scene,
-    single_impact_orbits,
 )
 from afm_jax.cli.main import main
 from afm_jax.dynamics import curves, impact_orbits
@@ -282,19 +280,6 @@ def run(made: Scene, folder: Path, command: str, *arguments: str) -> dict:
     return strictly(result.stdout)
 
 
-@pytest.mark.slow
-def test_the_command_tells_what_python_finds(doubled: Continuation, tmp_path: Path):
-    ranges = ("--parameter", "platform.reduced_frequency=0.9:1.4", "--second", "platform.offset_nm=-1.9:0")
-    answer = run(scene(), tmp_path, "continue", "--order", "1", *ranges)
-    assert [point["parameter"] for point in answer["points"]] == doubled.branches[0].parameter.tolist()
-    (special,) = answer["special"]
-    assert (special["kind"], special["parameter"]) == ("period_doubling", doubled.special[0].parameter)
-    for point in answer["points"]:
-        # beyond the doubling one multiplier is below -1
-        assert point["stable"] == (point["parameter"] < special["parameter"])
-    assert answer["curves"][0]["second"] == doubled.curves[0].second.tolist()
-
-
 COVARIANCE = [[4e-4**2, 0.2 * 4e-4 * 0.93], [0.2 * 4e-4 * 0.93, 0.93**2]]
 """Of r and epsilon."""
 
@@ -343,35 +328,6 @@ def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
         assert point["parameter_error"] == pytest.approx(error, rel=error_tolerance)
         assert np.diff(point["interval95"]) == pytest.approx([3.92 * error], rel=max(1e-4, error_tolerance))
     assert all(point["peak_amplitude_error_nm"] > 0.0 for point in answer["points"])
-
-
-@pytest.mark.slow
-def test_charts_and_exponents_take_the_law_of_a_fit(tmp_path: Path):
-    """The share of draws with a stable orbit is that of a plain loop over the same draws."""
-    made, law = scene(4.0, 1.01, 0.5), ("--law", fit_file(tmp_path / "fit.json"))
-    number = 10
-    unknowns = np.random.default_rng(0).multivariate_normal([0.0, 0.0], np.eye(2), size=50 * number)[:number]
-    drawn = [0.95, 60.0] + unknowns @ np.linalg.cholesky(COVARIANCE).T
-
-    def steady(amplitude: float, r: float, epsilon: float) -> bool:
-        platform = Platform(amplitude, 180.0 * 1.01, -1.0)
-        found = single_impact_orbits(Scene(Cantilever(90.0), platform, ImpactLaw(r, epsilon)), 1)
-        return bool(np.any(np.asarray(found.stable & found.admissible)))
-
-    low, high = 0.3, 4.0
-    while high - low > 1e-3:
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if steady(middle, 0.95, 60.0) else (middle, high)
-    given = ("--x", f"platform.amplitude_nm={high - 0.02}:{high + 0.02}:5", "--y", "platform.offset_nm=-1:-0.99:2")
-    run(made, tmp_path, "chart", *given, "--orders", "1", *law, "--draws", str(number), "--out", str(tmp_path))
-    with (tmp_path / "chart.csv").open(encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if float(row["platform.offset_nm"]) == -1.0]
-    shares = [np.mean([steady(float(row["platform.amplitude_nm"]), *one) for one in drawn]) for row in rows]
-    assert min(shares) < 0.5 < max(shares)
-    assert [float(row["stable_probability_1"]) for row in rows] == pytest.approx(shares)
-    told = run(made, tmp_path, "lyapunov", *law, "--draws", "4", "--impacts", "100")
-    ends = told["exponent_per_impact_interval95"]
-    assert ends[0] < ends[1]
 
 
 def test_where_axes_set_every_parameter_of_a_fit_nothing_is_drawn():

@@ -85,9 +85,9 @@ def tabulated(scene: Scene, origin: str = "") -> Scene:
 
 
 @cache
-def scenes_with(law: str) -> list[Scene]:
-    """Return three scenes with a law as formula or table, made when a test asks: listing tests computes nothing."""
-    scenes = [
+def scenes() -> list[Scene]:
+    """Return three scenes with a law, made when a test asks: listing tests computes nothing."""
+    return [
         bouncing(reduced, frequency_khz=frequency, offset_nm=offset, r=r, delay=(hertz, 5.64, 0.726))
         for reduced, frequency, offset, r, hertz in (
             (1.01, 90.0, -1.0, 0.9981, 0.206),
@@ -95,19 +95,13 @@ def scenes_with(law: str) -> list[Scene]:
             (0.99, 89.5, -1.5, 0.98, 0.19),
         )
     ]
-    return scenes if law == "formula" else [tabulated(scene) for scene in scenes]
 
 
-FORMULAS = [(function, "formula") for function in OBJECTS]
-TABLES = [pytest.param(function, "table", marks=pytest.mark.slow) for function in OBJECTS[2:]]
-
-
-@pytest.mark.parametrize(("function", "law"), FORMULAS + TABLES)
-def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any], law: str):
-    scenes = scenes_with(law)
-    batch = np.asarray(jax.jit(jax.vmap(function))(stacked(scenes)))
+@pytest.mark.parametrize("function", OBJECTS)
+def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any]):
+    batch = np.asarray(jax.jit(jax.vmap(function))(stacked(scenes())))
     assert np.all(np.isfinite(batch))
-    for row, scene in zip(batch, scenes, strict=True):
+    for row, scene in zip(batch, scenes(), strict=True):
         # Compiled code fuses multiply and add; the condition of an impact is below 1e3, of a trace near capture 1e4.
         np.testing.assert_allclose(function(scene), row, rtol=1e-11)
     assert not np.allclose(batch[0], batch[1])
@@ -115,9 +109,9 @@ def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any], law:
 
 @pytest.mark.parametrize("function", OBJECTS[:6])
 def test_single_precision_goes_as_far_as_it_can(function: Callable[[Scene], Any], monkeypatch: pytest.MonkeyPatch):
-    double = np.asarray(function(scenes_with("formula")[0]))
+    double = np.asarray(function(scenes()[0]))
     monkeypatch.setattr("afm_jax.checks._NARROW", set())
-    narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scenes_with("formula")[0])
+    narrow = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scenes()[0])
     single = np.asarray(function(narrow))
     assert single.dtype == np.float32
     assert np.all(np.isfinite(single))
@@ -132,7 +126,7 @@ def built_in_many_ways() -> list[tuple[Scene, Any, Any]]:
         delay = CollisionDelay(number(1), number(6), number(2), corrections=False)
         law = ImpactLaw(r=number(1), epsilon=number(100), viscous_loss=number(1), delay=delay)
         scene = Scene(Cantilever(number(90), number(40)), Platform(number(4), number(181), number(-1)), law)
-        ways += [(scene, 4, 60), (scenes_with("formula")[len(ways) % 3], number(4), number(60))]
+        ways += [(scene, 4, 60), (scenes()[len(ways) % 3], number(4), number(60))]
     return ways
 
 
@@ -154,8 +148,8 @@ def test_one_compilation_serves_all_values_and_tables_of_one_length():
     ways = [(scene, jnp.asarray(t, float), jnp.asarray(v, float)) for scene, t, v in built_in_many_ways()]
     for function in (next_impact, map_jacobian):
         assert traces(function, ways) == 1
-    scenes = [tabulated(scene, origin=f"table {row}") for row, scene in enumerate(scenes_with("formula"))]
-    assert traces(impact_law, [(scene,) for scene in scenes]) == 1
+    tables = [tabulated(scene, origin=f"table {row}") for row, scene in enumerate(scenes())]
+    assert traces(impact_law, [(scene,) for scene in tables]) == 1
 
 
 @pytest.mark.slow
@@ -221,7 +215,7 @@ ASKING: list[Callable[[Any], Any]] = [
 def test_what_was_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Any], Any]):
     with jax.enable_x64(False):  # noqa: FBT003
         early, contact = bouncing(), Contact.paper()
-    late = scenes_with("formula")[0]
+    late = scenes()[0]
     law = Scene(late.cantilever, early.platform, late.interaction)
     for scene in (early, law) if call in ASKING[:2] else (Scene(late.cantilever, late.platform, contact),):
         with pytest.raises(

@@ -9,7 +9,6 @@ from click.testing import CliRunner
 from afm_jax.cli.main import main
 from fitting import fit, read_table
 from tests.answers import answer as answer_of
-from tests.answers import table as records
 from tests.fit_tables import EXAMPLE, rows
 from tests.strict_reading import strictly
 
@@ -42,31 +41,6 @@ def test_json_holds_points_and_what_they_promise(reported):
         assert answer["points"][-1]["standard_errors"][name] == answer["expected"][name]["standard_error"]
     assert answer["measured_so_far"]["quality_factor"]["standard_error"] == pytest.approx(0.4)
     assert any("epsilon" in warning and "taken from the paper" in warning for warning in answer["warnings"])
-
-
-def test_report_is_written(reported):
-    answer, folder = reported
-    points = records(folder / "design.csv")
-    for point, wanted in zip(points, answer["points"], strict=True):
-        assert {name: float(text) for name, text in point.items()}.items() <= wanted.items()
-    assert sorted(path.name for path in folder.iterdir() if path.name.startswith("design")) == [
-        "design.csv",
-        "design.json",
-        "design.png",
-    ]
-
-
-def test_a_saved_fit_is_added_to(tmp_path):
-    result = fit(rows(read_table(EXAMPLE), slice(0, 20)), "law")
-    path = tmp_path / "fit.json"
-    path.write_text(json.dumps(result.to_dict()), encoding="utf-8")
-    found = run("--fit", path, *FEW, "--for", "epsilon", "--points", 4, "--json")
-    assert found.exit_code == 0, found.stderr
-    answer = strictly(found.stdout)
-    assert (answer["model"], answer["interest"]) == ("law", ["epsilon"])
-    before, after = (answer[when]["epsilon"]["standard_error"] for when in ("measured_so_far", "expected"))
-    assert before == pytest.approx(result.parameters["epsilon"].standard_error, rel=1e-6)
-    assert after < before
 
 
 def test_what_was_measured_is_not_planned_again(tmp_path):

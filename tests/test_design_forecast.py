@@ -19,7 +19,7 @@ from tests.fit_tables import table_of
 
 pytestmark = pytest.mark.slow
 
-EXPERIMENTS = 200
+EXPERIMENTS = 60
 STEPS = 8
 VALUES = {"r": 0.99, "epsilon": 122.0, "delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726}
 

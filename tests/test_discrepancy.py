@@ -9,12 +9,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from afm_jax.impact.law_table import coordinate_of
-from afm_jax.units import EV_PER_AJ, TWO_SIDED_95
+from afm_jax.units import EV_PER_AJ
 from fitting import fit
 from fitting.infer.closest import closest_parameters
 from fitting.infer.explain import Explained, run_of_residuals
 from fitting.infer.fit import explained_of, model_of
-from fitting.infer.law import LawWithErrors, containing
 from fitting.infer.result import EnergyLost, Loss, WithInterval, interval_of, scaled
 from fitting.infer.rows import remainders_of, weights_of
 from fitting.infer.search import Descent, Found, orbits_at
@@ -171,21 +170,6 @@ def test_residuals_that_run_together_over_the_speed_are_seen(explained):
     assert runs[2] > 10.0
 
 
-def test_a_band_holds_that_of_another_law_too():
-    factor = np.array([[[0.3, 0.4], [0.0, 1.0]], [[0.1, 0.0], [0.2, 0.0]]])
-    one = LawWithErrors(np.array([[10.0, 20.0], [0.1, 0.2]]), factor, 5.0, np.array([0.1, 0.0]))
-    other = LawWithErrors(one.law + np.array([[0.5, -3.0], [0.0, 0.01]]), 2.0 * factor, 5.5, np.array([0.0, 0.2]))
-    both = containing(one, other)
-    for law in (one, other):
-        own, mine = (np.linalg.norm(x.factor, axis=2) * TWO_SIDED_95 for x in (law, both))
-        assert np.all(both.law - mine <= law.law - own + 1e-9)
-        assert np.all(both.law + mine >= law.law + own - 1e-9)
-        reach = TWO_SIDED_95 * np.linalg.norm(law.capture_factor)
-        assert both.capture + TWO_SIDED_95 * np.linalg.norm(both.capture_factor) >= law.capture + reach - 1e-9
-    same = containing(one, one._replace(factor=0.5 * factor))
-    np.testing.assert_allclose(same.factor, one.factor)
-
-
 def precise(seed: int) -> AmplitudeTable:
     """Return the amplitudes of the full scene at the paper's contact with 0.3 % of noise."""
     exact = dataclasses.replace(paper_experiment().exact, phase_deg=None, phase_error_deg=None)
@@ -193,6 +177,7 @@ def precise(seed: int) -> AmplitudeTable:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_scipy_finds_the_same_minimum_with_everything_free():
     """From half an error away, by differences, every row's orbits searched for anew each time."""
     result = fit(drives(), "law+delay")

@@ -3,7 +3,6 @@
 from itertools import product
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.continuation import continue_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of
-from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
@@ -184,24 +182,6 @@ def test_at_higher_order_the_drives_frequency_is_read_as_a_direct_integration_ha
 
 
 @pytest.mark.slow
-def test_jacobian_trace_and_determinant_are_those_of_automatic_differentiation():
-    scene = driven("force", INSTANT, 1.03, 60.0, -40.0, 200.0)
-    found = single_impact_orbits(scene, 1)
-    slot = fastest(found)
-    start = started(scene, found, slot)
-    at = jnp.stack([start.time_us, start.velocity_nm_per_us])
-
-    def after(state):
-        impact = next_impact(scene, *state)
-        return jnp.stack([impact.time_us, impact.velocity_after_nm_per_us])
-
-    jacobian = np.asarray(map_jacobian(scene, *at))
-    np.testing.assert_allclose(jacobian, jax.jacfwd(after)(at), rtol=1e-9)
-    assert np.trace(jacobian) == pytest.approx(float(found.trace[slot]), rel=1e-9)
-    assert np.linalg.det(jacobian) == pytest.approx(float(found.determinant[slot]), rel=1e-9)
-
-
-@pytest.mark.slow
 def test_sample_and_force_of_one_frequency_drive_together():
     """An orbit of both is one of those that the search from many starts finds, peak and stability included."""
     scene = driven("force", INSTANT, 1.03, 60.0, -40.0, 200.0)
@@ -228,10 +208,9 @@ def test_drives_of_several_frequencies_have_no_single_orbit():
             single_impact_orbits(Scene(cantilever, sample, INSTANT, force=force), 1)
 
 
-@pytest.mark.parametrize("path", ["base.frequency_khz", "base.reduced_frequency", "platform.frequency_khz"])
-def test_a_frequency_that_two_parts_share_is_no_range_and_is_told_so(path: str):
+def test_a_frequency_that_two_parts_share_is_no_range_and_is_told_so():
     scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 182.0), INSTANT, base=BaseDrive(0.5, 182.0))
-    low, high = (1.0, 1.02) if "reduced" in path else (180.0, 184.0)
+    path, low, high = "base.frequency_khz", 180.0, 184.0
     why = "several frequencies, so .* moves one part's alone: give"
     with pytest.raises(ValueError, match=why):
         continue_orbits(scene, 1, ParameterRange(path, low, high))

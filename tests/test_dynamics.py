@@ -1,21 +1,13 @@
 """Bifurcation diagrams, charts and basins against plain loops over the map, single tips and closed forms."""
 
-import csv
-from pathlib import Path
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import afm_jax as afm
-from afm_jax.cli.main import main
 from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
-from afm_jax.dynamics.starts import bouncing_tips
-from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
+from afm_jax.scenefile.parameter_paths import scene_family
 
 FREQUENCY = "platform.reduced_frequency"
 
@@ -141,27 +133,6 @@ def test_ranges_as_texts_are_those_of_the_command():
 
 
 @pytest.mark.slow
-def test_many_tips_begin_on_the_fastest_stable_orbit_of_the_full_search():
-    delay = afm.CollisionDelay(0.20774, 5.3795, 0.79532)
-    law = afm.ImpactLaw(1.0, 111.5, 0.55, delay)
-    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 181.8, 0.5), law)
-    values = np.linspace(0.9, 2.6, 100)
-    scenes = scene_batch(scene, {FREQUENCY: values})
-    tips = bouncing_tips(scenes)
-    found = jax.vmap(afm.single_impact_orbits)(scenes, jnp.maximum(1.0, jnp.round(jnp.asarray(values))))
-    steady = np.asarray(found.exists & found.admissible & found.stable)
-    slot = np.argmax(np.where(steady, found.approach_speed_nm_per_us, -np.inf), axis=1)
-    there, rows = steady.any(axis=1), np.arange(len(values))
-    assert 0.3 < there.mean() < 1.0
-    omega = np.asarray(scenes.platform.angular_frequency)
-    usual = 0.75 * np.asarray(scenes.platform.period_us)
-    time = np.where(there, np.asarray(found.phase_rad)[rows, slot] / omega, usual)
-    np.testing.assert_allclose(tips.time_us, time, rtol=1e-9)
-    velocity = np.asarray(found.velocity_after_nm_per_us)[rows, slot]
-    np.testing.assert_allclose(np.asarray(tips.velocity_nm_per_us)[there], velocity[there], rtol=1e-9)
-
-
-@pytest.mark.slow
 def test_shares_of_basins_are_those_of_random_starts():
     scene = law_scene(1.57)
     found = basins_of_attraction(scene, columns=100, rows=100, speeds_nm_per_us=(0.0, 15.0))
@@ -174,21 +145,3 @@ def test_shares_of_basins_are_those_of_random_starts():
     for attractor, share, error in zip(found.attractors, found.share, found.share_error, strict=True):
         other = np.mean(m == attractor.impacts)
         assert abs(share - other) < 4.0 * np.hypot(error, np.sqrt(other * (1.0 - other) / starts))
-
-
-@pytest.mark.slow
-def test_a_chart_is_written_as_a_table(tmp_path: Path):
-    file = tmp_path / "scene.toml"
-    afm.save_scene(law_scene(1.57), file)
-    options = ["--x", f"{FREQUENCY}=0.5:2.5:9", "--y", "platform.amplitude_nm=1:3:3", "--orders", "2"]
-    run = CliRunner().invoke(main, ["chart", str(file), *options, "--out", str(tmp_path)])
-    assert run.exit_code == 0, run.stderr
-    with (tmp_path / "chart.csv").open(encoding="utf-8") as table:
-        rows = list(csv.DictReader(table))
-    x, y = np.linspace(0.5, 2.5, 9), np.linspace(1.0, 3.0, 3)
-    plane = scene_family(law_scene(1.57), FREQUENCY, "platform.amplitude_nm")
-    verdicts = stability_chart(plane, x_values=x, y_values=y, last_order=2).verdicts
-    for name in ("stable", "admissible"):
-        for number, order in enumerate(getattr(verdicts, name), 1):
-            assert order.ravel().tolist() == [row[f"{name}_{number}"] == "true" for row in rows]
-    np.testing.assert_array_equal(np.tile(x, 3), [float(row[FREQUENCY]) for row in rows])

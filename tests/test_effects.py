@@ -163,14 +163,11 @@ def test_a_scene_pays_only_for_its_effects():
         program = jax.jit(lambda one: simulate(one, begin, 10.0, max_contacts=8)).lower(scene)
         return (program.cost_analysis() or {})["flops"]
 
-    platform = Platform(4.0, 181.8, 0.0, 1e-3, Tone(1.0, 47.0))
-    base = BaseDrive(0.1, 90.0, 0.0, Tone(1.0, 33.0))
-    scene = Scene(Cantilever(90.0, 40.0), platform, LAW, base)
+    scene = law_scene()
     whole = operations(scene)
     known = {effect.name: effect for effect in effects_in(scene)}
     assert operations(known["adhesion"].without(scene)) == whole
-    for name in ("delay", "base_second_frequency"):
-        assert operations(known[name].without(scene)) < whole
+    assert operations(known["delay"].without(scene)) < whole
 
 
 def contact_study(viscosity_pa_s: float, only: list[str]) -> EffectStudy:

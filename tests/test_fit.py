@@ -106,6 +106,7 @@ def test_full_law_is_found_from_its_amplitudes(table):
     assert found.chi2 < 1e-3
 
 
+@pytest.mark.slow
 def test_scaled_errors_bring_chi2_to_its_degrees_of_freedom(table):
     amplitude, error = amplitudes_and_errors(table)
     wide = with_amplitudes(table, amplitude, 3.0 * error)

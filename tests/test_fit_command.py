@@ -115,6 +115,7 @@ def test_damping_must_be_said_and_energies_need_a_mass(tmp_path, reported):
     assert energy["value"] == pytest.approx(0.5 * mass * (u**2 * (1.0 - r**2) + epsilon), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_repeated_readings_count_and_tell_the_error(tmp_path):
     table = read_table(EXAMPLE)
     # every row twice, the second reading two errors of the peak and one of the lock-in larger

@@ -5,7 +5,7 @@ import itertools
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
@@ -62,6 +62,7 @@ def test_kelvin_radius_is_054_nm_over_ln_2():
     assert float(Liquid().kelvin_radius_nm) == pytest.approx(0.54 / np.log(2.0), rel=1e-6)  # V_m has 6 digits
 
 
+@settings(max_examples=20)
 @given(
     st.permutations([Capillary(), Structural(), CoreRepulsion(), Viscous()]),
     st.floats(0.1, 5.0),

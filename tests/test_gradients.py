@@ -117,13 +117,6 @@ def test_it_agrees_with_extrapolated_differences_of_orbits_searched_for(model, v
     np.testing.assert_allclose(off, 0.0, atol=2e-6)
 
 
-def test_more_rows_than_a_program_takes_change_nothing():
-    many = tuple((1, 176.0 + 0.2 * i, 4.0, 0.0) for i in range(45))
-    whole, part = (amplitude_gradients(table_of(*rows), "law", LAW) for rows in (many, many[40:]))
-    assert whole.gradient.shape == (45, 2, 3)
-    np.testing.assert_allclose(whole.gradient[40:], part.gradient, rtol=1e-12)  # other lanes, other rounding
-
-
 def test_without_an_orbit_it_says_so():
     found = amplitude_gradients(table_of(ROWS[0], (1, 181.8, 0.1, 0.0)), "law", LAW)
     assert found.reasons == (None, NO_ORBIT)

@@ -44,6 +44,7 @@ def test_contradictions_about_what_is_held_are_refused(fixed, pair, said):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_error_of_what_is_held_adds_to_that_of_what_does_the_same():
     """Humidity and temperature act through the Kelvin length alone, which goes as 1/(T ln(1/h))."""
     free, table = ("relative_humidity",), rows(drives(), slice(0, None, 2))

@@ -129,19 +129,6 @@ def test_no_module_is_imported_by_its_name_as_a_text_to_get_round_the_order():
     assert {place for place in places if not {place, place.split("/")[0]} & BY_TEXT} == set()
 
 
-def test_a_call_needs_few_files():
-    # five because results are written into files; a simulation starts on an orbit that a contact's law predicts
-    contacts = {"afm_jax.contact.collide": 33, "afm_jax.motion.simulate": 50}
-    for module, most in {**contacts, "afm_jax.studies.effects": 57, "fitting.infer.fit": 69}.items():
-        files, ahead = {module}, [module]
-        while ahead:
-            further = needs()[ahead.pop()] - files
-            files |= further
-            ahead += further
-        assert "afm_jax.results" in files
-        assert len(files) <= most, sorted(files)
-
-
 def test_no_two_classes_have_one_name():
     found: dict[str, list[str]] = {}
     for path in LIBRARY:

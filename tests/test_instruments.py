@@ -467,14 +467,13 @@ def damaged(data: bytes, random: np.random.Generator) -> bytes:
 @pytest.mark.parametrize(
     "whole",
     [
-        *(NEASNOM.read_bytes, AMPLITUDES.read_bytes, THERMAL.read_bytes, asylum_ramp),
-        lambda: nanonis_ramp().encode(),
-        lambda: with_units_in_names(";", ".").encode(),
+        # texts are spoiled by `tests.fuzz`
+        *(AMPLITUDES.read_bytes, THERMAL.read_bytes, asylum_ramp),
     ],
 )
 def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, whole, capfd: pytest.CaptureFixture[str]):
     random, data = np.random.default_rng(20260), whole()
-    for _ in range(40):
+    for _ in range(20):
         path = saved(tmp_path, damaged(data, random))
         fault, curves = str(path), []
         try:
@@ -485,29 +484,6 @@ def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, whole, capfd: py
         assert "\n" not in fault
         assert all(np.all(np.isfinite(curve.offset_nm)) for curve in curves)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize(
-    ("head", "channel", "said"),
-    [
-        ("# ImagingMode: PFM Mode\n", "Defl (V)", "mode 'PFM Mode'"),
-        ("# mode = bimodal\n", "Defl (V)", "mode 'bimodal'"),
-        ("# Operating mode = Lateral Force\n", "Defl (V)", "mode 'Lateral Force'"),
-        ("# mode = FM\n", "Defl (V)", "mode 'FM'"),
-        ("", "Amp2 (V)", "channel 'Amp2'"),
-        ("", "Lateral Amplitude (V)", "channel 'Lateral Amplitude'"),
-        ("# ImagingMode: AC Mode\n", "Defl (V)", ""),
-        ("# mode = Intermittent contact\n", "Defl (V)", ""),
-    ],
-)
-def test_files_that_say_another_mode_are_refused_by_name(tmp_path: Path, head: str, channel: str, said: str):
-    columns = {"Z (nm)": OFFSET, "Amp (nm)": AMPLITUDE, "Phase (deg)": LAG, channel: LAG}
-    path = saved(tmp_path, head + separated(columns))
-    if not said:
-        assert read_curve(path).valid
-        return
-    with pytest.raises(TableError, match=f"{said}.*amplitude modulation"):
-        read_curve(path)
 
 
 def test_tapping_takes_a_curve_that_was_read_and_its_file_alike():

@@ -1,14 +1,12 @@
 """Direct inversion of amplitudes and phases, against collisions of free tips and orbits in closed form."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting.inversion.invert import Inversion, invert
-from fitting.predict.orbit import _evaluated
 from fitting.simulated.experiment import with_noise
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
@@ -192,12 +190,3 @@ def test_rows_that_give_nothing_are_named():
     assert np.isnan(impacts(found)[[1, 3]]).all()
     with pytest.raises(TableError, match="no row has a phase with an amplitude; add the columns phase_deg"):
         invert(dataclasses.replace(table, phase_deg=None, phase_error_deg=None))
-
-
-def test_one_program_serves_tables_of_any_length():
-    programs: tuple[Any, ...] = (vars(_evaluated)["outside"](),)
-    table, _ = law_table(ImpactLaw(0.95, 60.0), 40.0, LAW_ROWS)
-    assert invert(table).valid
-    before = [program._cache_size() for program in programs]
-    assert invert(noisy(3, 0.1)).valid
-    assert [program._cache_size() for program in programs] == before

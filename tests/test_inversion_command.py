@@ -10,7 +10,6 @@ from afm_jax.cli.main import main
 from fitting import read_table, write_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE
 from tests.answers import answer as answer_of
-from tests.answers import table as records
 from tests.fit_tables import rows
 from tests.strict_reading import strictly
 
@@ -40,19 +39,6 @@ def test_json_holds_rows_and_lines_near_the_truth(reported):
     # 0.1 % is what 1 % and 0.1 degree allow
     np.testing.assert_allclose(found, [38.2958, 58.7902, 99.1735], rtol=1e-3)
     assert abs(line["epsilon"] - 113.6) < 3.0 * line["epsilon_error"]
-
-
-def test_files_are_written(reported):
-    answer, folder = reported
-    assert {path.name for path in folder.iterdir()} == {"invert.csv", "invert.json", "invert.png"}
-    told_rows = records(folder / "invert.csv")
-    assert len(told_rows) == 57
-    slow = [row["note"] for row in told_rows if row["in_lines"] == "false"]
-    assert slow
-    assert all("slower than 2.5 sqrt(epsilon)" in note for note in slow)
-    assert [float(row["rebound_speed_nm_per_us"]) for row in told_rows] == [
-        row["rebound_speed_nm_per_us"] for row in answer["rows"]
-    ]
 
 
 def test_two_rows_end_with_exit_code_3(tmp_path: Path):

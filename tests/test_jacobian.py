@@ -39,9 +39,8 @@ def test_written_and_automatic_jacobians_have_twelve_digits(name, start):
         np.testing.assert_allclose(found, exact, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["paper", "damped"])
-def test_second_derivatives_of_the_impact_time_have_nine_digits(name):
-    p, scene, (time, velocity) = SCENES[name], scene_of(SCENES[name]), STARTS[0]
+def test_second_derivatives_of_the_impact_time_have_nine_digits():
+    p, scene, (time, velocity) = SCENES["damped"], scene_of(SCENES["damped"]), STARTS[0]
     guess = float(next_impact(scene, time, velocity).arrival_time_us)
 
     def arrival(t, v):
@@ -60,7 +59,7 @@ def test_second_derivatives_of_the_impact_time_have_nine_digits(name):
         np.testing.assert_allclose(hessian[0, 1], hessian[1, 0], rtol=1e-10)
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=20)
 @given(r=st.floats(0.3, 1.0), phase=st.floats(0.0, 6.0), velocity=st.floats(-100.0, -30.0))
 def test_equation_7_without_adhesion_is_that_of_equation_1(r, phase, velocity):
     platform = Platform(amplitude_nm=2.0, frequency_khz=180.0)
@@ -75,8 +74,9 @@ def _cubic(x, p):
     return x**3 + p * x - 1.0
 
 
-@pytest.mark.parametrize("p", [0.5, 2.0])
-def test_implicit_root_differentiates_twice_in_both_modes(p):
+def test_implicit_root_differentiates_twice_in_both_modes():
+    p = 0.5
+
     def root(value):
         found = jax.lax.stop_gradient(jnp.real(jnp.roots(jnp.array([1.0, 0.0, p, -1.0]), strip_zeros=False)))
         x = found[jnp.argmin(jnp.abs(found**3 + p * found - 1.0))]

@@ -8,17 +8,12 @@ import pytest
 import afm_jax as afm
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
-from fitting.infer.closest import closest_parameters
-from fitting.infer.explain import freed
 from fitting.infer.fit import model_of
 from fitting.infer.result import FitResult
 from fitting.infer.rows import plain_weights, weights_of
-from fitting.infer.search import Followed, begun, orbits_at
-from fitting.infer.summary import Fitted, convergence_of, intervals_of
+from fitting.infer.search import Followed, orbits_at
 from fitting.infer.unknowns import Model
 from fitting.models import task_of
-from fitting.parameters import MODELS
-from fitting.predict.law import SMOOTH
 from fitting.simulated.experiment import simulate_experiment
 from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment
@@ -139,43 +134,6 @@ def test_orbits_that_would_grow_cost_and_chi2_has_the_slope_of_its_gradient():
         assert 2.0 * here.jacobian[:, i] @ here.residual == pytest.approx(slope, rel=1e-4, abs=1e-3)
 
 
-@pytest.mark.parametrize("far", [0.3, 1.0, 4.0])
-def test_an_interval_of_epsilon_holds_the_value_beside_it(shared, far):
-    """The value is the closest formula's, the profile the unknown's: a made-up one is narrow, and the value far off."""
-    model = model_for(shared, "law+delay")
-    explained = freed(model, begun(model), np.zeros(shared.rows, bool), (SMOOTH,))
-    closest = closest_parameters(explained, MODELS["law+delay"], {})
-    place, end = model.names.index("epsilon"), explained.end
-    values, factor = closest.values.copy(), closest.factor.copy()
-    at = closest.names.index("epsilon")
-    values[at] *= far
-    factor[at] *= 0.5 * values[at] / closest.errors[at]
-    there = convergence_of(explained, "none", 0)
-    narrow = Fitted(explained, explained, None, lambda _, of, y: end.chi2 + (50.0 * (y - end.theta[of])) ** 2, there)
-    interval = intervals_of(narrow, closest._replace(values=values, factor=factor))[at]
-    assert interval.kind == "profile"
-    assert interval.low <= values[at] <= interval.high
-    # and what the profile allows
-    low, high = np.exp(end.theta[place] + np.array([-1.96, 1.96]) / 50.0)
-    assert interval.low <= 1.001 * low
-    assert interval.high >= 0.999 * high
-
-
-def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):
-    model = model_for(shared, "viscous+delay")
-    best = at(model, {name: parameter.value for name, parameter in viscous.parameters.items()})
-    for share in np.linspace(-0.03, 0.03, 5):
-        theta = best + np.log1p(share) * (np.arange(best.size) < len(model.law.own))
-        searched = orbits_at(model, theta)
-        # from orbits a little away the same are reached where there are any
-        near = orbits_at(model, theta + 3e-3 * (np.arange(best.size) < len(model.law.own)))
-        followed = model.follow(theta, near.orbits.x)
-        there = searched.exists & near.exists
-        assert there.mean() > 0.98
-        same = np.abs(followed.readings / searched.orbits.readings - 1.0)[there, :2] < 1e-6
-        assert same.mean() > 0.99
-
-
 def test_the_contact_is_read_off_the_shared_table(shared):
     result = fit(shared, model="contact")
     assert law_error(result) < 0.0035
@@ -185,11 +143,13 @@ def test_the_contact_is_read_off_the_shared_table(shared):
         assert abs(parameter.value - truth) < 4.0 * (parameter.standard_error or 0.0)
 
 
+@pytest.mark.long
 def test_without_noise_the_law_is_sharp():
     result = fit(paper_experiment().exact, model="contact")
     assert law_error(result) < 0.0012
 
 
+@pytest.mark.long
 def test_another_contact_without_noise():
     made = simulate_experiment(afm.Contact.paper(relative_humidity=0.35), afm.Cantilever(90.0, 150.0), example_drives())
     result = fit(made.exact, model="viscous+delay")

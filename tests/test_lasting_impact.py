@@ -271,12 +271,10 @@ def check_against_collisions(numbers: dict[str, Any]) -> bool:
     return True
 
 
-@pytest.mark.parametrize(
-    ("seed", "count", "with_junction"), [(11, 12, 10), pytest.param(12, 60, 57, marks=pytest.mark.slow)]
-)
-def test_random_contacts_are_tabulated_from_capture_on(seed, count, with_junction):
-    rng = np.random.default_rng(seed)
-    assert sum(check_against_collisions(random_contact(rng)) for _ in range(count)) >= with_junction
+@pytest.mark.slow
+def test_random_contacts_are_tabulated_from_capture_on():
+    rng = np.random.default_rng(11)
+    assert sum(check_against_collisions(random_contact(rng)) for _ in range(12)) >= 10
     assert check_against_collisions(WET)
 
 

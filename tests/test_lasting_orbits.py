@@ -44,9 +44,10 @@ def speeds_found(problem: OrbitProblem) -> np.ndarray:
     return np.sort(np.asarray(speeds)[np.asarray(roots.found)])
 
 
+@pytest.mark.slow
 def test_without_a_duration_they_are_the_instantaneous_laws():
     count, laws = 0, itertools.cycle([(0.9, 60.0, 0.0), (0.95, 0.0, 0.0), (1.0, 60.0, 2.0)])
-    for (order, reduced, amplitude, offset), (r, epsilon, loss) in zip(DRIVES, laws, strict=False):
+    for (order, reduced, amplitude, offset), (r, epsilon, loss) in zip(DRIVES[:3], laws, strict=False):
         p = scene(reduced, amplitude_nm=amplitude, offset_nm=offset, r=r, epsilon=epsilon, viscous_loss=loss)
         found = steady(problem_of(p, order, delay=CollisionDelay(0.0, 0.0, 0.0)))
         orbits = afm.single_impact_orbits(scene_of(p), order)
@@ -55,7 +56,7 @@ def test_without_a_duration_they_are_the_instantaneous_laws():
         # the closing conditions are written differently: rounding near resonance
         np.testing.assert_allclose(np.asarray(found.amplitude_nm)[np.asarray(found.steady), :2], expected, rtol=1e-9)
         count += len(expected)
-    assert count > len(DRIVES) // 2
+    assert count > 1
 
 
 @pytest.mark.parametrize("drive", DRIVES[::2])
@@ -123,6 +124,12 @@ def test_following_leads_to_the_root_that_a_search_finds(drive):
 def test_steady_orbits_and_folds_are_those_of_jacobian_and_closing_condition():
     unstable = folds = 0
 
+    @jax.jit
+    def judged(place, problem: OrbitProblem):
+        flight = orbit_state(place, problem).flight
+        parts = trace_and_determinant(problem.impact, problem.cantilever, problem.platform, flight)
+        return contracts(*parts), near_fold(place.coordinate, problem)
+
     def driven(amplitude: float) -> OrbitProblem:
         return problem_of(delayed(1, 0.97, amplitude, 0.0)[0], 1)
 
@@ -131,15 +138,13 @@ def test_steady_orbits_and_folds_are_those_of_jacobian_and_closing_condition():
     for _ in range(20):
         middle = 0.5 * (nothing + weakest)
         nothing, weakest = (nothing, middle) if bool(find(driven(middle)).found.any()) else (middle, weakest)
-    for amplitude in (weakest, weakest + 1e-6, weakest + 1e-4, 2.2, 2.5, 4.0, 8.0):
+    for amplitude in (weakest, weakest + 1e-6, 2.5, 8.0):
         problem = driven(amplitude)
         roots, steady_ones = find(problem), steady(problem)
         for slot in np.flatnonzero(roots.found):
             place = jax.tree.map(lambda leaf, slot=slot: leaf[slot], roots.place)
-            state = orbit_state(place, problem)
-            parts = trace_and_determinant(problem.impact, problem.cantilever, problem.platform, state.flight)
-            stable = bool(contracts(*parts))
-            assert bool(roots.near_fold[slot]) == bool(near_fold(place.coordinate, problem))
+            stable, fold = (bool(part) for part in judged(place, problem))
+            assert bool(roots.near_fold[slot]) == fold
             assert stable or not bool(steady_ones.steady[slot])
             unstable, folds = unstable + (not stable), folds + bool(roots.near_fold[slot])
     assert unstable > 0

@@ -10,9 +10,8 @@ import pytest
 import afm_jax as afm
 from afm_jax import CollisionDelay, ImpactLaw, TabulatedLaw
 from afm_jax.cli.scenes import as_drawn, with_fitted_law
-from afm_jax.dynamics.charts import batch_of_scenes
 from afm_jax.scenefile.law_files import save_law_csv
-from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
+from afm_jax.scenefile.parameter_paths import scene_family
 from tests.test_scenefile import CANTILEVER, PLATFORM
 
 WET = ImpactLaw(0.9999, 114.0, 0.48, CollisionDelay(0.206, 5.64, 0.726))
@@ -136,27 +135,3 @@ def test_a_scene_and_one_with_a_drawn_law_run_in_the_same_programs(tmp_path):
     assert jax.tree.structure(as_drawn(made)) == jax.tree.structure(one)
     assert jax.tree.map(jax.numpy.shape, as_drawn(made)) == jax.tree.map(jax.numpy.shape, one)
     assert as_drawn(scene) is scene
-
-
-def test_batches_of_scenes_are_compiled_once(law):
-    scene, frequency = (
-        afm.Scene(afm.Cantilever(90.0, 40.0, 1.5), afm.Platform(4.0, 181.8), law),
-        np.linspace(1.0, 1.2, 5),
-    )
-    compiled = []
-
-    def called_again() -> None:
-        found = scene_batch(scene, {"platform.reduced_frequency": frequency, "interaction.unknown_1": frequency})
-        np.testing.assert_allclose(found.platform.frequency_khz, 180.0 * frequency, rtol=1e-14)
-        made = batch_of_scenes(scene_family(scene, "platform.amplitude_nm"), frequency)
-        np.testing.assert_array_equal(made.platform.amplitude_nm, frequency)
-
-    called_again()
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None
-    )
-    try:
-        called_again()
-    finally:
-        jax.monitoring.clear_event_listeners()
-    assert not compiled

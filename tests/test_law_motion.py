@@ -69,7 +69,7 @@ def test_flights_and_impacts_are_those_of_the_map(changes):
     ("system", "start"),
     [
         (LawSystem(Cosines(-1.0, 0.0, ((4.0, 181.8, 0.0),)), 0.99, 50.0, quality_factor=40.0), (1.3, 25.0, -7.0)),
-        (DRIVEN, (0.4, 18.0, 3.0)),
+        pytest.param(DRIVEN, (0.4, 18.0, 3.0), marks=pytest.mark.slow),
     ],
     ids=["platform", "every drive"],
 )

@@ -14,8 +14,7 @@ from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum
 from afm_jax.dynamics.many_tips import Record, recorded, tips_after_contacts
 from afm_jax.dynamics.starts import batch_and_tips
 from afm_jax.motion.record import State
-from afm_jax.motion.start import default_start, start_of, state
-from afm_jax.outcomes import Outcome
+from afm_jax.motion.start import default_start, start_of
 from afm_jax.scenefile.parameter_paths import scene_batch
 from tests.test_dynamics import law_scene
 
@@ -130,21 +129,6 @@ def test_a_motion_that_stays_on_an_unstable_orbit_is_undecided():
 
 
 @pytest.mark.slow
-def test_a_start_at_rest_on_the_platform_is_let_go_or_held():
-    # undamped, the platform stops pressing after three quarters of a period, where it is fastest
-    platform = afm.Platform(4.0, 181.8)
-    scene = afm.Scene(afm.Cantilever(90.0), platform, afm.ImpactLaw(0.5))
-    period = float(platform.period_us)
-    _, tips = batch_and_tips(scene, state(0.5 * period, -4.0, 0.0))
-    assert tips.outcome.tolist() == [Outcome.IMPACT]
-    assert float(tips.time_us[0]) == pytest.approx(0.75 * period, abs=1e-3 * period)
-    assert float(tips.velocity_nm_per_us[0]) == pytest.approx(float(platform.top_speed_nm_per_us), rel=1e-3)
-    pressed = afm.Scene(scene.cantilever, afm.Platform(1.0, 30.0, 3.0), scene.interaction)
-    _, tips = batch_and_tips(pressed, state(0.0, 4.0, 0.0))
-    assert tips.outcome.tolist() == [Outcome.CAPTURED]
-
-
-@pytest.mark.slow
 @pytest.mark.long
 def test_the_contact_is_chaotic_at_high_frequency():
     scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0 * 5.277), afm.Contact.paper())
@@ -171,19 +155,6 @@ def test_the_contact_is_chaotic_at_high_frequency():
     grown = growth(scene, one, other, slow, fast)
     assert np.isfinite(grown).all()
     assert np.mean(grown) == pytest.approx(larger, abs=4.0 * np.hypot(error, np.std(grown) / np.sqrt(few)))
-
-
-@pytest.mark.slow
-def test_contacts_that_a_captured_tip_does_not_have_are_told_as_none():
-    # every contact takes some speed, until the tip is slower than the 10.9 nm/us that the bridge keeps
-    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(0.5, 180.0), afm.Contact.paper())
-    scenes, tips = batch_and_tips(scene, start_of(scene, (270.0, 5.0, 60.0)))
-    tips, record = tips_after_contacts(scenes, tips, skip=0, record=100, accuracy=1e-6)
-    assert tips.outcome.tolist() == [Outcome.CAPTURED]
-    left = np.isfinite(record.departure_us[0])
-    assert 5 < left.sum() < 40
-    assert not np.any(left[:60])
-    assert all(np.array_equal(np.isfinite(part[0]), left) for part in record[:6])
 
 
 @pytest.mark.slow

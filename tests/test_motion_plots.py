@@ -37,9 +37,10 @@ def drawn(scene: Scene, found: Simulation, folder: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def bouncing():
     scene = presets.contact_scene(1.01, 4.0, 0.0)
-    return scene, simulate(scene, default_start(scene), 120.0)
+    return scene, simulate(scene, default_start(scene), 60.0)
 
 
+@pytest.mark.slow
 def test_the_stretch_shown_ends_with_whole_contacts(bouncing):
     scene, found = bouncing
     look = look_at(scene, found)
@@ -68,6 +69,7 @@ def test_a_free_cantilever_has_the_line_of_its_drive(tmp_path: Path):
     assert spectrum.amplitude_nm[line] == pytest.approx(0.5 * abs(response), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_batches_and_empty_simulations_are_refused(bouncing, tmp_path: Path):
     scene, found = bouncing
     for changes, said in (({"count": jnp.array([1, 2])}, "pick one of"), ({"final": found.start}, "nothing to draw")):

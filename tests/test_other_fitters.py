@@ -1,4 +1,4 @@
-"""Other programs on chi2 of the paper's map: the same minimum from eight starts, the same errors and intervals."""
+"""Other programs on chi2 of the paper's map: the same minimum from four starts, the same errors and intervals."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from tests.fit_tables import chi2_residuals, law, model, standard_errors_of, tab
 
 __all__ = ["law", "model", "table"]
 NAMES = ("r", "epsilon", "quality_factor")
-STARTS = np.random.default_rng(0).uniform([0.85, 10.0, 39.0], [0.99, 150.0, 41.0], (8, 3))
+STARTS = np.random.default_rng(0).uniform([0.85, 10.0, 39.0], [0.99, 150.0, 41.0], (4, 3))
 
 
 def errors_from(law, values) -> np.ndarray:
@@ -30,7 +30,7 @@ def migrad(table, start):
     return minimiser
 
 
-def test_the_fit_ends_at_one_minimum_from_eight_starts(law, model):
+def test_the_fit_ends_at_one_minimum_from_four_starts(law, model):
     chi2 = Chi2(model, plain_weights(model.data, 0.0, np.zeros(len(model.data.read), bool)))
     for r, epsilon, quality in STARTS:
         best = chi2.minimised(np.array([1.0 - r**2, epsilon, 100.0 * np.log(quality / 40.0)])).place
@@ -41,7 +41,7 @@ def test_the_fit_ends_at_one_minimum_from_eight_starts(law, model):
     assert law.convergence.gradient < 1e-3
 
 
-def test_scipy_finds_this_minimum_from_eight_starts_and_the_same_errors(law, table):
+def test_scipy_finds_this_minimum_from_four_starts_and_the_same_errors(law, table):
     settings = {"bounds": ([0.0, 0.0, 1.0], [1.0, np.inf, np.inf]), "x_scale": [1e-3, 1.0, 1.0]}
     ends = [
         least_squares(lambda values: chi2_residuals(table, *values), start, xtol=1e-12, ftol=1e-12, **settings)
@@ -56,8 +56,8 @@ def test_scipy_finds_this_minimum_from_eight_starts_and_the_same_errors(law, tab
     np.testing.assert_allclose(law.correlations, covariance / np.outer(errors, errors), atol=2e-3)
 
 
-def test_migrad_finds_this_minimum_from_eight_starts(law, table):
-    for start in STARTS:
+def test_migrad_finds_this_minimum_from_two_starts(law, table):
+    for start in STARTS[:2]:
         minimiser = migrad(table, start)
         assert np.abs(errors_from(law, minimiser.values)).max() < 1e-3
         assert minimiser.fval == pytest.approx(law.chi2, abs=1e-5)

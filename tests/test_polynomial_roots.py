@@ -20,7 +20,7 @@ def found_in(coefficients, low=LOW, high=HIGH) -> np.ndarray:
     return np.asarray(roots)[np.asarray(exists)]
 
 
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 @given(
     roots=st.lists(st.integers(-60, 200), min_size=4, max_size=4, unique=True), scale=st.sampled_from([-3.0, 1e-6, 1e5])
 )
@@ -35,7 +35,7 @@ def test_separate_roots_are_all_found(roots, scale):
 
 
 @pytest.mark.filterwarnings("ignore:Descending")  # newer mpmath would like the lowest power first, older cannot
-@settings(deadline=None, max_examples=150)
+@settings(deadline=None, max_examples=80)
 @given(coefficients=st.lists(st.integers(-50, 50), min_size=5, max_size=5))
 def test_roots_of_any_quartic_are_those_of_mpmath(coefficients):
     leading = np.flatnonzero(coefficients)

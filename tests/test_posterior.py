@@ -15,7 +15,6 @@ from fitting import fit, posterior
 from fitting.infer.fit import explained_of
 from fitting.sampling.posterior import LogDensity, log_density_of
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
-from tests.batched_refit import chi2_of as chi2_at
 from tests.fit_tables import _orbits as orbits_of
 from tests.fit_tables import (
     amplitudes_and_errors,
@@ -59,6 +58,7 @@ def assert_close(found, name: str, mean: float, deviation: float) -> None:
     assert found.standard_deviation[name] == pytest.approx(deviation, rel=4.0 / np.sqrt(2.0 * count))
 
 
+@pytest.mark.long
 def test_one_parameter_agrees_with_quadrature(exact_q):
     result = fit(exact_q, "restitution")
     found = posterior(result)
@@ -81,14 +81,6 @@ def test_one_parameter_agrees_with_quadrature(exact_q):
         # four binomial deviations of the share below
         deviation = np.sqrt(0.025 * 0.975 / count)
         assert quad(density, ends[0], end, epsrel=1e-8)[0] / total == pytest.approx(share, abs=4.0 * deviation)
-
-
-def test_a_loss_that_vanishes_has_a_one_sided_density(exact_q):
-    result = fit(exact_q, "law")
-    found = posterior(result)
-    assert found.chains.samples[..., 1].min() >= 0.0
-    assert found.interval95["epsilon"][0] > 0.0
-    assert found.mean["epsilon"] > 0.0
 
 
 def test_the_sampler_agrees_with_importance_sampling(law, sampled):
@@ -137,14 +129,6 @@ def log_density(law) -> LogDensity:
     return log_density_of(explained_of(law))
 
 
-@pytest.mark.parametrize("tie", [1.0, np.nan])
-def test_parameters_that_are_one_have_no_space(law, tie):
-    explained = explained_of(law)
-    tied = tie * np.repeat(explained.end.jacobian[:, :1], 3, axis=1)
-    with pytest.raises(ValueError, match="hardly distinguish r, epsilon, quality_factor"):
-        log_density_of(dataclasses.replace(explained, end=explained.end._replace(jacobian=tied)))
-
-
 def test_the_samplers_density_is_that_of_another_programs_amplitudes(law, log_density):
     here, there = jnp.array([0.3, -0.4, 0.2]), jnp.array([-0.6, 0.5, 0.1])
     values = np.array([log_density.values(z) for z in (here, there)])
@@ -153,13 +137,6 @@ def test_the_samplers_density_is_that_of_another_programs_amplitudes(law, log_de
     expected = -0.5 * (chi2[0] - chi2[1]) + priors[0] - priors[1]
     # amplitudes agree to 1e-9 of themselves, 1e-7 of their errors
     assert float(log_density(here) - log_density(there)) == pytest.approx(expected, abs=1e-6)
-
-
-def test_the_samplers_gradient_is_that_of_its_density(log_density):
-    z, step = jnp.array([0.3, -0.4, 0.2]), 1e-4
-    density = jax.jit(log_density)
-    slope = [float(density(z + shift) - density(z - shift)) / (2.0 * step) for shift in step * jnp.eye(3)]
-    np.testing.assert_allclose(jax.grad(log_density)(z), slope, rtol=1e-5, atol=1e-6)
 
 
 def test_the_prior_is_the_derivative_of_the_values(log_density):
@@ -192,23 +169,6 @@ def test_the_posterior_of_impacts_that_last_is_that_of_the_fit(of_lasting):
     assert np.all(np.abs(off) < 4.0 * errors / np.sqrt(4000))
     np.testing.assert_allclose(list(found.standard_deviation.values()), errors, rtol=4.0 / np.sqrt(8000))
     assert np.corrcoef(found.chains.samples.reshape(-1, len(errors)).T) == pytest.approx(result.correlations, abs=0.07)
-
-
-def test_chi2_itself_agrees_with_the_gaussian_around_the_fit(of_lasting):
-    """Draws weighted to chi2 itself have the fit's mean, as far as so few tell."""
-    result, found = of_lasting
-    explained = explained_of(result)
-    covariance = explained.covariance
-    drawn = np.random.default_rng(3).multivariate_normal(explained.end.theta, covariance, size=300)
-    off = drawn - explained.end.theta
-    raw = -0.5 * (chi2_at(explained, drawn) - np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance), off))
-    weight = np.exp(raw - raw.max())
-    weight /= weight.sum()
-    worth = 1.0 / np.sum(weight**2)
-    # a heavy weight decides how many draws count
-    assert 1.0 < found.chains.effective_samples[0] < 120.0
-    pull = weight @ off / np.sqrt(np.diag(covariance))
-    assert np.abs(pull).max() < 4.5 / np.sqrt(worth)
 
 
 def test_samples_are_given_to_arviz(of_lasting):

@@ -279,33 +279,6 @@ def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_
     assert time.monotonic() < deadline
 
 
-WRITING = """
-import sys
-from afm_jax.whole_files import write_whole
-print("ready", flush=True)
-for number in range(10**9):
-    write_whole(sys.argv[1], f"{number % 10}" * 3_000_000)
-"""
-
-
-@pytest.mark.slow
-def test_a_kill_at_any_time_leaves_no_half_file(tmp_path):
-    # all that commands write goes this way (above); what is left beside the file has a name of its own
-    path, random, found = tmp_path / "fit.json", np.random.default_rng(4), set()
-    for _ in range(20):
-        with subprocess.Popen([sys.executable, "-c", WRITING, path], cwd=ROOT, stdout=subprocess.PIPE) as process:
-            assert process.stdout is not None
-            process.stdout.readline()
-            time.sleep(random.uniform(0.0, 0.05))
-            process.kill()
-        if path.exists():
-            text = path.read_text(encoding="utf-8")
-            assert text == text[:1] * 3_000_000
-            found.add(text[:1])
-    assert len(found) > 1
-    assert all(rest.name.startswith(".fit.json.") for rest in tmp_path.iterdir() if rest != path)
-
-
 @pytest.mark.slow
 def test_a_little_random_work_finds_nothing():
     fuzz_orbits(256, 3)

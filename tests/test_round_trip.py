@@ -4,7 +4,6 @@ The bundled table is of the full contact, which no formula of the fitted family 
 """
 
 import dataclasses
-import json
 from typing import Any
 
 import jax
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.motion.observe import observe
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE
 from tests.contact_experiment import paper_collisions
@@ -55,18 +53,6 @@ def test_orbits_of_a_scene_with_the_law_are_the_rows_predictions(result):
     np.testing.assert_allclose(speeds, result.rows.approach_speed_nm_per_us[rows], rtol=1e-6)
 
 
-def test_a_simulation_with_the_law_reads_the_predicted_amplitudes(result):
-    rows = result.rows
-    row = int(np.flatnonzero(rows.used & (result.table.order == 1))[0])
-    scene = scene_of(result, row)
-    orbits = afm.single_impact_orbits(scene, 1)
-    near = int(np.nanargmin(np.abs(np.asarray(orbits.peak_amplitude_nm) - rows.predicted_nm[row, 0])))
-    time = float(orbits.phase_rad[near]) / float(scene.platform.angular_frequency)
-    start = afm.State(time, float(scene.platform.position(time)), float(orbits.velocity_after_nm_per_us[near]))
-    found = observe(scene, afm.simulate(scene, start, duration_us=2000.0))
-    assert found.lockin_amplitude_nm == pytest.approx(rows.predicted_nm[row, 1], rel=1e-4)
-
-
 def test_the_law_and_its_samples_hold_the_contacts_law(result):
     law = result.law
     u = np.geomspace(30.0, 200.0, 30)
@@ -79,14 +65,3 @@ def test_the_law_and_its_samples_hold_the_contacts_law(result):
     # the samples are as wide as the band that is printed
     half = np.interp(u, law.approach_speed_nm_per_us, law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us)
     np.testing.assert_allclose(1.96 * drawn.std(axis=0), half, rtol=0.15)
-
-
-def test_the_law_comes_back_from_the_fits_file(result, tmp_path):
-    path = tmp_path / "fit.json"
-    path.write_text(json.dumps(result.to_dict(), allow_nan=False), encoding="utf-8")
-    law = afm.load_law(path)
-    u = np.geomspace(15.0, 400.0, 50)
-    np.testing.assert_allclose(law.rebound_speed(u), result.law.rebound_speed(u), rtol=1e-9)
-    np.testing.assert_allclose(law.collision_delay(u), result.law.collision_delay(u), rtol=1e-8, atol=1e-12)
-    np.testing.assert_allclose(law.capture_speed_nm_per_us, result.law.capture_speed_nm_per_us, rtol=1e-12)
-    assert [bool(law.extrapolated(speed)) for speed in (5.0, 50.0)] == [True, False]

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from afm_jax import Cantilever, Contact, Platform, Scene, load_scene, save_scene
@@ -58,6 +58,7 @@ def test_loop_is_exact_for_every_choice_of_effects(path: Path, effects: tuple[st
     assert eqx.tree_equal(load_scene(path), scene)
 
 
+@settings(max_examples=30)
 @given(values=st.fixed_dictionaries({name: st.floats(0.98 * value, 1.02 * value) for name, value in CHANGED.items()}))
 def test_loop_is_exact(values: dict[str, Any], tmp_path_factory: pytest.TempPathFactory):
     path = tmp_path_factory.getbasetemp() / "contact.toml"

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, load_scene, save_scene
@@ -82,6 +82,7 @@ def different(drive: Any) -> bool:
     return not np.isclose(float(drive.frequency_khz), float(drive.second.frequency_khz), rtol=1e-9, atol=0.0)
 
 
+@settings(max_examples=40)
 @given(
     cantilever=cantilevers,
     platform=st.builds(Platform, not_negative, frequencies, finite, finite, tones),

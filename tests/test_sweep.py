@@ -23,8 +23,7 @@ from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.scenefile import Start, load_scene, scene_tables
 from afm_jax.solve.lanes import LANES, filled
 from afm_jax.studies.sweep import STORE, plan_of, run_plan, sweep
-from tests.kills import ROOT, chunks_done, survive
-from tests.sweep_numbers import contents, plan
+from tests.kills import ROOT, chunks_done
 
 FREQUENCY, AMPLITUDE = "platform.reduced_frequency", "platform.amplitude_nm"
 PLANE = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 9]}, {"parameter": FREQUENCY, "linear": [0.8, 2.2, 15]}]
@@ -61,6 +60,7 @@ def test_orbits_are_those_of_single_impact_orbits():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_orbits_of_a_contact_are_those_that_simulations_end_in():
     axes = [{"parameter": FREQUENCY, "list": [2.1]}, {"parameter": AMPLITUDE, "list": [0.0, 8.0]}]
     scene = load_scene("figure8")
@@ -127,16 +127,6 @@ def test_an_interrupt_is_one_message(tmp_path: Path):
     assert process.returncode != 0, told
     assert told.count("Traceback") <= 1, told
     assert told.splitlines()[-1] == "KeyboardInterrupt", told
-
-
-@pytest.mark.slow
-def test_a_sweep_killed_twice_ends_in_the_same_bytes(tmp_path: Path):
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    broken.mkdir()
-    run_plan(plan(seconds=0.1), whole)
-    line = [*NUMBERS, str(broken), json.dumps({"seconds": 0.1})]
-    assert sum(survive(line, broken, times=2, chunks=14, seed=3)) == 14
-    assert contents(whole) == contents(broken)
 
 
 def test_the_command_says_why_points_have_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -237,7 +237,7 @@ def table_fields(draw: st.DrawFn) -> dict[str, Any]:
     }
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(fields=table_fields())
 def test_a_written_table_reads_back_the_same(tmp_path: Path, fields: dict[str, Any]):
     # The run-time type checks draw random numbers, which a strategy must not; hence the table is made here.

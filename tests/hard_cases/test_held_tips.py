@@ -22,6 +22,7 @@ from tests.reference_driven_contact import DrivenContact, follow
 from tests.test_simulate_contact import ROOM, reference, scene_of, state
 
 
+@pytest.mark.slow
 def test_a_held_tip_is_followed():
     system = reference(1.01, 0.5)
     start = system.start(phase_deg=0, height_nm=5, velocity_nm_per_us=-8.0)
