@@ -28,14 +28,8 @@ from afm_jax.scenefile.parameter_paths import parse_range, scene_batch
 from afm_jax.solve.lanes import LANES, Report
 from afm_jax.units import within_turn
 
-_STRETCHES = LANES
-"""Stretches at most that are ramped side by side: one block of tips."""
-_LONGEST_AGAIN = 320
-"""Values at most over which a lane goes on beyond its stretch."""
 _FEW = 16
 """Lanes of a block of laws."""
-_SAME = 1e-4
-"""Of the largest speed: points of orbits closer than this are the same."""
 _LISTED = 6
 """Kinds of motion that a line names."""
 _NONE_WENT_ON = (
@@ -231,15 +225,9 @@ def bifurcation_diagram(  # noqa: PLR0913
         return np.where(shown, part, np.nan)
 
     # in the lab the platform is another one than the frame's
-    amplitude, offset, ahead, omega = (
-        np.asarray(part)[:, None]
-        for part in (
-            platform.amplitude_nm,
-            platform.offset_nm,
-            seen.frame.phase_rad,
-            seen.scenes.platform.angular_frequency,
-        )
-    )
+    amplitude, offset = np.asarray(platform.amplitude_nm)[:, None], np.asarray(platform.offset_nm)[:, None]
+    ahead = np.asarray(seen.frame.phase_rad)[:, None]
+    omega = np.asarray(seen.scenes.platform.angular_frequency)[:, None]
     return BifurcationDiagram(
         values=ordered,
         upward=upward,
@@ -270,14 +258,16 @@ def _ramped(scenes: Scene, fresh: Tips, impacts: int, accuracy: float, report: R
         report: called with how many of how many values are done.
     """
     count = len(fresh.time_us)
-    length = -(-count // _STRETCHES)
+    # stretches at most that are ramped side by side: one block of tips
+    length = -(-count // LANES)
     numbers = starts = np.arange(0, count, length)
     few = {} if isinstance(scenes.interaction, Contact) else {"block": _FEW, "widths": (_FEW,)}
     at, begin = _rows_of((scenes, fresh), starts)
     rows = motions_of(at, begin, impacts, accuracy=accuracy, **few)
     # no motion is of the kind -1
     ramped = jax.tree.map(lambda part: np.full((count, *part.shape[1:]), -1, part.dtype), rows)
-    for step in range(1, length + _LONGEST_AGAIN):
+    # a lane goes on over so many values at most beyond its stretch
+    for step in range(1, length + 320):
         new = ~_same(rows, _rows_of(ramped, numbers))
         for part, values in zip(jax.tree.leaves(ramped), jax.tree.leaves(rows), strict=True):
             part[numbers[new]] = values[new]
@@ -325,7 +315,8 @@ def _same(one: Motions, other: Motions) -> Bool[np.ndarray, " lanes"]:
     speeds, others = (
         np.sort(np.where(_shown(each.verdicts), each.record.approach_nm_per_us, 0.0), axis=1) for each in (one, other)
     )
-    near = np.abs(speeds - others).max(axis=1) <= _SAME * np.maximum(others[:, -1], 1e-12)
+    # of the largest speed
+    near = np.abs(speeds - others).max(axis=1) <= 1e-4 * np.maximum(others[:, -1], 1e-12)
     return same & (near | (a.kind != MotionKind.ORBIT))
 
 

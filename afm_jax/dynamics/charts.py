@@ -31,9 +31,6 @@ from afm_jax.results import Result, public_result
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parse_range, scene_family
 from afm_jax.solve.lanes import Report, again_for, in_blocks
 
-_LANES = 1024
-"""Scenes gone through together: few enough for the cache, many enough to fill the vector units."""
-
 
 class OrbitVerdicts(NamedTuple):
     """What there is at each scene, one row an order, one column a scene (NumPy arrays).
@@ -84,7 +81,8 @@ def orbit_verdicts(
         stable, admissible = (orbits[name] > 0 for name in ("stable_orbits", "admissible_orbits"))
         return OrbitVerdicts(stable, admissible, **{name: orbits[name] for name in names})
 
-    return jax.tree.map(np.transpose, in_blocks(work, seen, block=_LANES, report=report))
+    # few enough for the cache, many enough to fill the vector units
+    return jax.tree.map(np.transpose, in_blocks(work, seen, block=1024, report=report))
 
 
 ORBIT_NUMBERS = (
@@ -99,8 +97,6 @@ ORBIT_NUMBERS = (
 """Columns of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
 DRIVEN_NUMBERS = ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg")
 """Further columns of a scene that base or force drives."""
-_ORBITS_AT_ONCE = 2
-"""Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
 
 @partial(jax.jit, static_argnames=("names",))
@@ -144,7 +140,8 @@ def highest_orbits(
         rows = jnp.arange(count * slots) // slots
         nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(names) + 1), jnp.nan),)
         there = frame.periodic & impact_law_of(scenes).leaves
-        few = max(count // _ORBITS_AT_ONCE, 1)
+        # few scenes have more than one orbit: blocks of roots are smaller than blocks of scenes
+        few = max(count // 2, 1)
         is_orbit = roots.found.ravel() & jnp.repeat(there, slots)
         columns = again_for(jax.vmap(orbit_of), is_orbit, (places, rows), nothing, block=few)
         admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in columns)

@@ -20,12 +20,20 @@ from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import approximate_law
-from afm_jax.dynamics.impact_loop import GRAZING, LoopFamily, LoopReading, driven_part, highest_of_flights, lowest_gap
+from afm_jax.dynamics.impact_loop import (
+    GRAZING,
+    LoopFamily,
+    LoopReading,
+    driven_part,
+    highest_of_flights,
+    impacts_at,
+    lowest_gap,
+)
 from afm_jax.dynamics.impact_orbits import (
+    LawLoops,
     ManyImpactOrbits,
     check_loop,
     loops_told_apart,
-    many_impact_orbits,
     multipliers_of,
     orbits_of,
 )
@@ -44,21 +52,11 @@ _STARTS = 8
 """Tips that are simulated for guesses, besides the one that starts where `simulate` does."""
 _SETTLING = 60
 """Contacts before their guesses."""
-_WINDOW = 0.05
-"""Periods by which the contacts of a guess may miss N drive periods."""
-_LARGEST_CHANGE = 0.3
-"""Longest step of Newton's method: in a phase, rad, and of a speed."""
-_FEW = 16
-"""Contacts of a few loops followed together, one program."""
 CHART_ACCURACY = 1e-6
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _DIFFERENCE = 1e-5
 """Of unknowns without dimension, for derivatives of test functions."""
-_RISING = 8
-"""Rounds of Newton's method for where a flight comes to the end of contact."""
-_LONGEST_CONTACT = 0.5
-"""Time that a contact may take beyond where it was expected to end, in flights of the loop."""
 
 
 @checked
@@ -161,12 +159,13 @@ def _flown(
     unknowns = np.concatenate(
         [np.stack([phase, rebound], axis=2), np.repeat(parameters[:, None], count, axis=1)], axis=2
     )
-    until = (following + _LONGEST_CONTACT * shortest)[flies]
+    # a contact may take longer than expected by this, in flights of the loop
+    until = (following + 0.5 * shortest)[flies]
     lanes = (
         jax.tree.map(lambda leaf: np.repeat(leaf[flies], count, axis=0), scenes),
         *(part.reshape(flies.size * count, *part.shape[2:]) for part in (unknowns[flies], until)),
     )
-    block, widths = (_FEW, ()) if few else (CONTACTS_AT_ONCE, WIDTHS)
+    block, widths = (16, ()) if few else (CONTACTS_AT_ONCE, WIDTHS)
     results = in_blocks(lambda part: next_departures(*part, **settings), lanes, block=block, widths=widths)
     later, maps, contacts, there = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), results)
     ends = (contacts.kind == ContactKind.IMPACT).all(axis=1) & np.isfinite(maps).all(axis=(1, 2, 3))
@@ -201,7 +200,8 @@ def _closed(
 
     def damped(loops: Float[np.ndarray, "loops n"], step: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
         longest = np.concatenate([np.ones((len(loops), count)), loops[:, count:]], axis=1)
-        return shortened(step, _LARGEST_CHANGE * longest)
+        # of a phase in rad, and of a speed
+        return shortened(step, 0.3 * longest)
 
     def linearised(loops: Float[np.ndarray, "loops n"], rows: Int[np.ndarray, " open"]) -> LinearisedRows:
         residual, slopes = np.full_like(loops, np.nan), np.full((*loops.shape, loops.shape[1]), np.nan)
@@ -219,40 +219,13 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> Float[np.ndarray, 
     law = approximate_law(scene.interaction, float(scene.cantilever.mass_ng))
     if law is None:
         return np.zeros((0, 2 * impacts))
-    law_scene = eqx.tree_at(lambda scene: scene.interaction, scene, law)
-    if impacts == 1:
-        # all of them, close to capture too, where no start of a search stays
-        orbits = single_impact_orbits(law_scene, order)
-        admissible = np.asarray(orbits.exists & orbits.admissible)
-        phases = np.asarray(orbits.phase_rad)[admissible, None]
-        rebounds = np.asarray(orbits.rebound_speed_nm_per_us)[admissible, None]
-    else:
-        reading = many_impact_orbits(law_scene, order, impacts).reading
-        phases, rebounds = np.asarray(reading.phase_rad), np.asarray(reading.rebound_speed_nm_per_us)
-    # `phase_rad` is within [0, 2 pi), but the impacts follow one another: a phase that falls is one turn later
-    turns = np.cumsum(np.diff(phases, axis=1) < 0.0, axis=1)
-    starts = phases + 2.0 * np.pi * np.pad(turns, ((0, 0), (1, 0)))
-    guesses = _where_contact_ends(scene, starts, rebounds)
-    return guesses[np.isfinite(guesses).all(axis=1) & (guesses[:, impacts:] > 0.0).all(axis=1)]
-
-
-def _where_contact_ends(
-    scene: Scene, phases: Float[np.ndarray, "orbits m"], rebounds: Float[np.ndarray, "orbits m"]
-) -> Float[np.ndarray, "orbits n"]:
-    """Return phases and speeds against the surface at which flights from the surface come to where contact ends.
-
-    By Newton's method, from straight paths: slow tips take a good part of a drive period.
-    """
-    surface, _ = surface_of(scene)
-    omega, gap = float(drive_of(scene).angular_frequency), float(gap_of_departure(scene))
-    begin, rise, speed = phases / omega, gap / rebounds, rebounds
-    height, rate = surface.position_and_velocity(begin)
-    for _ in range(_RISING):
-        position, velocity = scene.cantilever.propagator(rise)(height, rate + rebounds)
-        level, level_rate = surface.position_and_velocity(begin + rise)
-        speed = velocity - level_rate
-        rise = rise - (position - level - gap) / speed
-    return np.concatenate([phases + omega * rise, speed], axis=1)
+    family = LawLoops.of(eqx.tree_at(lambda scene: scene.interaction, scene, law), order)
+    loops, _ = family.found(np.zeros(0), impacts)
+    of_law = jax.vmap(lambda loop: impacts_at(*family.at(loop)))(jnp.asarray(loops))
+    omega, rebound = float(drive_of(scene).angular_frequency), np.asarray(of_law.speeds.rebound)
+    # a straight path to the gap at which contact ends
+    phases = omega * (np.asarray(of_law.leaving_us) + float(gap_of_departure(scene)) / rebound)
+    return np.concatenate([phases, rebound], axis=1)[(rebound > 0.0).all(axis=1)]
 
 
 def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
@@ -280,7 +253,8 @@ def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> lis
     for lane in range(_STARTS + 1):
         for begin in range(impacts + 1):
             window = turns[lane, begin : begin + impacts + 1]
-            if abs(window[-1] - window[0] - order) < _WINDOW:
+            # the contacts of a guess may miss N drive periods by this
+            if abs(window[-1] - window[0] - order) < 0.05:
                 phases = 2.0 * np.pi * (window[:-1] - np.floor(window[0]))
                 guesses.append(np.concatenate([phases, rebound[lane, begin : begin + impacts]]))
     return guesses
@@ -411,10 +385,6 @@ class ContactLoops(LoopFamily):
         if len(flown) < len(points):
             raise ValueError("a loop that was closed does not fly")
         return _readings_of(flown, (points.shape[1] - len(self.paths)) // 2)
-
-    def captures_nothing(self, point: Float[np.ndarray, " n"]) -> bool:  # noqa: ARG002
-        """Say no: a contact may capture."""
-        return False
 
     def _tests(self, flown: FlownLoop, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `LoopFamily.tests`; that of grazing NaN where it is not asked for."""

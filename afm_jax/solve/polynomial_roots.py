@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-_MAX_STEPS = 200  # Laguerre's method needs about 5; bisection alone over the widest interval about 100
 _SETTLED = 1e-12  # the last relative step; it has been cubed by then
 
 
@@ -72,7 +71,8 @@ def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, 
 
     def unsettled(state):
         step, _, _, x, move = state
-        return (step < _MAX_STEPS) & jnp.any(jnp.abs(move) > _SETTLED * jnp.abs(x))
+        # Laguerre's method needs about 5; bisection alone over the widest interval about 100
+        return (step < 200) & jnp.any(jnp.abs(move) > _SETTLED * jnp.abs(x))
 
     def narrow(state):
         step, a, b, x, move = state
