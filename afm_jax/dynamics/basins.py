@@ -80,11 +80,8 @@ class Basins(ResultTuple):
         """Why the shares are not valid: some starts could not be followed; None where all were."""
         lost = np.array([attractor.kind == MotionKind.UNRESOLVED for attractor in self.attractors])
         unresolved = 100.0 * self.share[lost].sum()
-        return (
-            f"{unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}"
-            if unresolved
-            else None
-        )
+        why = f"{unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}"
+        return why if unresolved else None
 
     @property
     def impact_speeds_nm_per_us(self) -> Float[np.ndarray, " impacts"]:
@@ -139,17 +136,12 @@ class Basins(ResultTuple):
             "attractor": names[self.attractor.ravel()],
         }
         points = [
-            {
-                "attractor": attractor.name,
-                "share": share,
-                "share_error": error,
-                "phase_rad": phase,
-                "velocity_after_nm_per_us": velocity,
-            }
-            for attractor, share, error in zip(self.attractors, self.share, self.share_error, strict=True)
+            {"attractor": told["name"], "share": told["share"], "share_error": told["share_error"]}
+            | {"phase_rad": phase, "velocity_after_nm_per_us": velocity}
+            for told in self.to_dict()["attractors"]
             # an attractor without an impact has a row, too
             for phase, velocity in zip(
-                attractor.phase_rad.tolist() or [None], attractor.velocity_nm_per_us.tolist() or [None], strict=True
+                told["phase_rad"].tolist() or [None], told["velocity_after_nm_per_us"].tolist() or [None], strict=True
             )
         ]
         return {"basins.csv": starts, "attractors.csv": columns_of(points)}

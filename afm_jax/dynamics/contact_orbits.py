@@ -86,7 +86,8 @@ def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = 
         raise TypeError("`scene` must have a `Contact`; `many_impact_orbits` has the orbits of a law")
     check_loop(order, impacts)
     family = ContactLoops.of(scene, order, accuracy=accuracy)
-    flown = [loop for loop in family.flown(family.found(np.zeros(0), impacts)[0]) if loop is not None]
+    found, _ = family.found(np.zeros(0), impacts)
+    flown = [loop for loop in family.flown(found, np.zeros((len(found), 0))) if loop is not None]
     loops = np.array([loop.loop for loop in flown]).reshape(-1, 2 * impacts)
     return orbits_of(loops, _readings_of(flown, impacts))
 
@@ -290,22 +291,19 @@ def single_contact_orbits(
     if laws is None:
         return columns
     plain, driven = jax.tree.map(np.asarray, scenes), driven_part(jax.tree.map(lambda leaf: leaf[0], scenes))
-    with_law = np.flatnonzero(laws[1])
-    law_scenes = jax.tree.map(
-        lambda leaf: np.asarray(leaf)[with_law], eqx.tree_at(lambda each: each.interaction, scenes, laws[0])
-    )
+    law_scenes = jax.tree.map(np.asarray, eqx.tree_at(lambda each: each.interaction, scenes, laws[0]))
     for number, order in enumerate(orders):
 
         def of_law(block: Scene, order: int = order) -> SingleImpactOrbits:
             return jax.vmap(lambda scene: single_impact_orbits(scene, order))(block)
 
         orbits = in_blocks(of_law, law_scenes, block=CONTACTS_AT_ONCE)
-        row, slot = np.nonzero(orbits.exists & orbits.admissible)
-        lane, rebound = with_law[row], orbits.rebound_speed_nm_per_us[row, slot]
+        lane, slot = np.nonzero(orbits.exists & orbits.admissible & laws[1][:, None])
+        rebound = orbits.rebound_speed_nm_per_us[lane, slot]
         # a straight path to the gap at which contact ends
         omega = RAD_PER_US_PER_KHZ * getattr(plain, driven).frequency_khz
         rise = np.asarray(omega * gap_of_departure(scenes))
-        guesses = np.stack([orbits.phase_rad[row, slot] + rise[lane] / rebound, rebound], axis=1)
+        guesses = np.stack([orbits.phase_rad[lane, slot] + rise[lane] / rebound, rebound], axis=1)
 
         def flown(
             loops: np.ndarray, rows: np.ndarray, lane: np.ndarray = lane, order: int = order
@@ -338,9 +336,10 @@ class ContactLoops(LoopFamily):
     accuracy: float = eqx.field(static=True, default=DEFAULT_ACCURACY)
     """Of `simulate`."""
 
-    def flown(self, points: Float[np.ndarray, "points n"]) -> list[FlownLoop | None]:
-        """Return the loops at points of a curve as they are simulated."""
-        loops, values = self.loops_and_values(points)
+    def flown(
+        self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
+    ) -> list[FlownLoop | None]:
+        """Return loops in rad and nm/us at values of the parameters as they are simulated."""
         scenes = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(loops), *np.shape(leaf))), self.scene)
         settings = {"paths": self.paths, "driven": self.driven, "accuracy": self.accuracy}
         return _flown(scenes, loops, int(self.order), values, few=True, **settings)
@@ -349,10 +348,9 @@ class ContactLoops(LoopFamily):
         """Return loops of m contacts in rad and nm/us, each once; see `LoopFamily`."""
         scene, order = self.scene_at(values), int(self.order)
         guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, order, impacts, self.accuracy)]
-        fractions = (values - np.asarray(self.low)) / np.asarray(self.width)
 
         def flown(loops: np.ndarray, _: Any) -> list[FlownLoop | None]:
-            return self.flown(np.hstack([loops / self.units(impacts), np.tile(fractions, (len(loops), 1))]))
+            return self.flown(loops, np.tile(values, (len(loops), 1)))
 
         roots = _closed(flown, np.array(guesses).reshape(-1, 2 * impacts), _CLOSING)
         return loops_told_apart(roots.x[roots.converged], order), 0
@@ -363,7 +361,7 @@ class ContactLoops(LoopFamily):
         size = len(point)
         around = [np.eye(size), -np.eye(size)] if self.test is not None else []
         aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
-        flown = [loop for loop in self.flown(point + aside) if loop is not None]
+        flown = [loop for loop in self.flown(*self.loops_and_values(point + aside)) if loop is not None]
         if len(flown) < len(aside):
             return None
         here = flown[0]
@@ -381,7 +379,7 @@ class ContactLoops(LoopFamily):
 
     def readings(self, points: Float[np.ndarray, "points n"]) -> LoopReading:
         """Return the readings of the orbits at points of a curve, NumPy arrays."""
-        flown = [loop for loop in self.flown(points) if loop is not None]
+        flown = [loop for loop in self.flown(*self.loops_and_values(points)) if loop is not None]
         if len(flown) < len(points):
             raise ValueError("a loop that was closed does not fly")
         return _readings_of(flown, (points.shape[1] - len(self.paths)) // 2)

@@ -27,7 +27,7 @@ from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import ParameterRange
-from afm_jax.solve.lanes import LANES, WIDTHS, Report, in_blocks
+from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.words import counted, with_error
 
 _PARTS = 20
@@ -221,8 +221,7 @@ def lyapunov_spectrum(
     else:
         # impacts recorded together: of long motions a block holds fewer
         block = max(1, min(LANES, 1_200_000 // impacts))
-        widths = [width for width in WIDTHS if width <= block]
-        exponents = in_blocks(work, (scenes, tips), block=block, widths=widths, report=report)
+        exponents = in_blocks(work, (scenes, tips), block=block, report=report)
     return jax.tree.map(lambda part: part[0], exponents) if single else exponents
 
 

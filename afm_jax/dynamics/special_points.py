@@ -135,16 +135,13 @@ def _roots_on(curve: FollowedCurve, family: LoopFamily) -> list[_Root]:
             if test == CAPTURE:
                 # there the branch ends: its last point is beside it
                 position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
-            roots.append(_Root(position, test, point, [point.point, *_beside(leg, fraction, test, family)]))
+            seen = [point]
+            if test in (GRAZING, CAPTURE):
+                # on one side the orbit may be flown
+                beside = (leg.at(fraction + apart, family) for apart in (-_ASIDE, _ASIDE))
+                seen += [each for each in beside if each is not None]
+            roots.append(_Root(position, test, point, [each.point for each in seen]))
     return roots
-
-
-def _beside(leg: CurveLeg, fraction: float, test: int, family: LoopFamily) -> list[np.ndarray]:
-    """Return the points on either side of a grazing or a capture: on one of them the orbit may be flown."""
-    if test not in (GRAZING, CAPTURE):
-        return []
-    points = (leg.at(fraction + apart, family) for apart in (-_ASIDE, _ASIDE))
-    return [point.point for point in points if point is not None]
 
 
 def at_lost_ends(curve: FollowedCurve) -> list[_Root]:
