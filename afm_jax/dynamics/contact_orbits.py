@@ -6,7 +6,6 @@ loop is closed to rounding and its multipliers are exact.
 """
 
 from collections.abc import Callable, Sequence
-from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,6 +27,7 @@ from afm_jax.dynamics.impact_loop import (
     highest_of_flights,
     impacts_at,
     lowest_gap,
+    trace_and_determinant,
 )
 from afm_jax.dynamics.impact_orbits import (
     LawLoops,
@@ -115,18 +115,19 @@ class FlownLoop(NamedTuple):
         by_parameters = self.maps[:, :, 2:].transpose(1, 0, 2).reshape(2 * count, -1)
         return np.hstack([whole.reshape(2 * count, 2 * count), by_parameters])
 
-    @property
-    def trace_and_determinant(self) -> tuple[float, float]:
-        """T and D of the linearised map."""
-        maps = self.maps[:, :, :2]
-        # the determinant of the product cancels
-        return float(np.trace(reduce(lambda product, each: each @ product, maps))), float(np.prod(np.linalg.det(maps)))
+    @jax.jit
+    def heights(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return the largest height of the tip in nm, and its lowest point above the gap at which the bridge forms.
 
-    def heights(self) -> tuple[float, float]:
-        """Return the largest height of the tip in nm, and its lowest above the gap at which the bridge forms."""
-        rebound = np.split(self.loop, 2)[1]
-        highest, lowest = _heights(self.scene, self.departure_us, rebound, self.contacts.arrival_time_us)
-        return float(highest), float(lowest)
+        That one is infinite where no flight has a lowest point.
+        """
+        scene, begin_us, rebound = self.scene, jnp.asarray(self.departure_us), jnp.split(self.loop, 2)[1]
+        surface, response = surface_of(scene)
+        level, rate = surface.position_and_velocity(begin_us)
+        lasts = self.contacts.arrival_time_us - begin_us
+        flights = begin_us, level + gap_of_departure(scene), rate + rebound, jnp.zeros_like(begin_us), lasts
+        lowest = lowest_gap(scene.cantilever, surface, flights, _SAMPLES) - scene.interaction.bridge_forms_nm
+        return highest_of_flights(scene.cantilever, response, flights, _SAMPLES), lowest
 
 
 def _flown(
@@ -316,8 +317,8 @@ def single_contact_orbits(
         for row in np.flatnonzero(roots.converged):
             place, loop = (number, lane[row]), roots.details[row]
             columns["admissible"][place], columns["unresolved"][place] = True, False
-            largest, _ = np.abs(multipliers_of(*map(np.asarray, loop.trace_and_determinant)))
-            multiplier, peak = largest, loop.heights()[0]
+            largest, _ = np.abs(multipliers_of(*trace_and_determinant(loop.maps)))
+            multiplier, peak = largest, float(loop.heights()[0])
             if multiplier < 1.0 and not peak < columns["peak_amplitude_nm"][place]:
                 columns["stable"][place] = True
                 columns["peak_amplitude_nm"][place], columns["largest_multiplier"][place] = peak, multiplier
@@ -386,8 +387,8 @@ class ContactLoops(LoopFamily):
 
     def _tests(self, flown: FlownLoop, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `LoopFamily.tests`; that of grazing NaN where it is not asked for."""
-        trace, determinant = flown.trace_and_determinant
-        near = flown.heights()[1] * float(flown.scene.cantilever.angular_frequency) if grazing else np.nan
+        trace, determinant = trace_and_determinant(flown.maps)
+        near = float(flown.heights()[1]) * float(flown.scene.cantilever.angular_frequency) if grazing else np.nan
         speeds = np.array([near, np.split(flown.loop, 2)[1].min()]) / float(self.speed_unit)
         return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, speeds)
 
@@ -402,7 +403,7 @@ def _readings_of(flown: Sequence[FlownLoop], impacts: int) -> LoopReading:
 
 def _reading_of(flown: FlownLoop) -> LoopReading:
     scene, contacts, (phase, rebound) = flown.scene, flown.contacts, np.split(flown.loop, 2)
-    trace, determinant = flown.trace_and_determinant
+    trace, determinant = trace_and_determinant(flown.maps)
     # of the contact before each departure
     approach = np.roll(contacts.approach_speed_nm_per_us, 1)
     lasts = np.roll(contacts.departure_time_us - contacts.arrival_time_us, 1)
@@ -421,17 +422,3 @@ def _reading_of(flown: FlownLoop) -> LoopReading:
         "missing": np.abs(flown.gaps * np.repeat([1.0, 1.0 / rebound.max()], len(phase))).max(),
     }
     return LoopReading(**{name: jnp.asarray(value) for name, value in values.items()})
-
-
-@jax.jit
-def _heights(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array) -> tuple[Array, Array]:
-    """Return the largest height in nm of flights between contacts, and their lowest point above where the bridge forms.
-
-    Infinite where no flight has a lowest point.
-    """
-    surface, response = surface_of(scene)
-    level, rate = surface.position_and_velocity(begin_us)
-    height, velocity, lasts = level + gap_of_departure(scene), rate + rebound, arrival_us - begin_us
-    flights = begin_us, height, velocity, jnp.zeros_like(begin_us), lasts
-    lowest = lowest_gap(scene.cantilever, surface, flights, _SAMPLES) - scene.interaction.bridge_forms_nm
-    return highest_of_flights(scene.cantilever, response, flights, _SAMPLES), lowest

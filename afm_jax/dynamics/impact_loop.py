@@ -133,10 +133,14 @@ def trace_and_determinant_of(
 
     before = surface.velocity(impacts.arrival_us) - impacts.speeds.approach
     parts = jax.vmap(step_of_map)(impacts.leaving_us, impacts.velocity, impacts.duration_us, jnp.roll(before, -1))
-    whole = reduce(lambda product, part: part @ product, list(parts))
+    return trace_and_determinant(parts)
+
+
+def trace_and_determinant(maps: Float[Any, "m 2 unknowns"]) -> tuple[Any, Any]:
+    """Return T and D of linearised maps one after the other, by their first two unknowns."""
+    whole = reduce(lambda product, each: each[:, :2] @ product, list(maps), np.eye(2))
     # the determinant as a product of those of the parts: that of the whole cancels
-    each = parts[:, 0, 0] * parts[:, 1, 1] - parts[:, 0, 1] * parts[:, 1, 0]
-    return whole[0, 0] + whole[1, 1], jnp.prod(each)
+    return whole[0, 0] + whole[1, 1], (maps[:, 0, 0] * maps[:, 1, 1] - maps[:, 0, 1] * maps[:, 1, 0]).prod()
 
 
 def flights_of(unknowns: Float[Array, " n"], loop: ImpactLoop) -> tuple[Float[Array, " m"], ...]:
