@@ -136,12 +136,12 @@ class Basins(ResultTuple):
             "attractor": names[self.attractor.ravel()],
         }
         points = [
-            {"attractor": told["name"], "share": told["share"], "share_error": told["share_error"]}
+            {"attractor": row["name"], "share": row["share"], "share_error": row["share_error"]}
             | {"phase_rad": phase, "velocity_after_nm_per_us": velocity}
-            for told in self.to_dict()["attractors"]
+            for row in self.to_dict()["attractors"]
             # an attractor without an impact has a row, too
             for phase, velocity in zip(
-                told["phase_rad"].tolist() or [None], told["velocity_after_nm_per_us"].tolist() or [None], strict=True
+                row["phase_rad"].tolist() or [None], row["velocity_after_nm_per_us"].tolist() or [None], strict=True
             )
         ]
         return {"basins.csv": starts, "attractors.csv": columns_of(points)}
@@ -266,10 +266,10 @@ class _Finder:
 
     def number_of(self, motion: Attractor) -> int:
         """Return the number of the attractor that a motion has come to; one that is not known so far is added."""
-        for number, known in enumerate(self.attractors):
+        for number, attractor in enumerate(self.attractors):
             # the name says kind, m and N
-            if known.name == motion.name and (
-                not motion.impacts or self._is_at(known, motion.phase_rad[-1:], motion.velocity_nm_per_us[-1:])[0]
+            if attractor.name == motion.name and (
+                not motion.impacts or self._is_at(attractor, motion.phase_rad[-1:], motion.velocity_nm_per_us[-1:])[0]
             ):
                 return number
         self.attractors.append(motion)
